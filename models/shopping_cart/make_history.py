@@ -1,0 +1,319 @@
+"""Make a history of one rigid body with Box2D, an engine that pbrl_ppl does not use.
+
+    python make_history.py --effect angular_drag=1.2 --seed 5 --out recorded
+
+The step is 1 ms, and forces, floor friction and damping are applied here, not by the engine, so an
+agreement with pbrl_ppl is no tautology. Vectors of the plane are complex numbers: ``a.real`` is
+along x, a turn by an angle is a product with ``exp(1j * angle)``.
+"""
+
+import argparse
+import cmath
+import math
+import warnings
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+with warnings.catch_warnings():  # Box2D's generated wrapper warns on import under newer Pythons
+    warnings.simplefilter("ignore", DeprecationWarning)
+    import Box2D
+
+STEP = 0.001  # s
+NORMAL_GRAVITY = 9.81  # m/s^2
+# Box2D's tolerances are compiled in (b2_linearSlop 0.005, b2_velocityThreshold 1 length unit per
+# second, below which nothing bounces). With the centimetre as unit of length they are 0.05 mm and
+# 1 cm/s, too small to matter here.
+CM = 100.0
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """Anisotropic Coulomb friction at a point of the body (m, m, rad, 1, 1)."""
+
+    x: float
+    y: float
+    theta: float
+    mu_x: float
+    mu_y: float
+
+
+@dataclass(frozen=True)
+class Setup:
+    """A box, the world it is in, and how it is pushed and measured; SI units.
+
+    A ``noise`` of NaN says that the state dimension is not measured.
+    """
+
+    name: str
+    size: tuple[float, float]
+    mass: float
+    r: float = 0.0
+    mu_c: float = 0.0
+    wheel: Wheel | None = None
+    hinge: complex | None = None  # body point that is pinned to the world's origin
+    gravity: float = 0.0  # in the plane, downwards
+    room: float | None = None  # walls at +-room
+    time_step: float = 0.1
+    n_train: int = 12
+    n_test: int = 4
+    n_intervals: int = 30
+    hold: int = 3  # intervals that a random wrench is held for
+    wrench_sd: tuple[float, float, float] = (12.0, 12.0, 2.0)
+    start_range: tuple[float, float, float] = (3.0, 3.0, math.pi)  # x, y, theta are uniform in +-
+    start_sd: tuple[float, float, float] = (1.2, 1.2, 0.8)  # vx, vy, omega are normal
+    noise: tuple[float, ...] = (0.002, 0.002, 0.004, 0.01, 0.01, 0.02)
+
+    @property
+    def inertia(self) -> float:
+        """Moment of inertia about the centre under uniform density, kg m^2."""
+        return self.mass * (self.size[0] ** 2 + self.size[1] ** 2) / 12
+
+
+@dataclass(frozen=True)
+class Effects:
+    """Physics that a scene does not declare; every default is the null value."""
+
+    linear_drag: float = 0.0  # kg/s
+    quadratic_drag: float = 0.0  # kg/m
+    angular_drag: float = 0.0  # N m s
+    constant_force: tuple[float, float] = (0.0, 0.0)  # N, world frame
+    body_force: tuple[float, float] = (0.0, 0.0)  # N, body frame
+    constant_torque: float = 0.0  # N m
+    push_offset: tuple[float, float] = (0.0, 0.0)  # m, body frame
+    actuator_rotation: float = 0.0  # rad
+    inertia_scale: float = 1.0
+    pivot_friction: float = 0.0  # N m, Coulomb torque in the hinge
+    pivot_damping: float = 0.0  # N m s
+    # Outside pbrl_ppl's catalogue:
+    stiction_patch: float = 0.0  # extra isotropic Coulomb friction of the floor where x > 0
+    time_varying_gain: tuple[float, float] = (0.0, 1.0)  # force times 1 + a sin(2 pi t / period)
+
+    def __post_init__(self) -> None:
+        for f in fields(self):
+            got, expected = np.shape(getattr(self, f.name)), np.shape(f.default)
+            if got != expected:
+                raise ValueError(f"effect {f.name}: expected shape {expected}, got {got}")
+
+
+CART = Setup(
+    name="cart",
+    size=(0.9, 0.55),
+    mass=6.5,
+    r=0.2,
+    mu_c=0.3,
+    wheel=Wheel(x=-0.25, y=0.0, theta=0.0, mu_x=0.04, mu_y=0.45),
+    room=12.0,
+)
+PENDULUM = Setup(
+    name="arm",
+    size=(0.03, 0.4),
+    mass=0.5,
+    hinge=0.18j,
+    gravity=9.81,
+    time_step=0.02,
+    n_train=8,
+    n_test=3,
+    n_intervals=100,
+    wrench_sd=(0.0, 0.0, 0.0),  # it swings freely
+    start_range=(0.0, 0.0, 1.5),
+    start_sd=(0.0, 0.0, 2.0),
+    noise=(math.nan, math.nan, 0.001, math.nan, math.nan, 0.02),
+)
+SETUPS = {"cart": CART, "pendulum": PENDULUM}
+
+
+def dot(a: complex, b: complex) -> float:
+    """Scalar product of two plane vectors."""
+    return (a.conjugate() * b).real
+
+
+def cross(a: complex, b: complex) -> float:
+    """Out-of-plane part of the vector product of two plane vectors."""
+    return (a.conjugate() * b).imag
+
+
+def rollout(
+    setup: Setup, start: np.ndarray, wrenches: np.ndarray, effects: Effects | None = None
+) -> np.ndarray:
+    """Return the states (n + 1, 6) at the samples, noise-free, from start (6,) and wrenches (n, 3).
+
+    A hinged body takes only theta and omega from ``start``; the hinge gives the rest.
+    """
+    effects = Effects() if effects is None else effects
+    if setup.hinge is None and (effects.pivot_friction or effects.pivot_damping):
+        raise ValueError("pivot_friction and pivot_damping act in a hinge, and the setup has none")
+    x, y, theta, vx, vy, omega = (float(v) for v in start)
+    if setup.hinge is not None:
+        position = -setup.hinge * cmath.exp(1j * theta)
+        velocity = 1j * omega * position
+        x, y, vx, vy = position.real, position.imag, velocity.real, velocity.imag
+    inertia = setup.inertia * effects.inertia_scale
+
+    world = Box2D.b2World(gravity=(0, -setup.gravity * CM), doSleep=False, continuousPhysics=False)
+    ground = world.CreateStaticBody()
+    if setup.room is not None:
+        a = setup.room * CM
+        corners = [(-a, -a), (a, -a), (a, a), (-a, a)]
+        for i in range(4):
+            # The engine mixes friction as sqrt(product) and restitution as the maximum, so the
+            # pair has the body's values when the wall has the same friction and no restitution.
+            ground.CreateEdgeFixture(
+                vertices=[corners[i - 1], corners[i]], friction=setup.mu_c, restitution=0.0
+            )
+    body = world.CreateDynamicBody(
+        position=(x * CM, y * CM),
+        angle=theta,
+        linearVelocity=(vx * CM, vy * CM),
+        angularVelocity=omega,
+    )
+    half = (setup.size[0] * CM / 2, setup.size[1] * CM / 2)
+    body.CreatePolygonFixture(box=half, density=1.0, friction=setup.mu_c, restitution=setup.r)
+    body.massData = Box2D.b2MassData(mass=setup.mass, center=(0, 0), I=inertia * CM**2)
+    if setup.hinge is not None:
+        world.CreateRevoluteJoint(
+            bodyA=ground,
+            bodyB=body,
+            localAnchorA=(0, 0),
+            localAnchorB=(setup.hinge.real * CM, setup.hinge.imag * CM),
+            enableMotor=effects.pivot_friction > 0,
+            motorSpeed=0.0,
+            maxMotorTorque=effects.pivot_friction * CM**2,
+        )
+
+    def state() -> list[float]:
+        p, v = body.position, body.linearVelocity
+        return [p.x / CM, p.y / CM, body.angle, v.x / CM, v.y / CM, body.angularVelocity]
+
+    states = [state()]
+    steps = round(setup.time_step / STEP)
+    for i, wrench in enumerate(wrenches):
+        for j in range(steps):
+            x, _, theta, vx, vy, omega = state()
+            v, turn = complex(vx, vy), cmath.exp(1j * theta)
+            force, torque = total_wrench(effects, wrench, turn, v, omega, (i * steps + j) * STEP)
+            v += force / setup.mass * STEP
+            omega += torque / inertia * STEP
+            if effects.stiction_patch and x > 0:
+                v *= 1 - min(1.0, effects.stiction_patch * NORMAL_GRAVITY * STEP / (abs(v) or 1.0))
+            if setup.wheel is not None:
+                v, omega = roll(setup.wheel, setup.mass, inertia, turn, v, omega)
+            body.linearVelocity = (v.real * CM, v.imag * CM)
+            body.angularVelocity = omega
+            world.Step(STEP, 20, 10)
+            if setup.hinge is not None:
+                # The step moves the centre along its tangent; the engine's next solve would project
+                # the old velocity on the new tangent and so lose energy, 2.5 % a second at 5 rad/s.
+                arm = -setup.hinge * cmath.exp(1j * body.angle)
+                v = 1j * body.angularVelocity * arm
+                body.linearVelocity = (v.real * CM, v.imag * CM)
+        states.append(state())
+    return np.array(states)
+
+
+def total_wrench(
+    effects: Effects, wrench: np.ndarray, turn: complex, v: complex, omega: float, time: float
+) -> tuple[complex, float]:
+    """Return the force (N) and the torque (N m) on the body: the commanded ones and the effects."""
+    amplitude, period = effects.time_varying_gain
+    force = complex(wrench[0], wrench[1]) * cmath.exp(1j * effects.actuator_rotation)
+    force *= 1 + amplitude * math.sin(2 * math.pi * time / period)
+    torque = float(wrench[2]) + cross(turn * complex(*effects.push_offset), force)
+    force -= (effects.linear_drag + effects.quadratic_drag * abs(v)) * v
+    force += complex(*effects.constant_force) + turn * complex(*effects.body_force)
+    torque += effects.constant_torque - (effects.angular_drag + effects.pivot_damping) * omega
+    return force, torque
+
+
+def roll(
+    wheel: Wheel, mass: float, inertia: float, turn: complex, v: complex, omega: float
+) -> tuple[complex, float]:
+    """Return the velocities after the floor's friction on the wheel over one step.
+
+    Along each axis the impulse that stops the wheel's point, at most mu m g dt. The axes are
+    iterated with the clipping on the accumulated impulse, so their order does not matter.
+    """
+    arm = turn * complex(wheel.x, wheel.y)
+    along = turn * cmath.exp(1j * wheel.theta)
+    axes = ((along, wheel.mu_x), (1j * along, wheel.mu_y))
+    impulse = [0.0, 0.0]
+    for _ in range(10):
+        for k, (axis, mu) in enumerate(axes):
+            lever = cross(arm, axis)
+            effective_mass = 1 / (1 / mass + lever**2 / inertia)
+            speed = dot(v, axis) + omega * lever
+            limit = mu * mass * NORMAL_GRAVITY * STEP
+            wanted = min(max(impulse[k] - effective_mass * speed, -limit), limit)
+            v += (wanted - impulse[k]) / mass * axis
+            omega += (wanted - impulse[k]) * lever / inertia
+            impulse[k] = wanted
+    return v, omega
+
+
+def simulate(seed: int, setup: Setup = CART, **effects: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
+    """Return (train, test) in the history format; ``effects`` are the fields of `Effects`.
+
+    Examples
+    --------
+    >>> train, test = simulate(5, angular_drag=1.2)
+    """
+    rng = np.random.default_rng(seed)
+    undeclared = Effects(**effects)
+    train = [_trajectory(rng, setup, undeclared, k) for k in range(setup.n_train)]
+    test = [_trajectory(rng, setup, undeclared, k) for k in range(setup.n_test)]
+    return pd.concat(train, ignore_index=True), pd.concat(test, ignore_index=True)
+
+
+def _trajectory(
+    rng: np.random.Generator, setup: Setup, effects: Effects, number: int
+) -> pd.DataFrame:
+    limit = np.array(setup.start_range)
+    start = np.concatenate([rng.uniform(-limit, limit), rng.normal(0.0, setup.start_sd)])
+    n = setup.n_intervals
+    held = rng.normal(0.0, setup.wrench_sd, size=(math.ceil(n / setup.hold), 3))
+    wrenches = np.repeat(held, setup.hold, axis=0)[:n].round(6)
+    states = rollout(setup, start, wrenches, effects)
+    measured = states + rng.standard_normal(states.shape) * np.array(setup.noise)
+    frame = pd.DataFrame({"trajectory": number, "step": range(n + 1)})
+    frame["time"] = (frame["step"] * setup.time_step).round(6)
+    frame["body"] = setup.name
+    frame[["x", "y", "theta", "vx", "vy", "omega"]] = measured.round(6)
+    frame[["force_x", "force_y", "torque"]] = np.vstack([wrenches, np.full(3, np.nan)])
+    return frame
+
+
+def parse_effect(text: str) -> tuple[str, float | tuple[float, ...]]:
+    """Return name and value of ``name=1.2`` or ``name=1.2,-0.6``."""
+    known = [f.name for f in fields(Effects)]
+    name, _, value = text.partition("=")
+    if name not in known:
+        raise argparse.ArgumentTypeError(f"unknown effect {name!r}; known: {', '.join(known)}")
+    try:
+        numbers = tuple(float(part) for part in value.split(","))
+    except ValueError:
+        message = f"{name}: expected a number, or two with a comma, got {value!r}"
+        raise argparse.ArgumentTypeError(message) from None
+    return name, numbers[0] if len(numbers) == 1 else numbers
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Write train.csv and test.csv."""
+    parser = argparse.ArgumentParser(description="Make a history with Box2D.")
+    parser.add_argument("--setup", choices=SETUPS, default="cart")
+    parser.add_argument(
+        "--effect", action="append", default=[], type=parse_effect, metavar="NAME=VALUE[,VALUE]"
+    )
+    parser.add_argument("--seed", type=int, required=True)
+    parser.add_argument("--out", type=Path, required=True, help="folder for train.csv and test.csv")
+    options = parser.parse_args(arguments)
+    train, test = simulate(options.seed, SETUPS[options.setup], **dict(options.effect))
+    options.out.mkdir(parents=True, exist_ok=True)
+    train.to_csv(options.out / "train.csv", index=False)
+    test.to_csv(options.out / "test.csv", index=False)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,37 @@
+"""The package's exceptions: each message says what is wrong, where, and the cure."""
+
+
+class PbrlError(Exception):
+    """Base of every error that a user can cause and cure."""
+
+
+class SceneError(PbrlError, ValueError):
+    """A scene that cannot be: an unknown key, an impossible shape, a joint to nowhere."""
+
+
+class HistoryError(PbrlError, ValueError):
+    """A history that cannot be used: missing columns, bad times, values that are not numbers."""
+
+
+class ParameterError(PbrlError, ValueError):
+    """A physical parameter outside its support, or one that is missing or unknown."""
+
+
+class EffectError(PbrlError, ValueError):
+    """An effect that is not in the catalogue, or that does not apply to the body named."""
+
+
+class SimulationError(PbrlError, RuntimeError):
+    """The engine was asked for something impossible."""
+
+
+class PosteriorError(PbrlError, ValueError):
+    """A file that is no posterior of this package, or one that lacks a part."""
+
+
+class OutputError(PbrlError, OSError):
+    """An output that cannot be written, or that exists already."""
+
+
+class ConvergenceWarning(UserWarning):
+    """A fit whose R-hat or effective sample size is not good enough to rely on."""

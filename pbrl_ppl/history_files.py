@@ -1,0 +1,177 @@
+"""Files of histories: CSV, Parquet and NetCDF to a table, and back, written atomically."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import secrets
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from pbrl_ppl.errors import HistoryError, OutputError
+
+STATE = ("x", "y", "theta", "vx", "vy", "omega")
+WRENCH = ("force_x", "force_y", "torque")
+COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
+SUFFIXES = (".csv", ".parquet", ".nc")
+
+# pandas reads numbers exactly from 3.1 on, and warns there of the option that older ones need.
+_PANDAS = tuple(int(part) for part in pd.__version__.split(".")[:2])
+_EXACT: dict[str, Any] = {} if _PANDAS >= (3, 1) else {"float_precision": "round_trip"}
+_MISSING = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None"]
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Return the rows of a history file, as they are.
+
+    Raises
+    ------
+    HistoryError
+        If the file is missing, of an unknown kind, or damaged.
+    """
+    readers = {".csv": _read_csv, ".parquet": _read_parquet, ".nc": _read_netcdf}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise HistoryError(
+            f"history {path}: the suffix is {path.suffix!r}, expected one of {', '.join(SUFFIXES)}; "
+            "save it as one of these"
+        )
+    try:
+        return reader(path)
+    except FileNotFoundError:
+        raise HistoryError(f"history {path}: there is no such file; check the path") from None
+    except OSError as error:
+        raise HistoryError(f"history {path}: cannot be read: {error}") from None
+
+
+def _read_csv(path: Path) -> pd.DataFrame:
+    content = path.read_bytes()
+    lines = content.removeprefix(b"\xef\xbb\xbf").splitlines()
+    if not any(line.strip() for line in lines):
+        raise HistoryError(f"history {path}: the file is empty; expected a header and rows")
+    # pandas fills short rows with blanks without a word, so that a file that was cut off would pass.
+    if b'"' not in content:
+        cells = lines[0].count(b",") + 1
+        for number, line in enumerate(lines, start=1):
+            found = line.count(b",") + 1
+            if found != cells and line.strip():
+                raise HistoryError(
+                    f"history row {number}: {found} cells, expected {cells} as in the header; "
+                    f"repair or drop the row (file {path})"
+                )
+    number_columns = {name: _MISSING for name in ("step", "time", *STATE, *WRENCH)}
+    try:
+        frame = pd.read_csv(
+            io.BytesIO(content),
+            dtype={"trajectory": "str", "body": "str"},
+            keep_default_na=False,
+            na_values=number_columns,
+            skipinitialspace=True,
+            skip_blank_lines=False,
+            low_memory=False,
+            encoding="utf-8",
+            **_EXACT,
+        )
+    except (ValueError, pd.errors.ParserError) as error:
+        raise HistoryError(f"history {path}: not a CSV table: {error}") from None
+    if not isinstance(frame.index, pd.RangeIndex):
+        raise HistoryError(f"history {path}: rows have more cells than the header; repair them")
+    return frame
+
+
+def _read_parquet(path: Path) -> pd.DataFrame:
+    with path.open("rb") as file:
+        try:
+            return pd.read_parquet(file)
+        except Exception as error:  # pyarrow's own errors share no base with Python's
+            raise HistoryError(f"history {path}: not a Parquet table: {error}") from None
+
+
+def _read_netcdf(path: Path) -> pd.DataFrame:
+    path.open("rb").close()
+    try:
+        with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
+            dataset = stored.load()
+    except Exception as error:  # HDF5 raises many kinds on a damaged file
+        raise HistoryError(f"history {path}: not a NetCDF file: {error}") from None
+    dims = {
+        "observed": ("trajectory", "time", "body", "state"),
+        "action": ("trajectory", "time", "body", "wrench"),
+        "clock": ("trajectory", "time"),
+    }
+    for name, expected in dims.items():
+        got = dataset[name].dims if name in dataset else None
+        if got != expected:
+            raise HistoryError(
+                f"history {path}: variable {name!r} has dimensions {got}, expected {expected}; "
+                "write the file with History.save"
+            )
+    return to_table(dataset)
+
+
+def to_table(dataset: xr.Dataset) -> pd.DataFrame:
+    """Return one row for each (trajectory, step, body) of a history's dataset."""
+    clock = dataset["clock"].to_numpy()
+    trajectory, step = np.nonzero(~np.isnan(clock))
+    bodies = np.asarray(dataset["body"].to_numpy(), dtype=object)
+    labels = dataset["trajectory"].to_numpy()
+    k = len(bodies)
+    columns = {
+        "trajectory": np.repeat(labels[trajectory], k),
+        "step": np.repeat(step, k),
+        "time": np.repeat(clock[trajectory, step], k),
+        "body": np.tile(bodies, len(step)),
+    }
+    for variable, dim in (("observed", "state"), ("action", "wrench")):
+        rows = dataset[variable].to_numpy()[trajectory, step].reshape(len(step) * k, -1)
+        for name, column in zip(dataset[dim].to_numpy(), rows.T, strict=True):
+            columns[str(name)] = column
+    return pd.DataFrame(columns)
+
+
+def write_dataset(dataset: xr.Dataset, path: Path) -> None:
+    """Write a history's measured arrays as CSV, Parquet or NetCDF by suffix.
+
+    Raises
+    ------
+    OutputError
+        If the suffix is unknown or the file cannot be written.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise OutputError(
+            f"history {path}: the suffix is {path.suffix!r}, expected one of {', '.join(SUFFIXES)}"
+        )
+    if suffix == ".csv":
+        table = to_table(dataset)
+        write_atomically(path, lambda to: table.to_csv(to, index=False, lineterminator="\n"))
+    elif suffix == ".parquet":
+        table = to_table(dataset)
+        write_atomically(path, lambda to: table.to_parquet(to, index=False))
+    else:
+        measured = dataset[["observed", "action", "clock", "n_rows"]]
+        write_atomically(path, lambda to: measured.to_netcdf(to, engine="h5netcdf"))
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
+    """Call ``write`` with a temporary path beside ``path``, then rename it to ``path``.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written; nothing is left behind then.
+    """
+    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
+    try:
+        write(temporary)
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error}") from None
+    finally:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)

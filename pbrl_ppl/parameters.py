@@ -1,0 +1,212 @@
+"""Phi: the unknown physical parameters, their priors as data, and dict <-> vector."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import ParameterError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A univariate prior as data: a family of Table 1 (or a normal) and its hyper-parameters.
+
+    Parameters
+    ----------
+    family : str
+        ``log_normal``, ``truncated_normal``, ``normal``, ``half_normal`` or ``von_mises``.
+    mu, sigma : float
+        Location and scale; of the logarithm for ``log_normal``. For ``von_mises``, ``mu`` is the
+        mean direction and ``kappa`` the concentration.
+    lower, upper : float
+        Support of a truncated normal.
+    kappa : float
+        Concentration of a von Mises distribution.
+    """
+
+    family: str
+    mu: float = 0.0
+    sigma: float = 1.0
+    lower: float = -np.inf
+    upper: float = np.inf
+    kappa: float = 1.0
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that the prior allows."""
+        if self.family in ("log_normal", "half_normal"):
+            return 0.0, np.inf
+        if self.family == "truncated_normal":
+            return self.lower, self.upper
+        return -np.inf, np.inf
+
+    @property
+    def centre(self) -> float:
+        """A central value inside the support."""
+        if self.family == "log_normal":
+            return float(np.exp(self.mu))
+        if self.family == "half_normal":
+            return 0.6745 * self.sigma
+        return float(np.clip(self.mu, *self.support))
+
+    def residual(self, x: Array) -> Array:
+        """Half its square is the negative log-density up to a constant, so MAP is least squares.
+
+        Parameters
+        ----------
+        x : ndarray
+            Values inside the support, any shape.
+
+        Returns
+        -------
+        ndarray
+            Residuals, dimensionless, same shape.
+        """
+        if self.family == "log_normal":
+            # -log p = log x + (log x - mu)^2 / 2 sigma^2: a square about mu - sigma^2
+            safe = np.log(np.maximum(x, 1e-300))
+            return np.asarray((safe - self.mu + self.sigma**2) / self.sigma)
+        if self.family == "von_mises":
+            return np.asarray(2.0 * np.sqrt(self.kappa) * np.sin((x - self.mu) / 2.0))
+        return np.asarray((x - self.mu) / self.sigma)
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw values; ``size`` of them."""
+        if self.family == "log_normal":
+            return rng.lognormal(self.mu, self.sigma, size)
+        if self.family == "von_mises":
+            return rng.vonmises(self.mu, self.kappa, size)
+        if self.family == "half_normal":
+            return np.abs(rng.normal(0.0, self.sigma, size))
+        draws = rng.normal(self.mu, self.sigma, size)
+        outside = (draws < self.support[0]) | (draws > self.support[1])
+        while outside.any():
+            draws[outside] = rng.normal(self.mu, self.sigma, int(outside.sum()))
+            outside = (draws < self.support[0]) | (draws > self.support[1])
+        return draws
+
+
+#: Table 1's names for one body, in the order of Eq. 8, with units.
+BODY_PARAMETERS: Mapping[str, str] = {
+    "mass": "kg",
+    "r": "1",
+    "mu_c": "1",
+    "w_x": "m",
+    "w_y": "m",
+    "w_theta": "rad",
+    "mu_x": "1",
+    "mu_y": "1",
+}
+WHEEL_PARAMETERS = ("w_x", "w_y", "w_theta", "mu_x", "mu_y")
+
+
+@dataclass(frozen=True)
+class Block:
+    """One named parameter over the bodies that have it.
+
+    Parameters
+    ----------
+    name : str
+        Variable name, e.g. ``mass`` or ``linear_drag_coefficient``.
+    bodies : tuple of str
+        The bodies, in the scene's order; the length of the variable.
+    unit : str
+        SI unit.
+    priors : tuple of Prior
+        One a body.
+    effect : str, optional
+        The effect that the parameter belongs to; None for Table 1.
+    """
+
+    name: str
+    bodies: tuple[str, ...]
+    unit: str
+    priors: tuple[Prior, ...]
+    effect: str | None = None
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The order in which unknown parameters stand in the vector phi.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Named parameters; the vector is their concatenation.
+    """
+
+    blocks: tuple[Block, ...]
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return sum(len(block.bodies) for block in self.blocks)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """One readable label an entry, such as ``mass[cart]``."""
+        return tuple(f"{block.name}[{body}]" for block in self.blocks for body in block.bodies)
+
+    @property
+    def priors(self) -> tuple[Prior, ...]:
+        """One prior an entry."""
+        return tuple(prior for block in self.blocks for prior in block.priors)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper end of each entry's support, shape (p,) each."""
+        support = np.array([prior.support for prior in self.priors]).reshape(-1, 2)
+        return support[:, 0], support[:, 1]
+
+    def slices(self) -> Iterator[tuple[Block, slice]]:
+        """Each block with its place in the vector."""
+        begin = 0
+        for block in self.blocks:
+            yield block, slice(begin, begin + len(block.bodies))
+            begin += len(block.bodies)
+
+    def index(self, name: str, body: str) -> int:
+        """Place of one parameter of one body in the vector.
+
+        Raises
+        ------
+        ParameterError
+            If the layout has no such parameter.
+        """
+        label = f"{name}[{body}]"
+        if label not in self.labels:
+            raise ParameterError(
+                f"parameter {label} is not among the unknown ones: {', '.join(self.labels)}"
+            )
+        return self.labels.index(label)
+
+    def to_vector(self, values: Mapping[str, object]) -> Array:
+        """Stack named values, scalars or (body,) arrays, into the vector phi, shape (p,).
+
+        Raises
+        ------
+        ParameterError
+            If a name is missing, or a value has the wrong length.
+        """
+        vector = np.empty(self.size)
+        for block, place in self.slices():
+            if block.name not in values:
+                raise ParameterError(f"parameter {block.name} is missing; add it to the values")
+            value = np.asarray(values[block.name], dtype=float)
+            if value.size not in (1, len(block.bodies)):
+                raise ParameterError(
+                    f"parameter {block.name} has {value.size} values, expected"
+                    f" {len(block.bodies)}, one for each of {', '.join(block.bodies)}"
+                )
+            vector[place] = value.ravel()
+        return vector
+
+    def to_dict(self, vector: Array) -> dict[str, Array]:
+        """Split phi, shape (..., p), into named arrays, shape (..., body)."""
+        return {block.name: vector[..., place] for block, place in self.slices()}

@@ -1,0 +1,5 @@
+"""The engine: world building, wheel, joints and the batched rollout; alone in importing pymunk."""
+
+from pbrl_ppl.physics.simulator import Simulator
+
+__all__ = ["Simulator"]

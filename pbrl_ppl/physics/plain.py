@@ -1,0 +1,118 @@
+"""The reference rollout: a new engine world a transition, in plain Python. Slow, and clear."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.physics.properties import COLUMN, Array
+from pbrl_ppl.physics.world import World
+from pbrl_ppl.scene import Scene
+
+
+def rollout(
+    scene: Scene,
+    effects: tuple[Attached, ...],
+    properties: Array,
+    effect_values: Array,
+    start: Array,
+    actions: Array,
+    substeps: int,
+) -> tuple[Array, bool]:
+    """Step one transition of the horizon H through a new world.
+
+    Parameters
+    ----------
+    scene : Scene
+        Geometry.
+    effects : tuple of Attached
+        Effects; those with a force law act every substep.
+    properties : ndarray
+        Engine properties, shape (body, column).
+    effect_values : ndarray
+        Parameters of the force laws in their order, shape (q,).
+    start : ndarray
+        Start state, shape (body, 6), SI units.
+    actions : ndarray
+        Wrench held over each interval, shape (H, body, 3), N and N m.
+    substeps : int
+        Engine steps an interval.
+
+    Returns
+    -------
+    states : ndarray
+        State at the end of each interval, shape (H, body, 6).
+    touched : bool
+        Whether shapes came into contact.
+    """
+    world = World(scene)
+    world.set_properties(properties)
+    for body, state in zip(world.bodies, start, strict=True):
+        body.position, body.angle = tuple(state[:2]), state[2]
+        body.velocity, body.angular_velocity = tuple(state[3:5]), state[5]
+    names = [body.name for body in scene.dynamic]
+    laws = [one for one in effects if one.effect.force is not None]
+    offsets = np.cumsum([0, *(len(one.effect.parameters) for one in laws)])
+    step = scene.time_step / substeps
+    states = np.empty((len(actions), len(names), 6))
+    touched = False
+    for h, action in enumerate(actions):
+        for _ in range(substeps):
+            wrench = action.copy()
+            for one, begin, end in zip(laws, offsets[:-1], offsets[1:], strict=True):
+                i = names.index(one.body)
+                if one.effect.force is not None:
+                    state = _state(world, i)
+                    one.effect.force(state, action[i], effect_values[begin:end], wrench[i])
+            for i, body in enumerate(world.bodies):
+                body.force, body.torque = tuple(wrench[i, :2]), wrench[i, 2]
+            _place_wheels(world, properties, step)
+            world.space.step(step)
+            touched = touched or near_contact(world)
+        for i in range(len(names)):
+            states[h, i] = _state(world, i)
+    return states, touched
+
+
+def _state(world: World, i: int) -> Array:
+    body = world.bodies[i]
+    return np.array(
+        [*body.position, body.angle, *body.velocity, body.angular_velocity], dtype=float
+    )
+
+
+def _place_wheels(world: World, properties: Array, step: float) -> None:
+    """Put each ground body where the wheel will be when the engine solves for velocities."""
+    for wheel in world.wheels:
+        body, row = world.bodies[wheel.body], properties[wheel.body]
+        theta = body.angle + body.angular_velocity * step
+        c, s = math.cos(theta), math.sin(theta)
+        x, y = row[COLUMN["w_x"]], row[COLUMN["w_y"]]
+        wheel.ground.angle = theta + row[COLUMN["w_theta"]]
+        wheel.ground.position = (
+            body.position.x + body.velocity.x * step + c * x - s * y,
+            body.position.y + body.velocity.y * step + s * x + c * y,
+        )
+
+
+def near_contact(world: World) -> bool:
+    """Whether bounding circles reach a wall or each other: the same test as the compiled path's."""
+    for i, body in enumerate(world.bodies):
+        x, y = body.position
+        for segment in world.obstacles:
+            ax, ay, bx, by, radius = segment
+            dx, dy = bx - ax, by - ay
+            length = dx * dx + dy * dy
+            t = min(1.0, max(0.0, ((x - ax) * dx + (y - ay) * dy) / length)) if length else 0.0
+            reach = world.radii[i] + radius
+            if (x - ax - t * dx) ** 2 + (y - ay - t * dy) ** 2 <= reach * reach:
+                return True
+        for j in range(i):
+            if world.can_touch[i, j]:
+                ox, oy = world.bodies[j].position
+                reach = world.radii[i] + world.radii[j]
+                if (x - ox) ** 2 + (y - oy) ** 2 <= reach * reach:
+                    return True
+    return False

@@ -1,0 +1,339 @@
+"""Scenes: the known part of the physics (Gamma): shapes, walls, joints, gravity and the clock.
+
+Everything here is frozen and hashable, in SI units, and checked when it is built, whether it comes
+from a TOML file or from Python.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbrl_ppl import scene_toml
+from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene_checks import (
+    PARAMETER_NAMES,
+    Point,
+    finite,
+    flag,
+    hyper_parameters,
+    known_parameters,
+    label,
+    located,
+    nearest,
+    positive,
+    vector,
+)
+from pbrl_ppl.shape import Shape
+
+__all__ = ["PARAMETER_NAMES", "WORLD", "Body", "Joint", "Point", "Scene", "Shape", "Wall"]
+
+WORLD = "world"
+"""The name of the ground in a joint."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body: what is known of it, and what is to be inferred.
+
+    Attributes
+    ----------
+    name : str
+        Name, as in the history's ``body`` column.
+    shape : Shape
+        Outline (m).
+    wheel : bool
+        Whether an anisotropic-friction wheel is part of its prior.
+    static : bool
+        Whether it never moves; it then needs a `pose`.
+    known : tuple of (str, float)
+        Parameters that are given, not inferred; a mapping is accepted.
+    prior : tuple of (str, tuple of (str, float))
+        Hyper-parameters (``mu``, ``sigma``, ``kappa``) that replace the defaults; a mapping of
+        mappings is accepted.
+    effects : tuple of str
+        Effects of the catalogue that are declared from the start.
+    pose : tuple of float, optional
+        ``x, y, theta`` (m, m, rad) of a static body.
+
+    Raises
+    ------
+    SceneError
+        If a name, number or combination is impossible.
+
+    Examples
+    --------
+    >>> Body("cart", Shape.box(1.0, 0.6), known={"mass": 2.0}).known
+    (('mass', 2.0),)
+    """
+
+    name: str
+    shape: Shape
+    wheel: bool = False
+    static: bool = False
+    known: tuple[tuple[str, float], ...] = ()
+    prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
+    effects: tuple[str, ...] = ()
+    pose: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        label(self.name, "body: name")
+        where = f'body "{self.name}"'
+        if self.name == WORLD:
+            raise SceneError(f'{where}: "world" is the name of the ground; call the body otherwise')
+        if not isinstance(self.shape, Shape):
+            raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
+        flag(self.wheel, f"{where}: wheel")
+        flag(self.static, f"{where}: static")
+        object.__setattr__(self, "known", known_parameters(self.known, where))
+        object.__setattr__(self, "prior", hyper_parameters(self.prior, where))
+        for name in dict(self.known).keys() & dict(self.prior).keys():
+            raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
+        if isinstance(self.effects, str) or not isinstance(self.effects, Iterable):
+            raise SceneError(f"{where}: effects is {self.effects!r}, expected a list of names")
+        effects = tuple(label(effect, f"{where}: effects") for effect in self.effects)
+        if len(set(effects)) < len(effects):
+            raise SceneError(f"{where}: effects {list(effects)} names one twice; drop it")
+        object.__setattr__(self, "effects", effects)
+        if self.pose is not None:
+            object.__setattr__(self, "pose", vector(self.pose, 3, f"{where}: pose"))
+        if self.static and self.pose is None:
+            raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
+        if self.static and self.wheel:
+            raise SceneError(f"{where}: a static body cannot have a wheel; drop one of the two")
+
+
+@dataclass(frozen=True)
+class Wall:
+    """An immovable segment between two points of the world (m); TOML keys ``from`` and ``to``."""
+
+    start: Point
+    end: Point
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "start", vector(self.start, 2, "wall: from"))
+        object.__setattr__(self, "end", vector(self.end, 2, "wall: to"))
+        if self.start == self.end:
+            raise SceneError(f"wall: from and to are both {list(self.start)}; its length is zero")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint between two bodies, or a body and the world.
+
+    Attributes
+    ----------
+    kind : str
+        ``"hinge"`` or ``"distance"``.
+    bodies : tuple of str
+        Two names; ``"world"`` is the ground.
+    anchor_a, anchor_b : tuple of float
+        Where it holds the first and the second, each in that body's frame (m).
+    known : bool
+        Whether it is given (True) or to be inferred.
+    """
+
+    kind: str
+    bodies: tuple[str, str]
+    anchor_a: Point
+    anchor_b: Point
+    known: bool = True
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("hinge", "distance"):
+            raise SceneError(
+                f'joint: kind is {self.kind!r}, expected "hinge" or "distance"'
+                f"{nearest(self.kind, ('hinge', 'distance'))}"
+            )
+        if isinstance(self.bodies, str) or not isinstance(self.bodies, Iterable):
+            raise SceneError(f"joint: bodies is {self.bodies!r}, expected two names")
+        bodies = tuple(label(name, "joint: bodies") for name in self.bodies)
+        if len(bodies) != 2:
+            raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
+        if bodies[0] == bodies[1]:
+            raise SceneError(f'joint: it joins "{bodies[0]}" with itself; name two bodies')
+        object.__setattr__(self, "bodies", bodies)
+        where = f"joint of {bodies[0]} and {bodies[1]}"
+        object.__setattr__(self, "anchor_a", vector(self.anchor_a, 2, f"{where}: anchor_a"))
+        object.__setattr__(self, "anchor_b", vector(self.anchor_b, 2, f"{where}: anchor_b"))
+        flag(self.known, f"{where}: known")
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Everything that is known before a measurement (Gamma, and what Phi is to contain).
+
+    Attributes
+    ----------
+    gravity : tuple of float
+        Acceleration in the plane (m/s^2).
+    normal_gravity : float
+        Acceleration that presses bodies on the floor (m/s^2); 0 in a side view.
+    time_step : float
+        Time between samples (s).
+    substeps : int
+        Engine steps a sample.
+    bodies : tuple of Body
+        At least one that is not static.
+    walls : tuple of Wall
+        Immovable segments.
+    joints : tuple of Joint
+        Hinges and distance joints.
+
+    Raises
+    ------
+    SceneError
+        If the parts do not fit together.
+
+    Examples
+    --------
+    >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
+    >>> Scene.from_toml(scene.to_toml()) == scene
+    True
+    """
+
+    time_step: float
+    bodies: tuple[Body, ...]
+    gravity: Point = (0.0, 0.0)
+    normal_gravity: float = 0.0
+    substeps: int = 10
+    walls: tuple[Wall, ...] = ()
+    joints: tuple[Joint, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gravity", vector(self.gravity, 2, "[world]: gravity"))
+        normal = finite(self.normal_gravity, "[world]: normal_gravity")
+        if normal < 0:
+            raise SceneError(f"[world]: normal_gravity is {normal}, expected 0 or more")
+        object.__setattr__(self, "normal_gravity", normal)
+        object.__setattr__(self, "time_step", positive(self.time_step, "[world]: time_step"))
+        steps: Any = self.substeps
+        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+            raise SceneError(f"[world]: substeps is {steps!r}, expected a whole number from 1 up")
+        object.__setattr__(self, "substeps", int(steps))
+        for key, kind in (("bodies", Body), ("walls", Wall), ("joints", Joint)):
+            parts = tuple(getattr(self, key))
+            for part in parts:
+                if not isinstance(part, kind):
+                    raise SceneError(f"scene: {key} holds {part!r}, expected a {kind.__name__}")
+            object.__setattr__(self, key, parts)
+        self._check_bodies()
+        self._check_joints()
+
+    def _check_bodies(self) -> None:
+        names = [body.name for body in self.bodies]
+        for name in names:
+            if names.count(name) > 1:
+                raise SceneError(f'scene: {names.count(name)} bodies are called "{name}"; rename')
+        if not self.dynamic:
+            raise SceneError("scene: it has no body that moves; add a [[body]]")
+        for body in self.bodies:
+            if body.wheel and self.normal_gravity <= 0:
+                raise SceneError(
+                    f'body "{body.name}": wheel = true but nothing presses it on the floor; set '
+                    "normal_gravity (9.81 in a top view) in [world], or wheel = false"
+                )
+
+    def _check_joints(self) -> None:
+        names = [WORLD, *(body.name for body in self.bodies)]
+        for position, joint in enumerate(self.joints, start=1):
+            for name in joint.bodies:
+                if name not in names:
+                    raise SceneError(
+                        f'[[joint]] number {position}: there is no body "{name}"'
+                        f"{nearest(name, names)}"
+                    )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scene:
+        """Read a scene from a TOML file.
+
+        Raises
+        ------
+        SceneError
+            If the file is missing, is not TOML (says the line), or describes an impossible scene.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            raise SceneError(f"scene {path}: there is no such file; check the path") from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise SceneError(f"scene {path}: cannot be read as UTF-8 text: {error}") from None
+        with located(f"scene {path}"):
+            return cls.from_toml(text)
+
+    @classmethod
+    def from_toml(cls, text: str) -> Scene:
+        """Build a scene from TOML text.
+
+        Raises
+        ------
+        SceneError
+            As `load`; an unknown key is named with its table and the nearest known key.
+        """
+        world, arrays = scene_toml.read(text)
+        bodies, walls, joints = [], [], []
+        for where, table in arrays["body"]:
+            with located(where):
+                bodies.append(Body(**{**table, "shape": Shape(**table["shape"])}))
+        for where, table in arrays["wall"]:
+            with located(where):
+                walls.append(Wall(table["from"], table["to"]))
+        for where, table in arrays["joint"]:
+            with located(where):
+                joints.append(Joint(**table))
+        return cls(bodies=tuple(bodies), walls=tuple(walls), joints=tuple(joints), **world)
+
+    def to_toml(self) -> str:
+        """Return TOML text from which `from_toml` builds an equal scene."""
+        world = ("gravity", "normal_gravity", "time_step", "substeps")
+        sections = [("[world]", {key: getattr(self, key) for key in world})]
+        for body in self.bodies:
+            table = dict(vars(body), shape=vars(body.shape), known=dict(body.known))
+            table["prior"] = {name: dict(hyper) for name, hyper in body.prior}
+            sections.append(("[[body]]", table))
+        sections += [("[[wall]]", {"from": w.start, "to": w.end}) for w in self.walls]
+        sections += [("[[joint]]", vars(joint)) for joint in self.joints]
+        return scene_toml.write(sections)
+
+    @property
+    def dynamic(self) -> tuple[Body, ...]:
+        """The bodies that are not static, in order."""
+        return tuple(body for body in self.bodies if not body.static)
+
+    def body(self, name: str) -> Body:
+        """Return the body of this name.
+
+        Raises
+        ------
+        SceneError
+            If there is none; the nearest name is given.
+        """
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        names = [body.name for body in self.bodies]
+        raise SceneError(f'scene: there is no body "{name}"{nearest(name, names)}')
+
+    def replace(self, **changes: Any) -> Scene:
+        """Return a scene with these attributes changed, checked again."""
+        return dataclasses.replace(self, **changes)
+
+    def with_effects(self, body_name: str, *names: str) -> Scene:
+        """Return a scene in which this body has these effects declared as well.
+
+        Raises
+        ------
+        SceneError
+            If there is no such body.
+        """
+        body = self.body(body_name)
+        effects = tuple(dict.fromkeys((*body.effects, *names)))
+        changed = dataclasses.replace(body, effects=effects)
+        return self.replace(bodies=tuple(changed if b is body else b for b in self.bodies))

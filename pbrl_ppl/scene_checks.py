@@ -1,0 +1,134 @@
+"""Checks of a scene's values: each returns the value in canonical form or raises `SceneError`."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from numbers import Real
+from typing import Any
+
+from pbrl_ppl.errors import SceneError
+
+Point = tuple[float, float]
+
+PARAMETER_NAMES = ("mass", "r", "mu_c", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
+"""The parameters of a body, in the order of Table 1."""
+
+HYPER_NAMES = ("mu", "sigma", "kappa")
+
+
+def nearest(name: object, known: Iterable[str]) -> str:
+    """Return ``; did you mean "..."?`` with the known name nearest to this one, or nothing."""
+    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.0)
+    return f'; did you mean "{close[0]}"?' if close else ""
+
+
+@contextmanager
+def located(where: str) -> Iterator[None]:
+    """Say in a `SceneError` raised inside where it happened."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(f"{where}: {error}") from None
+
+
+def finite(value: object, where: str) -> float:
+    """Return a finite number as a float."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        raise SceneError(f"{where} is {value!r}, expected a number")
+    try:
+        number = float(value)
+    except OverflowError:
+        number = math.inf
+    if not math.isfinite(number):
+        raise SceneError(f"{where} is {number}, expected a finite number")
+    return number
+
+
+def positive(value: object, where: str) -> float:
+    """Return a number above zero as a float."""
+    number = finite(value, where)
+    if number <= 0:
+        raise SceneError(f"{where} is {number}, expected more than 0")
+    return number
+
+
+def flag(value: object, where: str) -> None:
+    """Refuse what is not a boolean."""
+    if not isinstance(value, bool):
+        raise SceneError(f"{where} is {value!r}, expected true or false")
+
+
+def label(value: object, where: str) -> str:
+    """Return a name: text that is not empty and has no blanks around it or control characters."""
+    if not isinstance(value, str):
+        raise SceneError(f"{where} is {value!r}, expected text")
+    if not value or value != value.strip() or not value.isprintable():
+        raise SceneError(f"{where} is {value!r}, expected a name without blanks around it")
+    return value
+
+
+def vector(value: object, length: int, where: str) -> Any:
+    """Return a tuple of this many finite numbers."""
+    if isinstance(value, str | Mapping) or not isinstance(value, Iterable):
+        raise SceneError(f"{where} is {value!r}, expected {length} numbers")
+    numbers = tuple(finite(item, where) for item in value)
+    if len(numbers) != length:
+        raise SceneError(f"{where} has {len(numbers)} numbers, expected {length}")
+    return numbers
+
+
+def _items(value: object, where: str) -> list[tuple[Any, Any]]:
+    """Return the pairs of a mapping, or of a tuple of pairs, refusing repeated names."""
+    if isinstance(value, Mapping):
+        return list(value.items())
+    try:
+        pairs = [(name, item) for name, item in value]  # type: ignore[attr-defined]
+    except (TypeError, ValueError):
+        raise SceneError(f"{where} is {value!r}, expected a table of names and values") from None
+    if len({name for name, _ in pairs}) < len(pairs):
+        raise SceneError(f"{where} gives one name twice; drop one")
+    return pairs
+
+
+def known_parameters(value: object, where: str) -> tuple[tuple[str, float], ...]:
+    """Return the known parameters of a body in Table 1's order."""
+    known: dict[str, float] = {}
+    for name, item in _items(value, f"{where}: known"):
+        if name not in PARAMETER_NAMES:
+            raise SceneError(
+                f'unknown parameter "{name}" in known of {where}{nearest(name, PARAMETER_NAMES)}'
+            )
+        number = finite(item, f"{where}: known {name}")
+        if name == "mass":
+            positive(number, f"{where}: known mass")
+        if name == "r" and number < 0:
+            raise SceneError(f"{where}: known r is {number}, expected 0 or more")
+        if name.startswith("mu_") and not 0 <= number <= 1:
+            raise SceneError(f"{where}: known {name} is {number}, expected between 0 and 1")
+        known[name] = number
+    return tuple((name, known[name]) for name in PARAMETER_NAMES if name in known)
+
+
+def hyper_parameters(
+    value: object, where: str
+) -> tuple[tuple[str, tuple[tuple[str, float], ...]], ...]:
+    """Return the priors' hyper-parameters of a body in Table 1's order."""
+    prior: dict[str, tuple[tuple[str, float], ...]] = {}
+    for name, table in _items(value, f"{where}: prior"):
+        if name not in PARAMETER_NAMES:
+            raise SceneError(
+                f'unknown parameter "{name}" in prior of {where}{nearest(name, PARAMETER_NAMES)}'
+            )
+        hyper: dict[str, float] = {}
+        for key, item in _items(table, f"{where}: prior {name}"):
+            if key not in HYPER_NAMES:
+                raise SceneError(
+                    f'unknown key "{key}" in prior {name} of {where}{nearest(key, HYPER_NAMES)}'
+                )
+            check = finite if key == "mu" else positive
+            hyper[key] = check(item, f"{where}: prior {name} {key}")
+        prior[name] = tuple((key, hyper[key]) for key in HYPER_NAMES if key in hyper)
+    return tuple((name, prior[name]) for name in PARAMETER_NAMES if name in prior)
