@@ -35,3 +35,7 @@ class OutputError(PbrlError, OSError):
 
 class ConvergenceWarning(UserWarning):
     """A fit whose R-hat or effective sample size is not good enough to rely on."""
+
+
+class FitError(PbrlError, ValueError):
+    """A model that cannot be fitted as asked."""

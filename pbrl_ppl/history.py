@@ -59,12 +59,12 @@ class Segments:
     @property
     def n(self) -> int:
         """Number of segments."""
-        return self.start.shape[0]
+        return len(self.start)
 
     @property
     def horizon(self) -> int:
         """Intervals in each segment, H."""
-        return self.actions.shape[1]
+        return int(self.actions.shape[1])
 
 
 class History:

@@ -38,8 +38,8 @@ def read_table(path: Path) -> pd.DataFrame:
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise HistoryError(
-            f"history {path}: the suffix is {path.suffix!r}, expected one of {', '.join(SUFFIXES)}; "
-            "save it as one of these"
+            f"history {path}: the suffix is {path.suffix!r}, expected one of "
+            f"{', '.join(SUFFIXES)}; save it as one of these"
         )
     try:
         return reader(path)
@@ -54,7 +54,7 @@ def _read_csv(path: Path) -> pd.DataFrame:
     lines = content.removeprefix(b"\xef\xbb\xbf").splitlines()
     if not any(line.strip() for line in lines):
         raise HistoryError(f"history {path}: the file is empty; expected a header and rows")
-    # pandas fills short rows with blanks without a word, so that a file that was cut off would pass.
+    # pandas fills short rows with blanks without a word: a file that was cut off would pass.
     if b'"' not in content:
         cells = lines[0].count(b",") + 1
         for number, line in enumerate(lines, start=1):
@@ -66,7 +66,7 @@ def _read_csv(path: Path) -> pd.DataFrame:
                 )
     number_columns = {name: _MISSING for name in ("step", "time", *STATE, *WRENCH)}
     try:
-        frame = pd.read_csv(
+        frame: pd.DataFrame = pd.read_csv(
             io.BytesIO(content),
             dtype={"trajectory": "str", "body": "str"},
             keep_default_na=False,

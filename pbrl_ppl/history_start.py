@@ -46,8 +46,7 @@ def complete_start(state: Floats, scene: Scene, *, estimate_velocities: bool) ->
 def _incomplete(start: Floats, scene: Scene) -> str:
     parts = []
     for i, body in enumerate(scene.dynamic):
-        empty = np.isnan(start[:, :, i]).all(axis=(0, 1))
-        lacking = [name for name, none in zip(STATE, empty, strict=True) if none]
+        lacking = [name for j, name in enumerate(STATE) if np.isnan(start[:, :, i, j]).all()]
         if lacking:
             parts.append(f'{", ".join(lacking)} of body "{body.name}"')
     what = "; ".join(parts) or "some cells at every step"

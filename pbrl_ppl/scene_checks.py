@@ -21,8 +21,9 @@ HYPER_NAMES = ("mu", "sigma", "kappa")
 
 def nearest(name: object, known: Iterable[str]) -> str:
     """Return ``; did you mean "..."?`` with the known name nearest to this one, or nothing."""
-    close = difflib.get_close_matches(str(name), list(known), n=1, cutoff=0.0)
-    return f'; did you mean "{close[0]}"?' if close else ""
+    lower = {each.lower(): each for each in known}
+    close = difflib.get_close_matches(str(name).lower(), list(lower), n=1, cutoff=0.0)
+    return f'; did you mean "{lower[close[0]]}"?' if close else ""
 
 
 @contextmanager

@@ -7,9 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene_checks import Point, nearest, positive, vector
+
+Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -63,8 +66,7 @@ class Shape:
         if self.radius is not None:
             object.__setattr__(self, "radius", positive(self.radius, "shape: radius"))
         if self.vertices is not None:
-            vertices, _ = polygon_outline(self.vertices)
-            object.__setattr__(self, "vertices", vertices)
+            object.__setattr__(self, "vertices", _check_polygon(self.vertices))
 
     @classmethod
     def box(cls, width: float, height: float) -> Shape:
@@ -88,7 +90,7 @@ class Shape:
             x, y = self.size[0] / 2, self.size[1] / 2
             return ((-x, -y), (x, -y), (x, y), (-x, y))
         if self.vertices is not None:
-            return polygon_outline(self.vertices)[1]
+            return self.vertices if _moments(self.vertices)[0] > 0 else self.vertices[::-1]
         return None
 
     @property
@@ -108,7 +110,7 @@ class Shape:
             return self.size[0] * self.size[1]
         if self.radius is not None:
             return float(np.pi * self.radius**2)
-        return self._polygon_moments()[0]
+        return abs(_moments(self.vertices or ())[0])
 
     @property
     def unit_moment(self) -> float:
@@ -117,59 +119,58 @@ class Shape:
             return (self.size[0] ** 2 + self.size[1] ** 2) / 12.0
         if self.radius is not None:
             return self.radius**2 / 2.0
-        return self._polygon_moments()[1]
-
-    def _polygon_moments(self) -> tuple[float, float]:
-        a = np.asarray(self.outline, dtype=float)
-        b = np.roll(a, -1, axis=0)
-        cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-        area = cross.sum() / 2.0
-        centroid = ((a + b) * cross[:, None]).sum(axis=0) / (6.0 * area)
-        second = (cross * (a * a + a * b + b * b).sum(axis=1)).sum() / 12.0
-        return float(area), float(second / area - centroid @ centroid)
+        return _moments(self.vertices or ())[2]
 
 
-def polygon_outline(value: object) -> tuple[tuple[Point, ...], tuple[Point, ...]]:
-    """Return a polygon's corners as given, and counter-clockwise.
+def _moments(vertices: tuple[Point, ...]) -> tuple[float, Floats, float]:
+    """Return a polygon's signed area, centroid (2,) and unit moment about the centroid."""
+    corners = np.asarray(vertices, dtype=float)
+    # Relative to a corner: a polygon far from the origin must not lose its area to rounding.
+    a = corners - corners[0]
+    b = np.roll(a, -1, axis=0)
+    cross = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    area = float(cross.sum()) / 2.0
+    if area == 0.0:
+        return 0.0, corners[0], 0.0
+    centroid = ((a + b) * cross[:, None]).sum(axis=0) / (6.0 * area)
+    second = (cross * (a * a + a * b + b * b).sum(axis=1)).sum() / 12.0
+    return area, corners[0] + centroid, float(second / area - centroid @ centroid)
 
-    Raises
-    ------
-    SceneError
-        If it has fewer than 3 corners, crosses itself, has no area, or its centroid is not the
-        origin.
-    """
+
+def _check_polygon(value: object) -> tuple[Point, ...]:
+    """Return a polygon's corners as given, or raise."""
     where = "shape: vertices"
     if isinstance(value, str) or not isinstance(value, Iterable):
         raise SceneError(f"{where} is {value!r}, expected a list of points")
     vertices: tuple[Point, ...] = tuple(vector(point, 2, where) for point in value)
     if len(vertices) < 3:
         raise SceneError(f"{where} has {len(vertices)} points, expected at least 3")
-    a = np.array(vertices)
-    size = float(np.ptp(a, axis=0).max())
-    # Relative to a corner: a polygon far from the origin must not lose its area to rounding.
-    p = a - a[0]
-    q = np.roll(p, -1, axis=0)
-    cross = p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0]
-    area = float(cross.sum()) / 2.0
-    crossing = _self_intersection(a)
+    for i, same in enumerate(vertices):
+        if vertices.index(same) < i:
+            raise SceneError(
+                f"{where}: point {i + 1} is point {vertices.index(same) + 1} again; list each "
+                "corner once (the outline closes by itself)"
+            )
+    crossing = _self_intersection(np.array(vertices))
     if crossing is not None:
         raise SceneError(
             f"{where}: edges {crossing[0] + 1} and {crossing[1] + 1} meet; list the corners in "
-            "order, each once"
+            "order round the outline"
         )
+    size = float(np.ptp(np.array(vertices), axis=0).max())
+    area, centroid, _ = _moments(vertices)
     if abs(area) <= 1e-12 * size**2:
         raise SceneError(f"{where}: the polygon has no area; move its points apart")
-    centroid = a[0] + ((p + q) * cross[:, None]).sum(axis=0) / (6.0 * area)
     if np.abs(centroid).max() > 1e-6 * size:
         x, y = (float(c) for c in centroid)
         raise SceneError(
             f"{where}: the centroid is at ({x:.9g}, {y:.9g}), expected the origin of the body's "
             f"frame; subtract ({x:.9g}, {y:.9g}) from every vertex"
         )
-    return vertices, vertices if area > 0 else vertices[::-1]
+    return vertices
 
 
-def _self_intersection(a: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[int, int] | None:
+def _self_intersection(a: Floats) -> tuple[int, int] | None:
     """Return the first two edges that touch other than at a shared corner, or None."""
     n = len(a)
 
@@ -181,8 +182,6 @@ def _self_intersection(a: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[int, i
 
     for i in range(n):
         o, u = a[i], a[(i + 1) % n]
-        if np.array_equal(o, u):
-            return i, (i + 1) % n
         for j in range(i + 1, n):
             v, w = a[j], a[(j + 1) % n]
             if j == i + 1 or (j + 1) % n == i:

@@ -1,0 +1,283 @@
+"""Eqs. 11 and 12: Gaussian next states, and what noise at a segment's start adds to them."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import Segments
+
+Array = NDArray[np.float64]
+
+STATE = ("x", "y", "theta", "vx", "vy", "omega")
+STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+_THETA = STATE.index("theta")
+
+
+@dataclass(frozen=True)
+class Observations:
+    """Measured next states of segments, with the state dimensions that were measured at all.
+
+    Parameters
+    ----------
+    values : ndarray
+        Shape (transition, H, body, state), NaN where missing.
+    columns : tuple of int
+        Which of the six state dimensions the last axis holds.
+    """
+
+    values: Array
+    columns: tuple[int, ...]
+
+    @classmethod
+    def of(cls, segments: Segments) -> Observations:
+        """Take the dimensions that were measured anywhere.
+
+        Raises
+        ------
+        HistoryError
+            If nothing was measured.
+        """
+        observed = segments.observed
+        columns = tuple(
+            d for d in range(6) if observed.size and np.isfinite(observed[..., d]).any()
+        )
+        if not columns:
+            raise HistoryError("history: it has no measured next state; record at least two rows")
+        return cls(observed[..., columns], columns)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The measured dimensions' names."""
+        return tuple(STATE[d] for d in self.columns)
+
+    @property
+    def measured(self) -> NDArray[np.bool_]:
+        """Whether a cell was measured, shape as ``values``."""
+        return np.isfinite(self.values)
+
+    def residual(self, predicted: Array) -> Array:
+        """Measured minus predicted, angles wrapped to (-pi, pi], 0 where missing.
+
+        Parameters
+        ----------
+        predicted : ndarray
+            Shape (..., transition, H, body, 6).
+
+        Returns
+        -------
+        ndarray
+            Shape (..., transition, H, body, state).
+        """
+        difference = self.values - predicted[..., self.columns]
+        for i, d in enumerate(self.columns):
+            if d == _THETA:
+                difference[..., i] = np.pi - np.mod(np.pi - difference[..., i], 2 * np.pi)
+        difference[..., ~self.measured] = 0.0
+        return np.asarray(difference)
+
+
+@dataclass(frozen=True)
+class StartNoise:
+    """How noise in a segment's measured start state spreads over its predictions.
+
+    To first order the residual's covariance is ``S + F S F^T``, with ``S = diag(sigma^2)`` and
+    ``F`` the derivative of the prediction by the start state. Its correlation and the ratio of its
+    scale to sigma are kept; sigma itself stays free. Without it: Eq. 11.
+
+    Parameters
+    ----------
+    gain : ndarray
+        Standard deviation over sigma, shape (transition, cell), cells being H x body x state.
+    unmix : ndarray
+        Inverse Cholesky factor of the correlation, shape (transition, cell, cell).
+    log_det : ndarray
+        Sum of log gains and half the log-determinant of the correlation, shape (transition,).
+    """
+
+    gain: Array
+    unmix: Array
+    log_det: Array
+
+    @classmethod
+    def of(cls, sensitivity: Array, measured: Array, sigma: Array) -> StartNoise:
+        """Build from a sensitivity at a reference sigma.
+
+        Parameters
+        ----------
+        sensitivity : ndarray
+            F, shape (transition, cell, start cell); start cells being body x state.
+        measured : ndarray
+            Whether a cell was measured, shape (transition, cell).
+        sigma : ndarray
+            Reference noise of each state dimension, shape (state,).
+        """
+        covariance = _covariance(sensitivity, measured, sigma)
+        own = np.tile(sigma, sensitivity.shape[1] // len(sigma))
+        scale = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        correlation = covariance / (scale[:, :, None] * scale[:, None, :])
+        factor = np.linalg.cholesky(correlation)
+        eye = np.broadcast_to(np.eye(factor.shape[-1]), factor.shape)
+        gain = np.where(measured, scale / own, 1.0)
+        log_det = np.log(gain).sum(axis=1) + np.log(
+            np.diagonal(factor, axis1=1, axis2=2)
+        ).sum(axis=1)
+        return cls(gain, np.linalg.solve(factor, eye), log_det)
+
+
+def _covariance(sensitivity: Array, measured: Array, sigma: Array) -> Array:
+    """S + F S F^T over measured cells; missing ones are independent of the rest."""
+    cells, starts = sensitivity.shape[1:]
+    spread = sensitivity * np.tile(sigma, starts // len(sigma))
+    spread = np.where(measured[:, :, None], spread, 0.0)
+    own = np.tile(sigma**2, cells // len(sigma))
+    return np.asarray(spread @ spread.transpose(0, 2, 1) + np.eye(cells) * own)
+
+
+def whiten(residual: Array, sigma: Array, noise: StartNoise | None) -> Array:
+    """Residuals in units of their noise, independent of each other if the model is right.
+
+    Parameters
+    ----------
+    residual : ndarray
+        Shape (..., transition, H, body, state).
+    sigma : ndarray
+        Noise of each state dimension, shape (state,) or (..., state) with the same leading axes.
+    noise : StartNoise or None
+        Spread of the start state's noise.
+
+    Returns
+    -------
+    ndarray
+        Shape (..., transition, cell), dimensionless.
+    """
+    scaled = residual / np.asarray(sigma)[..., None, None, None, :]
+    flat = scaled.reshape(*scaled.shape[:-3], -1)
+    if noise is None:
+        return np.asarray(flat)
+    return np.asarray(np.einsum("tij,...tj->...ti", noise.unmix, flat / noise.gain))
+
+
+def log_density(
+    residual: Array, sigma: Array, noise: StartNoise | None, measured: Array
+) -> Array:
+    """Log-likelihood of each transition (Eq. 11), in numpy.
+
+    Parameters
+    ----------
+    residual : ndarray
+        Shape (..., transition, H, body, state).
+    sigma : ndarray
+        Shape (..., state).
+    noise : StartNoise or None
+        Spread of the start state's noise.
+    measured : ndarray
+        Shape (transition, H, body, state).
+
+    Returns
+    -------
+    ndarray
+        Shape (..., transition); minus infinity where the engine diverged.
+    """
+    z = whiten(residual, sigma, noise)
+    log_sigma = np.where(measured, np.log(sigma)[..., None, None, None, :], 0.0).sum((-1, -2, -3))
+    count = measured.sum((-1, -2, -3))
+    result = -0.5 * (z**2).sum(-1) - log_sigma - 0.5 * count * math.log(2 * math.pi)
+    if noise is not None:
+        result = result - noise.log_det
+    return np.where(np.isnan(result), -np.inf, result)
+
+
+def estimate_sigma(residual: Array, measured: Array, sensitivity: Array | None) -> Array:
+    """Maximum-likelihood noise of each state dimension, given residuals.
+
+    Parameters
+    ----------
+    residual : ndarray
+        Shape (transition, H, body, state).
+    measured : ndarray
+        Same shape.
+    sensitivity : ndarray, optional
+        F; without it the start state counts as exact.
+
+    Returns
+    -------
+    ndarray
+        Shape (state,), in the units of the states.
+    """
+    count = np.maximum(measured.sum((0, 1, 2)), 1)
+    sigma = np.sqrt((residual**2).sum((0, 1, 2)) / count)
+    sigma = np.maximum(sigma, 1e-9)  # noise-free histories still need a scale
+    if sensitivity is None:
+        return np.asarray(sigma)
+    n = len(residual)
+    flat, seen = residual.reshape(n, -1), measured.reshape(n, -1)
+
+    def cost(log_sigma: Array) -> float:
+        factor = np.linalg.cholesky(_covariance(sensitivity, seen, np.exp(log_sigma)))
+        z = np.linalg.solve(factor, flat[:, :, None])[:, :, 0]
+        own = np.tile(log_sigma, seen.shape[1] // len(log_sigma))
+        log_det = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum() - (~seen * own).sum()
+        return float(0.5 * (z**2).sum() + log_det)
+
+    begin = np.log(sigma / 1.5)
+    result = minimize(cost, begin, method="L-BFGS-B", bounds=[(b - 7, b + 3) for b in begin])
+    return np.asarray(np.exp(result.x))
+
+
+def next_state_logp(
+    value: Any, predicted: Any, sigma: Any, observations: Observations, noise: StartNoise | None
+) -> Any:
+    """Eq. 11 as a pytensor expression, one log-density a transition.
+
+    Parameters
+    ----------
+    value, predicted : tensor
+        Measured and predicted next states, shape (transition, H, body, state).
+    sigma : tensor
+        Noise of each state dimension, shape (state,).
+    observations : Observations
+        Says which cells were measured.
+    noise : StartNoise or None
+        Spread of the start state's noise.
+    """
+    measured = observations.measured
+    n = len(measured)
+    residual = value - predicted  # s' - f(s, a; Phi)
+    if _THETA in observations.columns:
+        theta = observations.columns.index(_THETA)
+        wrapped = np.pi - pt.mod(np.pi - residual[..., theta], 2 * np.pi)
+        residual = pt.set_subtensor(residual[..., theta], wrapped)
+    z = (residual / sigma * measured).reshape((n, -1))
+    if noise is not None:
+        z = (pt.as_tensor(noise.unmix) @ (z / noise.gain)[:, :, None])[:, :, 0]
+    log_sigma = (pt.log(sigma) * measured).sum(axis=(1, 2, 3))
+    count = measured.sum(axis=(1, 2, 3))
+    logp = -0.5 * (z**2).sum(axis=1) - log_sigma - 0.5 * count * math.log(2 * math.pi)
+    if noise is not None:
+        logp = logp - noise.log_det
+    return pt.switch(pt.isnan(logp), -np.inf, logp)
+
+
+def next_state_random(
+    predicted: Any,
+    sigma: Any,
+    noise: StartNoise | None,
+    rng: np.random.Generator,
+    size: Any = None,
+) -> Array:
+    """Draw next states by Eq. 13, shape as ``predicted``: (..., transition, H, body, state)."""
+    predicted = np.asarray(predicted)
+    z = rng.standard_normal(predicted.shape)
+    if noise is not None:
+        flat = z.reshape(*z.shape[:-3], -1)
+        mixed = np.linalg.solve(noise.unmix, flat[..., None])[..., 0] * noise.gain
+        z = mixed.reshape(z.shape)
+    return np.asarray(predicted + z * np.asarray(sigma))

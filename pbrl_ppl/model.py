@@ -1,0 +1,309 @@
+"""(scene, history, effects) -> pm.Model: Table 1 prior, Eq. 11 likelihood, named coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+
+from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import History, Segments
+from pbrl_ppl.history_start import fill_hinges
+from pbrl_ppl.likelihood import (
+    STATE,
+    Observations,
+    StartNoise,
+    next_state_logp,
+    next_state_random,
+    whiten,
+)
+from pbrl_ppl.op import SimulatorOp
+from pbrl_ppl.parameters import Block, Layout
+from pbrl_ppl.physics import Simulator
+from pbrl_ppl.prior import build_layout, random_variable
+from pbrl_ppl.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """An inference problem in plain numpy: what a model of :func:`physics_model` is made of.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry.
+    history : History
+        Measured transitions.
+    effects : tuple of Attached
+        All effects of the model, declared and added.
+    horizon : int
+        Intervals predicted from one measured state; 1 is the paper's Eq. 11.
+    substeps : int
+        Engine steps an interval.
+    scalar_sigma : bool
+        One sigma for all state dimensions, as in the paper.
+    noise : StartNoise or None
+        Spread of the start state's noise over the predictions.
+    threads : int
+        Engine worlds that run side by side.
+    """
+
+    scene: Scene
+    history: History
+    effects: tuple[Attached, ...]
+    horizon: int
+    substeps: int
+    scalar_sigma: bool = False
+    noise: StartNoise | None = None
+    threads: int = 1
+    layout: Layout = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "layout", build_layout(self.scene, self.effects))
+
+    @cached_property
+    def segments(self) -> Segments:
+        """Measured segments of the horizon's length."""
+        segments = self.history.segments(self.horizon)
+        if not segments.n:
+            raise HistoryError(
+                f"history: no trajectory is long enough for a horizon of {self.horizon} intervals;"
+                " choose a shorter one"
+            )
+        return segments
+
+    @cached_property
+    def observations(self) -> Observations:
+        """What was measured at the segments' steps."""
+        return Observations.of(self.segments)
+
+    @cached_property
+    def simulator(self) -> Simulator:
+        """The engine for this scene with these effects."""
+        return Simulator(
+            self.scene, self.layout, self.effects, substeps=self.substeps, threads=self.threads
+        )
+
+    def predict(self, phi: Array) -> Array:
+        """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""
+        return self.simulator(phi, self.segments.start, self.segments.actions)
+
+    def residual(self, phi: Array) -> Array:
+        """Measured minus predicted, shape (..., transition, H, body, state)."""
+        return self.observations.residual(self.predict(phi))
+
+    def whitened(self, phi: Array, sigma: Array) -> Array:
+        """Residuals in units of their noise, shape (..., transition, cell)."""
+        return whiten(self.residual(phi), sigma, self.noise)
+
+    def sensitivity(self, phi: Array, steps: Array) -> Array:
+        """Derivative of the predictions by the measured start state, F.
+
+        Parameters
+        ----------
+        phi : ndarray
+            Where to differentiate, shape (p,).
+        steps : ndarray
+            Finite-difference step of each measured state dimension, shape (state,), in its units;
+            about the noise is right.
+
+        Returns
+        -------
+        ndarray
+            Shape (transition, cell, start cell): cells are H x body x state, start cells body x
+            state. Cells that were not measured have no noise, and so no derivative.
+        """
+        start, columns = self.segments.start, self.observations.columns
+        n, k = start.shape[:2]
+        trajectory, step = self.segments.trajectory, self.segments.step
+        raw = self.history.dataset["observed"].values[trajectory, step]
+        result = []
+        for body in range(k):
+            for column, h in zip(columns, steps, strict=True):
+                plus, minus = raw.copy(), raw.copy()
+                plus[:, body, column] += h
+                minus[:, body, column] -= h
+                ends = []
+                for moved in (plus, minus):
+                    # what was not measured follows through the hinges, else stays
+                    fill_hinges(moved[:, None], self.scene)
+                    moved = np.where(np.isfinite(moved), moved, start)
+                    ends.append(self.simulator(phi, moved, self.segments.actions))
+                difference = (ends[0] - ends[1])[..., columns] / (2 * h)
+                result.append(difference.reshape(n, -1))
+        return np.stack(result, axis=-1)
+
+
+def physics_model(
+    scene: Scene,
+    history: History,
+    effects: Iterable[Effect | Attached] = (),
+    *,
+    horizon: int = 1,
+    sigma: str = "per_dimension",
+    substeps: int | None = None,
+    noise: StartNoise | None = None,
+    threads: int = 1,
+) -> pm.Model:
+    """Declare the model of the paper's section 3.2 for a scene and a history.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry, and which parameters are known.
+    history : History
+        Measured transitions.
+    effects : iterable of Effect or Attached
+        Effects beside those that the scene declares.
+    horizon : int
+        Intervals predicted from one measured state; 1 is Eq. 11.
+    sigma : str
+        ``per_dimension`` or ``scalar`` (the paper's Eq. 11).
+    substeps : int, optional
+        Engine steps an interval; the scene's by default.
+    noise : StartNoise, optional
+        Spread of the start state's noise over the predictions; without it the start counts as
+        exact, as in the paper.
+    threads : int
+        Engine worlds that run side by side within one evaluation.
+
+    Returns
+    -------
+    pymc.Model
+        An ordinary model; its ``problem`` attribute is the :class:`Problem` it was made from.
+
+    Raises
+    ------
+    EffectError
+        If an effect is unknown or does not apply.
+    HistoryError
+        If the history has nothing to fit at this horizon.
+    ValueError
+        If ``sigma`` is neither option or ``horizon`` is below 1.
+
+    Examples
+    --------
+    >>> import pbrl_ppl as pp  # doctest: +SKIP
+    >>> scene = pp.Scene.load("models/shopping_cart/scene.toml")  # doctest: +SKIP
+    >>> history = pp.History.load("models/shopping_cart/recorded/train.csv", scene)  # doctest: +SKIP
+    >>> model = pp.physics_model(scene, history)  # doctest: +SKIP
+    """
+    if sigma not in ("per_dimension", "scalar"):
+        raise ValueError(f"sigma is {sigma!r}, expected 'per_dimension' or 'scalar'")
+    if horizon < 1:
+        raise ValueError(f"horizon is {horizon}, expected at least 1")
+    problem = Problem(
+        scene=scene,
+        history=history,
+        effects=attach(scene, effects),
+        horizon=horizon,
+        substeps=scene.substeps if substeps is None else substeps,
+        scalar_sigma=sigma == "scalar",
+        noise=noise,
+        threads=threads,
+    )
+    return build_model(problem)
+
+
+def build_model(problem: Problem) -> pm.Model:
+    """Declare the pm.Model of a problem; see :func:`physics_model`."""
+    observations, segments, layout = problem.observations, problem.segments, problem.layout
+    simulate = SimulatorOp(
+        problem.scene, layout, problem.effects, problem.substeps, problem.threads
+    )
+    with pm.Model(coords=_coords(problem)) as model:
+        start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
+        actions = pm.Data(
+            "actions", segments.actions, dims=("transition", "step", "body", "wrench")
+        )
+        # Table 1
+        phi = pt.concatenate(
+            [random_variable(b.name, b.priors, dims=_dim(problem, b)) for b in layout.blocks]
+        )
+        # P(sigma)
+        median, spread = sigma_prior(observations, segments)
+        if problem.scalar_sigma:
+            scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
+            sigma = pt.ones(len(median)) * scalar
+        else:
+            sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
+        # Eq. 7: s' = f(s, a; Phi) + eps, and Eq. 11
+        predicted = simulate(phi, start, actions)[..., list(observations.columns)]
+        pm.CustomDist(
+            "next_state",
+            predicted,
+            sigma,
+            logp=partial(_logp, observations=observations, noise=problem.noise),
+            random=partial(_random, noise=problem.noise),
+            signature="(h,k,d),(d)->(h,k,d)",
+            observed=np.nan_to_num(observations.values),
+            dims=("transition", "step", "body", "state"),
+        )
+    model.problem = problem
+    return model
+
+
+def _logp(
+    value: Any, predicted: Any, sigma: Any, observations: Observations, noise: StartNoise | None
+) -> Any:
+    return next_state_logp(value, predicted, sigma, observations, noise)
+
+
+def _random(
+    predicted: Any,
+    sigma: Any,
+    noise: StartNoise | None,
+    rng: np.random.Generator | None = None,
+    size: Any = None,
+) -> Any:
+    return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size)
+
+
+def sigma_prior(observations: Observations, segments: Segments) -> tuple[Array, float]:
+    """Median and log-scale of the weak prior of sigma: a tenth of how much the state changes.
+
+    Returns
+    -------
+    median : ndarray
+        Shape (state,), in the units of the states.
+    spread : float
+        Standard deviation of the logarithm.
+    """
+    columns = observations.columns
+    change = observations.residual(segments.start[:, None])
+    seen = observations.measured
+    typical = np.sqrt((change**2).sum((0, 1, 2)) / np.maximum(seen.sum((0, 1, 2)), 1))
+    return np.maximum(0.1 * typical, 1e-9) * np.ones(len(columns)), 2.0
+
+
+def _coords(problem: Problem) -> dict[str, Any]:
+    """Coordinates by name: every dimension of the model says what it runs over."""
+    segments = problem.segments
+    coords: dict[str, Any] = {
+        "body": [body.name for body in problem.scene.dynamic],
+        "full_state": list(STATE),
+        "state": list(problem.observations.names),
+        "wrench": ["force_x", "force_y", "torque"],
+        "transition": np.arange(segments.n),
+        "step": np.arange(1, problem.horizon + 1),
+    }
+    for block in problem.layout.blocks:
+        coords.setdefault(_dim(problem, block), list(block.bodies))
+    return coords
+
+
+def _dim(problem: Problem, block: Block) -> str:
+    """``body`` where all moving bodies have the parameter, else a dimension of its own."""
+    if len(block.bodies) == len(problem.scene.dynamic):
+        return "body"
+    return f"{block.effect or block.name}_body"
+

@@ -1,0 +1,315 @@
+"""Modes of the posterior: multi-start Gauss-Newton, and a Laplace covariance at each."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, minimize
+
+from pbrl_ppl.likelihood import StartNoise, estimate_sigma, log_density, whiten
+from pbrl_ppl.model import Problem
+from pbrl_ppl.parameters import Prior
+
+Array = NDArray[np.float64]
+
+#: How far inside a bound the search stays, as a share of the interval or of one unit.
+_MARGIN = 1e-6
+#: A residual beyond this many noise units says no more about where the mode is.
+_SCREEN_CLIP = 1e3
+#: Transitions used to tell basins apart, and how many of the best are searched with all data.
+_PART, _POLISHED = 100, 2
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """A mode of the posterior.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was fitted.
+    phi : ndarray
+        Parameters in the layout's order, shape (p,), SI units.
+    sigma : ndarray
+        Noise of each state dimension, shape (state,).
+    jacobian : ndarray
+        Derivative of the whitened residual by phi, shape (transition * cell, p).
+    covariance : ndarray
+        Laplace covariance of phi, shape (p, p).
+    log_posterior : float
+        Log-likelihood plus log-prior of phi, up to a constant of the priors.
+    """
+
+    problem: Problem
+    phi: Array
+    sigma: Array
+    jacobian: Array
+    covariance: Array
+    log_posterior: float
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Parameters by name, shape (body,) each."""
+        return self.problem.layout.to_dict(self.phi)
+
+    @property
+    def whitened(self) -> Array:
+        """Residuals in units of noise, shape (transition, cell)."""
+        return self.problem.whitened(self.phi, self.sigma)
+
+
+def prior_residual(priors: tuple[Prior, ...], phi: Array) -> Array:
+    """Each prior's least-squares residual, shape (..., p)."""
+    columns = [prior.residual(phi[..., i]) for i, prior in enumerate(priors)]
+    return np.stack(columns, axis=-1) if columns else np.zeros_like(phi)
+
+
+def inside(priors: tuple[Prior, ...], phi: Array) -> Array:
+    """Move values just inside their supports, shape (..., p)."""
+    lower, upper = _box(priors)
+    return np.clip(phi, lower, upper)
+
+
+def _box(priors: tuple[Prior, ...]) -> tuple[Array, Array]:
+    """Bounds of the search: the supports, less a margin."""
+    support = np.array([prior.support for prior in priors]).reshape(-1, 2)
+    width = np.where(np.isfinite(np.ptp(support, axis=1)), np.ptp(support, axis=1), 1.0)
+    return support[:, 0] + _MARGIN * width, support[:, 1] - _MARGIN * width
+
+
+def differentiate(
+    function: Callable[[Array], Array],
+    phi: Array,
+    steps: Array,
+    lower: Array,
+    upper: Array,
+) -> Array:
+    """Derivative by finite differences, all columns in one call.
+
+    Central where the bounds leave room, one-sided elsewhere.
+
+    Parameters
+    ----------
+    function : callable
+        Takes (proposal, p), gives (proposal, n).
+    phi, steps, lower, upper : ndarray
+        Point, step and bounds of each parameter, shape (p,).
+
+    Returns
+    -------
+    ndarray
+        Shape (n, p).
+    """
+    forward = np.minimum(phi + steps, upper)
+    backward = np.maximum(phi - steps, lower)
+    p = len(phi)
+    points = np.tile(phi, (2 * p, 1))
+    points[np.arange(p), np.arange(p)] = forward
+    points[p + np.arange(p), np.arange(p)] = backward
+    values = function(points)
+    width = np.maximum(forward - backward, 1e-300)
+    return np.asarray(((values[:p] - values[p:]) / width[:, None]).T)
+
+
+def posterior_steps(
+    function: Callable[[Array], Array], phi: Array, lower: Array, upper: Array, begin: Array
+) -> tuple[Array, Array]:
+    """Derivative with steps of about one posterior standard deviation, and those steps.
+
+    Friction makes kinks; a derivative over the posterior's own scale sees their average, one over a
+    tiny step sees whichever side it is on.
+    """
+    steps = begin
+    for _ in range(2):
+        jacobian = differentiate(function, phi, steps, lower, upper)
+        size = np.sqrt((jacobian**2).sum(axis=0))
+        steps = np.clip(1.0 / np.maximum(size, 1e-300), 1e-3 * begin, 1e2 * begin)
+    return jacobian, steps
+
+
+def find_modes(
+    problem: Problem,
+    *,
+    seed: int | np.random.Generator = 0,
+    starts: int = 4,
+    screened: int = 48,
+    initial: Array | None = None,
+) -> list[Mode]:
+    """Search for modes from several starts, best first.
+
+    Parameters
+    ----------
+    problem : Problem
+        What to fit.
+    seed : int or Generator
+        Of the draws from the prior.
+    starts : int
+        Local searches.
+    screened : int
+        Draws from the prior among which the starts are chosen.
+    initial : ndarray, optional
+        Where to begin, shape (p,); then there is one local search.
+
+    Returns
+    -------
+    list of Mode
+        At least one.
+    """
+    priors = problem.layout.priors
+    if initial is not None:
+        return [_finish(problem, *_search(problem, inside(priors, initial)))]
+    rng = np.random.default_rng(seed)
+    draws = np.stack([prior.sample(rng, screened) for prior in priors], axis=1)
+    draws = np.vstack([[prior.centre for prior in priors], draws])
+    draws = inside(priors, draws)
+    # the basins show in a part of the data already
+    part = _part(problem, _PART)
+    residual = part.residual(draws)
+    sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations.measured, None)
+    z = np.nan_to_num(residual / sigma, nan=_SCREEN_CLIP).reshape(len(draws), -1)
+    # log(1 + z^2): a good start fits most transitions, not the worst one
+    order = np.argsort(np.log1p(np.minimum(z, _SCREEN_CLIP) ** 2).sum(axis=1))
+    rough = [_search(part, draws[i]) for i in order[:starts]]
+    rough.sort(key=lambda result: -result[2])
+    found = [_search(problem, phi) for phi, _, _ in rough[:_POLISHED]]
+    found.sort(key=lambda result: -result[2])
+    return [_finish(problem, *result) for result in found]
+
+
+def _part(problem: Problem, transitions: int) -> Problem:
+    """The problem on evenly chosen trajectories that hold about so many transitions."""
+    history = problem.history
+    share = transitions / max(problem.segments.n, 1)
+    count = max(2, math.ceil(share * history.n_trajectories))
+    if problem.noise is not None or count >= history.n_trajectories:
+        return problem
+    chosen = np.linspace(0, history.n_trajectories - 1, count).astype(int)
+    part = replace(problem, history=history.select(chosen))
+    return part if part.observations.columns == problem.observations.columns else problem
+
+
+def find_mode(
+    problem: Problem, *, seed: int | np.random.Generator = 0, initial: Array | None = None
+) -> Mode:
+    """Best mode; see :func:`find_modes`."""
+    return find_modes(problem, seed=seed, initial=initial)[0]
+
+
+def _search(problem: Problem, phi: Array) -> tuple[Array, Array, float]:
+    """Alternate between phi by least squares and sigma by maximum likelihood."""
+    priors = problem.layout.priors
+    lower, upper = _box(priors)
+    sigma = profile_sigma(problem, problem.residual(phi))
+    steps = np.array([_first_step(prior, x) for prior, x in zip(priors, phi, strict=True)])
+    value = -np.inf
+    for _ in range(40):
+
+        def residual(points: Array, sigma: Array = sigma) -> Array:
+            z = problem.whitened(points, sigma).reshape(*points.shape[:-1], -1)
+            z = np.nan_to_num(z, nan=_SCREEN_CLIP, posinf=_SCREEN_CLIP, neginf=-_SCREEN_CLIP)
+            return np.concatenate([z, prior_residual(priors, points)], axis=-1)
+
+        def jacobian(point: Array, residual: Callable[[Array], Array] = residual) -> Array:
+            size = np.minimum(steps, 0.1 * np.maximum(np.abs(point), steps))
+            return differentiate(residual, point, size, lower, upper)
+
+        result = least_squares(
+            residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=4,
+            ftol=1e-6, xtol=1e-6, gtol=1e-6,
+        )  # fmt: skip
+        phi = result.x
+        size = np.sqrt((result.jac**2).sum(axis=0))
+        steps = np.clip(1.0 / np.maximum(size, 1e-12), 1e-6, 0.1)
+        sigma = profile_sigma(problem, problem.residual(phi))
+        improved = _log_posterior(problem, phi, sigma)
+        if improved - value < 0.02:
+            break
+        value = improved
+    return phi, sigma, improved
+
+
+def _first_step(prior: Prior, x: float) -> float:
+    """A finite-difference step to begin with: small against the prior."""
+    return 1e-3 * max(abs(x), 0.1 * min(prior.sigma, 1.0))
+
+
+def _log_posterior(problem: Problem, phi: Array, sigma: Array) -> float:
+    residual = problem.residual(phi)
+    measured = problem.observations.measured
+    likelihood = log_density(residual, sigma, problem.noise, measured).sum()
+    return float(likelihood - 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum())
+
+
+def profile_sigma(problem: Problem, residual: Array) -> Array:
+    """Maximum-likelihood sigma at given residuals, shape (state,).
+
+    Parameters
+    ----------
+    problem : Problem
+        Says which cells were measured, and how the start state's noise spreads.
+    residual : ndarray
+        Shape (transition, H, body, state).
+    """
+    measured, noise = problem.observations.measured, problem.noise
+    residual = np.nan_to_num(residual, nan=_SCREEN_CLIP)
+    sigma = estimate_sigma(residual, measured, None)
+    if problem.scalar_sigma:
+        z = whiten(residual, np.ones_like(sigma), noise)
+        return np.full_like(sigma, max(np.sqrt((z**2).sum() / measured.sum()), 1e-9))
+    if noise is None:
+        return sigma
+    begin = np.log(sigma / np.median(noise.gain))
+
+    def cost(log_sigma: Array) -> float:
+        return -float(log_density(residual, np.exp(log_sigma), noise, measured).sum())
+
+    bounds = [(b - 6, b + 6) for b in begin]
+    return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x))
+
+
+def _finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> Mode:
+    """Fold the wheel's symmetry, and take the Jacobian at the posterior's own scale."""
+    phi = fold_wheels(problem, phi)
+    priors = problem.layout.priors
+    lower, upper = _box(priors)
+
+    def residual(points: Array) -> Array:
+        z = problem.whitened(points, sigma).reshape(len(points), -1)
+        return np.concatenate([np.nan_to_num(z), prior_residual(priors, points)], axis=-1)
+
+    begin = np.array([_first_step(prior, x) for prior, x in zip(priors, phi, strict=True)])
+    jacobian, _ = posterior_steps(residual, phi, lower, upper, begin)
+    precision = jacobian.T @ jacobian
+    covariance = np.linalg.pinv(precision, hermitian=True)
+    n_cells = len(jacobian) - len(phi)
+    return Mode(problem, phi, sigma, jacobian[:n_cells], covariance, log_posterior)
+
+
+def fold_wheels(problem: Problem, phi: Array) -> Array:
+    """Choose one of a wheel's four equal descriptions: mu_x <= mu_y, w_theta in (-pi/2, pi/2]."""
+    phi = phi.copy()
+    layout = problem.layout
+    for body in problem.scene.dynamic:
+        names = [f"{name}[{body.name}]" for name in ("w_theta", "mu_x", "mu_y")]
+        if not all(name in layout.labels for name in names):
+            continue
+        angle, x, y = (layout.labels.index(name) for name in names)
+        if phi[x] > phi[y]:
+            phi[[x, y]] = phi[[y, x]]
+            phi[angle] += np.pi / 2
+        phi[angle] = np.pi / 2 - np.mod(np.pi / 2 - phi[angle], np.pi)
+    return phi
+
+
+def with_start_noise(problem: Problem, mode: Mode) -> Problem:
+    """Account for the noise of measured start states, linearised at a mode."""
+    measured = problem.observations.measured.reshape(problem.segments.n, -1)
+    sensitivity = problem.sensitivity(mode.phi, mode.sigma)
+    sigma = estimate_sigma(
+        problem.residual(mode.phi), problem.observations.measured, sensitivity
+    )
+    return replace(problem, noise=StartNoise.of(sensitivity, measured, sigma))

@@ -1,0 +1,133 @@
+"""SimulatorOp: the physics engine as a black-box pytensor Op, and its numba dispatch."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from typing import Any
+
+import numba
+import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pytensor.graph.basic import Apply
+from pytensor.graph.op import Op
+from pytensor.link.numba.dispatch.basic import numba_funcify
+
+from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.parameters import Layout
+from pbrl_ppl.physics import Simulator
+from pbrl_ppl.scene import Scene
+
+#: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
+_REMEMBERED = 4
+
+
+class SimulatorOp(Op):
+    """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
+
+    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3);
+    the output has shape (transition, H, body, 6); all float64, in SI units. A transition in which
+    the engine diverges is NaN.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry.
+    layout : Layout
+        Order of phi.
+    effects : tuple of Attached
+        All effects of the model.
+    substeps : int, optional
+        Engine steps an interval; the scene's by default.
+    threads : int
+        Worlds that run side by side.
+    """
+
+    __props__ = ("scene", "layout", "effects", "substeps", "threads")
+
+    def __init__(
+        self,
+        scene: Scene,
+        layout: Layout,
+        effects: tuple[Attached, ...] = (),
+        substeps: int | None = None,
+        threads: int = 1,
+    ) -> None:
+        self.scene, self.layout, self.effects = scene, layout, effects
+        self.substeps = scene.substeps if substeps is None else substeps
+        self.threads = threads
+        self.simulator = Simulator(scene, layout, effects, substeps=self.substeps, threads=threads)
+        self._memory: OrderedDict[tuple[int, int, bytes], NDArray[np.float64]] = OrderedDict()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the memory behind when the Op goes to another process."""
+        return self.__dict__ | {"_memory": OrderedDict()}
+
+    def make_node(self, phi: Any, start: Any, actions: Any) -> Apply:
+        """Check what can be checked before values are there.
+
+        Raises
+        ------
+        SimulationError
+            If an input has the wrong number of dimensions or a static shape that does not fit.
+        """
+        k, p = len(self.scene.dynamic), self.layout.size
+        inputs = []
+        for name, value, shape in (
+            ("phi", phi, (p,)),
+            ("start", start, (None, k, 6)),
+            ("actions", actions, (None, None, k, 3)),
+        ):
+            tensor = pt.cast(pt.as_tensor_variable(value), "float64")
+            static = tensor.type.shape
+            fits = len(static) == len(shape) and all(
+                s is None or e is None or s == e for s, e in zip(static, shape, strict=True)
+            )
+            if not fits:
+                expected = ", ".join("?" if e is None else str(e) for e in shape)
+                raise SimulationError(
+                    f"SimulatorOp: {name} has shape {static}, expected ({expected})"
+                )
+            inputs.append(tensor)
+        return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, k, 6))])
+
+    def infer_shape(self, fgraph: Any, node: Apply, shapes: Any) -> list[tuple[Any, ...]]:
+        """(transition, H, body, 6) from the shape of the actions."""
+        actions = shapes[2]
+        return [(actions[0], actions[1], actions[2], 6)]
+
+    def perform(self, node: Apply, inputs: Any, outputs: Any) -> None:
+        """Run the engine."""
+        outputs[0][0] = self.predict(*inputs)
+
+    def predict(
+        self,
+        phi: NDArray[np.float64],
+        start: NDArray[np.float64],
+        actions: NDArray[np.float64],
+    ) -> NDArray[np.float64]:
+        """Run the engine, or recall what it said of these very inputs a moment ago."""
+        key = (hash(start.tobytes()), hash(actions.tobytes()), phi.tobytes())
+        if key in self._memory:
+            self._memory.move_to_end(key)
+            return self._memory[key].copy()
+        result = self.simulator(phi, start, actions)
+        self._memory[key] = result
+        if len(self._memory) > _REMEMBERED:
+            self._memory.popitem(last=False)
+        return result.copy()
+
+
+@numba_funcify.register(SimulatorOp)
+def _numba_simulator(op: SimulatorOp, node: Any = None, **kwargs: Any) -> Any:
+    """For the numba backend: step out to the rollout, which is compiled code of its own."""
+    kind = numba.types.Array(numba.float64, 4, "C")
+
+    @numba.njit
+    def simulate(phi, start, actions):  # type: ignore[no-untyped-def]
+        with numba.objmode(result=kind):
+            result = op.predict(phi, start, actions)
+        return result
+
+    return simulate

@@ -1,0 +1,254 @@
+"""Posteriors as files and draws; the one place that knows ArviZ 0.x from 1.x."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import OutputError, PosteriorError
+from pbrl_ppl.scene import Scene
+
+with warnings.catch_warnings():
+    # ArviZ 0.23 announces the refactoring of 1.0 at import; nothing here depends on it
+    warnings.simplefilter("ignore", FutureWarning)
+    import arviz as az
+
+Array = NDArray[np.float64]
+
+#: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in its own InferenceData.
+DATATREE = not hasattr(az, "InferenceData")
+
+#: Level of the intervals in reports, as in ArviZ 0.x.
+HDI_PROB = 0.94
+
+_KIND = "pbrl_ppl posterior 1"
+_NEEDED = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
+
+
+def groups(idata: Any) -> dict[str, xr.Dataset]:
+    """All groups of an InferenceData or DataTree as plain datasets."""
+    if DATATREE:
+        return {name: node.to_dataset() for name, node in idata.children.items()}
+    return {name: idata[name] for name in idata.groups()}
+
+
+def group(idata: Any, name: str) -> xr.Dataset:
+    """One group as a plain dataset.
+
+    Raises
+    ------
+    PosteriorError
+        If there is no such group.
+    """
+    found = groups(idata)
+    if name not in found:
+        raise PosteriorError(
+            f"posterior: it has no group {name!r}, only {', '.join(found)}; save it with"
+            " save_posterior after fit"
+        )
+    return found[name]
+
+
+def from_groups(datasets: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) -> Any:
+    """Build an InferenceData (ArviZ 0.x) or DataTree (1.x) from datasets by name."""
+    if DATATREE:
+        tree = xr.DataTree.from_dict({f"/{name}": data for name, data in datasets.items()})
+        tree.attrs.update(attrs)
+        return tree
+    idata = az.InferenceData(**datasets)
+    idata.attrs.update(attrs)
+    return idata
+
+
+def save_posterior(idata: Any, path: str | Path) -> None:
+    """Write a posterior to a NetCDF file, whole or not at all.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+    path : str or Path
+        Ends in ``.nc``.
+
+    Raises
+    ------
+    OutputError
+        If the folder does not exist or cannot be written.
+    """
+    path = Path(path)
+    try:
+        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+        os.close(handle)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot write there ({error.strerror}); choose an existing, writable folder"
+        ) from error
+    try:
+        _write(idata, name)
+        Path(name).replace(path)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def _write(idata: Any, name: str) -> None:
+    """NetCDF 4 with one group a dataset: the same file from both stacks."""
+    xr.Dataset(attrs=dict(idata.attrs)).to_netcdf(name, mode="w", engine="h5netcdf")
+    for group_name, data in groups(idata).items():
+        encoding = {key: {"zlib": True} for key, v in data.variables.items() if v.dtype.kind == "f"}
+        data.to_netcdf(name, mode="a", group=group_name, engine="h5netcdf", encoding=encoding)
+
+
+def load_posterior(path: str | Path) -> Any:
+    """Read a posterior file, written by either stack.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file written by :func:`save_posterior`.
+
+    Returns
+    -------
+    InferenceData or DataTree
+        With all data in memory; its ``attrs`` hold the scene, effects, versions and seed.
+
+    Raises
+    ------
+    PosteriorError
+        If the file is missing, is no posterior of this package, or lacks a group.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise PosteriorError(f"{path}: there is no such file")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as root:
+            attrs = dict(root.attrs)
+        import h5py
+
+        with h5py.File(path) as file:
+            names = [name for name, item in file.items() if isinstance(item, h5py.Group)]
+        found = {}
+        for name in names:
+            with xr.open_dataset(path, group=name, engine="h5netcdf") as data:
+                found[name] = data.load()
+    except (OSError, ValueError, KeyError) as error:
+        raise PosteriorError(f"{path}: this is not a NetCDF file; pass one that fit saved") from error
+    if attrs.get("pbrl_ppl") != _KIND:
+        raise PosteriorError(
+            f"{path}: this is no posterior file of pbrl_ppl; save one with save_posterior"
+        )
+    missing = [name for name in _NEEDED if name not in found]
+    if missing:
+        raise PosteriorError(f"{path}: it lacks {', '.join(missing)}; save the whole fit again")
+    return from_groups(found, attrs)
+
+
+def attributes(scene: Scene, **values: Any) -> dict[str, Any]:
+    """What a posterior file says of itself: plain strings and numbers, no pickle."""
+    packed = {key: v if isinstance(v, (int, float, str)) else json.dumps(v) for key, v in values.items()}
+    return {"pbrl_ppl": _KIND, "scene": scene.to_toml(), **packed}
+
+
+def scene_of(idata: Any) -> Scene:
+    """The scene that a posterior was fitted with, added effects included.
+
+    Raises
+    ------
+    PosteriorError
+        If there is none.
+    """
+    if "scene" not in idata.attrs:
+        raise PosteriorError("posterior: it holds no scene; make it with pbrl_ppl.fit")
+    return Scene.from_toml(str(idata.attrs["scene"]))
+
+
+def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Array]:
+    """Posterior draws by name, chains joined.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        A posterior.
+    n : int, optional
+        How many, chosen at random without replacement; all by default.
+    seed : int
+        Of the choice.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Shape (draw, ...), SI units.
+
+    Raises
+    ------
+    PosteriorError
+        If more are asked for than there are.
+    """
+    stacked = group(idata, "posterior").stack(sample=("chain", "draw")).transpose("sample", ...)
+    total = stacked.sizes["sample"]
+    if n is not None and n > total:
+        raise PosteriorError(f"posterior: {n} draws were asked for, it has {total}")
+    chosen: Any = slice(None)
+    if n is not None:
+        chosen = np.random.default_rng(seed).choice(total, n, replace=False)
+    return {str(name): stacked[name].values[chosen] for name in stacked.data_vars}
+
+
+def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
+    """Rank-normalised R-hat, and the smaller of bulk and tail ESS, of every scalar parameter.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        A posterior.
+
+    Returns
+    -------
+    r_hat, ess : dict of str to float
+        By label, such as ``mass[cart]``.
+    """
+    posterior = group(idata, "posterior")
+    names = list(posterior.data_vars)
+    r_hat: dict[str, float] = {}
+    ess: dict[str, float] = {}
+    measures = (_dataset(az.rhat(posterior)), *(
+        _dataset(az.ess(posterior, method=method)) for method in ("bulk", "tail")
+    ))
+    for name in names:
+        hat, bulk, tail = (measure[name] for measure in measures)
+        for index in np.ndindex(hat.shape):
+            parts = [str(hat[dim].values[i]) for dim, i in zip(hat.dims, index, strict=True)]
+            label = f"{name}[{','.join(parts)}]" if parts else str(name)
+            r_hat[label] = float(hat.values[index])
+            ess[label] = float(min(bulk.values[index], tail.values[index]))
+    return r_hat, ess
+
+
+def _dataset(value: Any) -> xr.Dataset:
+    """A diagnostic's result as a dataset in both generations."""
+    if isinstance(value, xr.Dataset):
+        return value
+    if hasattr(value, "to_dataset"):
+        node = value["posterior"] if "posterior" in getattr(value, "children", {}) else value
+        return node.to_dataset() if hasattr(node, "to_dataset") else node
+    return value
+
+
+def interval(values: Array, prob: float = HDI_PROB) -> tuple[float, float]:
+    """Highest-density interval of draws, 1-d: the shortest that holds ``prob`` of them."""
+    ordered = np.sort(np.asarray(values).ravel())
+    count = max(1, int(np.floor(prob * len(ordered))))
+    if count >= len(ordered):
+        return float(ordered[0]), float(ordered[-1])
+    widths = ordered[count:] - ordered[: len(ordered) - count]
+    best = int(np.argmin(widths))
+    return float(ordered[best]), float(ordered[best + count])

@@ -1,0 +1,148 @@
+"""Parts of a scene: bodies, walls and joints, frozen and checked when they are built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene_checks import (
+    Point,
+    flag,
+    hyper_parameters,
+    known_parameters,
+    label,
+    nearest,
+    vector,
+)
+from pbrl_ppl.shape import Shape
+
+WORLD = "world"
+"""The name of the ground in a joint."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body: what is known of it, and what is to be inferred.
+
+    Attributes
+    ----------
+    name : str
+        Name, as in the history's ``body`` column.
+    shape : Shape
+        Outline (m).
+    wheel : bool
+        Whether an anisotropic-friction wheel is part of its prior.
+    static : bool
+        Whether it never moves; it then needs a `pose`.
+    known : tuple of (str, float)
+        Parameters that are given, not inferred; a mapping is accepted.
+    prior : tuple of (str, tuple of (str, float))
+        Hyper-parameters (``mu``, ``sigma``, ``kappa``) that replace the defaults; a mapping of
+        mappings is accepted.
+    effects : tuple of str
+        Effects of the catalogue that are declared from the start.
+    pose : tuple of float, optional
+        ``x, y, theta`` (m, m, rad) of a static body.
+
+    Raises
+    ------
+    SceneError
+        If a name, number or combination is impossible.
+
+    Examples
+    --------
+    >>> Body("cart", Shape.box(1.0, 0.6), known={"mass": 2.0}).known
+    (('mass', 2.0),)
+    """
+
+    name: str
+    shape: Shape
+    wheel: bool = False
+    static: bool = False
+    known: tuple[tuple[str, float], ...] = ()
+    prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
+    effects: tuple[str, ...] = ()
+    pose: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        label(self.name, "body: name")
+        where = f'body "{self.name}"'
+        if self.name == WORLD:
+            raise SceneError(f'{where}: "world" is the name of the ground; call the body otherwise')
+        if not isinstance(self.shape, Shape):
+            raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
+        flag(self.wheel, f"{where}: wheel")
+        flag(self.static, f"{where}: static")
+        object.__setattr__(self, "known", known_parameters(self.known, where))
+        object.__setattr__(self, "prior", hyper_parameters(self.prior, where))
+        for name in dict(self.known).keys() & dict(self.prior).keys():
+            raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
+        if isinstance(self.effects, str) or not isinstance(self.effects, Iterable):
+            raise SceneError(f"{where}: effects is {self.effects!r}, expected a list of names")
+        effects = tuple(label(effect, f"{where}: effects") for effect in self.effects)
+        if len(set(effects)) < len(effects):
+            raise SceneError(f"{where}: effects {list(effects)} names one twice; drop it")
+        object.__setattr__(self, "effects", effects)
+        if self.pose is not None:
+            object.__setattr__(self, "pose", vector(self.pose, 3, f"{where}: pose"))
+        if self.static and self.pose is None:
+            raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
+        if self.static and self.wheel:
+            raise SceneError(f"{where}: a static body cannot have a wheel; drop one of the two")
+
+
+@dataclass(frozen=True)
+class Wall:
+    """An immovable segment between two points of the world (m); TOML keys ``from`` and ``to``."""
+
+    start: Point
+    end: Point
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "start", vector(self.start, 2, "wall: from"))
+        object.__setattr__(self, "end", vector(self.end, 2, "wall: to"))
+        if self.start == self.end:
+            raise SceneError(f"wall: from and to are both {list(self.start)}; its length is zero")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint between two bodies, or a body and the world.
+
+    Attributes
+    ----------
+    kind : str
+        ``"hinge"`` or ``"distance"``.
+    bodies : tuple of str
+        Two names; ``"world"`` is the ground.
+    anchor_a, anchor_b : tuple of float
+        Where it holds the first and the second, each in that body's frame (m).
+    known : bool
+        Whether it is given (True) or to be inferred.
+    """
+
+    kind: str
+    bodies: tuple[str, str]
+    anchor_a: Point
+    anchor_b: Point
+    known: bool = True
+
+    def __post_init__(self) -> None:
+        if self.kind not in ("hinge", "distance"):
+            raise SceneError(
+                f'joint: kind is {self.kind!r}, expected "hinge" or "distance"'
+                f"{nearest(self.kind, ('hinge', 'distance'))}"
+            )
+        if isinstance(self.bodies, str) or not isinstance(self.bodies, Iterable):
+            raise SceneError(f"joint: bodies is {self.bodies!r}, expected two names")
+        bodies = tuple(label(name, "joint: bodies") for name in self.bodies)
+        if len(bodies) != 2:
+            raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
+        if bodies[0] == bodies[1]:
+            raise SceneError(f'joint: it joins "{bodies[0]}" with itself; name two bodies')
+        object.__setattr__(self, "bodies", bodies)
+        where = f"joint of {bodies[0]} and {bodies[1]}"
+        object.__setattr__(self, "anchor_a", vector(self.anchor_a, 2, f"{where}: anchor_a"))
+        object.__setattr__(self, "anchor_b", vector(self.anchor_b, 2, f"{where}: anchor_b"))
+        flag(self.known, f"{where}: known")
