@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +127,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
     slopes = _prior_slopes(problem, mode.phi)
     jacobian = np.vstack([-mode.jacobian, np.diag(slopes)])
     edges = np.cumsum([0, *map(len, columns)])
-    split = [derivative[:, a:b] for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    split = [derivative[:, a:b] for a, b in pairwise(edges)]
     return residual, jacobian, split
 
 

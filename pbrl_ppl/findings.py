@@ -228,7 +228,7 @@ class Findings:
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of ``report.json``; numbers that are not finite become null."""
-        return _clean(
+        contents: dict[str, Any] = _clean(
             {
                 "verdict": self.verdict,
                 "numerical": vars(self.numerical),
@@ -266,6 +266,7 @@ class Findings:
                 "provenance": self.provenance,
             }
         )
+        return contents
 
 
 def _clean(value: Any) -> Any:

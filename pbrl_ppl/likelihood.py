@@ -15,6 +15,7 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import Segments
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 STATE = ("x", "y", "theta", "vx", "vy", "omega")
 STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
@@ -59,7 +60,7 @@ class Observations:
         return tuple(STATE[d] for d in self.columns)
 
     @property
-    def measured(self) -> NDArray[np.bool_]:
+    def measured(self) -> Bools:
         """Whether a cell was measured, shape as ``values``."""
         return np.isfinite(self.values)
 
@@ -107,7 +108,7 @@ class StartNoise:
     log_det: Array
 
     @classmethod
-    def of(cls, sensitivity: Array, measured: Array, sigma: Array) -> StartNoise:
+    def of(cls, sensitivity: Array, measured: Bools, sigma: Array) -> StartNoise:
         """Build from a sensitivity at a reference sigma.
 
         Parameters
@@ -126,13 +127,13 @@ class StartNoise:
         factor = np.linalg.cholesky(correlation)
         eye = np.broadcast_to(np.eye(factor.shape[-1]), factor.shape)
         gain = np.where(measured, scale / own, 1.0)
-        log_det = np.log(gain).sum(axis=1) + np.log(
-            np.diagonal(factor, axis1=1, axis2=2)
-        ).sum(axis=1)
-        return cls(gain, np.linalg.solve(factor, eye), log_det)
+        log_det = np.log(gain).sum(axis=1) + np.log(np.diagonal(factor, axis1=1, axis2=2)).sum(
+            axis=1
+        )
+        return cls(gain, np.asarray(np.linalg.solve(factor, eye), dtype=float), log_det)
 
 
-def _covariance(sensitivity: Array, measured: Array, sigma: Array) -> Array:
+def _covariance(sensitivity: Array, measured: Bools, sigma: Array) -> Array:
     """S + F S F^T over measured cells; missing ones are independent of the rest."""
     cells, starts = sensitivity.shape[1:]
     spread = sensitivity * np.tile(sigma, starts // len(sigma))
@@ -165,9 +166,7 @@ def whiten(residual: Array, sigma: Array, noise: StartNoise | None) -> Array:
     return np.asarray(np.einsum("tij,...tj->...ti", noise.unmix, flat / noise.gain))
 
 
-def log_density(
-    residual: Array, sigma: Array, noise: StartNoise | None, measured: Array
-) -> Array:
+def log_density(residual: Array, sigma: Array, noise: StartNoise | None, measured: Bools) -> Array:
     """Log-likelihood of each transition (Eq. 11), in numpy.
 
     Parameters
@@ -195,7 +194,7 @@ def log_density(
     return np.where(np.isnan(result), -np.inf, result)
 
 
-def estimate_sigma(residual: Array, measured: Array, sensitivity: Array | None) -> Array:
+def estimate_sigma(residual: Array, measured: Bools, sensitivity: Array | None) -> Array:
     """Maximum-likelihood noise of each state dimension, given residuals.
 
     Parameters
@@ -224,7 +223,9 @@ def estimate_sigma(residual: Array, measured: Array, sensitivity: Array | None) 
         factor = np.linalg.cholesky(_covariance(sensitivity, seen, np.exp(log_sigma)))
         z = np.linalg.solve(factor, flat[:, :, None])[:, :, 0]
         own = np.tile(log_sigma, seen.shape[1] // len(log_sigma))
-        log_det = np.log(np.diagonal(factor, axis1=1, axis2=2)).sum() - (~seen * own).sum()
+        log_det = (
+            np.log(np.diagonal(factor, axis1=1, axis2=2)).sum() - np.where(seen, 0.0, own).sum()
+        )
         return float(0.5 * (z**2).sum() + log_det)
 
     begin = np.log(sigma / 1.5)

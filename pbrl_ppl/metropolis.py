@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 TARGET_ACCEPTANCE = 0.234
 #: The Laplace covariance counts as much as this many draws.
 _PRIOR_DRAWS = 300
-_LARGEST_BETA = np.log(0.95)
+_LARGEST_BETA = float(np.log(0.95))
 
 
 @dataclass_state
@@ -46,8 +46,8 @@ class AdaptiveMetropolis(pm.Metropolis):
     ----------
     vars : list
         Random variables of the block.
-    covariance : ndarray
-        First guess of the block's posterior covariance in the sampler's unconstrained space.
+    mean, covariance : ndarray
+        First guess of the block's posterior in the sampler's unconstrained space.
     thin : int
         Metropolis steps a draw.
     **kwargs
@@ -64,7 +64,9 @@ class AdaptiveMetropolis(pm.Metropolis):
     }
     _state_class = AdaptiveState
 
-    def __init__(self, vars: Any, *, covariance: Array, thin: int = 1, **kwargs: Any) -> None:
+    def __init__(
+        self, vars: Any, *, mean: Array, covariance: Array, thin: int = 1, **kwargs: Any
+    ) -> None:
         super().__init__(vars, S=covariance, **{"blocked": True, **kwargs})
         self.elemwise_update = False  # all dimensions move together
         self.enum_dims = np.arange(1)
@@ -74,9 +76,9 @@ class AdaptiveMetropolis(pm.Metropolis):
         self.thin = thin
         self.covariance = covariance.copy()
         self.factor = np.linalg.cholesky(covariance)
-        self.mean = np.zeros(len(covariance))
+        self.mean = mean.copy()
         self.log_scale = float(np.log(2.38 / np.sqrt(len(covariance))))
-        self.log_beta = np.log(0.3)
+        self.log_beta = float(np.log(0.6))
         self.seen = 0
 
     def astep(self, q0: RaveledVars) -> tuple[RaveledVars, list[dict[str, Any]]]:
@@ -116,8 +118,6 @@ class AdaptiveMetropolis(pm.Metropolis):
         return float(0.5 * z @ z)
 
     def _learn(self, q: Array, rate: float, walk: bool) -> None:
-        if self.seen == 0:
-            self.mean = q.copy()
         self.seen += 1
         gain = 1.0 / (self.seen + _PRIOR_DRAWS)
         change = (rate - TARGET_ACCEPTANCE) * self.seen**-0.6

@@ -306,4 +306,3 @@ def _dim(problem: Problem, block: Block) -> str:
     if len(block.bodies) == len(problem.scene.dynamic):
         return "body"
     return f"{block.effect or block.name}_body"
-

@@ -213,7 +213,9 @@ def _search(problem: Problem, phi: Array) -> tuple[Array, Array, float]:
             z = np.nan_to_num(z, nan=_SCREEN_CLIP, posinf=_SCREEN_CLIP, neginf=-_SCREEN_CLIP)
             return np.concatenate([z, prior_residual(priors, points)], axis=-1)
 
-        def jacobian(point: Array, residual: Callable[[Array], Array] = residual) -> Array:
+        def jacobian(
+            point: Array, residual: Callable[[Array], Array] = residual, steps: Array = steps
+        ) -> Array:
             size = np.minimum(steps, 0.1 * np.maximum(np.abs(point), steps))
             return differentiate(residual, point, size, lower, upper)
 
@@ -286,7 +288,9 @@ def _finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) ->
     precision = jacobian.T @ jacobian
     covariance = np.linalg.pinv(precision, hermitian=True)
     n_cells = len(jacobian) - len(phi)
-    return Mode(problem, phi, sigma, jacobian[:n_cells], covariance, log_posterior)
+    return Mode(
+        problem, phi, sigma, jacobian[:n_cells], np.asarray(covariance, dtype=float), log_posterior
+    )
 
 
 def fold_wheels(problem: Problem, phi: Array) -> Array:
@@ -309,7 +313,5 @@ def with_start_noise(problem: Problem, mode: Mode) -> Problem:
     """Account for the noise of measured start states, linearised at a mode."""
     measured = problem.observations.measured.reshape(problem.segments.n, -1)
     sensitivity = problem.sensitivity(mode.phi, mode.sigma)
-    sigma = estimate_sigma(
-        problem.residual(mode.phi), problem.observations.measured, sensitivity
-    )
+    sigma = estimate_sigma(problem.residual(mode.phi), problem.observations.measured, sensitivity)
     return replace(problem, noise=StartNoise.of(sensitivity, measured, sigma))

@@ -25,7 +25,7 @@ with warnings.catch_warnings():
 Array = NDArray[np.float64]
 
 #: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in its own InferenceData.
-DATATREE = not hasattr(az, "InferenceData")
+DATATREE = not az.__version__.startswith("0.")
 
 #: Level of the intervals in reports, as in ArviZ 0.x.
 HDI_PROB = 0.94
@@ -94,10 +94,18 @@ def save_posterior(idata: Any, path: str | Path) -> None:
         ) from error
     try:
         _write(idata, name)
+        Path(name).chmod(0o666 & ~_umask())
         Path(name).replace(path)
     except BaseException:
         Path(name).unlink(missing_ok=True)
         raise
+
+
+def _umask() -> int:
+    """The process's file mode mask; it can only be read by setting it."""
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
 
 
 def _write(idata: Any, name: str) -> None:
@@ -141,7 +149,9 @@ def load_posterior(path: str | Path) -> Any:
             with xr.open_dataset(path, group=name, engine="h5netcdf") as data:
                 found[name] = data.load()
     except (OSError, ValueError, KeyError) as error:
-        raise PosteriorError(f"{path}: this is not a NetCDF file; pass one that fit saved") from error
+        raise PosteriorError(
+            f"{path}: this is not a NetCDF file; pass one that fit saved"
+        ) from error
     if attrs.get("pbrl_ppl") != _KIND:
         raise PosteriorError(
             f"{path}: this is no posterior file of pbrl_ppl; save one with save_posterior"
@@ -154,7 +164,9 @@ def load_posterior(path: str | Path) -> Any:
 
 def attributes(scene: Scene, **values: Any) -> dict[str, Any]:
     """What a posterior file says of itself: plain strings and numbers, no pickle."""
-    packed = {key: v if isinstance(v, (int, float, str)) else json.dumps(v) for key, v in values.items()}
+    packed = {
+        key: v if isinstance(v, (int, float, str)) else json.dumps(v) for key, v in values.items()
+    }
     return {"pbrl_ppl": _KIND, "scene": scene.to_toml(), **packed}
 
 
@@ -220,9 +232,10 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     names = list(posterior.data_vars)
     r_hat: dict[str, float] = {}
     ess: dict[str, float] = {}
-    measures = (_dataset(az.rhat(posterior)), *(
-        _dataset(az.ess(posterior, method=method)) for method in ("bulk", "tail")
-    ))
+    measures = (
+        _dataset(az.rhat(posterior)),
+        *(_dataset(az.ess(posterior, method=method)) for method in ("bulk", "tail")),
+    )
     for name in names:
         hat, bulk, tail = (measure[name] for measure in measures)
         for index in np.ndindex(hat.shape):
@@ -235,12 +248,9 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
 
 def _dataset(value: Any) -> xr.Dataset:
     """A diagnostic's result as a dataset in both generations."""
-    if isinstance(value, xr.Dataset):
-        return value
-    if hasattr(value, "to_dataset"):
-        node = value["posterior"] if "posterior" in getattr(value, "children", {}) else value
-        return node.to_dataset() if hasattr(node, "to_dataset") else node
-    return value
+    if "posterior" in getattr(value, "children", {}):
+        value = value["posterior"]
+    return value if isinstance(value, xr.Dataset) else xr.Dataset(value.to_dataset())
 
 
 def interval(values: Array, prob: float = HDI_PROB) -> tuple[float, float]:

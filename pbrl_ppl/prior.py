@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 from typing import Any
 
@@ -58,7 +57,14 @@ def table1(body: Body) -> dict[str, Prior]:
                     f"body {body.name!r}: prior of {name} has {key!r}, expected"
                     f" {' and '.join(allowed)} ({priors[name].family})"
                 )
-        priors[name] = replace(priors[name], **dict(hyper))
+        values = dict(hyper)
+        prior = priors[name]
+        priors[name] = replace(
+            prior,
+            mu=values.get("mu", prior.mu),
+            sigma=values.get("sigma", prior.sigma),
+            kappa=values.get("kappa", prior.kappa),
+        )
     return priors
 
 
@@ -85,9 +91,7 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
     for effect in dict.fromkeys(one.effect for one in effects):
         on = tuple(one.body for one in effects if one.effect == effect)
         blocks += [
-            Block(
-                effect.variable(each), on, each.unit, (each.prior,) * len(on), effect=effect.name
-            )
+            Block(effect.variable(each), on, each.unit, (each.prior,) * len(on), effect=effect.name)
             for each in effect.parameters
         ]
     return Layout(tuple(blocks))
@@ -130,9 +134,3 @@ def random_variable(name: str, priors: tuple[Prior, ...], dims: str) -> Any:
         f"prior of {name}: family {family!r} is unknown; use log_normal, truncated_normal, normal,"
         " half_normal or von_mises"
     )
-
-
-def guess(prior: Prior) -> float:
-    """A finite starting value well inside the support."""
-    value = prior.centre
-    return value if math.isfinite(value) else 0.0

@@ -72,10 +72,7 @@ def find_remainder(mode: Mode, *, seed: int = 0) -> Unexplained | None:
         smoother = _cross_validated(kernels.sum(axis=0), groups, rng)
         shares = _explained(smoother, y)
         null = np.array(
-            [
-                _explained(smoother, y[rng.permutation(len(y))]).max()
-                for _ in range(_PERMUTATIONS)
-            ]
+            [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
         )
         at = int(np.argmax(shares))
         p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * k
@@ -113,7 +110,7 @@ def _kernels(features: Array) -> Array:
     return kernels / max(int(varies.sum()), 1)
 
 
-def _cross_validated(kernel: Array, groups: Array, rng: np.random.Generator) -> Array:
+def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
     """Matrix that predicts each transition from those of other trajectories."""
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))

@@ -16,7 +16,7 @@ from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.findings import Added, Errors, Estimate, Findings, Numerical, Rollout
-from pbrl_ppl.fit import fit, parameter_draws, versions
+from pbrl_ppl.fitting import fit, parameter_draws, versions
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import STATE_UNITS, StartNoise, log_density
 from pbrl_ppl.model import Problem, build_model
@@ -39,7 +39,7 @@ TRIED, MOST_ADDED = 3, 5
 #: Likelihoods that differ by less do not choose between effects: the catalogue's order does.
 TIE = 1.0
 #: A doubling of the substeps may move predictions by this share of the noise.
-SMALL_SHIFT = 0.05
+SMALL_SHIFT = 0.1
 MOST_SUBSTEPS = 640
 #: A start state's noise may spread to this many times the noise of the measured end.
 LARGEST_SPREAD = 3.0
@@ -60,7 +60,7 @@ def revise(
     seed: int = 0,
     horizon: int | None = None,
     substeps: int | None = None,
-    draws: int = 750,
+    draws: int = 500,
     progress: Callable[[str], None] | None = None,
 ) -> Findings:
     """Fit a declared model, trace its residual to missing effects, add them, and compare.
@@ -106,7 +106,8 @@ def revise(
     declared = loop.declared_mode(horizon, substeps)
     say("scoring what the model might lack")
     first = rank_candidates(declared, loop.missing(declared))
-    current, ranked, added = declared, first, []
+    current, ranked = declared, first
+    added: list[_Step] = []
     while ranked and len(added) < MOST_ADDED:
         step = loop.best_addition(current, ranked)
         if step is None:
@@ -160,10 +161,7 @@ class _Loop:
             threads=2,
         )
         mode = find_mode(problem, seed=self.seed)
-        if horizon is None:
-            mode = self._choose_horizon(mode)
-        else:
-            mode = _noisy(mode)
+        mode = self._choose_horizon(mode) if horizon is None else _noisy(mode)
         return self.with_enough_substeps(mode)
 
     def _choose_horizon(self, mode: Mode) -> Mode:
@@ -175,10 +173,10 @@ class _Loop:
                 break
             problem = replace(mode.problem, horizon=horizon, noise=None)
             mode = _noisy(mode if horizon == 1 else find_mode(problem, initial=mode.phi))
-            noise = mode.problem.noise
-            last = mode.problem.observations.measured[:, -1].reshape(mode.problem.segments.n, -1)
-            spread = np.sqrt(np.maximum(noise.gain[:, -last.shape[1] :] ** 2 - 1, 0))
-            worst = float(np.max(np.median(np.where(last, spread, 0.0), axis=0)))
+            gain = mode.problem.noise.gain if mode.problem.noise else np.ones((1, 1))
+            cells = len(mode.problem.scene.dynamic) * len(mode.sigma)  # of the last interval
+            spread = np.sqrt(np.maximum(gain[:, -cells:] ** 2 - 1.0, 0.0))
+            worst = float(np.median(spread, axis=0).max())
             tried.append((worst, mode))
             if worst <= LARGEST_SPREAD:
                 break
@@ -208,7 +206,7 @@ class _Loop:
         def gain(item: tuple[Signature, Mode]) -> float:
             signature, fitted = item
             penalty = 0.5 * signature.candidate.dof * np.log(fitted.problem.segments.n)
-            return _log_likelihood(fitted) - penalty
+            return float(_log_likelihood(fitted) - penalty)
 
         while fits:
             most = max(map(gain, fits))
@@ -269,9 +267,7 @@ class _Loop:
     def posterior(self, mode: Mode, draws: int) -> Any:
         """Sample a mode's model."""
         model = build_model(replace(mode.problem, threads=1))
-        return fit(
-            model, seed=self.seed, draws=draws, tune=500, thin=2, start=mode, progress=False
-        )
+        return fit(model, seed=self.seed, draws=draws, tune=400, thin=2, start=mode, progress=False)
 
     def findings(
         self,
@@ -293,9 +289,7 @@ class _Loop:
         return Findings(
             scene=self.scene,
             verdict=verdict,
-            numerical=Numerical(
-                self.scene.substeps, revised.problem.substeps, shift(revised)
-            ),
+            numerical=Numerical(self.scene.substeps, revised.problem.substeps, shift(revised)),
             candidates=tuple(each.candidate for each in first),
             added=tuple(self._added(step, after) for step in steps),
             unexplained=remainder,
@@ -325,9 +319,7 @@ class _Loop:
     def _added(self, step: _Step, posterior: Any) -> Added:
         candidate, effect = step.signature.candidate, step.signature.attached.effect
         named = posterior_draws(posterior)
-        bodies = [
-            one.body for one in step.after.problem.effects if one.effect.name == effect.name
-        ]
+        bodies = [one.body for one in step.after.problem.effects if one.effect.name == effect.name]
         estimates = {}
         for parameter in effect.parameters:
             values = named[effect.variable(parameter)][:, bodies.index(candidate.body)]
@@ -348,7 +340,8 @@ class _Loop:
 
     def _rollout_horizon(self, horizon: int) -> int:
         longest = int(self.test.dataset["n_rows"].min()) - 1
-        return max(min(horizon, longest), min(longest, round(ROLLOUT_SECONDS / self.scene.time_step)))
+        second = round(ROLLOUT_SECONDS / self.scene.time_step)
+        return min(longest, max(horizon, second))
 
     def _errors(self, mode: Mode, scale: Mode, posterior: Any, rollout: int) -> Errors:
         """Errors of a model; ``scale`` is the model whose noise is the unit."""
@@ -364,11 +357,13 @@ class _Loop:
         )
 
     def _floor(self, mode: Mode, rollout: int) -> Errors:
-        """What measurement noise alone would give, at both ends of a prediction."""
+        """Errors that measurement noise alone would give, at both ends of a prediction."""
 
         def expected(problem: Problem) -> dict[str, float]:
             names = problem.observations.names
-            gain = problem.noise.gain.reshape(problem.observations.values.shape)[:, -1]
+            gain = problem.noise.gain if problem.noise else np.ones(1)
+            gain = np.broadcast_to(gain, (problem.segments.n, gain.shape[-1]))
+            gain = gain.reshape(problem.observations.values.shape)[:, -1]
             seen = problem.observations.measured[:, -1]
             square = ((gain * mode.sigma) ** 2 * seen).sum((0, 1)) / np.maximum(seen.sum((0, 1)), 1)
             return dict(zip(names, np.sqrt(square).tolist(), strict=True))
@@ -386,7 +381,7 @@ class _Loop:
         )
 
     def _rollout(self, declared: Mode, revised: Mode) -> Rollout:
-        """The body that moves most, over the first held-out trajectory that starts complete."""
+        """Follow the body that moves most over the first held-out trajectory."""
         length = int(self.test.dataset["n_rows"].min()) - 1
         problem = replace(revised.problem, history=self.test, horizon=length, noise=None)
         first = slice(0, 1)
@@ -402,7 +397,7 @@ class _Loop:
         origin = np.where(np.isfinite(start[0, body]), start[0, body], np.nan)
         return Rollout(
             body=self.scene.dynamic[body].name,
-            time=np.arange(length + 1) * self.scene.time_step,
+            time=np.arange(length + 1, dtype=float) * self.scene.time_step,
             names=problem.observations.names,
             units=tuple(STATE_UNITS[d] for d in columns),
             measured=np.vstack([origin[list(columns)], measured[:, body]]),
@@ -474,6 +469,5 @@ def _by_dimension(scale: Problem, mode: Mode, unit: Mode) -> dict[str, Array]:
     observations = scale.observations
     z = _whitened(scale, mode, unit).reshape(observations.values.shape)
     return {
-        name: z[..., i][observations.measured[..., i]]
-        for i, name in enumerate(observations.names)
+        name: z[..., i][observations.measured[..., i]] for i, name in enumerate(observations.names)
     }

@@ -20,7 +20,7 @@ from pbrl_ppl.effects.quadratic_drag import quadratic_drag
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.scene import Scene
 
-__all__ = ["Attached", "Effect", "EffectParameter", "attach", "catalogue", "candidates"]
+__all__ = ["Attached", "Effect", "EffectParameter", "attach", "candidates", "catalogue"]
 
 #: A hinge's own friction stands before drag on a body, which looks the same on a single pendulum.
 catalogue: tuple[Effect, ...] = (

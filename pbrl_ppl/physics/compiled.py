@@ -394,7 +394,7 @@ def rollout(  # type: ignore[no-untyped-def]
     Returns the item at which the engine diverged (its world is then of no more use), or ``last``.
     """
     n = len(start)
-    scratch = np.empty(actions.shape[1:3] + (6,))
+    scratch = np.empty((actions.shape[1], actions.shape[2], 6))
     proposal = -1
     touched = _TOUCHED  # what an earlier call left behind is unknown
     for item in range(first, last):

@@ -80,9 +80,7 @@ def engine_properties(
     return properties, np.stack(laws, axis=1) if laws else np.zeros((n, 0))
 
 
-def _values(
-    one: Attached, value: Callable[[str, str], Array | None], n: int
-) -> dict[str, Array]:
+def _values(one: Attached, value: Callable[[str, str], Array | None], n: int) -> dict[str, Array]:
     """Each parameter of an attached effect, shape (proposal,); null where phi does not hold it."""
     result = {}
     for parameter in one.effect.parameters:
@@ -99,9 +97,10 @@ def _check(body: str, row: Mapping[str, Array]) -> None:
             raise ParameterError(
                 f"body {body!r}: {name} is {values.min():g}, expected a positive number"
             )
-        if name in ("mu_c", "mu_x", "mu_y", "r", "pivot_torque", "pivot_damping") and (
-            values < 0
-        ).any():
+        if (
+            name in ("mu_c", "mu_x", "mu_y", "r", "pivot_torque", "pivot_damping")
+            and (values < 0).any()
+        ):
             raise ParameterError(
                 f"body {body!r}: {name} is {values.min():g}, expected zero or more"
             )

@@ -90,8 +90,8 @@ class Simulator:
         Returns
         -------
         ndarray
-            Shape (transition, H, body, 6), with a leading proposal axis if phi has one. A transition
-            in which the engine diverged is NaN.
+            Shape (transition, H, body, 6), with a leading proposal axis if phi has one. A
+            transition in which the engine diverged is NaN.
 
         Raises
         ------
@@ -137,7 +137,13 @@ class Simulator:
             raise SimulationError("start states and actions must be finite; drop the missing rows")
 
     def _run_plain(
-        self, properties: Array, values: Array, start: Array, actions: Array, coarse: int, out: Array
+        self,
+        properties: Array,
+        values: Array,
+        start: Array,
+        actions: Array,
+        coarse: int,
+        out: Array,
     ) -> None:
         for item in range(len(out)):
             p, t = divmod(item, len(start))
@@ -151,7 +157,13 @@ class Simulator:
                     out[item] = total / (self.substeps - coarse)
 
     def _run_compiled(
-        self, properties: Array, values: Array, start: Array, actions: Array, coarse: int, out: Array
+        self,
+        properties: Array,
+        values: Array,
+        start: Array,
+        actions: Array,
+        coarse: int,
+        out: Array,
     ) -> None:
         laws = [one for one in self.effects if one.effect.force is not None]
         names = [body.name for body in self.scene.dynamic]

@@ -34,9 +34,9 @@ def fit(
     *,
     seed: int = 0,
     draws: int = 1000,
-    tune: int = 1000,
+    tune: int = 500,
     chains: int = 4,
-    thin: int = 5,
+    thin: int = 2,
     cores: int | None = None,
     start: Mode | None = None,
     progress: bool = True,
@@ -82,18 +82,16 @@ def fit(
     """
     problem = getattr(model, "problem", None)
     if not isinstance(problem, Problem):
-        raise FitError(
-            "fit: this pm.Model was not made by physics_model; use pm.sample for others"
-        )
+        raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
     mode = find_mode(problem, seed=seed) if start is None else start
     rng = np.random.default_rng(seed)
     blocks = _blocks(model, problem)
     with model:
         steps = [
-            AdaptiveMetropolis(variables, covariance=covariance, thin=thin)
-            for variables, covariance in (
-                (blocks["phi"], _unconstrained_covariance(problem, mode)),
-                (blocks["sigma"], _sigma_covariance(problem, mode)),
+            AdaptiveMetropolis(variables, mean=mean, covariance=covariance, thin=thin)
+            for variables, (mean, covariance) in (
+                (blocks["phi"], _laplace(problem, mode)),
+                (blocks["sigma"], _sigma_laplace(problem, mode)),
             )
             if variables
         ]
@@ -121,31 +119,35 @@ def _blocks(model: pm.Model, problem: Problem) -> dict[str, list[Any]]:
     return {"phi": [model[name] for name in names], "sigma": [model["sigma"]]}
 
 
-def slope(prior: Prior, x: float) -> float:
-    """Derivative of PyMC's unconstraining transform of a prior's variable at x."""
+def unconstrain(prior: Prior, x: float) -> tuple[float, float]:
+    """PyMC's unconstraining transform of a prior's variable at x, and its derivative."""
     if prior.family in ("log_normal", "half_normal"):
-        return 1.0 / x
+        return float(np.log(x)), 1.0 / x
     if prior.family == "truncated_normal":
-        return 1.0 / (x - prior.lower) + 1.0 / (prior.upper - x)
-    return 1.0
+        left, right = x - prior.lower, prior.upper - x
+        return float(np.log(left / right)), 1.0 / left + 1.0 / right
+    return x, 1.0
 
 
-def _unconstrained_covariance(problem: Problem, mode: Mode) -> Array:
-    """Laplace covariance in the sampler's space, with no direction wider than the prior's."""
-    priors = problem.layout.priors
-    scale = np.array([slope(prior, x) for prior, x in zip(priors, mode.phi, strict=True)])
+def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
+    """Mode and Laplace covariance in the sampler's space, no direction wider than a prior's."""
+    pairs = [
+        unconstrain(prior, x) for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
+    ]
+    mean, scale = np.array(pairs).T
     covariance = scale[:, None] * mode.covariance * scale
-    widest = np.minimum(np.sqrt(np.diag(covariance)), 2.0)
-    shrink = widest / np.sqrt(np.diag(covariance))
-    return np.asarray(shrink[:, None] * covariance * shrink + 1e-12 * np.eye(len(scale)))
+    deviation = np.sqrt(np.diag(covariance))
+    shrink = np.minimum(deviation, 2.0) / deviation
+    return mean, shrink[:, None] * covariance * shrink + 1e-12 * np.eye(len(scale))
 
 
-def _sigma_covariance(problem: Problem, mode: Mode) -> Array:
-    """Of log sigma: half the inverse of the number of measurements."""
+def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
+    """Mean and covariance of log sigma: the latter half the inverse of the measurements."""
     counts = problem.observations.measured.sum((0, 1, 2))
+    mean = np.log(mode.sigma)
     if problem.scalar_sigma:
-        counts = np.array([counts.sum()])
-    return np.diag(0.5 / np.maximum(counts, 1))
+        counts, mean = counts.sum(keepdims=True), mean[:1]
+    return mean, np.diag(0.5 / np.maximum(counts, 1))
 
 
 def _dispersed(problem: Problem, mode: Mode, rng: np.random.Generator) -> dict[str, Array]:
@@ -205,7 +207,11 @@ def complete(problem: Problem, trace: Any, *, seed: int) -> Any:
                     likelihood.reshape(chains, n, -1),
                 )
             },
-            {"chain": posterior["chain"], "draw": posterior["draw"], "transition": coords["transition"]},
+            {
+                "chain": posterior["chain"],
+                "draw": posterior["draw"],
+                "transition": coords["transition"],
+            },
         ),
         "posterior_predictive": xr.Dataset(
             {"next_state": (("chain", "draw", *dims), np.stack(predictive)[None])},

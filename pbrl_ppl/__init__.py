@@ -1,0 +1,78 @@
+"""A physics engine as model prior, and a loop that closes on measured data.
+
+The public names; each is imported when it is first used, for PyMC takes seconds to load.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pbrl_ppl.effects import Attached, Effect, EffectParameter, catalogue
+    from pbrl_ppl.errors import PbrlError
+    from pbrl_ppl.findings import Findings
+    from pbrl_ppl.fitting import fit
+    from pbrl_ppl.history import History, Segments
+    from pbrl_ppl.model import physics_model
+    from pbrl_ppl.op import SimulatorOp
+    from pbrl_ppl.parameters import Prior
+    from pbrl_ppl.physics import Simulator
+    from pbrl_ppl.posterior import load_posterior, save_posterior
+    from pbrl_ppl.report import Loop, close_loop
+    from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+
+__version__ = "0.1.0"
+
+__all__ = [
+    "Attached",
+    "Body",
+    "Effect",
+    "EffectParameter",
+    "Findings",
+    "History",
+    "Joint",
+    "Loop",
+    "PbrlError",
+    "Prior",
+    "Scene",
+    "Segments",
+    "Shape",
+    "Simulator",
+    "SimulatorOp",
+    "Wall",
+    "catalogue",
+    "close_loop",
+    "fit",
+    "load_posterior",
+    "physics_model",
+    "save_posterior",
+]
+
+_MODULES = {
+    "effects": ("Attached", "Effect", "EffectParameter", "catalogue"),
+    "errors": ("PbrlError",),
+    "findings": ("Findings",),
+    "fitting": ("fit",),
+    "history": ("History", "Segments"),
+    "model": ("physics_model",),
+    "op": ("SimulatorOp",),
+    "parameters": ("Prior",),
+    "physics": ("Simulator",),
+    "posterior": ("load_posterior", "save_posterior"),
+    "report": ("Loop", "close_loop"),
+    "scene": ("Body", "Joint", "Scene", "Shape", "Wall"),
+}
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name on first use (PEP 562)."""
+    for module, names in _MODULES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"pbrl_ppl.{module}"), name)
+    raise AttributeError(f"module 'pbrl_ppl' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """Public names, for completion."""
+    return __all__
