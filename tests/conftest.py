@@ -1,0 +1,28 @@
+"""Fixtures that many tests share."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """Folder of recorded histories beside the project; tests on it are skipped where it is not."""
+    folder = ROOT.parent / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"no recorded histories at {folder}")
+    return folder
+
+
+@pytest.fixture(scope="session")
+def make_history() -> ModuleType:
+    """The Box2D generator, models/shopping_cart/make_history.py, as a module."""
+    path = ROOT / "models" / "shopping_cart" / "make_history.py"
+    spec = importlib.util.spec_from_file_location("make_history", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
