@@ -60,7 +60,7 @@ def revise(
     seed: int = 0,
     horizon: int | None = None,
     substeps: int | None = None,
-    draws: int = 500,
+    draws: int = 800,
     progress: Callable[[str], None] | None = None,
 ) -> Findings:
     """Fit a declared model, trace its residual to missing effects, add them, and compare.
@@ -267,7 +267,7 @@ class _Loop:
     def posterior(self, mode: Mode, draws: int) -> Any:
         """Sample a mode's model."""
         model = build_model(replace(mode.problem, threads=1))
-        return fit(model, seed=self.seed, draws=draws, tune=400, thin=2, start=mode, progress=False)
+        return fit(model, seed=self.seed, draws=draws, tune=500, thin=2, start=mode, progress=False)
 
     def findings(
         self,
@@ -415,9 +415,12 @@ def _noisy(mode: Mode) -> Mode:
 
 def shift(mode: Mode) -> float:
     """Root mean square change of predictions in noise units if the substeps are doubled."""
-    finer = replace(mode.problem, substeps=2 * mode.problem.substeps)
-    difference = (mode.problem.residual(mode.phi) - finer.residual(mode.phi)) / mode.sigma
-    return float(np.sqrt(np.nanmean(difference**2, axis=(0, 1, 2)).max()))
+    problem = mode.problem
+    finer = replace(problem, substeps=2 * problem.substeps)
+    change = (problem.residual(mode.phi) - finer.residual(mode.phi)) / mode.sigma
+    if problem.noise is not None:
+        change = change / problem.noise.gain.reshape(change.shape)
+    return float(np.sqrt(np.nanmean(change**2, axis=(0, 1, 2)).max()))
 
 
 def _log_likelihood(mode: Mode) -> float:

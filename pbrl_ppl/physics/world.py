@@ -12,8 +12,8 @@ from pymunk import autogeometry
 from pbrl_ppl.physics.properties import COLUMN, Array
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 
-#: Solver iterations: a wheel needs few, a chain of joints more.
-ITERATIONS, ITERATIONS_JOINTED = 10, 30
+#: Solver iterations: one moving body needs few (a wheel or a hinge is then exact), a chain more.
+ITERATIONS, ITERATIONS_CHAINED = 10, 30
 #: Allowed overlap of shapes (m); the engine's default is meant for pixels.
 COLLISION_SLOP = 1e-4
 #: Half the length of a wheel's groove (m): the wheel never leaves it within a substep.
@@ -52,7 +52,9 @@ class World:
         self.scene = scene
         self.space = pymunk.Space()
         self.space.gravity = scene.gravity
-        self.space.iterations = ITERATIONS_JOINTED if scene.joints else ITERATIONS
+        moving = {body.name for body in scene.dynamic}
+        chained = any(moving.issuperset(joint.bodies) for joint in scene.joints)
+        self.space.iterations = ITERATIONS_CHAINED if chained else ITERATIONS
         self.space.collision_slop = COLLISION_SLOP
         self.bodies: list[pymunk.Body] = []
         self.shapes: list[tuple[int, pymunk.Shape]] = []

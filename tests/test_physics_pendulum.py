@@ -1,0 +1,157 @@
+"""Hinges and rods against the pendulum's closed forms, an ODE solver and MuJoCo."""
+
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+from scipy.special import ellipk
+from worlds import G, body, predict, state
+
+from pbrl_ppl.scene import Joint, Scene, Shape
+
+ARM = Shape.box(0.03, 0.4)
+MASS, LEVER = 0.5, 0.18
+MOMENT = MASS * ARM.unit_moment + MASS * LEVER**2  # about the hinge, kg m^2
+
+
+def pendulum(time_step: float, substeps: int, order: int = 1) -> Scene:
+    bodies, anchors = ("arm", "world"), ((0.0, LEVER), (0.0, 0.0))
+    return Scene(
+        time_step=time_step,
+        substeps=substeps,
+        gravity=(0.0, -G),
+        bodies=(body("arm", ARM, mass=MASS),),
+        joints=(Joint("hinge", bodies[::order], *anchors[::order]),),
+    )
+
+
+def hanging(theta: float, omega: float = 0.0) -> np.ndarray:
+    """State of the arm that its hinge allows."""
+    x, y = LEVER * np.sin(theta), -LEVER * np.cos(theta)
+    return state(x, y, theta, -omega * y, omega * x, omega)
+
+
+def solve(theta: float, omega: float, times, damping=0.0, friction=0.0, torque=0.0) -> np.ndarray:
+    def rates(_, s):
+        moment = torque - MASS * G * LEVER * np.sin(s[0]) - damping * s[1]
+        return [s[1], (moment - friction * np.sign(s[1])) / MOMENT]
+
+    times = np.asarray(times)
+    solution = solve_ivp(
+        rates, (0, times[-1]), (theta, omega), t_eval=times, rtol=1e-10, atol=1e-12
+    )
+    return solution.y.T
+
+
+@pytest.mark.parametrize("order", [1, -1])
+@pytest.mark.parametrize("amplitude", [0.05, 1.0, 2.5])
+def test_period_is_the_elliptic_integral(amplitude, order) -> None:
+    period = 4 * np.sqrt(MOMENT / (MASS * G * LEVER)) * ellipk(np.sin(amplitude / 2) ** 2)
+    back = predict(pendulum(period / 50, 200, order), hanging(amplitude), horizon=50)[-1, 0]
+    assert back[2] == pytest.approx(amplitude, rel=1e-3)
+    # the angle is stationary there; a wrong period shows in the speed, in units of its greatest
+    greatest = amplitude * 2 * np.pi / period
+    assert back[5] == pytest.approx(0.0, abs=2e-3 * greatest)
+
+
+def test_hinge_holds_its_anchors_together() -> None:
+    states = predict(pendulum(0.02, 20), hanging(2.0, 3.0), horizon=100)[:, 0]
+    theta = states[:, 2]
+    lever = LEVER * np.stack([np.sin(theta), -np.cos(theta)], axis=1)
+    np.testing.assert_allclose(states[:, :2], lever, atol=1e-3 * LEVER)
+
+
+@pytest.mark.parametrize(
+    ("damping", "friction", "torque"),
+    [(0.0, 0.0, 0.0), (0.02, 0.0, 0.0), (0.0, 0.05, 0.0), (0.01, 0.03, 0.1)],
+)
+def test_against_an_ode_solver(damping, friction, torque) -> None:
+    """And the order: twice the substeps, a quarter of the error; half without extrapolation."""
+    effects = {"pivot_damping": damping, "pivot_friction": friction}
+    exact = solve(0.3, 6.0, [0.1, 0.2, 0.3], damping, friction, torque)[-1]
+
+    def error(substeps: int, extrapolate: bool) -> float:
+        got = predict(
+            pendulum(0.1, substeps),
+            hanging(0.3, 6.0),
+            (0, 0, torque),
+            horizon=3,
+            effects=effects,
+            extrapolate=extrapolate,
+        )
+        return float(np.abs(got[-1, 0, [2, 5]] - exact).max())
+
+    second = [error(n, True) for n in (20, 40, 80)]
+    assert second[-1] < 2e-3
+    assert second[0] / second[1] == pytest.approx(4.0, rel=0.3)
+    assert second[1] / second[2] == pytest.approx(4.0, rel=0.3)
+    first = [error(n, False) for n in (40, 80, 160)]
+    assert first[0] / first[1] == pytest.approx(2.0, rel=0.15)
+    assert first[1] / first[2] == pytest.approx(2.0, rel=0.15)
+
+
+def test_dry_friction_holds_a_pendulum_still() -> None:
+    pull = MASS * G * LEVER * np.sin(0.2)
+    scene = pendulum(0.1, 20)
+    held = predict(scene, hanging(0.2), horizon=5, effects={"pivot_friction": 1.05 * pull})
+    np.testing.assert_allclose(held[-1, 0], hanging(0.2), atol=1e-9)
+    freed = predict(scene, hanging(0.2), horizon=1, effects={"pivot_friction": 0.9 * pull})
+    assert freed[0, 0, 5] == pytest.approx(-0.1 * pull / MOMENT * 0.1, rel=0.05)
+
+
+def test_rod_keeps_its_length() -> None:
+    """A disc on a rod to the world, round in a circle without gravity."""
+    scene = Scene(
+        time_step=0.1,
+        substeps=50,
+        bodies=(body("disc", Shape.circle(0.1)),),
+        joints=(Joint("distance", ("disc", "world"), (0.0, 0.0), (0.0, 0.0)),),
+    )
+    got = predict(scene, state(x=1.0, vy=1.0), horizon=20)[:, 0]
+    time = 0.1 * np.arange(1, 21)
+    np.testing.assert_allclose(np.hypot(got[:, 0], got[:, 1]), 1.0, atol=1e-3)
+    np.testing.assert_allclose(np.hypot(got[:, 3], got[:, 4]), 1.0, atol=1e-3)
+    np.testing.assert_allclose(np.unwrap(np.arctan2(got[:, 1], got[:, 0])), time, atol=3e-3)
+
+
+MODEL = """
+<mujoco><option timestep="0.0005" gravity="0 -9.81 0" integrator="RK4"/>
+<compiler angle="radian"/><worldbody>
+<body name="upper" pos="0 0 0"><joint type="hinge" axis="0 0 1" damping="{damping}"/>
+  <inertial pos="0 -0.18 0" mass="0.5" diaginertia="1 1 {inertia}"/>
+  <body name="lower" pos="0 -0.36 0"><joint type="hinge" axis="0 0 1" damping="{damping}"/>
+    <inertial pos="0 -0.18 0" mass="0.5" diaginertia="1 1 {inertia}"/></body></body>
+</worldbody></mujoco>
+"""
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.01])
+def test_double_pendulum_against_mujoco(damping) -> None:
+    """Damping acts on the relative speed: the lower hinge's on both arms."""
+    mujoco = pytest.importorskip("mujoco")
+    inertia = MASS * ARM.unit_moment
+    model = mujoco.MjModel.from_xml_string(MODEL.format(damping=damping, inertia=inertia))
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = (1.2, -0.7), (2.0, -3.0)  # the second relative to the first
+    expected = []
+    for _ in range(4):
+        for _ in range(100):
+            mujoco.mj_step(model, data)
+        expected.append([*np.cumsum(data.qpos), *np.cumsum(data.qvel)])
+
+    scene = Scene(
+        time_step=0.05,
+        substeps=100,
+        gravity=(0.0, -G),
+        bodies=(body("upper", ARM, mass=MASS), body("lower", ARM, mass=MASS)),
+        joints=(
+            Joint("hinge", ("world", "upper"), (0.0, 0.0), (0.0, LEVER)),
+            Joint("hinge", ("upper", "lower"), (0.0, -LEVER), (0.0, LEVER)),
+        ),
+    )
+    theta, omega = np.cumsum((1.2, -0.7)), np.cumsum((2.0, -3.0))
+    upper = hanging(theta[0], omega[0])
+    lower = hanging(theta[1], omega[1])
+    lower[[0, 1, 3, 4]] += 2 * upper[[0, 1, 3, 4]]
+    got = predict(scene, [upper, lower], horizon=4, effects={"pivot_damping": damping})
+    np.testing.assert_allclose(got[:, :, 2], np.array(expected)[:, :2], atol=2e-3)
+    np.testing.assert_allclose(got[:, :, 5], np.array(expected)[:, 2:], atol=3e-2)

@@ -1,0 +1,69 @@
+"""Small scenes for tests: bodies of which everything is known, and a prediction in one call."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from pbrl_ppl.effects import attach, catalogue
+from pbrl_ppl.effects.base import Attached, Effect
+from pbrl_ppl.parameters import Layout
+from pbrl_ppl.physics import Simulator
+from pbrl_ppl.prior import build_layout
+from pbrl_ppl.scene import Body, Scene, Shape
+
+G = 9.81  # m/s^2
+BY_NAME = {effect.name: effect for effect in catalogue}
+
+
+def body(name: str, shape: Shape, *, wheel: bool = False, **known: float) -> Body:
+    """A body of which every parameter is known: mass 1 and no friction or bounce by default."""
+    defaults = {"mass": 1.0, "r": 0.0, "mu_c": 0.0}
+    if wheel:
+        defaults |= {"w_x": 0.0, "w_y": 0.0, "w_theta": 0.0, "mu_x": 0.0, "mu_y": 0.0}
+    return Body(name, shape, wheel=wheel, known=defaults | known)
+
+
+def state(x=0.0, y=0.0, theta=0.0, vx=0.0, vy=0.0, omega=0.0) -> np.ndarray:
+    """One body's state (6,)."""
+    return np.array([x, y, theta, vx, vy, omega], dtype=float)
+
+
+def simulator(scene: Scene, effects: tuple[Attached | Effect, ...] = (), **options) -> Simulator:
+    attached = attach(scene, effects)
+    return Simulator(scene, build_layout(scene, attached), attached, **options)
+
+
+def predict(
+    scene: Scene,
+    start: Any,
+    wrench: Any = 0.0,
+    *,
+    horizon: int = 1,
+    effects: Mapping[str, Any] | None = None,
+    phi: Any = None,
+    **options: Any,
+) -> np.ndarray:
+    """States (horizon, body, 6) of one transition under a wrench that is held throughout.
+
+    ``effects`` gives catalogue effects on every body they apply to, with the parameters' values;
+    ``start`` is (body, 6) or (6,), ``wrench`` broadcasts to (body, 3).
+    """
+    named = dict(effects or {})
+    sim = simulator(scene, tuple(BY_NAME[name] for name in named), **options)
+    if phi is None:
+        phi = phi_of(sim.layout, named)
+    k = len(scene.dynamic)
+    start = np.asarray(start, dtype=float).reshape(1, k, 6)
+    actions = np.broadcast_to(np.asarray(wrench, dtype=float), (1, horizon, k, 3))
+    return sim(np.asarray(phi, dtype=float), start, actions)[0]
+
+
+def phi_of(layout: Layout, named: Mapping[str, Any]) -> np.ndarray:
+    """Phi from the effects' values: a number, or a tuple in the order of the parameters."""
+    values = {}
+    for name, given in named.items():
+        effect = BY_NAME[name]
+        for parameter, value in zip(effect.parameters, np.atleast_1d(given), strict=True):
+            values[effect.variable(parameter)] = value
+    return layout.to_vector(values)
