@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 
 #: Signatures whose directions agree more than this cannot be told apart.
 PARALLEL = 0.95
+#: ... and more than this, they are the same.
+SAME = 0.9999
 #: A difference of score statistics beyond this tells even nearly parallel signatures apart.
 DECISIVE = 10.0
 #: Less than this share of a signature left means that the declared parameters absorb it.
@@ -178,6 +180,14 @@ def _score(
         identifiable=share,
     )
     return Signature(one, candidate, log_p, basis, direction)
+
+
+def twins(one: Signature, other: Signature) -> bool:
+    """Whether two candidates are the same physics here, such as drags on a single pendulum."""
+    if one.basis.shape != other.basis.shape or one.candidate.dof != other.candidate.dof:
+        return False
+    overlap = np.linalg.svd(one.basis.T @ other.basis, compute_uv=False)
+    return bool(overlap.size and overlap.min() > SAME)
 
 
 def inseparable(leader: Signature, others: Sequence[Signature]) -> tuple[str, ...]:

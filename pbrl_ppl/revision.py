@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from pbrl_ppl import findings
-from pbrl_ppl.criticism import Signature, inseparable, rank_candidates
+from pbrl_ppl.criticism import Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import HistoryError
@@ -35,7 +35,9 @@ MIN_ELPD, MIN_ELPD_SE = 4.0, 2.0
 #: ... and makes the held-out error this much smaller.
 MIN_ERROR_FALL = 0.01
 #: Candidates that are refitted in a round, and effects added at most.
-TRIED, MOST_ADDED = 3, 5
+TRIED, MOST_ADDED = 4, 5
+#: A candidate with less than this share of the leader's statistic waits until that has failed.
+WORTH_A_REFIT = 0.5
 #: Likelihoods that differ by less do not choose between effects: the catalogue's order does.
 TIE = 1.0
 #: A doubling of the substeps may move predictions by this share of the noise.
@@ -191,7 +193,7 @@ class _Loop:
         if mode.problem.substeps == begin:
             return mode
         self.say(f"using {mode.problem.substeps} engine steps an interval")
-        return _noisy(find_mode(mode.problem, initial=mode.phi))
+        return _noisy(mode, rounds=1)
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
         """Candidate effects for a model."""
@@ -199,24 +201,28 @@ class _Loop:
 
     def best_addition(self, mode: Mode, ranked: list[Signature]) -> _Step | None:
         """Refit with the leading candidates; the best that held-out data confirm, or None."""
-        leading = [each for each in ranked if each.candidate.p_value < TRY_P][:TRIED]
-        fits = [(each, self._refit(mode, each)) for each in leading]
         order = [one.effect.name for one in self.missing(mode)]
 
-        def gain(item: tuple[Signature, Mode]) -> float:
+        def rank(item: tuple[Signature, Mode]) -> float:
             signature, fitted = item
             penalty = 0.5 * signature.candidate.dof * np.log(fitted.problem.segments.n)
             return float(_log_likelihood(fitted) - penalty)
 
-        while fits:
-            most = max(map(gain, fits))
-            tied = [item for item in fits if gain(item) > most - TIE]
-            item = min(tied, key=lambda each: order.index(each[0].attached.effect.name))
-            fits.remove(item)
-            signature, fitted = item
-            step = self._confirm(mode, signature, fitted, ranked)
-            if step is not None:
-                return step
+        waiting = _distinct(ranked, order)[:TRIED]
+        while waiting:
+            # those far behind the first wait until it has failed
+            enough = WORTH_A_REFIT * waiting[0].candidate.statistic
+            leading = [each for each in waiting if each.candidate.statistic >= enough]
+            waiting = [each for each in waiting if each.candidate.statistic < enough]
+            fits = [(each, self._refit(mode, each)) for each in leading]
+            while fits:
+                best = max(map(rank, fits))
+                tied = [item for item in fits if rank(item) > best - TIE]
+                item = min(tied, key=lambda each: order.index(each[0].attached.effect.name))
+                fits.remove(item)
+                step = self._confirm(mode, *item, ranked)
+                if step is not None:
+                    return step
         return None
 
     def _refit(self, mode: Mode, signature: Signature) -> Mode:
@@ -237,7 +243,7 @@ class _Loop:
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> _Step | None:
         """Accept an improvement on held-out data that is clear and that matters."""
-        fitted = self.with_enough_substeps(_noisy(fitted))
+        fitted = self.with_enough_substeps(_noisy(fitted, rounds=1))
         rng = np.random.default_rng(self.seed)
         gains = _elpd(self._on_test(fitted), *_laplace_draws(fitted, rng)) - _elpd(
             self._on_test(mode), *_laplace_draws(mode, rng)
@@ -406,9 +412,19 @@ class _Loop:
         )
 
 
-def _noisy(mode: Mode) -> Mode:
-    """Account for start-state noise and refit; twice, for the noise depends on the fit."""
-    for _ in range(2):
+def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
+    """Significant candidates, best first; of twins, the one that the catalogue names first."""
+    kept: list[Signature] = []
+    for each in sorted(ranked, key=lambda each: order.index(each.attached.effect.name)):
+        significant = each.candidate.p_value < TRY_P
+        if significant and not any(twins(each, other) for other in kept):
+            kept.append(each)
+    return sorted(kept, key=lambda each: each.log_p)
+
+
+def _noisy(mode: Mode, rounds: int = 2) -> Mode:
+    """Account for start-state noise and refit; from scratch twice, for it depends on the fit."""
+    for _ in range(rounds):
         mode = find_mode(with_start_noise(mode.problem, mode), initial=mode.phi)
     return mode
 

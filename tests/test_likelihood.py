@@ -142,7 +142,7 @@ def fixed():
     """One case, compiled with and without start noise."""
     observations, predicted, sensitivity = case()
     noise = start_noise(observations, sensitivity)
-    functions = {one: compiled(observations, one) for one in (None, noise)}
+    functions = [(one, compiled(observations, one)) for one in (None, noise)]
     return observations, predicted, functions
 
 
@@ -153,10 +153,8 @@ def test_full_turns_of_measured_angles_change_nothing(fixed, turns) -> None:
     shifted = observations.values.copy()
     shifted[..., COLUMNS.index(2)] += 2 * math.pi * turns
     turned = Observations(shifted, COLUMNS)
-    for noise, logp in functions.items():
-        before = log_density(
-            observations.residual(predicted), SIGMA, noise, observations.measured
-        )
+    for noise, logp in functions:
+        before = log_density(observations.residual(predicted), SIGMA, noise, observations.measured)
         after = log_density(turned.residual(predicted), SIGMA, noise, turned.measured)
         np.testing.assert_allclose(after, before, rtol=1e-9)
         np.testing.assert_allclose(

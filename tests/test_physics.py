@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import G, body, predict, state
 
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
+from tests.worlds import G, body, predict, state
 
 BOX = Shape.box(0.9, 0.55)
 number = st.floats(-3.0, 3.0)
@@ -109,9 +109,7 @@ def test_off_centre_wheel_turns_the_sliding_body() -> None:
 @pytest.mark.parametrize("side", [1, -1])
 def test_restitution_at_a_wall(r, side, extrapolate) -> None:
     puck = body("puck", Shape.circle(0.1), mass=2.0, r=r)
-    scene = Scene(
-        time_step=1.0, substeps=200, bodies=(puck,), walls=(Wall((side, -9), (side, 9)),)
-    )
+    scene = Scene(time_step=1.0, substeps=200, bodies=(puck,), walls=(Wall((side, -9), (side, 9)),))
     after = predict(scene, state(vx=2.0 * side), extrapolate=extrapolate)[0, 0]
     assert after[3] == pytest.approx(-2.0 * side * r, abs=1e-9)
     # it got 0.9 m to the wall in 0.45 s and moved back for 0.55 s; a contact lasts a substep or two
@@ -120,9 +118,7 @@ def test_restitution_at_a_wall(r, side, extrapolate) -> None:
 
 
 @settings(deadline=None, max_examples=60)
-@given(
-    st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.5, 4.0), st.floats(-4.0, 4.0), number
-)
+@given(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.5, 4.0), st.floats(-4.0, 4.0), number)
 def test_tangential_impulse_is_at_most_mu_times_the_normal_one(r, mu_c, vx, vy, omega) -> None:
     mass, radius = 2.0, 0.1
     puck = body("puck", Shape.circle(radius), mass=mass, r=r, mu_c=mu_c)
@@ -211,7 +207,9 @@ def test_two_free_bodies_keep_momentum(mass, r, mu_c, offset, speed, omega) -> N
 
 def _energy(masses: np.ndarray, unit_moment: float, s: np.ndarray) -> float:
     """Kinetic energy (J) of bodies in states (..., body, 6)."""
-    return float((masses * (s[..., 3] ** 2 + s[..., 4] ** 2 + unit_moment * s[..., 5] ** 2)).sum()) / 2
+    return (
+        float((masses * (s[..., 3] ** 2 + s[..., 4] ** 2 + unit_moment * s[..., 5] ** 2)).sum()) / 2
+    )
 
 
 @settings(deadline=None, max_examples=40)

@@ -1,12 +1,14 @@
 """Hinges and rods against the pendulum's closed forms, an ODE solver and MuJoCo."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import ellipk
-from worlds import G, body, predict, state
 
 from pbrl_ppl.scene import Joint, Scene, Shape
+from tests.worlds import G, body, predict, state
 
 ARM = Shape.box(0.03, 0.4)
 MASS, LEVER = 0.5, 0.18
@@ -65,52 +67,76 @@ def test_hinge_holds_its_anchors_together() -> None:
     [(0.0, 0.0, 0.0), (0.02, 0.0, 0.0), (0.0, 0.05, 0.0), (0.01, 0.03, 0.1)],
 )
 def test_against_an_ode_solver(damping, friction, torque) -> None:
-    """And the order: twice the substeps, a quarter of the error; half without extrapolation."""
+    """And the order: twice the substeps, a quarter of the error or less; half as they come."""
     effects = {"pivot_damping": damping, "pivot_friction": friction}
-    exact = solve(0.3, 6.0, [0.1, 0.2, 0.3], damping, friction, torque)[-1]
+    exact = solve(0.3, 6.0, [0.1, 0.2], damping, friction, torque)[-1]
+    assert exact[1] > 0  # it has not turned back: dry friction would jump, and the order be lost
 
     def error(substeps: int, extrapolate: bool) -> float:
         got = predict(
             pendulum(0.1, substeps),
             hanging(0.3, 6.0),
             (0, 0, torque),
-            horizon=3,
+            horizon=2,
             effects=effects,
             extrapolate=extrapolate,
         )
         return float(np.abs(got[-1, 0, [2, 5]] - exact).max())
 
-    second = [error(n, True) for n in (20, 40, 80)]
-    assert second[-1] < 2e-3
-    assert second[0] / second[1] == pytest.approx(4.0, rel=0.3)
-    assert second[1] / second[2] == pytest.approx(4.0, rel=0.3)
+    second = [error(n, True) for n in (40, 80, 160)]
+    assert second[-1] < 2e-4
+    assert second[0] / second[1] > 3.0
+    assert second[1] / second[2] > 3.0
     first = [error(n, False) for n in (40, 80, 160)]
     assert first[0] / first[1] == pytest.approx(2.0, rel=0.15)
     assert first[1] / first[2] == pytest.approx(2.0, rel=0.15)
+
+
+def test_dry_friction_through_a_reversal() -> None:
+    times = 0.05 * np.arange(1, 21)
+    exact = solve(0.3, 6.0, times, friction=0.03)
+    assert (np.diff(np.sign(exact[:, 1])) != 0).sum() >= 2
+    got = predict(
+        pendulum(0.05, 40), hanging(0.3, 6.0), horizon=20, effects={"pivot_friction": 0.03}
+    )
+    np.testing.assert_allclose(got[:, 0, 2], exact[:, 0], atol=2e-3)
+    np.testing.assert_allclose(got[:, 0, 5], exact[:, 1], atol=2e-2)
 
 
 def test_dry_friction_holds_a_pendulum_still() -> None:
     pull = MASS * G * LEVER * np.sin(0.2)
     scene = pendulum(0.1, 20)
     held = predict(scene, hanging(0.2), horizon=5, effects={"pivot_friction": 1.05 * pull})
-    np.testing.assert_allclose(held[-1, 0], hanging(0.2), atol=1e-9)
+    np.testing.assert_allclose(held[-1, 0], hanging(0.2), atol=1e-5)
     freed = predict(scene, hanging(0.2), horizon=1, effects={"pivot_friction": 0.9 * pull})
-    assert freed[0, 0, 5] == pytest.approx(-0.1 * pull / MOMENT * 0.1, rel=0.05)
+    # while it falls, friction is a constant torque upwards
+    exact = solve(0.2, 0.0, [0.1], torque=0.9 * pull)[-1]
+    np.testing.assert_allclose(freed[0, 0, [2, 5]], exact, atol=1e-4)
 
 
-def test_rod_keeps_its_length() -> None:
-    """A disc on a rod to the world, round in a circle without gravity."""
+@pytest.mark.parametrize(
+    ("pose", "anchor", "start"),
+    [
+        # its length is the anchors' distance in the reference pose: the scene's, else the origin
+        ((1.0, 0.0, 0.0), (0.0, 0.0), state(x=1.0, vy=1.0)),
+        (None, (1.0, 0.0), state(x=2.0, vy=1.0)),
+    ],
+)
+def test_rod_keeps_its_length(pose, anchor, start) -> None:
+    """A disc on a rod to the world goes round in a circle."""
+    disc = dataclasses.replace(body("disc", Shape.circle(0.1)), pose=pose)
     scene = Scene(
         time_step=0.1,
         substeps=50,
-        bodies=(body("disc", Shape.circle(0.1)),),
-        joints=(Joint("distance", ("disc", "world"), (0.0, 0.0), (0.0, 0.0)),),
+        bodies=(disc,),
+        joints=(Joint("distance", ("disc", "world"), (0.0, 0.0), anchor),),
     )
-    got = predict(scene, state(x=1.0, vy=1.0), horizon=20)[:, 0]
+    got = predict(scene, start, horizon=20)[:, 0]
     time = 0.1 * np.arange(1, 21)
-    np.testing.assert_allclose(np.hypot(got[:, 0], got[:, 1]), 1.0, atol=1e-3)
+    x, y = (got[:, :2] - anchor).T
+    np.testing.assert_allclose(np.hypot(x, y), 1.0, atol=1e-3)
     np.testing.assert_allclose(np.hypot(got[:, 3], got[:, 4]), 1.0, atol=1e-3)
-    np.testing.assert_allclose(np.unwrap(np.arctan2(got[:, 1], got[:, 0])), time, atol=3e-3)
+    np.testing.assert_allclose(np.unwrap(np.arctan2(y, x)), time, atol=3e-3)
 
 
 MODEL = """

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import G, body, predict
 
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
+from tests.worlds import G, body, predict
 
 BOX = Shape.box(0.9, 0.55)
 number = st.floats(-3.0, 3.0)
@@ -59,20 +59,18 @@ def test_rotation(start, wrench, wheel, angle) -> None:
         effects=DRAG,
     )[0, 0]
     here = predict(scene, start, wrench, effects=DRAG)[0, 0]
-    # a solver that has not converged depends on the axes it works in; the wheel's turn with the body
+    # a solver short of convergence depends on its axes, but those of the wheel turn with the body
     np.testing.assert_allclose(there, turn(here), atol=1e-7)
 
 
 @settings(deadline=None, max_examples=40)
 @given(states, wrenches, wheels)
 def test_mirror(start, wrench, wheel) -> None:
-    """Seen in a mirror along x: y, theta, vy, omega, force_y, torque, w_y and w_theta change sign."""
+    """In a mirror along x: y, theta, vy, omega, force_y, torque, w_y, w_theta change sign."""
     flip = np.array([1, -1, -1, 1, -1, -1])
     mirrored = wheel | {"w_y": -wheel["w_y"], "w_theta": -wheel["w_theta"]}
     here = predict(cart(wheel), start, wrench, effects=DRAG)
-    there = predict(
-        cart(mirrored), flip * start, np.array([1, -1, -1]) * wrench, effects=DRAG
-    )
+    there = predict(cart(mirrored), flip * start, np.array([1, -1, -1]) * wrench, effects=DRAG)
     np.testing.assert_allclose(there, flip * here, atol=1e-8)
 
 

@@ -64,7 +64,10 @@ def test_table_1_families_and_supports() -> None:
     points = {name: law.ppf(levels) for name, law in TABLE_1.items()}
     inside = log_densities({name: (priors[name], points[name]) for name in TABLE_1})
     for name, law in TABLE_1.items():
-        np.testing.assert_allclose(inside[name], law.logpdf(points[name]), err_msg=name)
+        # the two libraries' normal probabilities agree to 1e-8
+        np.testing.assert_allclose(
+            inside[name], law.logpdf(points[name]), rtol=1e-6, atol=1e-7, err_msg=name
+        )
 
     beyond = {
         name: np.array([low - 0.01, high + 0.01 if np.isfinite(high) else low - 3.0])
@@ -104,9 +107,8 @@ def test_draws_of_the_variables_stay_in_their_supports() -> None:
             random_variable(block.name, block.priors, dims="body")
     named = {variable.name: variable for variable in model.free_RVs}
     assert set(named) == set(BODY_PARAMETERS)
-    values = dict(
-        zip(named, pm.draw(list(named.values()), draws=200, random_seed=1), strict=True)
-    )
+    drawn = pm.draw(list(named.values()), draws=200, random_seed=1, mode="FAST_COMPILE")
+    values = dict(zip(named, drawn, strict=True))
     for name, (low, high) in SUPPORT.items():
         assert values[name].shape == (200, 1)
         assert ((values[name] >= low) & (values[name] <= high)).all(), name

@@ -379,51 +379,47 @@ def rollout(  # type: ignore[no-untyped-def]
     actions,
     time_step,
     normal_gravity,
-    fine,
-    coarse,
+    counts,
+    weights,
     first,
     last,
     out,
 ):
     """Predict items ``first`` to ``last`` of proposals x transitions into ``out``.
 
-    ``out`` has shape (proposal * transition, H, body, 6). With ``coarse`` > 0 the same transition
-    is run with fewer substeps as well and the first-order error is extrapolated away, unless shapes
-    came close: a collision's time is no smooth function of the substep.
+    ``out`` has shape (proposal * transition, H, body, 6). The transition is run with each number of
+    substeps in ``counts``, the finest first, and the weighted sum taken, which cancels the leading
+    errors; where shapes came close the finest run stands alone: a collision's time is no smooth
+    function of the substep.
 
     Returns the item at which the engine diverged (its world is then of no more use), or ``last``.
     """
     n = len(start)
     scratch = np.empty((actions.shape[1], actions.shape[2], 6))
+    total = np.empty_like(scratch)
     proposal = -1
-    touched = _TOUCHED  # what an earlier call left behind is unknown
+    state = _TOUCHED  # what an earlier call left behind is unknown
     for item in range(first, last):
         p, t = item // n, item % n
         if p != proposal:
             proposal = p
             _set_properties(fn, world, properties[p], normal_gravity)
-        _forget(fn, world, properties[p], normal_gravity, touched)
-        touched = _transition(
-            fn, world, properties[p], laws, law_body, law_offset, values[p],
-            start[t], actions[t], time_step / fine, fine, out[item],
-        )  # fmt: skip
-        if touched == _LOST:
-            return item
-        if coarse > 0 and touched == _FREE:
-            _forget(fn, world, properties[p], normal_gravity, touched)
-            touched = _transition(
+        total[:] = 0.0
+        for level in range(len(counts)):
+            _forget(fn, world, properties[p], normal_gravity, state)
+            state = _transition(
                 fn, world, properties[p], laws, law_body, law_offset, values[p],
-                start[t], actions[t], time_step / coarse, coarse, scratch,
+                start[t], actions[t], time_step / counts[level], counts[level], scratch,
             )  # fmt: skip
-            if touched == _LOST:
+            if state == _LOST:
                 return item
-            if touched == _FREE:
-                for h in range(scratch.shape[0]):
-                    for i in range(scratch.shape[1]):
-                        for d in range(6):
-                            out[item, h, i, d] = (
-                                fine * out[item, h, i, d] - coarse * scratch[h, i, d]
-                            ) / (fine - coarse)
+            if level == 0:
+                out[item] = scratch
+            if state == _TOUCHED:
+                break
+            total += weights[level] * scratch
+        if state == _FREE and len(counts) > 1:
+            out[item] = total
     return last
 
 

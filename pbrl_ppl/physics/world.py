@@ -12,8 +12,9 @@ from pymunk import autogeometry
 from pbrl_ppl.physics.properties import COLUMN, Array
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 
-#: Solver iterations: one moving body needs few (a wheel or a hinge is then exact), a chain more.
-ITERATIONS, ITERATIONS_CHAINED = 10, 30
+#: Solver iterations: one body with nothing to touch needs few (its wheel or hinge is then solved to
+#: rounding), a body among others the engine's default, a chain of joints more.
+ITERATIONS_ALONE, ITERATIONS, ITERATIONS_CHAINED = 5, 10, 30
 #: Allowed overlap of shapes (m); the engine's default is meant for pixels.
 COLLISION_SLOP = 1e-4
 #: Half the length of a wheel's groove (m): the wheel never leaves it within a substep.
@@ -52,9 +53,7 @@ class World:
         self.scene = scene
         self.space = pymunk.Space()
         self.space.gravity = scene.gravity
-        moving = {body.name for body in scene.dynamic}
-        chained = any(moving.issuperset(joint.bodies) for joint in scene.joints)
-        self.space.iterations = ITERATIONS_CHAINED if chained else ITERATIONS
+        self.space.iterations = _iterations(scene)
         self.space.collision_slop = COLLISION_SLOP
         self.bodies: list[pymunk.Body] = []
         self.shapes: list[tuple[int, pymunk.Shape]] = []
@@ -157,6 +156,14 @@ class World:
         for pivot in self.pivots:
             pivot.motor.max_force = properties[pivot.body, COLUMN["pivot_torque"]]
             pivot.damper.damping = properties[pivot.body, COLUMN["pivot_damping"]]
+
+
+def _iterations(scene: Scene) -> int:
+    moving = {body.name for body in scene.dynamic}
+    if any(moving.issuperset(joint.bodies) for joint in scene.joints):
+        return ITERATIONS_CHAINED
+    alone = len(scene.bodies) == 1 and not scene.walls
+    return ITERATIONS_ALONE if alone else ITERATIONS
 
 
 def hanging_body(scene: Scene, joint: Joint) -> str:
