@@ -86,8 +86,10 @@ class History:
 
     Examples
     --------
-    >>> history = History.load("train.csv", scene)  # doctest: +SKIP
-    >>> history.segments(horizon=5).start.shape  # doctest: +SKIP
+    ::
+
+        history = History.load("train.csv", scene)
+        history.segments(horizon=5).start.shape
     (72, 1, 6)
     """
 

@@ -192,10 +192,15 @@ def physics_model(
 
     Examples
     --------
-    >>> import pbrl_ppl as pp  # doctest: +SKIP
-    >>> scene = pp.Scene.load("models/shopping_cart/scene.toml")  # doctest: +SKIP
-    >>> history = pp.History.load("models/shopping_cart/recorded/train.csv", scene)  # doctest: +SKIP
-    >>> model = pp.physics_model(scene, history)  # doctest: +SKIP
+    >>> import pandas as pd
+    >>> from pbrl_ppl.scene import Body, Shape
+    >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2)),))
+    >>> rows = pd.DataFrame({"trajectory": 0, "time": [0.0, 0.1], "body": "puck", "x": [0.0, 0.1],
+    ...     "y": 0.0, "theta": 0.0, "vx": 1.0, "vy": 0.0, "omega": 0.0,
+    ...     "force_x": 0.0, "force_y": 0.0, "torque": 0.0})
+    >>> model = physics_model(scene, History.from_dataframe(rows, scene))
+    >>> [variable.name for variable in model.free_RVs]
+    ['mass', 'r', 'mu_c', 'sigma']
     """
     if sigma not in ("per_dimension", "scalar"):
         raise ValueError(f"sigma is {sigma!r}, expected 'per_dimension' or 'scalar'")

@@ -58,7 +58,7 @@ class SimulatorOp(Op):
         self.substeps = scene.substeps if substeps is None else substeps
         self.threads = threads
         self.simulator = Simulator(scene, layout, effects, substeps=self.substeps, threads=threads)
-        self._memory: OrderedDict[tuple[int, int, bytes], NDArray[np.float64]] = OrderedDict()
+        self._memory: OrderedDict[tuple[object, ...], NDArray[np.float64]] = OrderedDict()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the memory behind when the Op goes to another process."""
@@ -92,9 +92,9 @@ class SimulatorOp(Op):
             inputs.append(tensor)
         return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, k, 6))])
 
-    def infer_shape(self, fgraph: Any, node: Apply, shapes: Any) -> list[tuple[Any, ...]]:
+    def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
         """(transition, H, body, 6) from the shape of the actions."""
-        actions = shapes[2]
+        actions = arguments[-1][2]  # older stacks pass (fgraph, node, shapes), newer (node, shapes)
         return [(actions[0], actions[1], actions[2], 6)]
 
     def perform(self, node: Apply, inputs: Any, outputs: Any) -> None:
@@ -108,7 +108,13 @@ class SimulatorOp(Op):
         actions: NDArray[np.float64],
     ) -> NDArray[np.float64]:
         """Run the engine, or recall what it said of these very inputs a moment ago."""
-        key = (hash(start.tobytes()), hash(actions.tobytes()), phi.tobytes())
+        key = (
+            start.shape,
+            actions.shape,
+            hash(start.tobytes()),
+            hash(actions.tobytes()),
+            phi.tobytes(),
+        )
         if key in self._memory:
             self._memory.move_to_end(key)
             return self._memory[key].copy()

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import truncnorm
 
 from pbrl_ppl.errors import ParameterError
 
@@ -84,12 +85,11 @@ class Prior:
             return rng.vonmises(self.mu, self.kappa, size)
         if self.family == "half_normal":
             return np.abs(rng.normal(0.0, self.sigma, size))
-        draws = rng.normal(self.mu, self.sigma, size)
-        outside = (draws < self.support[0]) | (draws > self.support[1])
-        while outside.any():
-            draws[outside] = rng.normal(self.mu, self.sigma, int(outside.sum()))
-            outside = (draws < self.support[0]) | (draws > self.support[1])
-        return draws
+        if self.family == "truncated_normal":
+            ends = (np.array(self.support) - self.mu) / self.sigma
+            draws = truncnorm.rvs(*ends, self.mu, self.sigma, size=size, random_state=rng)
+            return np.asarray(np.clip(draws, *self.support))
+        return rng.normal(self.mu, self.sigma, size)
 
 
 #: Table 1's names for one body, in the order of Eq. 8, with units.

@@ -143,9 +143,10 @@ def close_loop(scene: Scene, train: History, test: History | None = None, **opti
 
     Examples
     --------
-    >>> loop = close_loop(scene, train, test, seed=1)  # doctest: +SKIP
-    >>> loop.verdict  # doctest: +SKIP
-    'effects-added'
+    ::
+
+        loop = close_loop(scene, train, test, seed=1)
+        loop.verdict  # 'effects-added'
     """
     return Loop(revise(scene, train, test, **options))
 

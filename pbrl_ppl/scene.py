@@ -106,6 +106,11 @@ class Scene:
                         f'[[joint]] number {position}: there is no body "{name}"'
                         f"{nearest(name, names)}"
                     )
+            if not any(body.name in joint.bodies for body in self.dynamic):
+                raise SceneError(
+                    f"[[joint]] number {position}: neither {joint.bodies[0]} nor"
+                    f" {joint.bodies[1]} can move; join a moving body"
+                )
 
     @classmethod
     def load(cls, path: str | Path) -> Scene:

@@ -97,7 +97,21 @@ def frictionless_history(scene, rng, n=60, mass=2.0, drag=0.0, push=True):
             measured = state + noise * rng.normal(size=6)
             action = [*force, 0.0] if step == 0 else [np.nan] * 3
             rows.append([i, step, step * dt, "puck", *measured, *action])
-    columns = "trajectory step time body x y theta vx vy omega force_x force_y torque".split()
+    columns = [
+        "trajectory",
+        "step",
+        "time",
+        "body",
+        "x",
+        "y",
+        "theta",
+        "vx",
+        "vy",
+        "omega",
+        "force_x",
+        "force_y",
+        "torque",
+    ]
     import pandas as pd
 
     return History.from_dataframe(pd.DataFrame(rows, columns=columns), scene)

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import differentiate, find_mode, find_modes, fold_wheels, with_start_noise

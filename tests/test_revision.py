@@ -137,16 +137,28 @@ def tethered_history(stiffness, seed):
             position = rest + offset * c + velocity / w * s
             velocity = velocity * c - offset * w * s
             theta += omega * dt
-    columns = "trajectory step time body x y theta vx vy omega force_x force_y torque".split()
+    columns = [
+        "trajectory",
+        "step",
+        "time",
+        "body",
+        "x",
+        "y",
+        "theta",
+        "vx",
+        "vy",
+        "omega",
+        "force_x",
+        "force_y",
+        "torque",
+    ]
     return pd.DataFrame(rows, columns=columns)
 
 
 def test_an_effect_of_the_users_own_is_found():
     puck = pp.Body("puck", pp.Shape.circle(0.2), known={"r": 0.1, "mu_c": 0.3})
     scene = pp.Scene(time_step=0.1, bodies=(puck,), normal_gravity=9.81, substeps=10)
-    train, test = (
-        pp.History.from_dataframe(tethered_history(3.0, seed), scene) for seed in (1, 2)
-    )
+    train, test = (pp.History.from_dataframe(tethered_history(3.0, seed), scene) for seed in (1, 2))
     found = revise(scene, train, test, catalogue=(*pp.catalogue, TETHER), seed=1, draws=200)
     assert [one.effect for one in found.added] == ["tether"]
     low, high = found.added[0].parameters["stiffness"].hdi

@@ -313,3 +313,11 @@ def test_bad_files(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("[world]\ntime_step = \n", encoding="utf-8")
     with pytest.raises(SceneError, match=r"bad.toml: not TOML: .*line 2"):
         Scene.load(tmp_path / "bad.toml")
+
+
+def test_joint_of_two_things_that_cannot_move():
+    table = Body("table", Shape.circle(0.5), static=True, pose=(0, 0, 0))
+    puck = Body("puck", Shape.circle(0.1))
+    joint = Joint("hinge", ("table", "world"), (0, 0), (0, 0))
+    with pytest.raises(SceneError, match="neither table nor world can move"):
+        Scene(time_step=0.1, bodies=(table, puck), joints=(joint,))

@@ -95,6 +95,7 @@ def attach(
                 raise EffectError(f"effect {item.name} applies to no body of this scene")
             attached.extend(on)
     bodies = {body.name: body for body in scene.dynamic}
+    names = [(one.effect.name, one.body) for one in attached]
     for one in attached:
         if one.body not in bodies:
             raise EffectError(
@@ -103,7 +104,7 @@ def attach(
             )
         if not one.effect.applies(scene, bodies[one.body]):
             raise EffectError(f"effect {one.effect.name} does not apply to body {one.body!r}")
-        if attached.count(one) > 1:
+        if names.count((one.effect.name, one.body)) > 1:
             raise EffectError(f"effect {one.effect.name} is put on body {one.body!r} twice")
     return tuple(attached)
 

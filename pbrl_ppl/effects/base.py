@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 
 #: ``force(state, command, parameters, wrench)``: adds to ``wrench`` (force_x, force_y, torque) in
 #: place, given one body's state (6,), the commanded wrench (3,) and the effect's parameters (q,).
@@ -134,5 +134,22 @@ class Attached:
 
 
 def is_pivoted(scene: Scene, body: Body) -> bool:
-    """Whether the body turns in a hinge."""
-    return any(joint.kind == "hinge" and body.name in joint.bodies for joint in scene.joints)
+    """Whether the body hangs in a hinge; the friction of a hinge belongs to the body that does."""
+    return any(
+        joint.kind == "hinge" and hanging_body(scene, joint) == body.name for joint in scene.joints
+    )
+
+
+def hanging_body(scene: Scene, joint: Joint) -> str:
+    """Name of the body that hangs in a hinge: the one farther from the world along the hinges."""
+    fixed = {WORLD, *(body.name for body in scene.bodies if body.static)}
+    depth = dict.fromkeys(fixed, 0)
+    hinges = [each for each in scene.joints if each.kind == "hinge"]
+    for _ in hinges:
+        for each in hinges:
+            for near, far in (each.bodies, each.bodies[::-1]):
+                if near in depth and far not in depth:
+                    depth[far] = depth[near] + 1
+    # of two bodies that nothing ties to the world, the second hangs on the first
+    first, second = joint.bodies
+    return first if depth.get(first, 0) > depth.get(second, 1) else second

@@ -21,7 +21,7 @@ from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.effects.base import Force
 from pbrl_ppl.physics.properties import COLUMN, COLUMNS
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import DIVERGED, FAR, TINY, World
 
 _FUNCTIONS = (
     "cpSpaceStep",
@@ -68,10 +68,6 @@ _MASS, _R, _MU_C, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING
 )
 #: The engine remembers contacts for this many steps after the shapes have parted.
 _PARKED_STEPS = 5
-_FAR = 1e5
-_TINY = 1e-9
-#: No body is this fast (m/s or rad/s): the engine has diverged.
-_DIVERGED = 1e6
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
 
@@ -266,14 +262,14 @@ def _forget(fn, world, properties, normal_gravity, touched):  # type: ignore[no-
         return
     for i in range(len(bodies)):
         if touched:
-            _call2(fn[_SET_POSITION], bodies[i], _FAR * (i + 1.0), _FAR)
+            _call2(fn[_SET_POSITION], bodies[i], FAR * (i + 1.0), FAR)
         _call2(fn[_SET_VELOCITY], bodies[i], 0.0, 0.0)
         _call1(fn[_SET_SPIN], bodies[i], 0.0)
         _call2(fn[_SET_FORCE], bodies[i], 0.0, 0.0)
         _call1(fn[_SET_TORQUE], bodies[i], 0.0)
     _set_strengths(fn, world, properties, normal_gravity, 0.0)
     for _ in range(_PARKED_STEPS if touched else 1):
-        _call1(fn[_STEP], space, _TINY)
+        _call1(fn[_STEP], space, TINY)
     _set_strengths(fn, world, properties, normal_gravity, 1.0)
 
 
@@ -353,7 +349,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 state[i, 3], state[i, 4] = _get2(fn[_GET_VELOCITY], bodies[i])
                 state[i, 5] = _get1(fn[_GET_SPIN], bodies[i])
                 speed = abs(state[i, 3]) + abs(state[i, 4]) + abs(state[i, 5])
-                if not speed < _DIVERGED:  # also true of NaN
+                if not speed < DIVERGED:  # also true of NaN
                     return _LOST
                 if watch and touched == _FREE:
                     near = _near_contact(

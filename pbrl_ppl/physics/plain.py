@@ -8,7 +8,7 @@ import numpy as np
 
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.physics.properties import COLUMN, Array
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import DIVERGED, World
 from pbrl_ppl.scene import Scene
 
 
@@ -71,6 +71,9 @@ def rollout(
             _place_wheels(world, properties, step)
             world.space.step(step)
             touched = touched or near_contact(world)
+            if not all(np.abs(_state(world, i)[3:]).sum() < DIVERGED for i in range(len(names))):
+                states[:] = np.nan
+                return states, True
         for i in range(len(names)):
             states[h, i] = _state(world, i)
     return states, touched

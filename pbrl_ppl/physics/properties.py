@@ -84,7 +84,10 @@ def _values(one: Attached, value: Callable[[str, str], Array | None], n: int) ->
     """Each parameter of an attached effect, shape (proposal,); null where phi does not hold it."""
     result = {}
     for parameter in one.effect.parameters:
-        found = value(one.effect.variable(parameter), one.body)
+        name = one.effect.variable(parameter)
+        found = value(name, one.body)
+        if found is not None and not np.isfinite(found).all():
+            raise ParameterError(f"body {one.body!r}: {name} is not finite; give a finite number")
         result[parameter.name] = np.full(n, parameter.null) if found is None else found
     return result
 

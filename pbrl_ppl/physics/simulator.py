@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -71,10 +72,18 @@ class Simulator:
         self.substeps, self.threads, self.path = substeps, threads, path
         self.extrapolate = extrapolate
         self._worlds: list[compiled.CompiledWorld] = []
+        self._lock = threading.Lock()  # the worlds serve one call at a time
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the C objects behind: another process builds its own."""
-        return self.__dict__ | {"_worlds": []}
+        return {key: value for key, value in self.__dict__.items() if key != "_lock"} | {
+            "_worlds": []
+        }
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        """Build what was left behind."""
+        self.__dict__.update(state)
+        self._lock = threading.Lock()
 
     def __call__(self, phi: Array, start: Array, actions: Array) -> Array:
         """Predict the states after each interval of each transition.
@@ -112,7 +121,8 @@ class Simulator:
         if self.path == "plain":
             self._run_plain(properties, values, start, actions, out)
         else:
-            self._run_compiled(properties, values, start, actions, out)
+            with self._lock:
+                self._run_compiled(properties, values, start, actions, out)
         out = out.reshape(len(proposals), n, horizon, k, 6)
         return out if phi.ndim == 2 else out[0]
 
@@ -159,7 +169,7 @@ class Simulator:
             total = np.zeros_like(out[item])
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
                 states, touched = plain.rollout(*model, int(count))
-                if level == 0:
+                if level == 0 or np.isnan(states).any():  # diverged
                     out[item] = states
                 if touched:
                     break

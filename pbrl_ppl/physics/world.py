@@ -9,6 +9,7 @@ import numpy as np
 import pymunk
 from pymunk import autogeometry
 
+from pbrl_ppl.effects.base import hanging_body
 from pbrl_ppl.physics.properties import COLUMN, Array
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 
@@ -19,6 +20,10 @@ ITERATIONS_ALONE, ITERATIONS, ITERATIONS_CHAINED = 5, 10, 30
 COLLISION_SLOP = 1e-4
 #: Half the length of a wheel's groove (m): the wheel never leaves it within a substep.
 GROOVE = 10.0
+#: Where bodies are parked (m), and for how long (s).
+FAR, TINY = 1e5, 1e-9
+#: No body is this fast (m/s or rad/s): the engine has diverged.
+DIVERGED = 1e6
 
 
 @dataclass
@@ -72,6 +77,7 @@ class World:
             if body.wheel:
                 self._add_wheel(i, rigid)
         self._add_fixed()
+        self._part()
         for joint in scene.joints:
             self._add_joint(joint)
         #: What the near-contact test needs: circles about bodies, and segments with a radius.
@@ -89,6 +95,16 @@ class World:
             if joint.bodies[0] in names and joint.bodies[1] in names:
                 i, j = (names.index(name) for name in joint.bodies)
                 self.can_touch[i, j] = self.can_touch[j, i] = False
+
+    def _part(self) -> None:
+        """Step once with the bodies far apart: pairs are then found in an order without a past."""
+        for i, body in enumerate(self.bodies):
+            body.position = (FAR * (i + 1.0), FAR)
+        self.space.step(TINY)
+        for body, declared in zip(self.bodies, self.scene.dynamic, strict=True):
+            # the reference pose: a rod keeps the distance that its anchors have there
+            x, y, body.angle = declared.pose or (0.0, 0.0, 0.0)
+            body.position, body.velocity = (x, y), (0.0, 0.0)
 
     def _add_fixed(self) -> None:
         """Walls and static bodies; they carry 1, for the engine multiplies both shapes' values."""
@@ -164,21 +180,6 @@ def _iterations(scene: Scene) -> int:
         return ITERATIONS_CHAINED
     alone = len(scene.bodies) == 1 and not scene.walls
     return ITERATIONS_ALONE if alone else ITERATIONS
-
-
-def hanging_body(scene: Scene, joint: Joint) -> str:
-    """Name of the body that hangs in a hinge: the one farther from the world along the hinges."""
-    fixed = {WORLD, *(body.name for body in scene.bodies if body.static)}
-    depth = dict.fromkeys(fixed, 0)
-    hinges = [each for each in scene.joints if each.kind == "hinge"]
-    for _ in hinges:
-        for each in hinges:
-            for near, far in (each.bodies, each.bodies[::-1]):
-                if near in depth and far not in depth:
-                    depth[far] = depth[near] + 1
-    # of two bodies that nothing ties to the world, the second hangs on the first
-    first, second = joint.bodies
-    return first if depth.get(first, 0) > depth.get(second, 1) else second
 
 
 def _shapes(body: Body, rigid: pymunk.Body) -> list[pymunk.Shape]:
