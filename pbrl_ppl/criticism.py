@@ -77,7 +77,7 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
     residual, jacobian, signatures = _signatures(mode, candidates)
     q, r = np.linalg.qr(jacobian)
     # a parameter that the data and the prior say nothing about has no direction
-    q = q[:, np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max()]
+    q = q[:, np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)]
     left = residual - q @ (q.T @ residual)
     scored = []
     for one, signature in zip(candidates, signatures, strict=True):

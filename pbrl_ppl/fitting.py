@@ -134,7 +134,7 @@ def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     pairs = [
         unconstrain(prior, x) for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
     ]
-    mean, scale = np.array(pairs).T
+    mean, scale = np.array(pairs).reshape(-1, 2).T
     covariance = scale[:, None] * mode.covariance * scale
     deviation = np.sqrt(np.diag(covariance))
     shrink = np.minimum(deviation, 2.0) / deviation
@@ -227,11 +227,15 @@ def complete(problem: Problem, trace: Any, *, seed: int) -> Any:
 def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
     """Draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
     named = draws(trace)
+    n = len(named["sigma"])
     phi = np.concatenate(
-        [named[block.name].reshape(-1, len(block.bodies)) for block in problem.layout.blocks],
+        [
+            np.zeros((n, 0)),
+            *(named[block.name].reshape(n, -1) for block in problem.layout.blocks),
+        ],
         axis=1,
     )
-    sigma = named["sigma"].reshape(len(phi), -1)
+    sigma = named["sigma"].reshape(n, -1)
     return phi, np.broadcast_to(sigma, (len(phi), len(problem.observations.columns)))
 
 
@@ -285,6 +289,6 @@ def _checked(idata: Any) -> Any:
             f" (want <= {MAX_RHAT}), effective sample size {ess[worst_ess]:.0f} for {worst_ess}"
             f" (want >= {MIN_ESS}); raise draws= or thin=",
             ConvergenceWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     return idata

@@ -231,9 +231,8 @@ def build_model(problem: Problem) -> pm.Model:
             "actions", segments.actions, dims=("transition", "step", "body", "wrench")
         )
         # Table 1
-        phi = pt.concatenate(
-            [random_variable(b.name, b.priors, dims=_dim(problem, b)) for b in layout.blocks]
-        )
+        table1 = [random_variable(b.name, b.priors, dims=_dim(problem, b)) for b in layout.blocks]
+        phi = pt.concatenate(table1) if table1 else pt.zeros(0)
         # P(sigma)
         median, spread = sigma_prior(observations, segments)
         if problem.scalar_sigma:

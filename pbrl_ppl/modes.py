@@ -162,6 +162,8 @@ def find_modes(
     priors = problem.layout.priors
     if initial is not None:
         return [_finish(problem, *_search(problem, inside(priors, initial)))]
+    if not priors:  # everything is known but the noise
+        return [_finish(problem, *_search(problem, np.zeros(0)))]
     rng = np.random.default_rng(seed)
     draws = np.stack([prior.sample(rng, screened) for prior in priors], axis=1)
     draws = np.vstack([[prior.centre for prior in priors], draws])
@@ -204,6 +206,8 @@ def _search(problem: Problem, phi: Array) -> tuple[Array, Array, float]:
     priors = problem.layout.priors
     lower, upper = _box(priors)
     sigma = profile_sigma(problem, problem.residual(phi))
+    if not priors:
+        return phi, sigma, _log_posterior(problem, phi, sigma)
     steps = np.array([_first_step(prior, x) for prior, x in zip(priors, phi, strict=True)])
     value = -np.inf
     for _ in range(40):
@@ -277,6 +281,9 @@ def _finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) ->
     """Fold the wheel's symmetry, and take the Jacobian at the posterior's own scale."""
     phi = fold_wheels(problem, phi)
     priors = problem.layout.priors
+    if not priors:
+        cells = problem.observations.values.size
+        return Mode(problem, phi, sigma, np.zeros((cells, 0)), np.zeros((0, 0)), log_posterior)
     lower, upper = _box(priors)
 
     def residual(points: Array) -> Array:

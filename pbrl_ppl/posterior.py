@@ -232,9 +232,11 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     names = list(posterior.data_vars)
     r_hat: dict[str, float] = {}
     ess: dict[str, float] = {}
+    # the generations differ in the tail that they look at by default
     measures = (
         _dataset(az.rhat(posterior)),
-        *(_dataset(az.ess(posterior, method=method)) for method in ("bulk", "tail")),
+        _dataset(az.ess(posterior, method="bulk")),
+        _dataset(az.ess(posterior, method="tail", prob=(0.05, 0.95))),
     )
     for name in names:
         hat, bulk, tail = (measure[name] for measure in measures)

@@ -50,6 +50,7 @@ HORIZONS = (1, 2, 5, 10, 20, 50, 100)
 ROLLOUT_SECONDS = 1.0
 #: With less structure than this left (share of variance), added effects are the verdict.
 LARGE_REMAINDER = 0.1
+LEAST_TUNE = 250
 _ELPD_DRAWS = 100
 
 
@@ -271,9 +272,10 @@ class _Loop:
         return replace(problem, noise=StartNoise.of(sensitivity, measured, mode.sigma))
 
     def posterior(self, mode: Mode, draws: int) -> Any:
-        """Sample a mode's model."""
+        """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
         model = build_model(replace(mode.problem, threads=1))
-        return fit(model, seed=self.seed, draws=draws, tune=500, thin=2, start=mode, progress=False)
+        tune = max(LEAST_TUNE, 5 * draws // 8)
+        return fit(model, seed=self.seed, draws=draws, tune=tune, start=mode, progress=False)
 
     def findings(
         self,

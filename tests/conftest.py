@@ -7,6 +7,8 @@ from types import ModuleType
 import pytest
 
 ROOT = Path(__file__).parents[1]
+STATE = ["x", "y", "theta", "vx", "vy", "omega"]
+COLUMNS = ["trajectory", "step", "time", "body", *STATE, "force_x", "force_y", "torque"]
 
 
 @pytest.fixture(scope="session")

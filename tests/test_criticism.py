@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 import pytest
 from scipy.stats import kstest
 
@@ -12,7 +13,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import find_mode, with_start_noise
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.conftest import ROOT
+from tests.conftest import COLUMNS, ROOT
 
 EFFECTS = {effect.name: effect for effect in catalogue}
 
@@ -97,24 +98,7 @@ def frictionless_history(scene, rng, n=60, mass=2.0, drag=0.0, push=True):
             measured = state + noise * rng.normal(size=6)
             action = [*force, 0.0] if step == 0 else [np.nan] * 3
             rows.append([i, step, step * dt, "puck", *measured, *action])
-    columns = [
-        "trajectory",
-        "step",
-        "time",
-        "body",
-        "x",
-        "y",
-        "theta",
-        "vx",
-        "vy",
-        "omega",
-        "force_x",
-        "force_y",
-        "torque",
-    ]
-    import pandas as pd
-
-    return History.from_dataframe(pd.DataFrame(rows, columns=columns), scene)
+    return History.from_dataframe(pd.DataFrame(rows, columns=COLUMNS), scene)
 
 
 def test_statistic_is_chi_squared_if_nothing_is_missing(puck):

@@ -3,11 +3,12 @@
 import json
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.revision import revise
-from tests.conftest import ROOT
+from tests.conftest import COLUMNS, ROOT
 
 #: Effect in the truth file -> name in the catalogue, and its parameters' names.
 NAMES = {
@@ -116,8 +117,6 @@ TETHER = pp.Effect(
 
 def tethered_history(stiffness, seed):
     """A free puck on a spring: the closed form of a harmonic oscillator, with noise."""
-    import pandas as pd
-
     rng = np.random.default_rng(seed)
     mass, dt = 2.0, 0.1
     w = np.sqrt(stiffness / mass)
@@ -137,22 +136,7 @@ def tethered_history(stiffness, seed):
             position = rest + offset * c + velocity / w * s
             velocity = velocity * c - offset * w * s
             theta += omega * dt
-    columns = [
-        "trajectory",
-        "step",
-        "time",
-        "body",
-        "x",
-        "y",
-        "theta",
-        "vx",
-        "vy",
-        "omega",
-        "force_x",
-        "force_y",
-        "torque",
-    ]
-    return pd.DataFrame(rows, columns=columns)
+    return pd.DataFrame(rows, columns=COLUMNS)
 
 
 def test_an_effect_of_the_users_own_is_found():
@@ -186,3 +170,11 @@ def test_the_demo_finds_what_is_hidden(tmp_path):
     low, high = report["added"][0]["parameters"]["coefficient"]["hdi"]
     assert low <= 1.2 <= high
     assert pp.load_posterior(tmp_path / "out" / "after.nc")["posterior"]["mass"].size
+
+
+def test_a_model_without_unknowns_can_be_criticised():
+    puck = pp.Body("puck", pp.Shape.circle(0.2), known={"mass": 2.0, "r": 0.1, "mu_c": 0.3})
+    scene = pp.Scene(time_step=0.1, bodies=(puck,), normal_gravity=9.81, substeps=10)
+    history = pp.History.from_dataframe(tethered_history(3.0, 6), scene)
+    found = revise(scene, history, catalogue=(TETHER,), seed=1, draws=50)
+    assert [one.effect for one in found.added] == ["tether"]
