@@ -251,5 +251,7 @@ def _warnings_in_a_line() -> Iterator[None]:
         # for authors of libraries, not for users of a command
         for category in (DeprecationWarning, PendingDeprecationWarning, FutureWarning):
             warnings.simplefilter("ignore", category)
+        # a fast BLAS would change nothing here: the time goes into the engine
+        warnings.filterwarnings("ignore", message="PyTensor could not link to a BLAS")
         warnings.showwarning = show
         yield

@@ -107,6 +107,7 @@ def fit(
                 initvals=[_dispersed(problem, mode, rng) for _ in range(chains)],
                 random_seed=int(rng.integers(2**31)),
                 progressbar=progress,
+                quiet=not progress,
                 compute_convergence_checks=False,
                 discard_tuned_samples=True,
             )

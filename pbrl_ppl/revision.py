@@ -8,17 +8,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import logsumexp
 
 from pbrl_ppl import findings
 from pbrl_ppl.criticism import Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.findings import Added, Errors, Estimate, Findings, Numerical, Rollout
-from pbrl_ppl.fitting import fit, parameter_draws, versions
+from pbrl_ppl.evaluation import HeldOut, standard_error
+from pbrl_ppl.findings import Added, Estimate, Findings, Numerical
+from pbrl_ppl.fitting import fit, versions
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import STATE_UNITS, StartNoise, log_density
+from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode, find_mode, inside, with_start_noise
 from pbrl_ppl.posterior import draws as posterior_draws
@@ -46,12 +45,10 @@ MOST_SUBSTEPS = 640
 #: A start state's noise may spread to this many times the noise of the measured end.
 LARGEST_SPREAD = 3.0
 HORIZONS = (1, 2, 5, 10, 20, 50, 100)
-#: Rollouts of the error table last this long (s), or a whole trajectory.
-ROLLOUT_SECONDS = 1.0
-#: With less structure than this left (share of variance), added effects are the verdict.
+#: With less structure than this left (as a share of the declared model's squared error), the
+#: verdict is what was added, and what is left is reported beside it.
 LARGE_REMAINDER = 0.1
 LEAST_TUNE = 250
-_ELPD_DRAWS = 100
 
 
 def revise(
@@ -104,7 +101,7 @@ def revise(
     catalogue = tuple(catalogue)
     if test is None:
         train, test = train.split(0.25, seed)
-    loop = _Loop(scene, train, test, catalogue, seed, say)
+    loop = _Loop(scene, train, HeldOut(test, seed), catalogue, seed, say)
     say("fitting the declared model")
     declared = loop.declared_mode(horizon, substeps)
     say("scoring what the model might lack")
@@ -119,6 +116,9 @@ def revise(
         added.append(step)
         current = step.after
         ranked = rank_candidates(current, loop.missing(current))
+    if len(added) > 1:
+        say("checking that each added effect is still needed")
+        current, added = loop.prune(current, added)
     say("testing what is left")
     remainder = find_remainder(current, seed=seed)
     say("sampling the posterior of the declared model")
@@ -148,7 +148,7 @@ class _Loop:
 
     scene: Scene
     train: History
-    test: History
+    held_out: HeldOut
     catalogue: tuple[Effect, ...]
     seed: int
     say: Callable[[str], None]
@@ -245,31 +245,29 @@ class _Loop:
     ) -> _Step | None:
         """Accept an improvement on held-out data that is clear and that matters."""
         fitted = self.with_enough_substeps(_noisy(fitted, rounds=1))
-        rng = np.random.default_rng(self.seed)
-        gains = _elpd(self._on_test(fitted), *_laplace_draws(fitted, rng)) - _elpd(
-            self._on_test(mode), *_laplace_draws(mode, rng)
-        )
-        total = float(gains.sum())
-        error = float(np.sqrt(len(gains)) * gains.std(ddof=1)) if len(gains) > 1 else np.inf
-        scale = self._on_test(fitted)
-        fall = 1.0 - _normalised(scale, fitted, fitted) / _normalised(scale, mode, fitted)
+        gains = self.held_out.gains(mode, fitted)
+        total, error = float(gains.sum()), standard_error(gains)
+        fall = self.held_out.fall(mode, fitted)
         if total < MIN_ELPD or total < MIN_ELPD_SE * error or fall < MIN_ERROR_FALL:
             return None
         return _Step(signature, inseparable(signature, ranked), fitted, total, error)
 
-    def _on_test(self, mode: Mode, horizon: int | None = None) -> Problem:
-        """A mode's problem on the held-out history, with its start noise linearised there."""
-        problem = replace(
-            mode.problem, history=self.test, noise=None, horizon=horizon or mode.problem.horizon
-        )
-        if problem.observations.columns != mode.problem.observations.columns:
-            raise HistoryError(
-                f"test history measures {', '.join(problem.observations.names)}, the training"
-                f" history {', '.join(mode.problem.observations.names)}; they must be the same"
-            )
-        measured = problem.observations.measured.reshape(problem.segments.n, -1)
-        sensitivity = problem.sensitivity(mode.phi, mode.sigma)
-        return replace(problem, noise=StartNoise.of(sensitivity, measured, mode.sigma))
+    def prune(self, mode: Mode, steps: list[_Step]) -> tuple[Mode, list[_Step]]:
+        """Drop effects that later ones have made unnecessary; what gained most comes first."""
+        for step in sorted(steps, key=lambda each: each.elpd_difference):
+            without = self._without(mode, step.signature.attached)
+            gains = self.held_out.gains(without, mode)
+            if gains.sum() < MIN_ELPD or gains.sum() < MIN_ELPD_SE * standard_error(gains):
+                mode = without
+                steps = [each for each in steps if each is not step]
+        return mode, sorted(steps, key=lambda each: -each.elpd_difference)
+
+    def _without(self, mode: Mode, effect: Attached) -> Mode:
+        kept = tuple(each for each in mode.problem.effects if each != effect)
+        problem = replace(mode.problem, effects=kept)
+        labels = mode.problem.layout.labels
+        phi = [mode.phi[labels.index(label)] for label in problem.layout.labels]
+        return _noisy(find_mode(problem, initial=np.array(phi)), rounds=1)
 
     def posterior(self, mode: Mode, draws: int) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
@@ -288,130 +286,71 @@ class _Loop:
         after: Any,
     ) -> Findings:
         """Put everything together."""
-        verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
-        if remainder is not None and (not steps or remainder.share > LARGE_REMAINDER):
-            verdict = findings.UNEXPLAINED
         horizon = revised.problem.horizon
-        scale = self._on_test(revised)
-        rollout = self._rollout_horizon(horizon)
+        held_out = self.held_out
+        rollout = held_out.rollout_horizon(horizon, self.scene.time_step)
+        errors = [
+            held_out.errors(mode, revised, posterior, rollout)
+            for mode, posterior in ((declared, before), (revised, after))
+        ]
+        verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
+        if remainder is not None:
+            left = remainder.share * (errors[1].normalised_rmse / errors[0].normalised_rmse) ** 2
+            if not steps or left > LARGE_REMAINDER:
+                verdict = findings.UNEXPLAINED
         return Findings(
             scene=self.scene,
             verdict=verdict,
             numerical=Numerical(self.scene.substeps, revised.problem.substeps, shift(revised)),
             candidates=tuple(each.candidate for each in first),
-            added=tuple(self._added(step, after) for step in steps),
+            added=tuple(_added(step, revised, after) for step in steps),
             unexplained=remainder,
-            before=self._errors(declared, revised, before, rollout),
-            after=self._errors(revised, revised, after, rollout),
-            noise_floor=self._floor(revised, rollout),
+            before=errors[0],
+            after=errors[1],
+            noise_floor=held_out.noise_floor(revised, rollout),
             posterior_before=before,
             posterior_after=after,
-            residuals_before=_by_dimension(scale, declared, revised),
-            residuals_after=_by_dimension(scale, revised, revised),
-            rollout=self._rollout(declared, revised),
+            residuals_before=held_out.residuals(declared, revised),
+            residuals_after=held_out.residuals(revised, revised),
+            rollout=held_out.rollout(declared, revised),
             horizon=horizon,
             rollout_horizon=rollout,
             provenance={
                 "seed": self.seed,
                 "versions": versions(),
                 "data_sha256": self.train.data_sha256,
-                "test_sha256": self.test.data_sha256,
+                "test_sha256": held_out.history.data_sha256,
                 "transitions": self.train.n_transitions,
-                "test_transitions": self.test.n_transitions,
+                "test_transitions": held_out.history.n_transitions,
                 "horizon": horizon,
                 "rollout_horizon": rollout,
                 "rollout_seconds": rollout * self.scene.time_step,
             },
         )
 
-    def _added(self, step: _Step, posterior: Any) -> Added:
-        candidate, effect = step.signature.candidate, step.signature.attached.effect
-        named = posterior_draws(posterior)
-        bodies = [one.body for one in step.after.problem.effects if one.effect.name == effect.name]
-        estimates = {}
-        for parameter in effect.parameters:
-            values = named[effect.variable(parameter)][:, bodies.index(candidate.body)]
-            estimates[parameter.name] = Estimate(
-                float(values.mean()), float(values.std()), interval(values), parameter.unit
-            )
-        return Added(
-            effect=candidate.effect,
-            body=candidate.body,
-            sentence=candidate.sentence,
-            statistic=candidate.statistic,
-            p_value=candidate.p_value,
-            parameters=estimates,
-            not_separable_from=step.not_separable_from,
-            elpd_difference=step.elpd_difference,
-            elpd_difference_se=step.elpd_difference_se,
+
+def _added(step: _Step, revised: Mode, posterior: Any) -> Added:
+    """Summarise an added effect with its posterior."""
+    candidate, effect = step.signature.candidate, step.signature.attached.effect
+    named = posterior_draws(posterior)
+    bodies = [one.body for one in revised.problem.effects if one.effect.name == effect.name]
+    estimates = {}
+    for parameter in effect.parameters:
+        values = named[effect.variable(parameter)][:, bodies.index(candidate.body)]
+        estimates[parameter.name] = Estimate(
+            float(values.mean()), float(values.std()), interval(values), parameter.unit
         )
-
-    def _rollout_horizon(self, horizon: int) -> int:
-        longest = int(self.test.dataset["n_rows"].min()) - 1
-        second = round(ROLLOUT_SECONDS / self.scene.time_step)
-        return min(longest, max(horizon, second))
-
-    def _errors(self, mode: Mode, scale: Mode, posterior: Any, rollout: int) -> Errors:
-        """Errors of a model; ``scale`` is the model whose noise is the unit."""
-        problem = self._on_test(mode)
-        pick = np.random.default_rng(self.seed)
-        phi, sigma = parameter_draws(mode.problem, posterior)
-        chosen = pick.choice(len(phi), min(_ELPD_DRAWS, len(phi)), replace=False)
-        return Errors(
-            one_step_rmse=_rmse(replace(problem, horizon=1, noise=None), mode),
-            rollout_rmse=_rmse(replace(problem, horizon=rollout, noise=None), mode),
-            normalised_rmse=_normalised(self._on_test(scale), mode, scale),
-            elpd=float(_elpd(problem, phi[chosen], sigma[chosen]).sum()),
-        )
-
-    def _floor(self, mode: Mode, rollout: int) -> Errors:
-        """Errors that measurement noise alone would give, at both ends of a prediction."""
-
-        def expected(problem: Problem) -> dict[str, float]:
-            names = problem.observations.names
-            gain = problem.noise.gain if problem.noise else np.ones(1)
-            gain = np.broadcast_to(gain, (problem.segments.n, gain.shape[-1]))
-            gain = gain.reshape(problem.observations.values.shape)[:, -1]
-            seen = problem.observations.measured[:, -1]
-            square = ((gain * mode.sigma) ** 2 * seen).sum((0, 1)) / np.maximum(seen.sum((0, 1)), 1)
-            return dict(zip(names, np.sqrt(square).tolist(), strict=True))
-
-        problem = self._on_test(mode)
-        measured = problem.observations.measured
-        at_mode = log_density(
-            np.zeros_like(problem.observations.values), mode.sigma, problem.noise, measured
-        )
-        return Errors(
-            one_step_rmse=expected(self._on_test(mode, 1)),
-            rollout_rmse=expected(self._on_test(mode, rollout)),
-            normalised_rmse=1.0,
-            elpd=float(at_mode.sum() - 0.5 * measured.sum()),
-        )
-
-    def _rollout(self, declared: Mode, revised: Mode) -> Rollout:
-        """Follow the body that moves most over the first held-out trajectory."""
-        length = int(self.test.dataset["n_rows"].min()) - 1
-        problem = replace(revised.problem, history=self.test, horizon=length, noise=None)
-        first = slice(0, 1)
-        start, actions = problem.segments.start[first], problem.segments.actions[first]
-        measured = problem.observations.values[0]
-        columns = problem.observations.columns
-        spread = np.nanstd(measured, axis=0)
-        body = int(np.argmax(np.nansum(spread / np.maximum(revised.sigma, 1e-12), axis=1)))
-        predictions = [
-            np.concatenate([start, mode.problem.simulator(mode.phi, start, actions)[0]])
-            for mode in (declared, revised)
-        ]
-        origin = np.where(np.isfinite(start[0, body]), start[0, body], np.nan)
-        return Rollout(
-            body=self.scene.dynamic[body].name,
-            time=np.arange(length + 1, dtype=float) * self.scene.time_step,
-            names=problem.observations.names,
-            units=tuple(STATE_UNITS[d] for d in columns),
-            measured=np.vstack([origin[list(columns)], measured[:, body]]),
-            before=predictions[0][:, body][:, columns],
-            after=predictions[1][:, body][:, columns],
-        )
+    return Added(
+        effect=candidate.effect,
+        body=candidate.body,
+        sentence=candidate.sentence,
+        statistic=candidate.statistic,
+        p_value=candidate.p_value,
+        parameters=estimates,
+        not_separable_from=step.not_separable_from,
+        elpd_difference=step.elpd_difference,
+        elpd_difference_se=step.elpd_difference_se,
+    )
 
 
 def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
@@ -446,49 +385,3 @@ def _log_likelihood(mode: Mode) -> float:
     residual = problem.residual(mode.phi)
     measured = problem.observations.measured
     return float(log_density(residual, mode.sigma, problem.noise, measured).sum())
-
-
-def _laplace_draws(mode: Mode, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draws of phi and sigma from the Laplace approximation, cut at the supports."""
-    n, p = _ELPD_DRAWS, len(mode.phi)
-    factor = np.linalg.cholesky(mode.covariance + 1e-15 * np.eye(p))
-    # directions that the data say nothing about do not matter for prediction
-    phi = inside(mode.problem.layout.priors, mode.phi + rng.standard_normal((n, p)) @ factor.T)
-    counts = np.maximum(mode.problem.observations.measured.sum((0, 1, 2)), 1)
-    sigma = mode.sigma * np.exp(rng.standard_normal((n, len(counts))) * np.sqrt(0.5 / counts))
-    return phi, sigma
-
-
-def _elpd(problem: Problem, phi: Array, sigma: Array) -> Array:
-    """Log predictive density of each held-out transition, shape (transition,)."""
-    measured = problem.observations.measured
-    density = log_density(problem.residual(phi), sigma, problem.noise, measured)
-    return np.asarray(logsumexp(density, axis=0) - np.log(len(phi)))
-
-
-def _rmse(problem: Problem, mode: Mode) -> dict[str, float]:
-    """Error at the end of the horizon, per state dimension."""
-    residual = problem.residual(mode.phi)[:, -1]
-    seen = problem.observations.measured[:, -1]
-    square = (residual**2).sum((0, 1)) / np.maximum(seen.sum((0, 1)), 1)
-    return dict(zip(problem.observations.names, np.sqrt(square).tolist(), strict=True))
-
-
-def _normalised(scale: Problem, mode: Mode, unit: Mode) -> float:
-    """Root mean square held-out residual of a mode, in units of another's noise."""
-    z = _whitened(scale, mode, unit)
-    return float(np.sqrt((z**2).sum() / scale.observations.measured.sum()))
-
-
-def _whitened(scale: Problem, mode: Mode, unit: Mode) -> Array:
-    model = replace(mode.problem, history=scale.history, horizon=scale.horizon, noise=scale.noise)
-    return model.whitened(mode.phi, unit.sigma)
-
-
-def _by_dimension(scale: Problem, mode: Mode, unit: Mode) -> dict[str, Array]:
-    """Held-out residuals in noise units, by state dimension."""
-    observations = scale.observations
-    z = _whitened(scale, mode, unit).reshape(observations.values.shape)
-    return {
-        name: z[..., i][observations.measured[..., i]] for i, name in enumerate(observations.names)
-    }
