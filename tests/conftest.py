@@ -5,6 +5,11 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from hypothesis import settings
+
+# the same examples everywhere, and no test that fails because a machine is slow
+settings.register_profile("project", deadline=None, derandomize=True)
+settings.load_profile("project")
 
 ROOT = Path(__file__).parents[1]
 STATE = ["x", "y", "theta", "vx", "vy", "omega"]

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from test_report import made_up
 
 from pbrl_ppl import report
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
 from pbrl_ppl.report import FILES, Loop
+from tests.test_report import made_up
 
 SCENE = """
 [world]

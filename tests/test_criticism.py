@@ -104,7 +104,7 @@ def frictionless_history(scene, rng, n=60, mass=2.0, drag=0.0, push=True):
 def test_statistic_is_chi_squared_if_nothing_is_missing(puck):
     rng = np.random.default_rng(5)
     uncorrected = []
-    for _ in range(60):
+    for _ in range(40):
         mode = mode_of(puck, frictionless_history(puck, rng), initial=np.array([2.0]))
         (signature,) = rank_candidates(mode, [EFFECTS["constant_force"].on("puck")])
         uncorrected.append(np.exp(signature.log_p))
