@@ -117,6 +117,10 @@ def plot_residuals(findings: Findings) -> Figure:
             axes.plot([place + shift] * 2, [low, high], color=colour, linewidth=3)
     if largest > 12:
         axes.set_yscale("asinh", linear_width=4.0)
+        ticks = [tick for tick in (3, 10, 30, 100, 300, 1000) if tick <= largest]
+        ticks = [*(-tick for tick in reversed(ticks)), 0, *ticks]
+        axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.set_yticks([], minor=True)
     axes.set_xticks(range(len(names)), names)
     axes.set_ylabel("residual / noise")
     handles: list[Any] = [Line2D([], [], color=c, linewidth=3, label=n) for _, c, n, _ in shown]

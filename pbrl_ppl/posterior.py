@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
@@ -140,8 +141,6 @@ def load_posterior(path: str | Path) -> Any:
     try:
         with xr.open_dataset(path, engine="h5netcdf") as root:
             attrs = dict(root.attrs)
-        import h5py
-
         with h5py.File(path) as file:
             names = [name for name, item in file.items() if isinstance(item, h5py.Group)]
         found = {}
