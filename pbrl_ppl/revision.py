@@ -48,7 +48,7 @@ HORIZONS = (1, 2, 5, 10, 20, 50, 100)
 #: With less structure than this left (as a share of the declared model's squared error), the
 #: verdict is what was added, and what is left is reported beside it.
 LARGE_REMAINDER = 0.1
-LEAST_TUNE = 250
+LEAST_TUNE = 100
 
 
 def revise(

@@ -33,7 +33,7 @@ def load(folder, data=None):
 
 
 def test_clean_cart_is_adequate(shared_data):
-    found = revise(*load(shared_data / "cart-null"), seed=1, draws=300)
+    found = revise(*load(shared_data / "cart-null"), seed=1, draws=150)
     assert found.verdict == "adequate"
     assert found.added == ()
     assert found.unexplained is None
@@ -55,7 +55,7 @@ def test_clean_cart_is_adequate(shared_data):
 @pytest.mark.parametrize("case", CASES)
 def test_the_undeclared_effect_is_added_and_nothing_else(case, shared_data):
     scene, train, test = load(shared_data / case)
-    found = revise(scene, train, test, seed=1, draws=300)
+    found = revise(scene, train, test, seed=1, draws=150)
     truth = json.loads((shared_data / case / "truth.json").read_text())["undeclared"]
     ((key, value),) = truth.items()
     name, parameters = NAMES[key]
@@ -76,7 +76,7 @@ def test_the_undeclared_effect_is_added_and_nothing_else(case, shared_data):
 
 
 def test_friction_of_a_real_pivot(shared_data):
-    found = revise(*load(shared_data / "real" / "pendulum-swing"), seed=1, draws=100)
+    found = revise(*load(shared_data / "real" / "pendulum-swing"), seed=1, draws=40)
     assert found.added[0].effect in ("pivot_damping", "pivot_friction")
     assert found.rollout_horizon == 50  # 1 s
     assert found.before.rollout_rmse["theta"] == pytest.approx(0.013, abs=0.001)
@@ -85,7 +85,7 @@ def test_friction_of_a_real_pivot(shared_data):
 
 def test_a_pivot_of_another_engine():
     folder = ROOT / "models" / "pendulum"
-    found = revise(*load(folder, folder / "recorded"), seed=1, draws=200)
+    found = revise(*load(folder, folder / "recorded"), seed=1, draws=100)
     assert [one.effect for one in found.added] == ["pivot_friction"]
     low, high = found.added[0].parameters["torque"].hdi
     assert low <= 0.015 <= high
@@ -162,7 +162,7 @@ def test_same_seed_same_findings():
 
 def test_the_demo_finds_what_is_hidden(tmp_path):
     folder = ROOT / "models" / "shopping_cart"
-    loop = pp.close_loop(*load(folder, folder / "recorded"), seed=1, draws=300)
+    loop = pp.close_loop(*load(folder, folder / "recorded"), seed=1, draws=150)
     loop.save(tmp_path / "out")
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["verdict"] == "effects-added"
