@@ -48,7 +48,8 @@ HORIZONS = (1, 2, 5, 10, 20, 50, 100)
 #: With less structure than this left (as a share of the declared model's squared error), the
 #: verdict is what was added, and what is left is reported beside it.
 LARGE_REMAINDER = 0.1
-LEAST_TUNE = 100
+#: Draws kept of each chain, tuning draws at least, and engine steps of a long recording.
+DRAWS, LEAST_TUNE, LONG = 800, 100, 20_000
 
 
 def revise(
@@ -60,7 +61,7 @@ def revise(
     seed: int = 0,
     horizon: int | None = None,
     substeps: int | None = None,
-    draws: int = 800,
+    draws: int | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Findings:
     """Fit a declared model, trace its residual to missing effects, add them, and compare.
@@ -80,8 +81,8 @@ def revise(
         Intervals predicted from one measured state; chosen from the data by default.
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
-    draws : int
-        Posterior draws kept of each chain.
+    draws : int, optional
+        Posterior draws kept of each chain; 800 by default, half of that for long recordings.
     progress : callable, optional
         Told the name of each stage.
 
@@ -269,9 +270,13 @@ class _Loop:
         phi = [mode.phi[labels.index(label)] for label in problem.layout.labels]
         return _noisy(find_mode(problem, initial=np.array(phi)), rounds=1)
 
-    def posterior(self, mode: Mode, draws: int) -> Any:
+    def posterior(self, mode: Mode, draws: int | None) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
-        model = build_model(replace(mode.problem, threads=1))
+        problem = mode.problem
+        if draws is None:
+            steps = problem.segments.n * problem.horizon * int(problem.simulator.levels[0].sum())
+            draws = DRAWS if steps < LONG else DRAWS // 2
+        model = build_model(replace(problem, threads=1))
         tune = max(LEAST_TUNE, 5 * draws // 8)
         return fit(model, seed=self.seed, draws=draws, tune=tune, start=mode, progress=False)
 
