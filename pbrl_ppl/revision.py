@@ -45,8 +45,8 @@ MOST_SUBSTEPS = 640
 #: A start state's noise may spread to this many times the noise of the measured end.
 LARGEST_SPREAD = 3.0
 HORIZONS = (1, 2, 5, 10, 20, 50, 100)
-#: With less structure than this left (as a share of the declared model's squared error), the
-#: verdict is what was added, and what is left is reported beside it.
+#: Names are not to be trusted if what is left is more than this share of what they explained (of
+#: the squared error); with less, the verdict is what was added, and the rest is reported beside it.
 LARGE_REMAINDER = 0.1
 #: Draws kept of each chain, tuning draws at least, and engine steps of a long recording.
 DRAWS, LEAST_TUNE, LONG = 800, 100, 20_000
@@ -300,8 +300,9 @@ class _Loop:
         ]
         verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
         if remainder is not None:
-            left = remainder.share * (errors[1].normalised_rmse / errors[0].normalised_rmse) ** 2
-            if not steps or left > LARGE_REMAINDER:
+            square_before, square_after = (each.normalised_rmse**2 for each in errors)
+            explained = square_before - square_after
+            if not steps or remainder.share * square_after > LARGE_REMAINDER * explained:
                 verdict = findings.UNEXPLAINED
         return Findings(
             scene=self.scene,

@@ -77,7 +77,8 @@ def test_the_undeclared_effect_is_added_and_nothing_else(case, shared_data):
 
 def test_friction_of_a_real_pivot(shared_data):
     found = revise(*load(shared_data / "real" / "pendulum-swing"), seed=1, draws=40)
-    assert found.added[0].effect in ("pivot_damping", "pivot_friction")
+    assert found.candidates[0].effect == "pivot_damping"
+    assert {"pivot_damping", "pivot_friction"} & {one.effect for one in found.added}
     assert found.rollout_horizon == 50  # 1 s
     assert found.before.rollout_rmse["theta"] == pytest.approx(0.013, abs=0.001)
     assert found.after.rollout_rmse["theta"] <= 0.0045
