@@ -98,19 +98,28 @@ def fit(
         with warnings.catch_warnings():
             # convergence is checked and reported below, in this package's own words
             warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
-            trace = pm.sample(
-                draws=draws,
-                tune=tune,
-                chains=chains,
-                cores=min(chains, os.cpu_count() or 1) if cores is None else cores,
-                step=steps,
-                initvals=[_dispersed(problem, mode, rng) for _ in range(chains)],
-                random_seed=int(rng.integers(2**31)),
-                progressbar=progress,
-                quiet=not progress,
-                compute_convergence_checks=False,
-                discard_tuned_samples=True,
-            )
+            try:
+                trace = pm.sample(
+                    draws=draws,
+                    tune=tune,
+                    chains=chains,
+                    cores=min(chains, os.cpu_count() or 1) if cores is None else cores,
+                    step=steps,
+                    initvals=[_dispersed(problem, mode, rng) for _ in range(chains)],
+                    random_seed=int(rng.integers(2**31)),
+                    progressbar=progress,
+                    quiet=not progress,
+                    compute_convergence_checks=False,
+                    discard_tuned_samples=True,
+                )
+            except ValueError as error:
+                if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
+                    raise KeyboardInterrupt from error
+                raise
+    done = group(trace, "posterior").sizes
+    if done["draw"] < draws or done["chain"] < chains:
+        # PyMC ends an interrupted run quietly, with the draws so far
+        raise KeyboardInterrupt(f"sampling was interrupted after {done['draw']} of {draws} draws")
     return complete(problem, trace, seed=seed)
 
 
