@@ -270,3 +270,16 @@ def test_unconstrain_is_pymc_s_transform(prior, distribution) -> None:
         found, slope = unconstrain(prior, x)
         assert found == pytest.approx(forward(x))
         assert slope == pytest.approx((forward(x + 1e-5) - forward(x - 1e-5)) / 2e-5, rel=1e-6)
+
+
+def test_an_interrupted_sampler_is_no_posterior(monkeypatch):
+    """PyMC swallows an interrupt and returns what it has; or says that it has nothing."""
+    scene = cart_scene()
+    model = physics_model(scene, simulated_history(scene, CART))
+
+    def nothing(**options):
+        raise ValueError("Not enough samples to build a trace.")
+
+    monkeypatch.setattr("pbrl_ppl.fitting.pm.sample", nothing)
+    with pytest.raises(KeyboardInterrupt):
+        fit(model, draws=10, tune=10, progress=False)
