@@ -6,6 +6,7 @@ import importlib.metadata
 import os
 import sys
 import warnings
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -188,10 +189,7 @@ def complete(problem: Problem, trace: Any, *, seed: int) -> Any:
     predictive = []
     rng = np.random.default_rng(seed)
     keep = set(np.linspace(0, chains * n - 1, min(_PREDICTIVE_DRAWS, chains * n)).astype(int))
-    wide = Problem(
-        problem.scene, problem.history, problem.effects, problem.horizon, problem.substeps,
-        problem.scalar_sigma, problem.noise, threads=max(problem.threads, 2),
-    )  # fmt: skip
+    wide = replace(problem, threads=max(problem.threads, 2))
     for begin in range(0, len(phi), 64):
         part = slice(begin, begin + 64)
         states = wide.predict(phi[part])

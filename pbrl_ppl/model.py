@@ -246,7 +246,7 @@ def build_model(problem: Problem) -> pm.Model:
             "next_state",
             predicted,
             sigma,
-            logp=partial(_logp, observations=observations, noise=problem.noise),
+            logp=partial(next_state_logp, observations=observations, noise=problem.noise),
             random=partial(_random, noise=problem.noise),
             signature="(h,k,d),(d)->(h,k,d)",
             observed=np.nan_to_num(observations.values),
@@ -254,12 +254,6 @@ def build_model(problem: Problem) -> pm.Model:
         )
     model.problem = problem
     return model
-
-
-def _logp(
-    value: Any, predicted: Any, sigma: Any, observations: Observations, noise: StartNoise | None
-) -> Any:
-    return next_state_logp(value, predicted, sigma, observations, noise)
 
 
 def _random(
