@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.posterior import load_posterior, save_posterior
     from pbrl_ppl.report import Loop, close_loop
     from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+    from pbrl_ppl.transition import Transition
 
 __version__ = "0.1.0"
 
@@ -40,6 +41,7 @@ __all__ = [
     "Shape",
     "Simulator",
     "SimulatorOp",
+    "Transition",
     "Wall",
     "catalogue",
     "close_loop",
@@ -62,6 +64,7 @@ _MODULES = {
     "posterior": ("load_posterior", "save_posterior"),
     "report": ("Loop", "close_loop"),
     "scene": ("Body", "Joint", "Scene", "Shape", "Wall"),
+    "transition": ("Transition",),
 }
 
 

@@ -91,12 +91,10 @@ def _hinge_order(scene: Scene) -> list[tuple[str, str, Point, Point]]:
     """Return known hinges as (parent, child, anchors), breadth first from what is fixed."""
     edges = []
     for joint in scene.joints:
-        if joint.kind == "hinge" and joint.known:
+        if joint.kind == "hinge" and joint.known and joint.bodies:
             a, b = joint.bodies
-            edges += [
-                (a, b, joint.anchor_a, joint.anchor_b),
-                (b, a, joint.anchor_b, joint.anchor_a),
-            ]
+            at_a, at_b = joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0)
+            edges += [(a, b, at_a, at_b), (b, a, at_b, at_a)]
     fixed = [WORLD, *(body.name for body in scene.bodies if body.static)]
     reached, order = list(fixed), []
     for parent in reached:  # the list grows while it is walked: that is the breadth-first queue

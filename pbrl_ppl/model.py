@@ -231,8 +231,13 @@ def build_model(problem: Problem) -> pm.Model:
             "actions", segments.actions, dims=("transition", "step", "body", "wrench")
         )
         # Table 1
-        table1 = [random_variable(b.name, b.priors, dims=_dim(problem, b)) for b in layout.blocks]
-        phi = pt.concatenate(table1) if table1 else pt.zeros(0)
+        table1: dict[str, Any] = {}
+        for block in layout.blocks:
+            index = _index(block, layout, table1)
+            table1[block.name] = random_variable(
+                block.name, block.priors, _dim(problem, block), block.conditional, index
+            )
+        phi = pt.concatenate(list(table1.values())) if table1 else pt.zeros(0)
         # P(sigma)
         median, spread = sigma_prior(observations, segments)
         if problem.scalar_sigma:
@@ -254,6 +259,16 @@ def build_model(problem: Problem) -> pm.Model:
         )
     model.problem = problem
     return model
+
+
+def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
+    """Whose bounds hold an anchor: the index variable, 0 where the body is given."""
+    name = f"i_{block.name[0]}"
+    if not block.conditional or name not in variables:
+        return None
+    free = next(each.owners for each in layout.blocks if each.name == name)
+    held = [variables[name][free.index(each)] if each in free else 0 for each in block.owners]
+    return pt.stack(held)
 
 
 def _random(
@@ -295,12 +310,14 @@ def _coords(problem: Problem) -> dict[str, Any]:
         "step": np.arange(1, problem.horizon + 1),
     }
     for block in problem.layout.blocks:
-        coords.setdefault(_dim(problem, block), list(block.bodies))
+        coords.setdefault(_dim(problem, block), list(block.owners))
     return coords
 
 
 def _dim(problem: Problem, block: Block) -> str:
     """``body`` where all moving bodies have the parameter, else a dimension of its own."""
-    if len(block.bodies) == len(problem.scene.dynamic):
+    if block.of == "joint":
+        return "joint" if not block.name.startswith("i_") else "free_joint"
+    if len(block.owners) == len(problem.scene.dynamic):
         return "body"
     return f"{block.effect or block.name}_body"

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
+from pbrl_ppl.differences import differentiate
 from pbrl_ppl.likelihood import StartNoise, estimate_sigma, log_density, whiten
 from pbrl_ppl.model import Problem
 from pbrl_ppl.parameters import Prior
@@ -79,40 +80,6 @@ def _box(priors: tuple[Prior, ...]) -> tuple[Array, Array]:
     support = np.array([prior.support for prior in priors]).reshape(-1, 2)
     width = np.where(np.isfinite(np.ptp(support, axis=1)), np.ptp(support, axis=1), 1.0)
     return support[:, 0] + _MARGIN * width, support[:, 1] - _MARGIN * width
-
-
-def differentiate(
-    function: Callable[[Array], Array],
-    phi: Array,
-    steps: Array,
-    lower: Array,
-    upper: Array,
-) -> Array:
-    """Derivative by finite differences, all columns in one call.
-
-    Central where the bounds leave room, one-sided elsewhere.
-
-    Parameters
-    ----------
-    function : callable
-        Takes (proposal, p), gives (proposal, n).
-    phi, steps, lower, upper : ndarray
-        Point, step and bounds of each parameter, shape (p,).
-
-    Returns
-    -------
-    ndarray
-        Shape (n, p).
-    """
-    forward = np.minimum(phi + steps, upper)
-    backward = np.maximum(phi - steps, lower)
-    p = len(phi)
-    points = np.tile(phi, (2 * p, 1))
-    points[np.arange(p), np.arange(p)] = forward
-    points[p + np.arange(p), np.arange(p)] = backward
-    values = function(points)
-    width = np.maximum(forward - backward, 1e-300)
-    return np.asarray(((values[:p] - values[p:]) / width[:, None]).T)
 
 
 def posterior_steps(
@@ -208,7 +175,7 @@ def _search(problem: Problem, phi: Array) -> tuple[Array, Array, float]:
     sigma = profile_sigma(problem, problem.residual(phi))
     if not priors:
         return phi, sigma, _log_posterior(problem, phi, sigma)
-    steps = np.array([_first_step(prior, x) for prior, x in zip(priors, phi, strict=True)])
+    steps = 1e-3 * problem.layout.scale(phi)
     value = -np.inf
     for _ in range(40):
 
@@ -236,11 +203,6 @@ def _search(problem: Problem, phi: Array) -> tuple[Array, Array, float]:
             break
         value = improved
     return phi, sigma, improved
-
-
-def _first_step(prior: Prior, x: float) -> float:
-    """A finite-difference step to begin with: small against the prior."""
-    return 1e-3 * max(abs(x), 0.1 * min(prior.sigma, 1.0))
 
 
 def _log_posterior(problem: Problem, phi: Array, sigma: Array) -> float:
@@ -290,7 +252,7 @@ def _finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) ->
         z = problem.whitened(points, sigma).reshape(len(points), -1)
         return np.concatenate([np.nan_to_num(z), prior_residual(priors, points)], axis=-1)
 
-    begin = np.array([_first_step(prior, x) for prior, x in zip(priors, phi, strict=True)])
+    begin = 1e-3 * problem.layout.scale(phi)
     jacobian, _ = posterior_steps(residual, phi, lower, upper, begin)
     precision = jacobian.T @ jacobian
     covariance = np.linalg.pinv(precision, hermitian=True)

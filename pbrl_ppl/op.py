@@ -1,48 +1,34 @@
-"""SimulatorOp: the physics engine as a black-box pytensor Op, and its numba dispatch."""
+"""SimulatorOp: the engine as a black-box pytensor Op, its derivative, and numba dispatch."""
 
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any
 
 import numba
 import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import NDArray
+from pytensor.gradient import grad_undefined
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_funcify
 
 from pbrl_ppl.effects.base import Attached
-from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.scene import Scene
+
+Array = NDArray[np.float64]
 
 #: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
 _REMEMBERED = 4
 
 
-class SimulatorOp(Op):
-    """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
-
-    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3);
-    the output has shape (transition, H, body, 6); all float64, in SI units. A transition in which
-    the engine diverges is NaN.
-
-    Parameters
-    ----------
-    scene : Scene
-        Known geometry.
-    layout : Layout
-        Order of phi.
-    effects : tuple of Attached
-        All effects of the model.
-    substeps : int, optional
-        Engine steps an interval; the scene's by default.
-    threads : int
-        Worlds that run side by side.
-    """
+class _EngineOp(Op):
+    """What the prediction and its derivative share: inputs, and a memory of the last results."""
 
     __props__ = ("scene", "layout", "effects", "substeps", "threads")
 
@@ -58,11 +44,19 @@ class SimulatorOp(Op):
         self.substeps = scene.substeps if substeps is None else substeps
         self.threads = threads
         self.simulator = Simulator(scene, layout, effects, substeps=self.substeps, threads=threads)
-        self._memory: OrderedDict[tuple[object, ...], NDArray[np.float64]] = OrderedDict()
+        self._memory: OrderedDict[tuple[object, ...], Array] = OrderedDict()
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the memory behind when the Op goes to another process."""
         return self.__dict__ | {"_memory": OrderedDict()}
+
+    @property
+    def _last(self) -> tuple[int, ...]:
+        """Last dimensions of the output, after (transition, H)."""
+        raise NotImplementedError
+
+    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+        raise NotImplementedError
 
     def make_node(self, phi: Any, start: Any, actions: Any) -> Apply:
         """Check what can be checked before values are there.
@@ -87,26 +81,21 @@ class SimulatorOp(Op):
             if not fits:
                 expected = ", ".join("?" if e is None else str(e) for e in shape)
                 raise SimulationError(
-                    f"SimulatorOp: {name} has shape {static}, expected ({expected})"
+                    f"{type(self).__name__}: {name} has shape {static}, expected ({expected})"
                 )
             inputs.append(tensor)
-        return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, k, 6))])
+        return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, *self._last))])
 
     def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
-        """(transition, H, body, 6) from the shape of the actions."""
+        """(transition, H) from the shape of the actions."""
         actions = arguments[-1][2]  # older stacks pass (fgraph, node, shapes), newer (node, shapes)
-        return [(actions[0], actions[1], actions[2], 6)]
+        return [(actions[0], actions[1], *self._last)]
 
     def perform(self, node: Apply, inputs: Any, outputs: Any) -> None:
         """Run the engine."""
         outputs[0][0] = self.predict(*inputs)
 
-    def predict(
-        self,
-        phi: NDArray[np.float64],
-        start: NDArray[np.float64],
-        actions: NDArray[np.float64],
-    ) -> NDArray[np.float64]:
+    def predict(self, phi: Array, start: Array, actions: Array) -> Array:
         """Run the engine, or recall what it said of these very inputs a moment ago."""
         key = (
             start.shape,
@@ -118,17 +107,77 @@ class SimulatorOp(Op):
         if key in self._memory:
             self._memory.move_to_end(key)
             return self._memory[key].copy()
-        result = self.simulator(phi, start, actions)
+        try:
+            result = self._compute(phi, start, actions)
+        except ParameterError:  # a sampler may look there; nothing can be observed of it
+            result = np.full((*actions.shape[:2], *self._last), np.nan)
         self._memory[key] = result
         if len(self._memory) > _REMEMBERED:
             self._memory.popitem(last=False)
         return result.copy()
 
 
-@numba_funcify.register(SimulatorOp)
-def _numba_simulator(op: SimulatorOp, node: Any = None, **kwargs: Any) -> Any:
+class SimulatorOp(_EngineOp):
+    """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
+
+    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3);
+    the output has shape (transition, H, body, 6); all float64, in SI units. A transition in which
+    the engine diverges is NaN, and so is everything where phi is impossible (a mass that is not
+    positive, say): the likelihood of that is zero. The derivative by phi is by finite differences,
+    all columns in one call of the engine.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry.
+    layout : Layout
+        Order of phi.
+    effects : tuple of Attached
+        All effects of the model.
+    substeps : int, optional
+        Engine steps an interval; the scene's by default.
+    threads : int
+        Worlds that run side by side.
+    """
+
+    @property
+    def _last(self) -> tuple[int, ...]:
+        return len(self.scene.dynamic), 6
+
+    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+        return self.simulator(phi, start, actions)
+
+    def pullback(
+        self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
+    ) -> list[Any]:
+        """Vector-Jacobian product; start states and actions are data and have no derivative."""
+        jacobian = JacobianOp(*(getattr(self, name) for name in self.__props__))(*inputs)
+        return [
+            (cotangents[0][..., None] * jacobian).sum(axis=(0, 1, 2, 3)),
+            *(
+                grad_undefined(self, i, inputs[i], "the engine is differentiated by phi alone")
+                for i in (1, 2)
+            ),
+        ]
+
+    L_op = pullback  # its name in pytensor 2
+
+
+class JacobianOp(_EngineOp):
+    """Derivative of :class:`SimulatorOp` by phi, shape (transition, H, body, 6, p)."""
+
+    @property
+    def _last(self) -> tuple[int, ...]:
+        return len(self.scene.dynamic), 6, self.layout.size
+
+    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+        return self.simulator.jacobian(phi, start, actions)
+
+
+@numba_funcify.register(_EngineOp)
+def _numba_engine(op: _EngineOp, node: Any = None, **kwargs: Any) -> Any:
     """For the numba backend: step out to the rollout, which is compiled code of its own."""
-    kind = numba.types.Array(numba.float64, 4, "C")
+    kind = numba.types.Array(numba.float64, 2 + len(op._last), "C")
 
     @numba.njit
     def simulate(phi, start, actions):  # type: ignore[no-untyped-def]

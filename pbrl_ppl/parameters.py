@@ -21,12 +21,13 @@ class Prior:
     Parameters
     ----------
     family : str
-        ``log_normal``, ``truncated_normal``, ``normal``, ``half_normal`` or ``von_mises``.
+        ``log_normal``, ``truncated_normal``, ``normal``, ``half_normal``, ``von_mises`` or
+        ``categorical``, which is uniform over the whole numbers from ``lower`` to ``upper``.
     mu, sigma : float
         Location and scale; of the logarithm for ``log_normal``. For ``von_mises``, ``mu`` is the
         mean direction and ``kappa`` the concentration.
     lower, upper : float
-        Support of a truncated normal.
+        Support of a truncated normal or a categorical distribution.
     kappa : float
         Concentration of a von Mises distribution.
     """
@@ -43,9 +44,14 @@ class Prior:
         """Smallest and largest value that the prior allows."""
         if self.family in ("log_normal", "half_normal"):
             return 0.0, np.inf
-        if self.family == "truncated_normal":
+        if self.family in ("truncated_normal", "categorical"):
             return self.lower, self.upper
         return -np.inf, np.inf
+
+    @property
+    def discrete(self) -> bool:
+        """Whether the values are whole numbers that stand for names."""
+        return self.family == "categorical"
 
     @property
     def centre(self) -> float:
@@ -54,6 +60,8 @@ class Prior:
             return float(np.exp(self.mu))
         if self.family == "half_normal":
             return 0.6745 * self.sigma
+        if self.discrete:
+            return self.lower
         return float(np.clip(self.mu, *self.support))
 
     def residual(self, x: Array) -> Array:
@@ -73,6 +81,8 @@ class Prior:
             # -log p = log x + (log x - mu)^2 / 2 sigma^2: a square about mu - sigma^2
             safe = np.log(np.maximum(x, 1e-300))
             return np.asarray((safe - self.mu + self.sigma**2) / self.sigma)
+        if self.discrete:
+            return np.zeros_like(x)
         if self.family == "von_mises":
             return np.asarray(2.0 * np.sqrt(self.kappa) * np.sin((x - self.mu) / 2.0))
         return np.asarray((x - self.mu) / self.sigma)
@@ -83,6 +93,8 @@ class Prior:
             return rng.lognormal(self.mu, self.sigma, size)
         if self.family == "von_mises":
             return rng.vonmises(self.mu, self.kappa, size)
+        if self.discrete:
+            return rng.integers(int(self.lower), int(self.upper) + 1, size).astype(float)
         if self.family == "half_normal":
             return np.abs(rng.normal(0.0, self.sigma, size))
         if self.family == "truncated_normal":
@@ -104,31 +116,41 @@ BODY_PARAMETERS: Mapping[str, str] = {
     "mu_y": "1",
 }
 WHEEL_PARAMETERS = ("w_x", "w_y", "w_theta", "mu_x", "mu_y")
+#: Table 1's names for one joint: which bodies it joins, and where in each one's frame, with units.
+JOINT_INDICES = ("i_a", "i_b")
+JOINT_ANCHORS: Mapping[str, str] = {"a_x": "m", "a_y": "m", "b_x": "m", "b_y": "m"}
 
 
 @dataclass(frozen=True)
 class Block:
-    """One named parameter over the bodies that have it.
+    """One named parameter over the bodies, or joints, that have it.
 
     Parameters
     ----------
     name : str
         Variable name, e.g. ``mass`` or ``linear_drag_coefficient``.
-    bodies : tuple of str
-        The bodies, in the scene's order; the length of the variable.
+    owners : tuple of str
+        The bodies in the scene's order, or the joints; the length of the variable.
     unit : str
         SI unit.
     priors : tuple of Prior
-        One a body.
+        One an owner.
     effect : str, optional
         The effect that the parameter belongs to; None for Table 1.
+    of : str
+        ``body`` or ``joint``.
+    conditional : tuple of tuple of Prior
+        For an anchor: an owner's prior if its index is 0, 1, ...; the support is the bounds of the
+        body that the index names. Empty for all others.
     """
 
     name: str
-    bodies: tuple[str, ...]
+    owners: tuple[str, ...]
     unit: str
     priors: tuple[Prior, ...]
     effect: str | None = None
+    of: str = "body"
+    conditional: tuple[tuple[Prior, ...], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -146,12 +168,12 @@ class Layout:
     @property
     def size(self) -> int:
         """Length of the vector."""
-        return sum(len(block.bodies) for block in self.blocks)
+        return sum(len(block.owners) for block in self.blocks)
 
     @property
     def labels(self) -> tuple[str, ...]:
         """One readable label an entry, such as ``mass[cart]``."""
-        return tuple(f"{block.name}[{body}]" for block in self.blocks for body in block.bodies)
+        return tuple(f"{block.name}[{owner}]" for block in self.blocks for owner in block.owners)
 
     @property
     def priors(self) -> tuple[Prior, ...]:
@@ -164,22 +186,36 @@ class Layout:
         support = np.array([prior.support for prior in self.priors]).reshape(-1, 2)
         return support[:, 0], support[:, 1]
 
+    def scale(self, phi: Array) -> Array:
+        """What is a large change of each entry of phi, shape (p,); zero of a discrete one."""
+        least = np.array([0.0 if each.discrete else min(each.sigma, 1.0) for each in self.priors])
+        return np.where(self.discrete, 0.0, np.maximum(np.abs(phi), 0.1 * least))
+
     def slices(self) -> Iterator[tuple[Block, slice]]:
         """Each block with its place in the vector."""
         begin = 0
         for block in self.blocks:
-            yield block, slice(begin, begin + len(block.bodies))
-            begin += len(block.bodies)
+            yield block, slice(begin, begin + len(block.owners))
+            begin += len(block.owners)
 
-    def index(self, name: str, body: str) -> int:
-        """Place of one parameter of one body in the vector.
+    @property
+    def discrete(self) -> NDArray[np.bool_]:
+        """Which entries are whole numbers that stand for names, shape (p,)."""
+        return np.array([prior.discrete for prior in self.priors], dtype=bool)
+
+    def owner_kind(self, place: int) -> str:
+        """Whether an entry belongs to a ``body`` or a ``joint``."""
+        return [block.of for block in self.blocks for _ in block.owners][place]
+
+    def index(self, name: str, owner: str) -> int:
+        """Place of one parameter of one body, or joint, in the vector.
 
         Raises
         ------
         ParameterError
             If the layout has no such parameter.
         """
-        label = f"{name}[{body}]"
+        label = f"{name}[{owner}]"
         if label not in self.labels:
             raise ParameterError(
                 f"parameter {label} is not among the unknown ones: {', '.join(self.labels)}"
@@ -187,7 +223,7 @@ class Layout:
         return self.labels.index(label)
 
     def to_vector(self, values: Mapping[str, object]) -> Array:
-        """Stack named values, scalars or (body,) arrays, into the vector phi, shape (p,).
+        """Stack named values, scalars or (owner,) arrays, into the vector phi, shape (p,).
 
         Raises
         ------
@@ -199,14 +235,14 @@ class Layout:
             if block.name not in values:
                 raise ParameterError(f"parameter {block.name} is missing; add it to the values")
             value = np.asarray(values[block.name], dtype=float)
-            if value.size not in (1, len(block.bodies)):
+            if value.size not in (1, len(block.owners)):
                 raise ParameterError(
                     f"parameter {block.name} has {value.size} values, expected"
-                    f" {len(block.bodies)}, one for each of {', '.join(block.bodies)}"
+                    f" {len(block.owners)}, one for each of {', '.join(block.owners)}"
                 )
             vector[place] = value.ravel()
         return vector
 
     def to_dict(self, vector: Array) -> dict[str, Array]:
-        """Split phi, shape (..., p), into named arrays, shape (..., body)."""
+        """Split phi, shape (..., p), into named arrays, shape (..., owner)."""
         return {block.name: vector[..., place] for block, place in self.slices()}

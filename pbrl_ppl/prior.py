@@ -5,12 +5,25 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pymc as pm
 
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS, Block, Layout, Prior
-from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.parameters import (
+    BODY_PARAMETERS,
+    JOINT_ANCHORS,
+    JOINT_INDICES,
+    WHEEL_PARAMETERS,
+    Block,
+    Layout,
+    Prior,
+)
+from pbrl_ppl.scene import WORLD, Body, Scene
+
+#: Half the side of the square in which a joint's anchor in the world is sought where the scene has
+#: neither walls nor poses (m).
+_UNBOUNDED = 10.0
 
 
 def table1(body: Body) -> dict[str, Prior]:
@@ -68,8 +81,65 @@ def table1(body: Body) -> dict[str, Prior]:
     return priors
 
 
+def anchor_prior(scene: Scene, holder: str, axis: int, centre: float | None = None) -> Prior:
+    """Table 1 for one coordinate of a joint's anchor, on the bounds of the body that holds it.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its extent bounds an anchor in the world.
+    holder : str
+        The body's name, or ``world``.
+    axis : int
+        0 for x, 1 for y.
+    centre : float, optional
+        Where the anchor is thought to be (m); the middle by default.
+    """
+    anywhere = (-_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, _UNBOUNDED)
+    bounds = (scene.extent or anywhere) if holder == WORLD else scene.body(holder).shape.bounds
+    lower, upper = bounds[2 * axis : 2 * axis + 2]
+    mu = (lower + upper) / 2 if centre is None else centre
+    return Prior("truncated_normal", mu=mu, sigma=upper - lower, lower=lower, upper=upper)
+
+
+def _joint_blocks(scene: Scene) -> list[Block]:
+    """Table 1's parameters of the joints that are to be inferred."""
+    joints = [
+        (name, joint)
+        for name, joint in zip(scene.joint_names, scene.joints, strict=True)
+        if not joint.known
+    ]
+    if not joints:
+        return []
+    free = tuple(name for name, joint in joints if joint.bodies is None)
+    index = Prior("categorical", lower=0.0, upper=float(len(scene.joinable) - 1))
+    blocks = [Block(i, free, "1", (index,) * len(free), of="joint") for i in JOINT_INDICES if free]
+    for column, (name, unit) in enumerate(JOINT_ANCHORS.items()):
+        side, axis = divmod(column, 2)
+        conditional = []
+        for _, joint in joints:
+            holders = scene.joinable
+            if joint.bodies is not None:
+                holders = (joint.bodies[side],) * len(holders)
+            anchor = (joint.anchor_a, joint.anchor_b)[side]
+            centre = None if anchor is None else anchor[axis]
+            conditional.append(tuple(anchor_prior(scene, each, axis, centre) for each in holders))
+        priors = tuple(_union(alternatives) for alternatives in conditional)
+        owners = tuple(owner for owner, _ in joints)
+        blocks.append(Block(name, owners, unit, priors, of="joint", conditional=tuple(conditional)))
+    return blocks
+
+
+def _union(priors: tuple[Prior, ...]) -> Prior:
+    """A prior over the support of all of these: what is known before the index is."""
+    if len(set(priors)) == 1:
+        return priors[0]
+    lower, upper = min(each.lower for each in priors), max(each.upper for each in priors)
+    return replace(priors[0], mu=(lower + upper) / 2, sigma=upper - lower, lower=lower, upper=upper)
+
+
 def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
-    """Phi of a scene: Table 1's unknown parameters of every moving body, then the effects'.
+    """Phi of a scene: Table 1's unknowns of moving bodies and of joints, then the effects'.
 
     Parameters
     ----------
@@ -88,6 +158,7 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
         if bodies:
             priors = tuple(table1(body)[name] for body in bodies)
             blocks.append(Block(name, tuple(body.name for body in bodies), unit, priors))
+    blocks += _joint_blocks(scene)
     for effect in dict.fromkeys(one.effect for one in effects):
         on = tuple(one.body for one in effects if one.effect == effect)
         blocks += [
@@ -97,17 +168,27 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
     return Layout(tuple(blocks))
 
 
-def random_variable(name: str, priors: tuple[Prior, ...], dims: str) -> Any:
-    """Declare priors of one family in the PyMC model of the context, one a body.
+def random_variable(
+    name: str,
+    priors: tuple[Prior, ...],
+    dims: str,
+    conditional: tuple[tuple[Prior, ...], ...] = (),
+    index: Any = None,
+) -> Any:
+    """Declare priors of one family in the PyMC model of the context, one an owner.
 
     Parameters
     ----------
     name : str
         The variable's name.
     priors : tuple of Prior
-        Same family, one a body.
+        Same family, one a body or joint.
     dims : str
-        The model's dimension over those bodies.
+        The model's dimension over those bodies or joints.
+    conditional : tuple of tuple of Prior
+        For each owner its prior if its index is 0, 1, ...; see `Block`.
+    index : tensor, optional
+        Index variable of each owner, whole numbers, shape (owner,).
 
     Raises
     ------
@@ -115,22 +196,30 @@ def random_variable(name: str, priors: tuple[Prior, ...], dims: str) -> Any:
         If the family is not one of Table 1 or a normal.
     """
     family = priors[0].family
-    mu = [prior.mu for prior in priors]
-    sigma = [prior.sigma for prior in priors]
+
+    def hyper(key: str) -> Any:
+        if index is None:
+            return [getattr(prior, key) for prior in priors]
+        table = np.array([[getattr(prior, key) for prior in row] for row in conditional])
+        chosen = pm.math.eq(index[:, None], np.arange(table.shape[1]))
+        return pm.math.where(chosen, table, 0.0).sum(axis=1)
+
+    mu, sigma = hyper("mu"), hyper("sigma")
     if family == "log_normal":
         return pm.LogNormal(name, mu=mu, sigma=sigma, dims=dims)
     if family == "truncated_normal":
-        lower = [prior.lower for prior in priors]
-        upper = [prior.upper for prior in priors]
+        lower, upper = hyper("lower"), hyper("upper")
         return pm.TruncatedNormal(name, mu=mu, sigma=sigma, lower=lower, upper=upper, dims=dims)
     if family == "von_mises":
-        kappa = [prior.kappa for prior in priors]
-        return pm.VonMises(name, mu=mu, kappa=kappa, dims=dims)
+        return pm.VonMises(name, mu=mu, kappa=hyper("kappa"), dims=dims)
     if family == "normal":
         return pm.Normal(name, mu=mu, sigma=sigma, dims=dims)
     if family == "half_normal":
         return pm.HalfNormal(name, sigma=sigma, dims=dims)
+    if family == "categorical":
+        n = int(priors[0].upper) + 1
+        return pm.Categorical(name, p=np.full((len(priors), n), 1.0 / n), dims=dims)
     raise ParameterError(
         f"prior of {name}: family {family!r} is unknown; use log_normal, truncated_normal, normal,"
-        " half_normal or von_mises"
+        " half_normal, von_mises or categorical"
     )

@@ -100,17 +100,23 @@ class Scene:
     def _check_joints(self) -> None:
         names = [WORLD, *(body.name for body in self.bodies)]
         for position, joint in enumerate(self.joints, start=1):
-            for name in joint.bodies:
+            where = f"[[joint]] number {position}"
+            for name in joint.bodies or ():
                 if name not in names:
-                    raise SceneError(
-                        f'[[joint]] number {position}: there is no body "{name}"'
-                        f"{nearest(name, names)}"
-                    )
-            if not any(body.name in joint.bodies for body in self.dynamic):
+                    raise SceneError(f'{where}: there is no body "{name}"{nearest(name, names)}')
+            could = joint.bodies or names
+            if not any(body.name in could for body in self.dynamic):
                 raise SceneError(
-                    f"[[joint]] number {position}: neither {joint.bodies[0]} nor"
-                    f" {joint.bodies[1]} can move; join a moving body"
+                    f"{where}: neither {could[0]} nor {could[1]} can move; join a moving body"
                 )
+            for body in self.bodies:
+                inferred_rod = not joint.known and joint.kind == "distance"
+                if inferred_rod and body.name in could and body.pose is None:
+                    raise SceneError(
+                        f'{where}: its anchors are to be inferred and body "{body.name}" has no'
+                        " pose; a distance joint keeps the distance that its anchors have in the"
+                        " reference pose: add pose = [x, y, theta] to the body"
+                    )
 
     @classmethod
     def load(cls, path: str | Path) -> Scene:
@@ -169,6 +175,31 @@ class Scene:
     def dynamic(self) -> tuple[Body, ...]:
         """The bodies that are not static, in order."""
         return tuple(body for body in self.bodies if not body.static)
+
+    @property
+    def joinable(self) -> tuple[str, ...]:
+        """What the indices ``i_a`` and ``i_b`` of an inferred joint count: moving bodies, world."""
+        return (*(body.name for body in self.dynamic), WORLD)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """One name a joint: ``joint1``, ``joint2``, ... in the order of the file."""
+        return tuple(f"joint{number}" for number in range(1, len(self.joints) + 1))
+
+    @property
+    def extent(self) -> tuple[float, float, float, float] | None:
+        """Where walls and reference poses are: ``x_min, x_max, y_min, y_max`` (m), if any are."""
+        points = [end for wall in self.walls for end in (wall.start, wall.end)]
+        for body in self.bodies:
+            if body.pose is not None:
+                x_min, x_max, y_min, y_max = body.shape.bounds
+                reach = max(-x_min, x_max, -y_min, y_max)
+                x, y = body.pose[:2]
+                points += [(x - reach, y - reach), (x + reach, y + reach)]
+        if not points:
+            return None
+        x, y = np.array(points).T
+        return float(x.min()), float(x.max()), float(y.min()), float(y.max())
 
     def body(self, name: str) -> Body:
         """Return the body of this name.

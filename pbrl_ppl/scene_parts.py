@@ -108,24 +108,37 @@ class Wall:
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint between two bodies, or a body and the world.
+    """J_d: a joint between two bodies, or a body and the world; what is left out is inferred.
 
     Attributes
     ----------
     kind : str
-        ``"hinge"`` or ``"distance"``.
-    bodies : tuple of str
-        Two names; ``"world"`` is the ground.
-    anchor_a, anchor_b : tuple of float
-        Where it holds the first and the second, each in that body's frame (m).
+        ``"distance"``, which keeps the distance that the anchors have in the bodies' reference
+        poses (zero is a hinge), or ``"hinge"``.
+    bodies : tuple of str, optional
+        Two names; ``"world"`` is the ground. None where which bodies it joins (the indices ``i_a``
+        and ``i_b`` of Table 1) is to be inferred.
+    anchor_a, anchor_b : tuple of float, optional
+        Where it holds the first and the second, each in that body's frame (m). Of a joint that is
+        not known these are the centres of the anchors' priors, or None for the default.
     known : bool
-        Whether it is given (True) or to be inferred.
+        Whether the anchors are given (True) or to be inferred.
+
+    Raises
+    ------
+    SceneError
+        If a kind, name or number is impossible, or a known joint lacks one.
+
+    Examples
+    --------
+    >>> Joint("hinge", known=False).bodies is None  # which bodies, and where, is to be inferred
+    True
     """
 
     kind: str
-    bodies: tuple[str, str]
-    anchor_a: Point
-    anchor_b: Point
+    bodies: tuple[str, str] | None = None
+    anchor_a: Point | None = None
+    anchor_b: Point | None = None
     known: bool = True
 
     def __post_init__(self) -> None:
@@ -134,15 +147,33 @@ class Joint:
                 f'joint: kind is {self.kind!r}, expected "hinge" or "distance"'
                 f"{nearest(self.kind, ('hinge', 'distance'))}"
             )
-        if isinstance(self.bodies, str) or not isinstance(self.bodies, Iterable):
-            raise SceneError(f"joint: bodies is {self.bodies!r}, expected two names")
-        bodies = tuple(label(name, "joint: bodies") for name in self.bodies)
+        flag(self.known, "joint: known")
+        if self.known and None in (self.bodies, self.anchor_a, self.anchor_b):
+            raise SceneError(
+                "joint: it lacks bodies, anchor_a or anchor_b; add them, or set known = false to"
+                " infer what is left out"
+            )
+        where = "joint"
+        if self.bodies is not None:
+            bodies = self._check_bodies(self.bodies)
+            where = f"joint of {bodies[0]} and {bodies[1]}"
+        for key in ("anchor_a", "anchor_b"):
+            anchor = getattr(self, key)
+            if anchor is not None and self.bodies is None:
+                raise SceneError(
+                    f"{where}: it has {key} and no bodies; in which body's frame is the anchor? Add"
+                    f" bodies, or drop {key}"
+                )
+            if anchor is not None:
+                object.__setattr__(self, key, vector(anchor, 2, f"{where}: {key}"))
+
+    def _check_bodies(self, names: object) -> tuple[str, str]:
+        if isinstance(names, str) or not isinstance(names, Iterable):
+            raise SceneError(f"joint: bodies is {names!r}, expected two names")
+        bodies = tuple(label(name, "joint: bodies") for name in names)
         if len(bodies) != 2:
             raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
         if bodies[0] == bodies[1]:
             raise SceneError(f'joint: it joins "{bodies[0]}" with itself; name two bodies')
         object.__setattr__(self, "bodies", bodies)
-        where = f"joint of {bodies[0]} and {bodies[1]}"
-        object.__setattr__(self, "anchor_a", vector(self.anchor_a, 2, f"{where}: anchor_a"))
-        object.__setattr__(self, "anchor_b", vector(self.anchor_b, 2, f"{where}: anchor_b"))
-        flag(self.known, f"{where}: known")
+        return bodies

@@ -8,9 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pbrl_ppl.differences import differentiate
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
-from pbrl_ppl.modes import differentiate, find_mode, find_modes, fold_wheels, with_start_noise
+from pbrl_ppl.modes import find_mode, find_modes, fold_wheels, with_start_noise
 from pbrl_ppl.scene import Scene
 from tests.test_model import CART, NOISE, cart_scene, simulated_history
 

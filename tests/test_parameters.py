@@ -45,7 +45,7 @@ def test_vector_to_dict_and_back(layout, n, random) -> None:
         assert layout.index(name, body) == position
     batch = np.stack([vector] * n) if n else np.empty((0, layout.size))
     for block in layout.blocks:
-        assert layout.to_dict(batch)[block.name].shape == (n, len(block.bodies))
+        assert layout.to_dict(batch)[block.name].shape == (n, len(block.owners))
 
 
 def test_scalars_stand_for_every_body() -> None:

@@ -123,7 +123,7 @@ def test_wheel_parameters_only_where_there_is_a_wheel() -> None:
     cart = Body("cart", TRIANGLE, wheel=True, known={"mu_x": 0.0})
     puck = Body("puck", Shape.circle(0.1), known={"mass": 1.0})
     layout = build_layout(scene_of(cart, puck))
-    bodies = {block.name: block.bodies for block in layout.blocks}
+    bodies = {block.name: block.owners for block in layout.blocks}
     assert bodies["mass"] == ("cart",)
     assert bodies["r"] == bodies["mu_c"] == ("cart", "puck")
     assert "mu_x" not in bodies
@@ -134,7 +134,7 @@ def test_wheel_parameters_only_where_there_is_a_wheel() -> None:
 def test_static_bodies_have_no_parameters() -> None:
     block = Body("block", TRIANGLE, static=True, pose=(0.0, 0.0, 0.0))
     puck = Body("puck", Shape.circle(0.1))
-    assert all(one.bodies == ("puck",) for one in build_layout(scene_of(block, puck)).blocks)
+    assert all(one.owners == ("puck",) for one in build_layout(scene_of(block, puck)).blocks)
 
 
 def test_two_bodies_each_have_their_own_bounds() -> None:

@@ -169,13 +169,26 @@ def scenes(draw: st.DrawFn) -> Scene:
     effects = st.lists(name, unique=True, max_size=2)
     movers = draw(st.lists(name, min_size=1, max_size=3, unique=True))
     bodies = [
-        Body(n, draw(shapes), draw(st.booleans()), False, draw(known), draw(prior), draw(effects))
+        Body(
+            n,
+            draw(shapes),
+            draw(st.booleans()),
+            known=draw(known),
+            prior=draw(prior),
+            effects=draw(effects),
+            pose=(*draw(pairs), draw(number)),
+        )
         for n in movers
     ]
     bodies.append(Body("w" + max(movers), draw(shapes), static=True, pose=(*draw(pairs), 1)))
     walls = [Wall(a, b) for a, b in draw(st.lists(st.tuples(pairs, pairs))) if a != b]
     kinds = st.sampled_from(["hinge", "distance"])
-    joint = st.builds(Joint, kinds, st.just(("world", movers[0])), pairs, pairs, st.booleans())
+    two, maybe = st.just(("world", movers[0])), st.none() | pairs
+    joint = st.one_of(
+        st.builds(Joint, kinds, two, pairs, pairs),
+        st.builds(Joint, kinds, two, maybe, maybe, st.just(False)),
+        st.builds(Joint, kinds, known=st.just(False)),
+    )
     return Scene(
         gravity=draw(pairs),
         normal_gravity=draw(size),
@@ -313,6 +326,37 @@ def test_bad_files(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("[world]\ntime_step = \n", encoding="utf-8")
     with pytest.raises(SceneError, match=r"bad.toml: not TOML: .*line 2"):
         Scene.load(tmp_path / "bad.toml")
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"bodies": ("puck", "world")}, "lacks bodies, anchor_a or anchor_b.*known = false"),
+        ({"anchor_a": (0, 0), "anchor_b": (0, 0)}, "lacks bodies"),
+        ({"anchor_a": (0, 0), "known": False}, "has anchor_a and no bodies.*in which body's frame"),
+        ({"bodies": ("puck", "puck"), "known": False}, 'joins "puck" with itself'),
+        ({"bodies": ("puck",), "known": False}, "expected two names"),
+        ({"known": 0}, "known is 0"),
+    ],
+)
+def test_impossible_joint(kwargs, message) -> None:
+    with pytest.raises(SceneError, match=message):
+        Joint("hinge", **kwargs)
+
+
+def test_rod_to_be_inferred_needs_reference_poses() -> None:
+    placed = Body("placed", Shape.circle(0.1), pose=(1.0, 0.0, 0.0))
+    Scene(time_step=0.1, bodies=(placed,), joints=(Joint("distance", known=False),))
+    Scene(time_step=0.1, bodies=(PUCK,), joints=(Joint("hinge", known=False),))
+    with pytest.raises(SceneError, match=r'number 1: .*body "puck" has no pose.*add pose'):
+        Scene(time_step=0.1, bodies=(placed, PUCK), joints=(Joint("distance", known=False),))
+
+
+def test_extent_holds_walls_and_poses() -> None:
+    assert Scene(time_step=0.1, bodies=(PUCK,)).extent is None
+    placed = Body("placed", Shape.circle(0.1), pose=(1.0, 0.0, 0.0))
+    scene = Scene(time_step=0.1, bodies=(PUCK, placed), walls=(Wall((-2, 0), (0, 3)),))
+    assert scene.extent == (-2.0, 1.1, -0.1, 3.0)
 
 
 def test_joint_of_two_things_that_cannot_move():

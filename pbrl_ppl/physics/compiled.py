@@ -10,78 +10,76 @@ from __future__ import annotations
 import math
 import platform
 import sys
-from typing import Any
+from collections import namedtuple
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.effects.base import Force
-from pbrl_ppl.physics.properties import COLUMN, COLUMNS
-from pbrl_ppl.physics.world import DIVERGED, FAR, TINY, World
+from pbrl_ppl.physics.properties import COLUMNS, JOINT_COLUMNS
+from pbrl_ppl.physics.world import DIVERGED, FAR, GROOVE, TINY, World
 
-_FUNCTIONS = (
-    "cpSpaceStep",
-    "cpBodySetMass",
-    "cpBodySetMoment",
-    "cpBodySetPosition",
-    "cpBodySetAngle",
-    "cpBodySetVelocity",
-    "cpBodySetAngularVelocity",
-    "cpBodySetForce",
-    "cpBodySetTorque",
-    "cpBodyGetPosition",
-    "cpBodyGetAngle",
-    "cpBodyGetVelocity",
-    "cpBodyGetAngularVelocity",
-    "cpShapeSetElasticity",
-    "cpShapeSetFriction",
-    "cpConstraintSetMaxForce",
-    "cpGrooveJointSetAnchorB",
-    "cpDampedRotarySpringSetDamping",
+#: The engine's functions in use, each by the name of its address.
+Functions = namedtuple(
+    "Functions",
+    [
+        "cpSpaceStep",
+        "cpSpaceSetIterations",
+        "cpSpaceSetCollisionPersistence",
+        "cpBodySetMass",
+        "cpBodySetMoment",
+        "cpBodySetPosition",
+        "cpBodySetAngle",
+        "cpBodySetVelocity",
+        "cpBodySetAngularVelocity",
+        "cpBodySetForce",
+        "cpBodySetTorque",
+        "cpBodyGetPosition",
+        "cpBodyGetAngle",
+        "cpBodyGetVelocity",
+        "cpBodyGetAngularVelocity",
+        "cpShapeSetElasticity",
+        "cpShapeSetFriction",
+        "cpConstraintSetMaxForce",
+        "cpGrooveJointSetGrooveA",
+        "cpGrooveJointSetGrooveB",
+        "cpGrooveJointSetAnchorB",
+        "cpPivotJointSetAnchorA",
+        "cpPivotJointSetAnchorB",
+        "cpPinJointSetAnchorA",
+        "cpPinJointSetAnchorB",
+        "cpPinJointSetDist",
+        "cpDampedRotarySpringSetDamping",
+    ],
 )
-(
-    _STEP,
-    _SET_MASS,
-    _SET_MOMENT,
-    _SET_POSITION,
-    _SET_ANGLE,
-    _SET_VELOCITY,
-    _SET_SPIN,
-    _SET_FORCE,
-    _SET_TORQUE,
-    _GET_POSITION,
-    _GET_ANGLE,
-    _GET_VELOCITY,
-    _GET_SPIN,
-    _SET_ELASTICITY,
-    _SET_FRICTION,
-    _SET_MAX_FORCE,
-    _SET_ANCHOR,
-    _SET_DAMPING,
-) = range(len(_FUNCTIONS))
 _MASS, _R, _MU_C, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(
     len(COLUMNS)
 )
-#: The engine remembers contacts for this many steps after the shapes have parted.
-_PARKED_STEPS = 5
+_A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
+#: A contact is dropped in the first step after the shapes have parted, when the engine is told to
+#: keep none (persistence 1); the pairs of near shapes in the second.
+_PARKED_STEPS = 2
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
 
-def _addresses() -> np.ndarray[Any, np.dtype[np.int64]] | None:
+def _addresses() -> Any:
     """Addresses of the C functions, or None where they cannot be called this way."""
     registers = platform.machine().lower() in ("x86_64", "amd64", "aarch64", "arm64")
     if sys.platform == "win32" or not registers:
         return None
     ffi, lib = _chipmunk_cffi.ffi, _chipmunk_cffi.lib
     try:
-        found = [int(ffi.cast("intptr_t", ffi.addressof(lib, name))) for name in _FUNCTIONS]
+        return Functions(
+            *(int(ffi.cast("intptr_t", ffi.addressof(lib, name))) for name in Functions._fields)
+        )
     except (AttributeError, ffi.error):
         return None
-    return np.array(found, dtype=np.int64)
 
 
 FUNCTIONS = _addresses()
@@ -116,6 +114,19 @@ def _void_call(n_doubles: int) -> Any:
 
 _call1 = _void_call(1)
 _call2 = _void_call(2)
+
+
+@intrinsic
+def _call_int(typing: Any, function: Any, pointer: Any, value: Any) -> Any:
+    """Call a C function of a pointer and an int that returns nothing."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64), ir.IntType(32)]).as_pointer()
+        value = builder.trunc(args[2], ir.IntType(32))
+        builder.call(builder.inttoptr(args[0], kind), [args[1], value])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64), codegen
 
 
 @intrinsic
@@ -166,115 +177,146 @@ def law_address(force: Force) -> int:
     return int(_LAWS[force].address)
 
 
-class CompiledWorld:
-    """A world of one thread as arrays of pointers for the compiled loop."""
+class Pointers(NamedTuple):
+    """The C objects of one world, for the compiled loop."""
 
-    def __init__(self, world: World) -> None:
-        self.world = world  # keeps the C objects alive
-        ffi = _chipmunk_cffi.ffi
+    space: int
+    iterations: int
+    persistence: int
+    bodies: NDArray[np.int64]
+    shapes: NDArray[np.int64]
+    shape_body: NDArray[np.int64]
+    wheels: NDArray[np.int64]  # (2, wheel): the groove along x, the groove along y
+    wheel_body: NDArray[np.int64]
+    links: NDArray[np.int64]
+    link_joint: NDArray[np.int64]
+    link_rod: NDArray[np.bool_]
+    pivots: NDArray[np.int64]  # (2, pivot): the motor, the damper
+    pivot_body: NDArray[np.int64]
+    radii: NDArray[np.float64]
+    obstacles: NDArray[np.float64]
+    can_touch: NDArray[np.bool_]
 
-        def pointers(objects: list[Any]) -> Any:
-            return np.array([int(ffi.cast("intptr_t", each)) for each in objects], dtype=np.int64)
 
-        self.space = int(ffi.cast("intptr_t", world.space._space))
-        self.bodies = pointers([body._body for body in world.bodies])
-        self.shapes = pointers([shape._shape for _, shape in world.shapes])
-        self.shape_body = np.array([i for i, _ in world.shapes], dtype=np.int64)
-        wheels, pivots = world.wheels, world.pivots
-        self.wheel_body = np.array([wheel.body for wheel in wheels], dtype=np.int64)
-        self.wheels = np.stack(
+def pointers(world: World) -> Pointers:
+    """Where the C objects of a world are; the world must be kept alive."""
+    ffi = _chipmunk_cffi.ffi
+
+    def at(objects: list[Any]) -> NDArray[np.int64]:
+        return np.array([int(ffi.cast("intptr_t", each)) for each in objects], dtype=np.int64)
+
+    def whole(numbers: list[int]) -> NDArray[np.int64]:
+        return np.array(numbers, dtype=np.int64)
+
+    wheels, links, pivots = world.wheels, world.links, world.pivots
+    return Pointers(
+        space=int(ffi.cast("intptr_t", world.space._space)),
+        iterations=world.space.iterations,
+        persistence=world.space.collision_persistence,
+        bodies=at([body._body for body in world.bodies]),
+        shapes=at([shape._shape for _, shape in world.shapes]),
+        shape_body=whole([i for i, _ in world.shapes]),
+        wheels=np.stack(
             [
-                pointers([wheel.ground._body for wheel in wheels]),
-                pointers([wheel.along_x._constraint for wheel in wheels]),
-                pointers([wheel.along_y._constraint for wheel in wheels]),
+                at([wheel.along_x._constraint for wheel in wheels]),
+                at([wheel.along_y._constraint for wheel in wheels]),
             ]
-        )
-        self.joints = pointers([joint._constraint for joint in world.joints])
-        self.pivot_body = np.array([pivot.body for pivot in pivots], dtype=np.int64)
-        self.pivots = np.stack(
+        ),
+        wheel_body=whole([wheel.body for wheel in wheels]),
+        links=at([link.constraint._constraint for link in links]),
+        link_joint=whole([link.joint for link in links]),
+        link_rod=np.array([link.rod for link in links], dtype=bool),
+        pivots=np.stack(
             [
-                pointers([pivot.motor._constraint for pivot in pivots]),
-                pointers([pivot.damper._constraint for pivot in pivots]),
+                at([pivot.motor._constraint for pivot in pivots]),
+                at([pivot.damper._constraint for pivot in pivots]),
             ]
-        )
-
-    def arrays(self) -> tuple[Any, ...]:
-        """What :func:`rollout` needs, in its order."""
-        return (
-            self.space,
-            self.bodies,
-            self.shapes,
-            self.shape_body,
-            self.wheel_body,
-            self.wheels,
-            self.joints,
-            self.pivot_body,
-            self.pivots,
-            self.world.radii,
-            self.world.obstacles,
-            self.world.can_touch,
-        )
+        ),
+        pivot_body=whole([pivot.body for pivot in pivots]),
+        radii=world.radii,
+        obstacles=world.obstacles,
+        can_touch=world.can_touch,
+    )
 
 
 @numba.njit(nogil=True, cache=True)
-def _set_properties(fn, world, properties, normal_gravity):  # type: ignore[no-untyped-def]
-    _, bodies, shapes, shape_body, wheel_body, wheels, _, pivot_body, pivots, _, _, _ = world
-    for i in range(len(bodies)):
-        _call1(fn[_SET_MASS], bodies[i], properties[i, _MASS])
-        _call1(fn[_SET_MOMENT], bodies[i], properties[i, _MOMENT])
-    for j in range(len(shapes)):
-        _call1(fn[_SET_ELASTICITY], shapes[j], properties[shape_body[j], _R])
-        _call1(fn[_SET_FRICTION], shapes[j], properties[shape_body[j], _MU_C])
-    for j in range(len(wheel_body)):
-        row = properties[wheel_body[j]]
-        _call2(fn[_SET_ANCHOR], wheels[1, j], row[_W_X], row[_W_Y])
-        _call2(fn[_SET_ANCHOR], wheels[2, j], row[_W_X], row[_W_Y])
-    for j in range(len(pivot_body)):
-        _call1(fn[_SET_DAMPING], pivots[1, j], properties[pivot_body[j], _DAMPING])
+def _set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
+    for i in range(len(world.bodies)):
+        _call1(fn.cpBodySetMass, world.bodies[i], bodies[i, _MASS])
+        _call1(fn.cpBodySetMoment, world.bodies[i], bodies[i, _MOMENT])
+    for j in range(len(world.shapes)):
+        row = bodies[world.shape_body[j]]
+        _call1(fn.cpShapeSetElasticity, world.shapes[j], row[_R])
+        _call1(fn.cpShapeSetFriction, world.shapes[j], row[_MU_C])
+    for j in range(len(world.wheel_body)):
+        row = bodies[world.wheel_body[j]]
+        x, y = row[_W_X], row[_W_Y]
+        c, s = GROOVE * math.cos(row[_W_THETA]), GROOVE * math.sin(row[_W_THETA])
+        along_x, along_y = world.wheels[0, j], world.wheels[1, j]
+        _call2(fn.cpGrooveJointSetGrooveA, along_x, x - c, y - s)
+        _call2(fn.cpGrooveJointSetGrooveB, along_x, x + c, y + s)
+        _call2(fn.cpGrooveJointSetGrooveA, along_y, x + s, y - c)
+        _call2(fn.cpGrooveJointSetGrooveB, along_y, x - s, y + c)
+    for j in range(len(world.links)):
+        link, row = world.links[j], joints[world.link_joint[j]]
+        if world.link_rod[j]:
+            _call2(fn.cpPinJointSetAnchorA, link, row[_A_X], row[_A_Y])
+            _call2(fn.cpPinJointSetAnchorB, link, row[_B_X], row[_B_Y])
+            _call1(fn.cpPinJointSetDist, link, row[_LENGTH])
+        else:
+            _call2(fn.cpPivotJointSetAnchorA, link, row[_A_X], row[_A_Y])
+            _call2(fn.cpPivotJointSetAnchorB, link, row[_B_X], row[_B_Y])
+    for j in range(len(world.pivot_body)):
+        damping = bodies[world.pivot_body[j], _DAMPING]
+        _call1(fn.cpDampedRotarySpringSetDamping, world.pivots[1, j], damping)
 
 
 @numba.njit(nogil=True, cache=True)
-def _set_strengths(fn, world, properties, normal_gravity, on):  # type: ignore[no-untyped-def]
+def _set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-untyped-def]
     """Give the joints their greatest forces, or none at all."""
-    _, _, _, _, wheel_body, wheels, joints, pivot_body, pivots, _, _, _ = world
-    for j in range(len(wheel_body)):
-        row = properties[wheel_body[j]]
+    for j in range(len(world.wheel_body)):
+        row = bodies[world.wheel_body[j]]
         load = on * row[_MASS] * normal_gravity
-        _call1(fn[_SET_MAX_FORCE], wheels[1, j], row[_MU_Y] * load)
-        _call1(fn[_SET_MAX_FORCE], wheels[2, j], row[_MU_X] * load)
-    for j in range(len(joints)):
-        _call1(fn[_SET_MAX_FORCE], joints[j], np.inf if on else 0.0)
-    for j in range(len(pivot_body)):
-        row = properties[pivot_body[j]]
-        _call1(fn[_SET_MAX_FORCE], pivots[0, j], on * row[_TORQUE])
-        _call1(fn[_SET_MAX_FORCE], pivots[1, j], np.inf if on else 0.0)
+        _call1(fn.cpConstraintSetMaxForce, world.wheels[0, j], row[_MU_Y] * load)
+        _call1(fn.cpConstraintSetMaxForce, world.wheels[1, j], row[_MU_X] * load)
+    for j in range(len(world.links)):
+        _call1(fn.cpConstraintSetMaxForce, world.links[j], np.inf if on else 0.0)
+    for j in range(len(world.pivot_body)):
+        torque = on * bodies[world.pivot_body[j], _TORQUE]
+        _call1(fn.cpConstraintSetMaxForce, world.pivots[0, j], torque)
+        _call1(fn.cpConstraintSetMaxForce, world.pivots[1, j], np.inf if on else 0.0)
 
 
 @numba.njit(nogil=True, cache=True)
-def _forget(fn, world, properties, normal_gravity, touched):  # type: ignore[no-untyped-def]
+def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-untyped-def]
     """Clear what the engine remembers of the last transition.
 
-    Contacts are dropped once their shapes have been apart for some steps, so bodies are parked far
-    from each other; a joint's stored impulse is clipped to its greatest force, here zero.
+    A contact is dropped once its shapes have been apart for some steps, for which bodies are parked
+    far from each other; a joint's stored impulse is clipped to its greatest force, here zero.
     """
-    space, bodies, _, _, wheel_body, _, joints, _, _, _, _, _ = world
-    if touched == _FREE and len(wheel_body) == 0 and len(joints) == 0:
+    if touched == _FREE and len(world.wheel_body) == 0 and len(world.links) == 0:
         return
-    for i in range(len(bodies)):
+    for i in range(len(world.bodies)):
         if touched:
-            _call2(fn[_SET_POSITION], bodies[i], FAR * (i + 1.0), FAR)
-        _call2(fn[_SET_VELOCITY], bodies[i], 0.0, 0.0)
-        _call1(fn[_SET_SPIN], bodies[i], 0.0)
-        _call2(fn[_SET_FORCE], bodies[i], 0.0, 0.0)
-        _call1(fn[_SET_TORQUE], bodies[i], 0.0)
-    _set_strengths(fn, world, properties, normal_gravity, 0.0)
+            _call2(fn.cpBodySetPosition, world.bodies[i], FAR * (i + 1.0), FAR)
+        _call2(fn.cpBodySetVelocity, world.bodies[i], 0.0, 0.0)
+        _call1(fn.cpBodySetAngularVelocity, world.bodies[i], 0.0)
+        _call2(fn.cpBodySetForce, world.bodies[i], 0.0, 0.0)
+        _call1(fn.cpBodySetTorque, world.bodies[i], 0.0)
+    _set_strengths(fn, world, bodies, normal_gravity, 0.0)
+    _call_int(fn.cpSpaceSetIterations, world.space, 1)
+    _call_int(fn.cpSpaceSetCollisionPersistence, world.space, 1)
     for _ in range(_PARKED_STEPS if touched else 1):
-        _call1(fn[_STEP], space, TINY)
-    _set_strengths(fn, world, properties, normal_gravity, 1.0)
+        _call1(fn.cpSpaceStep, world.space, TINY)
+    _call_int(fn.cpSpaceSetIterations, world.space, world.iterations)
+    _call_int(fn.cpSpaceSetCollisionPersistence, world.space, world.persistence)
+    _set_strengths(fn, world, bodies, normal_gravity, 1.0)
 
 
 @numba.njit(nogil=True, cache=True)
-def _near_contact(x, y, i, radii, obstacles, can_touch, places):  # type: ignore[no-untyped-def]
+def _near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-untyped-def]
+    """Whether body ``i`` may touch an obstacle or a body before it: as in plain.py."""
+    x, y = state[i, 0], state[i, 1]
     for j in range(len(obstacles)):
         ax, ay = obstacles[j, 0], obstacles[j, 1]
         dx, dy = obstacles[j, 2] - ax, obstacles[j, 3] - ay
@@ -289,7 +331,7 @@ def _near_contact(x, y, i, radii, obstacles, can_touch, places):  # type: ignore
     for j in range(i):
         if can_touch[i, j]:
             reach = radii[i] + radii[j]
-            ex, ey = x - places[j, 0], y - places[j, 1]
+            ex, ey = x - state[j, 0], y - state[j, 1]
             if ex * ex + ey * ey <= reach * reach:
                 return True
     return False
@@ -297,68 +339,65 @@ def _near_contact(x, y, i, radii, obstacles, can_touch, places):  # type: ignore
 
 @numba.njit(nogil=True, cache=True)
 def _transition(  # type: ignore[no-untyped-def]
-    fn, world, properties, laws, law_body, law_offset, values, start, actions, step, substeps, out
+    fn, world, bodies, forces, force_body, force_offset, laws, start, actions, step, substeps, out
 ):
     """One transition of horizon H into ``out`` (H, body, 6); says what became of it."""
-    space, bodies, _, _, wheel_body, wheels, _, _, _, radii, obstacles, can_touch = world
-    k = len(bodies)
+    k = len(world.bodies)
     state = start.copy()
     command = np.zeros(3)
     wrench = np.zeros((k, 3))
     touched = _FREE
-    watch = len(obstacles) > 0 or k > 1
+    watch = len(world.obstacles) > 0 or k > 1
     for i in range(k):
-        _call2(fn[_SET_POSITION], bodies[i], state[i, 0], state[i, 1])
-        _call1(fn[_SET_ANGLE], bodies[i], state[i, 2])
-        _call2(fn[_SET_VELOCITY], bodies[i], state[i, 3], state[i, 4])
-        _call1(fn[_SET_SPIN], bodies[i], state[i, 5])
+        body = world.bodies[i]
+        _call2(fn.cpBodySetPosition, body, state[i, 0], state[i, 1])
+        _call1(fn.cpBodySetAngle, body, state[i, 2])
+        _call2(fn.cpBodySetVelocity, body, state[i, 3], state[i, 4])
+        _call1(fn.cpBodySetAngularVelocity, body, state[i, 5])
     state_at, command_at = state.ctypes.data, command.ctypes.data
-    wrench_at, values_at = wrench.ctypes.data, values.ctypes.data
+    wrench_at, laws_at = wrench.ctypes.data, laws.ctypes.data
     for h in range(len(actions)):
         for _ in range(substeps):
             for i in range(k):
                 for w in range(3):
                     wrench[i, w] = actions[h, i, w]
-            for e in range(len(laws)):
-                i = law_body[e]
+            for e in range(len(forces)):
+                i = force_body[e]
                 for w in range(3):
                     command[w] = actions[h, i, w]
                 _call_law(
-                    laws[e],
+                    forces[e],
                     state_at + 48 * i,
                     command_at,
-                    values_at + 8 * law_offset[e],
+                    laws_at + 8 * force_offset[e],
                     wrench_at + 24 * i,
                 )
             for i in range(k):
-                _call2(fn[_SET_FORCE], bodies[i], wrench[i, 0], wrench[i, 1])
-                _call1(fn[_SET_TORQUE], bodies[i], wrench[i, 2])
-            for j in range(len(wheel_body)):
-                i = wheel_body[j]
+                _call2(fn.cpBodySetForce, world.bodies[i], wrench[i, 0], wrench[i, 1])
+                _call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
+            for j in range(len(world.wheel_body)):
+                i = world.wheel_body[j]
                 theta = state[i, 2] + state[i, 5] * step
                 c, s = math.cos(theta), math.sin(theta)
-                w_x, w_y = properties[i, _W_X], properties[i, _W_Y]
+                w_x, w_y = bodies[i, _W_X], bodies[i, _W_Y]
                 x = state[i, 0] + state[i, 3] * step + c * w_x - s * w_y
                 y = state[i, 1] + state[i, 4] * step + s * w_x + c * w_y
-                _call1(fn[_SET_ANGLE], wheels[0, j], theta + properties[i, _W_THETA])
-                _call2(fn[_SET_POSITION], wheels[0, j], x, y)
-            _call1(fn[_STEP], space, step)
+                _call2(fn.cpGrooveJointSetAnchorB, world.wheels[0, j], x, y)
+                _call2(fn.cpGrooveJointSetAnchorB, world.wheels[1, j], x, y)
+            _call1(fn.cpSpaceStep, world.space, step)
             for i in range(k):
-                state[i, 0], state[i, 1] = _get2(fn[_GET_POSITION], bodies[i])
-                state[i, 2] = _get1(fn[_GET_ANGLE], bodies[i])
-                state[i, 3], state[i, 4] = _get2(fn[_GET_VELOCITY], bodies[i])
-                state[i, 5] = _get1(fn[_GET_SPIN], bodies[i])
+                body = world.bodies[i]
+                state[i, 0], state[i, 1] = _get2(fn.cpBodyGetPosition, body)
+                state[i, 2] = _get1(fn.cpBodyGetAngle, body)
+                state[i, 3], state[i, 4] = _get2(fn.cpBodyGetVelocity, body)
+                state[i, 5] = _get1(fn.cpBodyGetAngularVelocity, body)
                 speed = abs(state[i, 3]) + abs(state[i, 4]) + abs(state[i, 5])
                 if not speed < DIVERGED:  # also true of NaN
                     return _LOST
                 if watch and touched == _FREE:
-                    near = _near_contact(
-                        state[i, 0], state[i, 1], i, radii, obstacles, can_touch, state
-                    )
+                    near = _near_contact(i, state, world.radii, world.obstacles, world.can_touch)
                     touched = _TOUCHED if near else _FREE
-        for i in range(k):
-            for d in range(6):
-                out[h, i, d] = state[i, d]
+        out[h] = state
     return touched
 
 
@@ -366,11 +405,12 @@ def _transition(  # type: ignore[no-untyped-def]
 def rollout(  # type: ignore[no-untyped-def]
     fn,
     world,
-    properties,
+    bodies,
+    joints,
     laws,
-    law_body,
-    law_offset,
-    values,
+    forces,
+    force_body,
+    force_offset,
     start,
     actions,
     time_step,
@@ -399,12 +439,12 @@ def rollout(  # type: ignore[no-untyped-def]
         p, t = item // n, item % n
         if p != proposal:
             proposal = p
-            _set_properties(fn, world, properties[p], normal_gravity)
+            _set_properties(fn, world, bodies[p], joints[p])
         total[:] = 0.0
         for level in range(len(counts)):
-            _forget(fn, world, properties[p], normal_gravity, state)
+            _forget(fn, world, bodies[p], normal_gravity, state)
             state = _transition(
-                fn, world, properties[p], laws, law_body, law_offset, values[p],
+                fn, world, bodies[p], forces, force_body, force_offset, laws[p],
                 start[t], actions[t], time_step / counts[level], counts[level], scratch,
             )  # fmt: skip
             if state == _LOST:
@@ -417,7 +457,3 @@ def rollout(  # type: ignore[no-untyped-def]
         if state == _FREE and len(counts) > 1:
             out[item] = total
     return last
-
-
-if len(COLUMN) != 11:  # the column numbers above are spelled out for the compiler
-    raise ImportError("physics/compiled.py: the columns of properties.py have changed")

@@ -9,14 +9,14 @@ import numpy as np
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.physics.properties import COLUMN, Array
 from pbrl_ppl.physics.world import DIVERGED, World
-from pbrl_ppl.scene import Scene
 
 
 def rollout(
-    scene: Scene,
+    world: World,
     effects: tuple[Attached, ...],
-    properties: Array,
-    effect_values: Array,
+    bodies: Array,
+    joints: Array,
+    laws: Array,
     start: Array,
     actions: Array,
     substeps: int,
@@ -25,13 +25,15 @@ def rollout(
 
     Parameters
     ----------
-    scene : Scene
-        Geometry.
+    world : World
+        A new one.
     effects : tuple of Attached
         Effects; those with a force law act every substep.
-    properties : ndarray
-        Engine properties, shape (body, column).
-    effect_values : ndarray
+    bodies : ndarray
+        Engine properties of the bodies, shape (body, column).
+    joints : ndarray
+        Engine properties of the joints, shape (joint, column).
+    laws : ndarray
         Parameters of the force laws in their order, shape (q,).
     start : ndarray
         Start state, shape (body, 6), SI units.
@@ -47,28 +49,28 @@ def rollout(
     touched : bool
         Whether shapes came into contact.
     """
-    world = World(scene)
-    world.set_properties(properties)
+    world.set_properties(bodies, joints)
     for body, state in zip(world.bodies, start, strict=True):
         body.position, body.angle = tuple(state[:2]), state[2]
         body.velocity, body.angular_velocity = tuple(state[3:5]), state[5]
+    scene = world.scene
     names = [body.name for body in scene.dynamic]
-    laws = [one for one in effects if one.effect.force is not None]
-    offsets = np.cumsum([0, *(len(one.effect.parameters) for one in laws)])
+    forces = [one for one in effects if one.effect.force is not None]
+    offsets = np.cumsum([0, *(len(one.effect.parameters) for one in forces)])
     step = scene.time_step / substeps
     states = np.empty((len(actions), len(names), 6))
     touched = False
     for h, action in enumerate(actions):
         for _ in range(substeps):
             wrench = action.copy()
-            for one, begin, end in zip(laws, offsets[:-1], offsets[1:], strict=True):
+            for one, begin, end in zip(forces, offsets[:-1], offsets[1:], strict=True):
                 i = names.index(one.body)
                 if one.effect.force is not None:
                     state = _state(world, i)
-                    one.effect.force(state, action[i], effect_values[begin:end], wrench[i])
+                    one.effect.force(state, action[i], laws[begin:end], wrench[i])
             for i, body in enumerate(world.bodies):
                 body.force, body.torque = tuple(wrench[i, :2]), wrench[i, 2]
-            _place_wheels(world, properties, step)
+            _place_wheels(world, bodies, step)
             world.space.step(step)
             touched = touched or near_contact(world)
             if not all(np.abs(_state(world, i)[3:]).sum() < DIVERGED for i in range(len(names))):
@@ -86,18 +88,18 @@ def _state(world: World, i: int) -> Array:
     )
 
 
-def _place_wheels(world: World, properties: Array, step: float) -> None:
-    """Put each ground body where the wheel will be when the engine solves for velocities."""
+def _place_wheels(world: World, bodies: Array, step: float) -> None:
+    """Put the ground's points where the wheels will be when the engine solves for velocities."""
     for wheel in world.wheels:
-        body, row = world.bodies[wheel.body], properties[wheel.body]
+        body, row = world.bodies[wheel.body], bodies[wheel.body]
         theta = body.angle + body.angular_velocity * step
         c, s = math.cos(theta), math.sin(theta)
         x, y = row[COLUMN["w_x"]], row[COLUMN["w_y"]]
-        wheel.ground.angle = theta + row[COLUMN["w_theta"]]
-        wheel.ground.position = (
+        point = (
             body.position.x + body.velocity.x * step + c * x - s * y,
             body.position.y + body.velocity.y * step + s * x + c * y,
         )
+        wheel.along_x.anchor_b = wheel.along_y.anchor_b = point
 
 
 def near_contact(world: World) -> bool:

@@ -3,20 +3,30 @@
 from __future__ import annotations
 
 import threading
+from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.differences import differentiate
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import compiled, plain
-from pbrl_ppl.physics.properties import Array, engine_properties
+from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Scene
 
 PATHS = ("compiled", "plain")
+#: Step of a finite difference as a share of a parameter's scale: about the cube root of the
+#: engine's rounding error. And what stands for an infinite bound.
+_STEP, _FAR = 1e-5, 1e300
+#: Worlds kept, of different choices of the bodies that inferred joints hold.
+_KEPT = 64
+#: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
+Joined = tuple[tuple[int, int], ...]
 
 
 class Simulator:
@@ -71,14 +81,15 @@ class Simulator:
         self.scene, self.layout, self.effects = scene, layout, effects
         self.substeps, self.threads, self.path = substeps, threads, path
         self.extrapolate = extrapolate
-        self._worlds: list[compiled.CompiledWorld] = []
+        self._properties = EngineProperties(scene, effects, layout)
+        self._worlds: OrderedDict[Joined, list[_Engine]] = OrderedDict()
         self._lock = threading.Lock()  # the worlds serve one call at a time
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the C objects behind: another process builds its own."""
-        return {key: value for key, value in self.__dict__.items() if key != "_lock"} | {
-            "_worlds": []
-        }
+        return {
+            key: value for key, value in self.__dict__.items() if key not in ("_lock", "_forces")
+        } | {"_worlds": OrderedDict()}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         """Build what was left behind."""
@@ -115,16 +126,48 @@ class Simulator:
         actions = np.ascontiguousarray(actions, dtype=float)
         self._check(phi, start, actions)
         proposals = np.atleast_2d(phi)
-        properties, values = engine_properties(self.scene, self.effects, self.layout, proposals)
+        given = self._properties(proposals)
         n, horizon, k = actions.shape[:3]
-        out = np.full((len(proposals) * n, horizon, k, 6), np.nan)
-        if self.path == "plain":
-            self._run_plain(properties, values, start, actions, out)
-        else:
-            with self._lock:
-                self._run_compiled(properties, values, start, actions, out)
-        out = out.reshape(len(proposals), n, horizon, k, 6)
+        out = np.full((len(proposals), n, horizon, k, 6), np.nan)
+        run = self._run_plain if self.path == "plain" else self._run_compiled
+        if not given.indices.shape[1]:
+            run((), given, start, actions, out.reshape(-1, horizon, k, 6))
+            return out if phi.ndim == 2 else out[0]
+        # each choice of the bodies that joints hold is a world of its own
+        choices, which = np.unique(given.indices, axis=0, return_inverse=True)
+        for i, choice in enumerate(choices):
+            joined = tuple((int(a), int(b)) for a, b in choice)
+            rows = which.ravel() == i
+            part = np.full((int(rows.sum()) * n, horizon, k, 6), np.nan)
+            run(joined, EngineInput(*(each[rows] for each in given)), start, actions, part)
+            out[rows] = part.reshape(-1, n, horizon, k, 6)
         return out if phi.ndim == 2 else out[0]
+
+    def jacobian(self, phi: Array, start: Array, actions: Array) -> Array:
+        """Derivative of the predictions by phi, by central differences in one batched call.
+
+        Parameters
+        ----------
+        phi : ndarray
+            Where to differentiate, shape (p,).
+        start, actions : ndarray
+            As in a call.
+
+        Returns
+        -------
+        ndarray
+            Shape (transition, H, body, 6, p). The columns of discrete parameters are zero; where
+            friction or a contact makes a kink it is the derivative of one side or a mean of both.
+        """
+        phi = np.asarray(phi, dtype=float)
+        lower, upper = self.layout.bounds
+        # never on a bound: a body has no mass of zero
+        lower = np.where(phi > lower, 0.5 * (phi + np.maximum(lower, -_FAR)), lower)
+        upper = np.where(phi < upper, 0.5 * (phi + np.minimum(upper, _FAR)), upper)
+        return differentiate(
+            lambda points: self(points, start, actions), phi, _STEP * self.layout.scale(phi),
+            lower, upper,
+        )  # fmt: skip
 
     def _check(self, phi: Array, start: Array, actions: Array) -> None:
         k, p = len(self.scene.dynamic), self.layout.size
@@ -146,7 +189,7 @@ class Simulator:
         if not (np.isfinite(start).all() and np.isfinite(actions).all()):
             raise SimulationError("start states and actions must be finite; drop the missing rows")
 
-    @property
+    @cached_property
     def levels(self) -> tuple[NDArray[np.int64], Array]:
         """Numbers of substeps to run, the finest first, and the weights of their results.
 
@@ -160,15 +203,34 @@ class Simulator:
         weights = np.linalg.solve(powers, np.eye(len(counts))[0])
         return np.array(counts, dtype=np.int64), weights
 
+    @cached_property
+    def _forces(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+        """Address, body and first parameter of each force law."""
+        attached = [one for one in self.effects if one.effect.force is not None]
+        names = [body.name for body in self.scene.dynamic]
+        sizes = [len(one.effect.parameters) for one in attached]
+        addresses = [compiled.law_address(one.effect.force) for one in attached if one.effect.force]
+        return (
+            np.array(addresses, dtype=np.int64),
+            np.array([names.index(one.body) for one in attached], dtype=np.int64),
+            np.cumsum([0, *sizes])[:-1].astype(np.int64),
+        )
+
+    def _new_world(self, joined: Joined) -> World:
+        return World(self.scene, self._properties.hinges, joined)
+
     def _run_plain(
-        self, properties: Array, values: Array, start: Array, actions: Array, out: Array
+        self, joined: Joined, given: EngineInput, start: Array, actions: Array, out: Array
     ) -> None:
         for item in range(len(out)):
             p, t = divmod(item, len(start))
-            model = (self.scene, self.effects, properties[p], values[p], start[t], actions[t])
+            properties = given.bodies[p], given.joints[p], given.laws[p]
             total = np.zeros_like(out[item])
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
-                states, touched = plain.rollout(*model, int(count))
+                states, touched = plain.rollout(
+                    self._new_world(joined), self.effects, *properties, start[t], actions[t],
+                    int(count),
+                )  # fmt: skip
                 if level == 0 or np.isnan(states).any():  # diverged
                     out[item] = states
                 if touched:
@@ -178,47 +240,46 @@ class Simulator:
                 out[item] = total
 
     def _run_compiled(
-        self, properties: Array, values: Array, start: Array, actions: Array, out: Array
+        self, joined: Joined, given: EngineInput, start: Array, actions: Array, out: Array
     ) -> None:
-        laws = [one for one in self.effects if one.effect.force is not None]
-        names = [body.name for body in self.scene.dynamic]
-        sizes = [len(one.effect.parameters) for one in laws]
-        addresses = [compiled.law_address(one.effect.force) for one in laws if one.effect.force]
-        shared = (
-            np.array(addresses, dtype=np.int64),
-            np.array([names.index(one.body) for one in laws], dtype=np.int64),
-            np.cumsum([0, *sizes])[:-1].astype(np.int64),
-            np.ascontiguousarray(values),
-            start,
-            actions,
-            self.scene.time_step,
-            self.scene.normal_gravity,
-            *self.levels,
-        )
-        while len(self._worlds) < self.threads:
-            self._worlds.append(compiled.CompiledWorld(World(self.scene)))
-
-        def run(worker: int, first: int, last: int) -> None:
-            while first < last:
-                stop = compiled.rollout(
-                    compiled.FUNCTIONS,
-                    self._worlds[worker].arrays(),
-                    properties,
-                    *shared,
-                    first,
-                    last,
-                    out,
-                )
-                if stop < last:  # diverged: that world is spoilt, and the item is lost
-                    out[stop] = np.nan
-                    self._worlds[worker] = compiled.CompiledWorld(World(self.scene))
-                first = stop + 1
-
         # a chunk a thread; with few items a thread costs more than it gives
         workers = min(self.threads, max(1, len(out) // 8))
         edges = np.linspace(0, len(out), workers + 1).astype(int)
-        if workers == 1:
-            run(0, 0, len(out))
-            return
-        with ThreadPoolExecutor(workers) as pool:
-            list(pool.map(run, range(workers), edges[:-1], edges[1:]))
+        shared = (
+            given.bodies, given.joints, given.laws, *self._forces, start, actions,
+            self.scene.time_step, self.scene.normal_gravity, *self.levels,
+        )  # fmt: skip
+
+        def run(engine: _Engine, first: int, last: int) -> None:
+            while first < last:
+                stop = compiled.rollout(
+                    compiled.FUNCTIONS, engine.pointers, *shared, first, last, out
+                )
+                if stop < last:  # diverged: that world is spoilt, and the item is lost
+                    out[stop] = np.nan
+                    engine.renew(self._new_world(joined))
+                first = stop + 1
+
+        with self._lock:
+            engines = self._worlds.setdefault(joined, [])
+            self._worlds.move_to_end(joined)
+            while len(self._worlds) > _KEPT:
+                self._worlds.popitem(last=False)
+            while len(engines) < workers:
+                engines.append(_Engine(self._new_world(joined)))
+            if workers == 1:
+                run(engines[0], 0, len(out))
+                return
+            with ThreadPoolExecutor(workers) as pool:
+                list(pool.map(run, engines, edges[:-1], edges[1:]))
+
+
+class _Engine:
+    """A world of one thread, and where its C objects are."""
+
+    def __init__(self, world: World) -> None:
+        self.renew(world)
+
+    def renew(self, world: World) -> None:
+        """Take another world."""
+        self.world, self.pointers = world, compiled.pointers(world)

@@ -28,12 +28,27 @@ DIVERGED = 1e6
 
 @dataclass
 class Wheel:
-    """J_w: two grooves of a ground body that is put at the wheel's place every substep."""
+    """J_w: two grooves in the body that slide along a point of the ground.
+
+    The point is put under the wheel every substep.
+    """
 
     body: int
-    ground: pymunk.Body
-    along_x: pymunk.GrooveJoint  # resists motion along the wheel's y axis
+    along_x: pymunk.GrooveJoint  # lets the wheel roll along its x axis, resists across
     along_y: pymunk.GrooveJoint
+
+
+@dataclass
+class Link:
+    """J_d: a rod, or a hinge where its length is zero."""
+
+    joint: int
+    constraint: pymunk.PinJoint | pymunk.PivotJoint
+
+    @property
+    def rod(self) -> bool:
+        """Whether it has a length."""
+        return isinstance(self.constraint, pymunk.PinJoint)
 
 
 @dataclass
@@ -52,18 +67,27 @@ class World:
     ----------
     scene : Scene
         Geometry, joints and gravity.
+    hinges : tuple of bool
+        Which joints have no length, one a joint.
+    joined : tuple of (int, int)
+        Which of ``scene.joinable`` each joint of unknown bodies holds, in the scene's order; a pair
+        of equals is no joint.
     """
 
-    def __init__(self, scene: Scene) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        hinges: tuple[bool, ...] = (),
+        joined: tuple[tuple[int, int], ...] = (),
+    ) -> None:
         self.scene = scene
         self.space = pymunk.Space()
         self.space.gravity = scene.gravity
-        self.space.iterations = _iterations(scene)
         self.space.collision_slop = COLLISION_SLOP
         self.bodies: list[pymunk.Body] = []
         self.shapes: list[tuple[int, pymunk.Shape]] = []
         self.wheels: list[Wheel] = []
-        self.joints: list[pymunk.Constraint] = []
+        self.links: list[Link] = []
         self.pivots: list[Pivot] = []
         self._by_name: dict[str, pymunk.Body] = {WORLD: self.space.static_body}
         for i, body in enumerate(scene.dynamic):
@@ -78,8 +102,13 @@ class World:
                 self._add_wheel(i, rigid)
         self._add_fixed()
         self._part()
-        for joint in scene.joints:
-            self._add_joint(joint)
+        self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
+        self._add_joints(hinges, joined)
+        chained = not self.can_touch.all()
+        alone = len(scene.bodies) == 1 and not scene.walls
+        self.space.iterations = (
+            ITERATIONS_CHAINED if chained else ITERATIONS_ALONE if alone else ITERATIONS
+        )
         #: What the near-contact test needs: circles about bodies, and segments with a radius.
         self.radii = np.array([bounding_radius(body) for body in scene.dynamic])
         fixed = [(*wall.start, *wall.end, 0.0) for wall in scene.walls]
@@ -89,22 +118,14 @@ class World:
             if body.static and body.pose is not None
         ]
         self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
-        self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
-        names = [body.name for body in scene.dynamic]
-        for joint in scene.joints:
-            if joint.bodies[0] in names and joint.bodies[1] in names:
-                i, j = (names.index(name) for name in joint.bodies)
-                self.can_touch[i, j] = self.can_touch[j, i] = False
 
     def _part(self) -> None:
         """Step once with the bodies far apart: pairs are then found in an order without a past."""
         for i, body in enumerate(self.bodies):
             body.position = (FAR * (i + 1.0), FAR)
         self.space.step(TINY)
-        for body, declared in zip(self.bodies, self.scene.dynamic, strict=True):
-            # the reference pose: a rod keeps the distance that its anchors have there
-            x, y, body.angle = declared.pose or (0.0, 0.0, 0.0)
-            body.position, body.velocity = (x, y), (0.0, 0.0)
+        for body in self.bodies:
+            body.velocity = (0.0, 0.0)
 
     def _add_fixed(self) -> None:
         """Walls and static bodies; they carry 1, for the engine multiplies both shapes' values."""
@@ -125,61 +146,75 @@ class World:
         self.space.add(shape)
 
     def _add_wheel(self, index: int, body: pymunk.Body) -> None:
-        ground = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        along_x = pymunk.GrooveJoint(ground, body, (-GROOVE, 0), (GROOVE, 0), (0, 0))
-        along_y = pymunk.GrooveJoint(ground, body, (0, -GROOVE), (0, GROOVE), (0, 0))
+        ground = self.space.static_body
+        along_x, along_y = (
+            pymunk.GrooveJoint(body, ground, (-GROOVE, 0), (GROOVE, 0), (0, 0)) for _ in range(2)
+        )
         for joint in (along_x, along_y):
             joint.max_bias = 0.0  # friction resists motion; it does not pull back
             joint.max_force = 0.0
-        self.space.add(ground, along_x, along_y)
-        self.wheels.append(Wheel(index, ground, along_x, along_y))
+        self.space.add(along_x, along_y)
+        self.wheels.append(Wheel(index, along_x, along_y))
 
-    def _add_joint(self, joint: Joint) -> None:
-        a, b = (self._by_name[name] for name in joint.bodies)
-        if joint.kind == "distance":
-            rod = pymunk.PinJoint(a, b, joint.anchor_a, joint.anchor_b)
-            rod.error_bias = 0.0
-            rod.collide_bodies = False
-            self.space.add(rod)
-            self.joints.append(rod)
-            return
-        hinge = pymunk.PivotJoint(a, b, joint.anchor_a, joint.anchor_b)
-        hinge.error_bias = 0.0  # correct the whole drift every substep
-        hinge.collide_bodies = False
+    def _add_joints(self, hinges: tuple[bool, ...], joined: tuple[tuple[int, int], ...]) -> None:
+        """Hinges and rods; their anchors and lengths are properties."""
+        pairs, names = iter(joined), self.scene.joinable
+        for position, (joint, hinge) in enumerate(zip(self.scene.joints, hinges, strict=True)):
+            bodies = joint.bodies
+            if bodies is None:
+                first, second = next(pairs)
+                if first == second:  # i_a = i_b nullifies the joint
+                    continue
+                bodies = names[first], names[second]
+            a, b = (self._by_name[name] for name in bodies)
+            link: pymunk.PinJoint | pymunk.PivotJoint
+            if hinge:
+                link = pymunk.PivotJoint(a, b, (0, 0), (0, 0))
+            else:
+                link = pymunk.PinJoint(a, b, (0, 0), (0, 0))
+            link.error_bias = 0.0  # correct the whole drift every substep
+            link.collide_bodies = False
+            self.space.add(link)
+            self.links.append(Link(position, link))
+            if joint.kind == "hinge" and joint.bodies is not None:
+                self._add_pivot(joint, a, b)
+            if a in self.bodies and b in self.bodies:
+                i, j = self.bodies.index(a), self.bodies.index(b)
+                self.can_touch[i, j] = self.can_touch[j, i] = False
+
+    def _add_pivot(self, joint: Joint, a: pymunk.Body, b: pymunk.Body) -> None:
         motor = pymunk.SimpleMotor(a, b, 0.0)
         motor.max_force = 0.0
         damper = pymunk.DampedRotarySpring(a, b, 0.0, 0.0, 0.0)
-        self.space.add(hinge, motor, damper)
-        self.joints.append(hinge)
+        self.space.add(motor, damper)
         hanging = self._by_name[hanging_body(self.scene, joint)]
         self.pivots.append(Pivot(self.bodies.index(hanging), motor, damper))
 
-    def set_properties(self, properties: Array) -> None:
-        """Give every body its numbers; ``properties`` has shape (body, column)."""
+    def set_properties(self, bodies: Array, joints: Array) -> None:
+        """Give the engine its numbers; shapes (body, column) and (joint, column)."""
         for i, body in enumerate(self.bodies):
-            body.mass = properties[i, COLUMN["mass"]]
-            body.moment = properties[i, COLUMN["moment"]]
+            body.mass = bodies[i, COLUMN["mass"]]
+            body.moment = bodies[i, COLUMN["moment"]]
         for i, shape in self.shapes:
-            shape.elasticity = properties[i, COLUMN["r"]]
-            shape.friction = properties[i, COLUMN["mu_c"]]
+            shape.elasticity = bodies[i, COLUMN["r"]]
+            shape.friction = bodies[i, COLUMN["mu_c"]]
         for wheel in self.wheels:
-            row = properties[wheel.body]
+            row = bodies[wheel.body]
             load = row[COLUMN["mass"]] * self.scene.normal_gravity
-            anchor = (row[COLUMN["w_x"]], row[COLUMN["w_y"]])
-            wheel.along_x.anchor_b = wheel.along_y.anchor_b = anchor
+            x, y, theta = (row[COLUMN[name]] for name in ("w_x", "w_y", "w_theta"))
+            c, s = GROOVE * math.cos(theta), GROOVE * math.sin(theta)
+            wheel.along_x.groove_a, wheel.along_x.groove_b = (x - c, y - s), (x + c, y + s)
+            wheel.along_y.groove_a, wheel.along_y.groove_b = (x + s, y - c), (x - s, y + c)
             wheel.along_x.max_force = row[COLUMN["mu_y"]] * load
             wheel.along_y.max_force = row[COLUMN["mu_x"]] * load
+        for link in self.links:
+            a_x, a_y, b_x, b_y, length = joints[link.joint]
+            link.constraint.anchor_a, link.constraint.anchor_b = (a_x, a_y), (b_x, b_y)
+            if isinstance(link.constraint, pymunk.PinJoint):
+                link.constraint.distance = length
         for pivot in self.pivots:
-            pivot.motor.max_force = properties[pivot.body, COLUMN["pivot_torque"]]
-            pivot.damper.damping = properties[pivot.body, COLUMN["pivot_damping"]]
-
-
-def _iterations(scene: Scene) -> int:
-    moving = {body.name for body in scene.dynamic}
-    if any(moving.issuperset(joint.bodies) for joint in scene.joints):
-        return ITERATIONS_CHAINED
-    alone = len(scene.bodies) == 1 and not scene.walls
-    return ITERATIONS_ALONE if alone else ITERATIONS
+            pivot.motor.max_force = bodies[pivot.body, COLUMN["pivot_torque"]]
+            pivot.damper.damping = bodies[pivot.body, COLUMN["pivot_damping"]]
 
 
 def _shapes(body: Body, rigid: pymunk.Body) -> list[pymunk.Shape]:
