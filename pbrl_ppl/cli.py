@@ -163,6 +163,9 @@ def check(
     """Read a scene and a history, and show what is in them and what is missing."""
     with _interruptible():
         declared, loaded = _load(scene, history, estimate_velocities)
+        from pbrl_ppl.physics import check_history
+
+        check_history(declared, loaded, loaded.segments(1))
         console = Console(highlight=False)
         console.print(_contents(declared, loaded))
         console.print(_cells(loaded))

@@ -26,7 +26,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.op import SimulatorOp
 from pbrl_ppl.parameters import Block, Layout
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Simulator, check_history
 from pbrl_ppl.prior import build_layout, random_variable
 from pbrl_ppl.scene import Scene
 
@@ -79,6 +79,7 @@ class Problem:
                 f"history: no trajectory is long enough for a horizon of {self.horizon} intervals;"
                 " choose a shorter one"
             )
+        check_history(self.scene, self.history, segments)
         return segments
 
     @cached_property
@@ -187,6 +188,8 @@ def physics_model(
         If an effect is unknown or does not apply.
     HistoryError
         If the history has nothing to fit at this horizon.
+    SimulationError
+        If bodies start deep inside each other or a wall, or a hinge's bodies apart.
     ValueError
         If ``sigma`` is neither option or ``horizon`` is below 1.
 

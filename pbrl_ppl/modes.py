@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares, minimize
 
 from pbrl_ppl.differences import differentiate
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import StartNoise, estimate_sigma, log_density, whiten
 from pbrl_ppl.model import Problem
 from pbrl_ppl.parameters import Prior
@@ -125,8 +126,18 @@ def find_modes(
     -------
     list of Mode
         At least one.
+
+    Raises
+    ------
+    FitError
+        If a joint's bodies are unknown: modes are sought over continuous parameters.
     """
     priors = problem.layout.priors
+    if problem.layout.discrete.any():
+        raise FitError(
+            "which bodies a joint of the scene joins is unknown, and a fit does not search over that"
+            " yet; name its bodies in the scene, or sample the model with pm.sample"
+        )
     if initial is not None:
         return [_finish(problem, *_search(problem, inside(priors, initial)))]
     if not priors:  # everything is known but the noise

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach
-from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.physics import Simulator, check_placement
 from pbrl_ppl.prior import build_layout
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene_checks import nearest
 
 Array = NDArray[np.float64]
 
@@ -32,6 +33,10 @@ class Transition:
         Engine steps a sampling interval; the scene's by default.
     threads : int
         Worlds that run side by side.
+    check_start : bool
+        Whether start states are refused in which bodies lie deep inside each other or a wall, or a
+        hinge's bodies are apart. Off, one may go on from where the engine left bodies pressed
+        together.
 
     Raises
     ------
@@ -59,11 +64,20 @@ class Transition:
         *,
         substeps: int | None = None,
         threads: int = 1,
+        check_start: bool = True,
     ) -> None:
         attached = attach(scene, effects)
         layout = build_layout(scene, attached)
+        names = [block.name for block in layout.blocks]
+        for name in parameters:
+            if name not in names:
+                raise ParameterError(
+                    f'parameter "{name}" is not among the unknown ones: {", ".join(names)}'
+                    f"{nearest(name, names)}"
+                )
         self.scene = scene
         self.phi = layout.to_vector(parameters)
+        self._check_start = check_start
         self._simulator = Simulator(scene, layout, attached, substeps=substeps, threads=threads)
         # impossible parameters are refused here, not at the first call
         k = len(scene.dynamic)
@@ -136,5 +150,6 @@ class Transition:
         """
         first = np.asarray(start, dtype=float)
         result = self._simulator(self.phi, first, np.asarray(wrenches, dtype=float))
-        check_placement(self.scene, first)
+        if self._check_start:
+            check_placement(self.scene, first)
         return result

@@ -124,6 +124,10 @@ def test_bad_files(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
     fails(capsys, "check", "scene.toml", "train.csv")
     (files / "scene.toml").write_bytes(b"\xff\xfe")
     fails(capsys, "check", "scene.toml", "train.csv")
+    # the puck moves along y = 0
+    (files / "scene.toml").write_text(SCENE + "[[wall]]\nfrom = [-9, 0]\nto = [9, 0]\n")
+    message = fails(capsys, "check", "scene.toml", "train.csv")
+    assert 'history trajectory 0, step 0: body "puck" and the wall' in message
     (files / "scene.toml").write_text(SCENE)
     (files / "train.csv").write_text("")
     fails(capsys, "check", "scene.toml", "train.csv")

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -11,7 +12,7 @@ import pytest
 from scipy import stats
 
 from pbrl_ppl.effects import attach, catalogue
-from pbrl_ppl.errors import EffectError, HistoryError
+from pbrl_ppl.errors import EffectError, HistoryError, SimulationError
 from pbrl_ppl.history import STATE, WRENCH, History
 from pbrl_ppl.likelihood import StartNoise
 from pbrl_ppl.model import Problem, physics_model
@@ -35,19 +36,26 @@ def simulated_history(
     trajectories: int = 4,
     intervals: int = 10,
     effects: Iterable = (),
-    noise: tuple[float, ...] = NOISE,
+    noise: float | tuple[float, ...] = NOISE,
     wrench_sd: tuple[float, float, float] = (12.0, 12.0, 2.0),
     start_sd: tuple[float, ...] = (1.0, 1.0, 1.5, 1.0, 1.0, 0.8),
+    poses: Any = None,
+    substeps: int = 40,
 ) -> History:
-    """A history of the scene's bodies, 4 m apart at the start, made with the package's engine."""
+    """A history made with the package's engine.
+
+    The bodies start 4 m apart, or at rest in these poses (body, 3).
+    """
     rng = np.random.default_rng(seed)
     attached = attach(scene, effects)
     layout = build_layout(scene, attached)
-    simulator = Simulator(scene, layout, attached, substeps=40)
+    simulator = Simulator(scene, layout, attached, substeps=substeps)
     names = [body.name for body in scene.dynamic]
     k = len(names)
     start = rng.normal(0.0, start_sd, (trajectories, k, 6))
     start[..., 0] += 4.0 * np.arange(k)
+    if poses is not None:
+        start[..., :3], start[..., 3:] = poses, 0.0
     actions = rng.normal(0.0, wrench_sd, (trajectories, intervals, k, 3))
     states = simulator(layout.to_vector(truth), start, actions)
     states = np.concatenate([start[:, None], states], axis=1)
@@ -385,6 +393,36 @@ def test_errors(cart) -> None:
         physics_model(cart_scene(effects=("linear_dragg",)), history)
     with pytest.raises(EffectError, match="pivot_friction applies to no body"):
         physics_model(scene, history, [BY_NAME["pivot_friction"]])
+
+
+@pytest.mark.parametrize("mass", [1e-300, 1e300, 0.0, np.inf])
+def test_an_impossible_proposal_has_no_likelihood(cart, mass) -> None:
+    """Minus infinity, never NaN: a body that a push would throw to the stars, or that is none."""
+    model = physics_model(*cart)
+    likelihood = model.compile_logp(vars=model.observed_RVs)
+    point = model.initial_point()
+    assert np.isfinite(likelihood(point))
+    with np.errstate(divide="ignore"):
+        point["mass_log__"] = np.log(np.array([mass]))
+    value = float(likelihood(point))
+    assert value == -np.inf or (mass == 1e300 and np.isfinite(value))
+
+
+def test_start_states_that_cannot_be() -> None:
+    """The history's row and the bodies are named."""
+    two = tuple(Body(name, Shape.circle(0.2)) for name in ("left", "right"))
+    scene = Scene(time_step=0.1, bodies=two)
+    rows = [
+        {"trajectory": t, "time": 0.1 * i, "body": name, "x": x, "y": 0.0, "theta": 0.0}
+        | {"vx": 0.0, "vy": 0.0, "omega": 0.0, "force_x": 0.0, "force_y": 0.0, "torque": 0.0}
+        for t in (3, 7)
+        for i in range(3)
+        for name, x in (("left", 0.0), ("right", 0.1 if (t, i) == (7, 1) else 1.0))
+    ]
+    history = History.from_dataframe(pd.DataFrame(rows), scene)
+    where = 'history trajectory 7, step 1: bodies "left" and "right" overlap by 0.3 m'
+    with pytest.raises(SimulationError, match=where):
+        physics_model(scene, history)
 
 
 def test_everything_known_but_the_noise() -> None:

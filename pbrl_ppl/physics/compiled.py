@@ -31,7 +31,8 @@ Functions = namedtuple(
     [
         "cpSpaceStep",
         "cpSpaceSetIterations",
-        "cpSpaceSetCollisionPersistence",
+        "cpSpaceAddShape",
+        "cpSpaceRemoveShape",
         "cpBodySetMass",
         "cpBodySetMoment",
         "cpBodySetPosition",
@@ -62,9 +63,6 @@ _MASS, _R, _MU_C, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING
     len(COLUMNS)
 )
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
-#: A contact is dropped in the first step after the shapes have parted, when the engine is told to
-#: keep none (persistence 1); the pairs of near shapes in the second.
-_PARKED_STEPS = 2
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
 
@@ -130,6 +128,18 @@ def _call_int(typing: Any, function: Any, pointer: Any, value: Any) -> Any:
 
 
 @intrinsic
+def _call_pointer(typing: Any, function: Any, pointer: Any, other: Any) -> Any:
+    """Call a C function of two pointers; what it returns, if anything, is left."""
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)] * 2).as_pointer()
+        builder.call(builder.inttoptr(args[0], kind), args[1:])
+        return context.get_dummy_value()
+
+    return types.void(types.int64, types.int64, types.int64), codegen
+
+
+@intrinsic
 def _get1(typing: Any, function: Any, pointer: Any) -> Any:
     """Call a C function of a pointer that returns a double."""
 
@@ -182,7 +192,7 @@ class Pointers(NamedTuple):
 
     space: int
     iterations: int
-    persistence: int
+    padding: int
     bodies: NDArray[np.int64]
     shapes: NDArray[np.int64]
     shape_body: NDArray[np.int64]
@@ -212,7 +222,7 @@ def pointers(world: World) -> Pointers:
     return Pointers(
         space=int(ffi.cast("intptr_t", world.space._space)),
         iterations=world.space.iterations,
-        persistence=world.space.collision_persistence,
+        padding=world.padding,
         bodies=at([body._body for body in world.bodies]),
         shapes=at([shape._shape for _, shape in world.shapes]),
         shape_body=whole([i for i, _ in world.shapes]),
@@ -291,25 +301,32 @@ def _set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-un
 def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-untyped-def]
     """Clear what the engine remembers of the last transition.
 
-    A contact is dropped once its shapes have been apart for some steps, for which bodies are parked
-    far from each other; a joint's stored impulse is clipped to its greatest force, here zero.
+    Contacts go with their shapes, which are taken out and put back as in a new world: far from each
+    other, and numbered alike. Where nothing has touched, and nothing will, that is left out. A
+    joint's stored impulse is clipped to its greatest force, here zero.
     """
     if touched == _FREE and len(world.wheel_body) == 0 and len(world.links) == 0:
         return
     for i in range(len(world.bodies)):
         if touched:
             _call2(fn.cpBodySetPosition, world.bodies[i], FAR * (i + 1.0), FAR)
+            _call1(fn.cpBodySetAngle, world.bodies[i], 0.0)
         _call2(fn.cpBodySetVelocity, world.bodies[i], 0.0, 0.0)
         _call1(fn.cpBodySetAngularVelocity, world.bodies[i], 0.0)
         _call2(fn.cpBodySetForce, world.bodies[i], 0.0, 0.0)
         _call1(fn.cpBodySetTorque, world.bodies[i], 0.0)
+    if touched:
+        for shape in world.shapes:
+            _call_pointer(fn.cpSpaceRemoveShape, world.space, shape)
+        for _ in range(world.padding):  # see World._add_shapes
+            _call_pointer(fn.cpSpaceAddShape, world.space, world.shapes[0])
+            _call_pointer(fn.cpSpaceRemoveShape, world.space, world.shapes[0])
+        for shape in world.shapes:
+            _call_pointer(fn.cpSpaceAddShape, world.space, shape)
     _set_strengths(fn, world, bodies, normal_gravity, 0.0)
     _call_int(fn.cpSpaceSetIterations, world.space, 1)
-    _call_int(fn.cpSpaceSetCollisionPersistence, world.space, 1)
-    for _ in range(_PARKED_STEPS if touched else 1):
-        _call1(fn.cpSpaceStep, world.space, TINY)
+    _call1(fn.cpSpaceStep, world.space, TINY)
     _call_int(fn.cpSpaceSetIterations, world.space, world.iterations)
-    _call_int(fn.cpSpaceSetCollisionPersistence, world.space, world.persistence)
     _set_strengths(fn, world, bodies, normal_gravity, 1.0)
 
 
@@ -442,11 +459,16 @@ def rollout(  # type: ignore[no-untyped-def]
             _set_properties(fn, world, bodies[p], joints[p])
         total[:] = 0.0
         for level in range(len(counts)):
-            _forget(fn, world, bodies[p], normal_gravity, state)
-            state = _transition(
-                fn, world, bodies[p], forces, force_body, force_offset, laws[p],
-                start[t], actions[t], time_step / counts[level], counts[level], scratch,
-            )  # fmt: skip
+            before = state
+            for _ in range(2):
+                _forget(fn, world, bodies[p], normal_gravity, before)
+                state = _transition(
+                    fn, world, bodies[p], forces, force_body, force_offset, laws[p],
+                    start[t], actions[t], time_step / counts[level], counts[level], scratch,
+                )  # fmt: skip
+                if state != _TOUCHED or before == _TOUCHED:
+                    break
+                before = _TOUCHED  # contacts in the order of a new world: once more from there
             if state == _LOST:
                 return item
             if level == 0:

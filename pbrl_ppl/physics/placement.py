@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import combinations, product
+from functools import lru_cache
+from itertools import product
 
 import numpy as np
 import pymunk
+from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.world import _shapes, bounding_radius
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
@@ -17,6 +20,7 @@ from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 #: What is put down to noise and resting contact: a share of the smaller body's size.
 ALLOWED = 0.25
 _ORIGIN = (0.0, 0.0, 0.0)
+_CHUNK = 2048  # transitions at a time, to spare memory
 
 
 def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | None = None) -> None:
@@ -68,10 +72,33 @@ def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | No
         )
     complete = np.isfinite(start).all(axis=-1, keepdims=True)
     poses = np.where(complete, start[..., :3], np.nan)
-    faults = [*_apart(scene, poses), *_overlaps(scene, poses)]
-    if faults:
-        i, message = min(faults, key=lambda fault: fault[0])
-        raise SimulationError(f"{where(i) if where else f'transition {i}'}: {message}")
+    for begin in range(0, len(poses), _CHUNK):
+        part = poses[begin : begin + _CHUNK]
+        faults = [*_apart(scene, part), *_overlaps(scene, part)]
+        if faults:
+            first, message = min(faults, key=lambda fault: fault[0])
+            i = begin + first
+            raise SimulationError(f"{where(i) if where else f'transition {i}'}: {message}")
+
+
+def check_history(scene: Scene, history: History, segments: Segments) -> None:
+    """Refuse a history with start states that cannot be; see :func:`check_placement`.
+
+    Parameters
+    ----------
+    scene : Scene
+        Shapes, walls, static bodies and joints.
+    history : History
+        Gives the trajectories their names.
+    segments : Segments
+        Of the history.
+    """
+    names = history.dataset["trajectory"].values
+
+    def where(i: int) -> str:
+        return f"history trajectory {names[segments.trajectory[i]]}, step {segments.step[i]}"
+
+    check_placement(scene, segments.start, where)
 
 
 # -- joints ----------------------------------------------------------------------------------------
@@ -114,21 +141,54 @@ def _anchor_distance(joint: Joint, poses: list[Array]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Solid:
-    """A body, or a wall, and where it is in each transition.
+    """A body in its own frame, or a wall in the world's.
 
-    ``parts`` are convex: corners (k, 2) counter-clockwise in its frame and a radius about them
-    (one corner is a circle, two are a wall); ``core`` and ``reach`` are a part about all of them.
+    ``parts`` are convex: corners (k, 2) counter-clockwise and a radius about them; one corner is a
+    circle, two are a wall. All of them are within ``reach`` of the ``core``, a segment (2, 2).
     """
 
     name: str
-    poses: Array  # (transition, 3)
     parts: tuple[tuple[Array, float], ...]
     core: Array
     reach: float
     width: float
 
 
-def _solid(body: Body, poses: Array) -> _Solid:
+@dataclass(frozen=True, eq=False)
+class _Solids:
+    """What takes up room in a scene: moving bodies, then walls and static bodies."""
+
+    solids: tuple[_Solid, ...]
+    fixed: Array  # poses of those that do not move, (fixed, 3)
+    pairs: tuple[tuple[int, int], ...]  # those that may not overlap; the first one moves
+    allowed: Array  # (pair,)
+
+
+@lru_cache(maxsize=16)
+def _solids(scene: Scene) -> _Solids:
+    moving = [_solid(body) for body in scene.dynamic]
+    ends = [np.array([wall.start, wall.end]) for wall in scene.walls]
+    walls = [_Solid(WORLD, ((end, 0.0),), end, 0.0, np.inf) for end in ends]
+    static = [body for body in scene.bodies if body.static]
+    solids = [*moving, *walls, *(_solid(body) for body in static)]
+    fixed = [_ORIGIN] * len(walls) + [body.pose or _ORIGIN for body in static]
+    joined = [set(joint.bodies) for joint in scene.joints if joint.bodies is not None]
+    # a joint of unknown bodies could join any two of the moving ones and the world
+    anyhow = any(joint.bodies is None for joint in scene.joints)
+    first = len(moving) + len(walls) if anyhow else 0
+    pairs = [
+        (i, j)
+        for i in range(len(moving))
+        for j in range(max(i + 1, first), len(solids))
+        if {solids[i].name, solids[j].name} not in joined
+    ]
+    allowed = [ALLOWED * min(solids[i].width, solids[j].width) for i, j in pairs]
+    return _Solids(
+        tuple(solids), np.array(fixed, dtype=float).reshape(-1, 3), tuple(pairs), np.array(allowed)
+    )
+
+
+def _solid(body: Body) -> _Solid:
     parts: list[tuple[Array, float]] = []
     for shape in _shapes(body, pymunk.Body()):
         if isinstance(shape, pymunk.Poly):
@@ -139,32 +199,21 @@ def _solid(body: Body, poses: Array) -> _Solid:
     width = min(x_max - x_min, y_max - y_min)
     if len(parts) > 1:  # no part of a thin frame can lie as deep as the whole is wide
         width = min(width, max(float(np.ptp(corners, axis=0).min()) for corners, _ in parts))
-    return _Solid(body.name, poses, tuple(parts), np.zeros((1, 2)), bounding_radius(body), width)
+    return _Solid(body.name, tuple(parts), np.zeros((2, 2)), bounding_radius(body), width)
 
 
 def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
     """First transition and message of every two shapes that lie deep inside each other."""
-    still = np.zeros((len(poses), 3))
-    moving = [_solid(body, poses[:, i]) for i, body in enumerate(scene.dynamic)]
-    static = [_solid(body, still + body.pose) for body in scene.bodies if body.pose and body.static]
-    ends = [np.array([wall.start, wall.end]) for wall in scene.walls]
-    walls = [_Solid(WORLD, still, ((end, 0.0),), end, 0.0, np.inf) for end in ends]
-    joined = [set(joint.bodies) for joint in scene.joints if joint.bodies is not None]
-    anyhow = any(joint.bodies is None for joint in scene.joints)  # it could join any of joinable
-    for a, b in [*combinations(moving, 2), *product(moving, [*walls, *static])]:
-        if {a.name, b.name} in joined or (anyhow and b not in static):
-            continue
-        allowed = ALLOWED * min(a.width, b.width)
-        # two shapes overlap by no more than what is about them does
-        near = np.flatnonzero(
-            _depth((a.core, a.reach), a.poses, (b.core, b.reach), b.poses) > allowed
-        )
-        if not len(near):
-            continue
-        depth = np.max(
-            [_depth(p, a.poses[near], q, b.poses[near]) for p, q in product(a.parts, b.parts)],
-            axis=0,
-        )
+    world = _solids(scene)
+    fixed = np.broadcast_to(world.fixed, (len(poses), *world.fixed.shape))
+    poses = np.concatenate([poses, fixed], axis=1)
+    near = _near(world, poses)
+    for pair in np.flatnonzero(near.any(axis=0)):
+        i, j = world.pairs[pair]
+        a, b, allowed = world.solids[i], world.solids[j], world.allowed[pair]
+        rows = np.flatnonzero(near[:, pair])
+        at_a, at_b = poses[rows, i], poses[rows, j]
+        depth = np.max([_depth(p, at_a, q, at_b) for p, q in product(a.parts, b.parts)], axis=0)
         deep = np.flatnonzero(depth > allowed)
         if len(deep):
             what, whose = f'bodies "{a.name}" and "{b.name}"', "the smaller one's"
@@ -173,10 +222,24 @@ def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
                 what = f'body "{a.name}" and the wall from ({x:g}, {y:g}) to ({to_x:g}, {to_y:g})'
                 whose = "the body's"
             yield (
-                int(near[deep[0]]),
+                int(rows[deep[0]]),
                 f"{what} overlap by {depth[deep[0]]:.3g} m, allowed is {allowed:.3g} m (a quarter"
                 f" of {whose} width); correct the poses, the shapes or the walls",
             )
+
+
+def _near(world: _Solids, poses: Array) -> NDArray[np.bool_]:
+    """Which pairs may overlap by more than is allowed, shape (transition, pair).
+
+    They overlap by no more than the circles about them, or about one and a wall's segment.
+    """
+    i, j = np.array(world.pairs, dtype=int).reshape(-1, 2).T
+    cores = np.array([solid.core for solid in world.solids])
+    reach = np.array([solid.reach for solid in world.solids])
+    edge = cores[j, 1] - cores[j, 0]
+    arm = poses[:, i, :2] - poses[:, j, :2] - cores[j, 0]
+    gap = _to_segment(arm, edge)
+    return np.asarray(gap + world.allowed < reach[i] + reach[j])
 
 
 # -- geometry --------------------------------------------------------------------------------------
@@ -222,9 +285,14 @@ def _distance(point: Array, corners: Array) -> Array:
     """Distance of a point (n, 2) from corners (n, k, 2), negative inside a polygon, shape (n,)."""
     edge = np.roll(corners, -1, axis=1) - corners
     arm = point[:, None] - corners
-    square = np.maximum((edge**2).sum(axis=-1), np.finfo(float).tiny)  # a single corner has no edge
-    share = np.clip((arm * edge).sum(axis=-1) / square, 0.0, 1.0)
-    distance = np.hypot(*np.moveaxis(arm - share[..., None] * edge, -1, 0)).min(axis=1)
+    distance = _to_segment(arm, edge).min(axis=1)
     left = edge[..., 0] * arm[..., 1] >= edge[..., 1] * arm[..., 0]
     inside = left.all(axis=1) & (corners.shape[1] > 2)
     return np.asarray(np.where(inside, -distance, distance))
+
+
+def _to_segment(arm: Array, edge: Array) -> Array:
+    """Distance of points from segments, given from each one's begin (..., 2); it may be a point."""
+    square = np.maximum((edge**2).sum(axis=-1), np.finfo(float).tiny)
+    share = np.clip((arm * edge).sum(axis=-1) / square, 0.0, 1.0)
+    return np.asarray(np.hypot(*np.moveaxis(arm - share[..., None] * edge, -1, 0)))

@@ -22,6 +22,8 @@ COLLISION_SLOP = 1e-4
 GROOVE = 10.0
 #: Where bodies are parked (m), and for how long (s).
 FAR, TINY = 1e5, 1e-9
+#: Sizes of the engine's hash tables: the least that is more than what it holds.
+_TABLES = (5, 13, 23, 47, 97, 193, 389, 769, 1543, 3079, 6151, 12289)
 #: No body is this fast (m/s or rad/s): the engine has diverged.
 DIVERGED = 1e6
 
@@ -90,18 +92,17 @@ class World:
         self.links: list[Link] = []
         self.pivots: list[Pivot] = []
         self._by_name: dict[str, pymunk.Body] = {WORLD: self.space.static_body}
+        self._add_fixed()
         for i, body in enumerate(scene.dynamic):
             rigid = pymunk.Body(1.0, 1.0)
+            rigid.position = FAR * (i + 1.0), FAR
             self.bodies.append(rigid)
             self._by_name[body.name] = rigid
             self.space.add(rigid)
-            for shape in _shapes(body, rigid):
-                self.shapes.append((i, shape))
-                self.space.add(shape)
+            self.shapes += [(i, shape) for shape in _shapes(body, rigid)]
             if body.wheel:
                 self._add_wheel(i, rigid)
-        self._add_fixed()
-        self._part()
+        self._add_shapes()
         self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
         self._add_joints(hinges, joined)
         chained = not self.can_touch.all()
@@ -119,10 +120,20 @@ class World:
         ]
         self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
 
-    def _part(self) -> None:
-        """Step once with the bodies far apart: pairs are then found in an order without a past."""
-        for i, body in enumerate(self.bodies):
-            body.position = (FAR * (i + 1.0), FAR)
+    def _add_shapes(self) -> None:
+        """Add the moving shapes so that contacts are found in an order without a past.
+
+        The engine numbers shapes as they are added and visits them by that number modulo the size
+        of a hash table: the first must get a multiple of it, here and whenever they are added anew.
+        """
+        table = next(size for size in _TABLES if size > len(self.shapes))
+        self.padding = -len(self.shapes) % table
+        first = self.shapes[0][1]
+        for _ in range(-len(self.space.shapes) % table):
+            self.space.add(first)
+            self.space.remove(first)
+        for _, shape in self.shapes:
+            self.space.add(shape)
         self.space.step(TINY)
         for body in self.bodies:
             body.velocity = (0.0, 0.0)

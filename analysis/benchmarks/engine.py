@@ -1,0 +1,272 @@
+"""Speed of the engine as ratios, both sides measured in turn in one run.
+
+    python analysis/benchmarks/engine.py          # a table
+    python analysis/benchmarks/engine.py --json   # one JSON object
+
+Every ratio is the median of rounds in which the two sides follow each other, so that what else the
+machine does in the meantime hits both.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import numba
+import numpy as np
+import pymunk
+import pytensor
+import pytensor.tensor as pt
+
+from pbrl_ppl import Body, Scene, Shape, Simulator, SimulatorOp
+from pbrl_ppl.parameters import Layout
+from pbrl_ppl.physics import compiled
+from pbrl_ppl.physics.world import World
+from pbrl_ppl.prior import build_layout
+
+APARTMENT = Path(__file__).parents[2] / "models" / "apartment" / "scene.toml"
+G, TIME_STEP, SUBSTEPS, TRANSITIONS = 9.81, 0.1, 10, 100
+CART = {"mass": 8.0, "r": 0.2, "mu_c": 0.3, "w_x": -0.3, "w_y": 0.0, "w_theta": 0.1}
+CART |= {"mu_x": 0.05, "mu_y": 0.4}
+BOX = Shape.box(0.9, 0.55)
+ROUNDS = 5
+
+
+@dataclass(frozen=True)
+class Row:
+    """One ratio: what it compares, its bound, and how to measure both sides (s)."""
+
+    key: str
+    what: str
+    bound: str
+    above: Callable[[], float]
+    below: Callable[[], float]
+    offset: float = 0.0
+
+    def measure(self) -> float:
+        """Median over the rounds."""
+        return float(np.median([self.above() / self.below() for _ in range(ROUNDS)])) + self.offset
+
+
+def seconds(function: Callable[[], object], least: float = 0.1) -> float:
+    """Time of one call: the mean over as many as take ``least`` seconds."""
+    function()
+    calls, begin = 0, time.perf_counter()
+    while (elapsed := time.perf_counter() - begin) < least:
+        function()
+        calls += 1
+    return elapsed / calls
+
+
+def timed(function: Callable[[], object]) -> Callable[[], float]:
+    """The function's time, to be measured when it is asked for."""
+    return lambda: seconds(function)
+
+
+# -- the worlds ------------------------------------------------------------------------------------
+
+
+def cart_scene() -> Scene:
+    """A wheeled cart on a floor without walls."""
+    cart = Body("cart", BOX, wheel=True)
+    return Scene(time_step=TIME_STEP, substeps=SUBSTEPS, normal_gravity=G, bodies=(cart,))
+
+
+def cart_data(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Random start states (n, 1, 6) and wrenches (n, 1, 1, 3)."""
+    rng = np.random.default_rng(1)
+    start = rng.normal(0, [3.0, 3.0, 1.5, 1.5, 1.5, 1.0], (n, 1, 6))
+    return start, rng.normal(0, [40.0, 40.0, 5.0], (n, 1, 1, 3))
+
+
+def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Furniture about its reference poses, moving; pushes on all of it; parameters."""
+    rng = np.random.default_rng(2)
+    k = len(scene.dynamic)
+    start = rng.normal(0, [0.05, 0.05, 0.1, 0.5, 0.5, 0.5], (n, k, 6))
+    start[..., :3] += [body.pose for body in scene.dynamic]
+    layout = build_layout(scene)
+    phi = np.array([prior.centre for prior in layout.priors])
+    return phi, start, rng.normal(0, [60.0, 60.0, 10.0], (n, 1, k, 3))
+
+
+def naive(start: np.ndarray, actions: np.ndarray) -> np.ndarray:
+    """What one would write first: a new Space for each transition, stepped from Python."""
+    out = np.empty((len(start), 1, 1, 6))
+    step = TIME_STEP / SUBSTEPS
+    c, s = 10.0 * math.cos(CART["w_theta"]), 10.0 * math.sin(CART["w_theta"])
+    wheel = CART["w_x"], CART["w_y"]
+    for t, (state, action) in enumerate(zip(start[:, 0], actions[:, 0, 0], strict=True)):
+        space = pymunk.Space()
+        space.iterations = 5
+        body = pymunk.Body(CART["mass"], CART["mass"] * BOX.unit_moment)
+        shape = pymunk.Poly(body, BOX.outline)
+        shape.elasticity, shape.friction = CART["r"], CART["mu_c"]
+        ground = space.static_body
+        rolls = pymunk.GrooveJoint(
+            body, ground, (wheel[0] - c, wheel[1] - s), (wheel[0] + c, wheel[1] + s), (0, 0)
+        )
+        drags = pymunk.GrooveJoint(
+            body, ground, (wheel[0] + s, wheel[1] - c), (wheel[0] - s, wheel[1] + c), (0, 0)
+        )
+        rolls.max_bias = drags.max_bias = 0.0
+        rolls.max_force = CART["mu_y"] * CART["mass"] * G
+        drags.max_force = CART["mu_x"] * CART["mass"] * G
+        space.add(body, shape, rolls, drags)
+        body.position, body.angle = (state[0], state[1]), state[2]
+        body.velocity, body.angular_velocity = (state[3], state[4]), state[5]
+        for _ in range(SUBSTEPS):
+            body.force, body.torque = (action[0], action[1]), action[2]
+            theta = body.angle + body.angular_velocity * step
+            here = pymunk.Vec2d(*wheel).rotated(theta) + body.position + body.velocity * step
+            rolls.anchor_b = drags.anchor_b = here
+            space.step(step)
+        out[t, 0, 0] = (*body.position, body.angle, *body.velocity, body.angular_velocity)
+    return out
+
+
+@numba.njit(nogil=True)
+def _bare(fn, world, start, step, substeps):  # type: ignore[no-untyped-def]
+    body = world.bodies[0]
+    for t in range(len(start)):
+        compiled._call2(fn.cpBodySetPosition, body, start[t, 0, 0], start[t, 0, 1])
+        compiled._call1(fn.cpBodySetAngle, body, start[t, 0, 2])
+        compiled._call2(fn.cpBodySetVelocity, body, start[t, 0, 3], start[t, 0, 4])
+        compiled._call1(fn.cpBodySetAngularVelocity, body, start[t, 0, 5])
+        for _ in range(substeps):
+            compiled._call1(fn.cpSpaceStep, world.space, step)
+
+
+def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[], None]:
+    """The engine's own C stepping of the same world from the same states, and nothing else."""
+    world = World(simulator.scene)
+    given = simulator._properties(phi[None])
+    world.set_properties(given.bodies[0], given.joints[0])
+    pointers = compiled.pointers(world)
+
+    def run() -> None:
+        _bare(compiled.FUNCTIONS, pointers, start, TIME_STEP / SUBSTEPS, SUBSTEPS)
+        if not world.bodies:  # the world must outlive its pointers
+            raise RuntimeError
+
+    return run
+
+
+# -- the ratios ------------------------------------------------------------------------------------
+
+
+def rows() -> list[Row]:
+    """All ratios."""
+    scene = cart_scene()
+    layout = build_layout(scene)
+    phi = layout.to_vector(CART)
+    start, actions = cart_data(TRANSITIONS)
+    many = cart_data(10_000)
+    plain = Simulator(scene, layout, extrapolate=False)
+    usual = Simulator(scene, layout)
+    two = Simulator(scene, layout, threads=2)
+    np.testing.assert_allclose(
+        plain(phi, start, actions), naive(start, actions), rtol=1e-9, atol=1e-9
+    )
+    proposals = phi * (1 + 0.01 * np.arange(30))[:, None]
+
+    apartment = Scene.load(APARTMENT)
+    rooms = Simulator(apartment, build_layout(apartment), extrapolate=False)
+    furniture = apartment_data(apartment, TRANSITIONS)
+    bodies = len(apartment.dynamic)
+
+    return [
+        Row("naive_over_ours", "Python loop, a new Space a transition / ours, the same numbers",
+            ">= 11", timed(lambda: naive(start, actions)),
+            timed(lambda: plain(phi, start, actions))),
+        Row("naive_over_default", "the same / ours with extrapolation, the default",
+            "", timed(lambda: naive(start, actions)), timed(lambda: usual(phi, start, actions))),
+        Row("ours_over_c", "ours / bare C stepping of the same world from the same states",
+            "<= 1.7", timed(lambda: plain(phi, start, actions)), timed(bare(plain, phi, start))),
+        Row("two_threads", "two threads / one thread, throughput, 10,000 transitions",
+            ">= 1.7", timed(lambda: usual(phi, *many)), timed(lambda: two(phi, *many))),
+        Row("linear", "10,000 transitions / 100 transitions",
+            "<= 105", timed(lambda: usual(phi, *many)), timed(lambda: usual(phi, start, actions))),
+        Row("apartment_per_body", f"{bodies}-body apartment, a transition and body / single body",
+            "<= 2", lambda: seconds(lambda: rooms(*furniture)) / bodies,
+            timed(lambda: plain(phi, start, actions))),
+        Row("proposals_30", "30 proposals in one call / 30 calls",
+            "<= 1.0", timed(lambda: usual(proposals, start, actions)),
+            timed(lambda: [usual(each, start, actions) for each in proposals])),
+        Row("op_overhead", "the Op / the rollout it wraps, less one",
+            "<= 5 %", *op_sides(scene, layout, phi, start, actions), offset=-1.0),
+    ]  # fmt: skip
+
+
+def op_sides(
+    scene: Scene, layout: Layout, phi: np.ndarray, start: np.ndarray, actions: np.ndarray
+) -> tuple[Callable[[], float], Callable[[], float]]:
+    """A compiled pytensor function of the Op, and the Simulator; each call at another phi."""
+    op = SimulatorOp(scene, layout)
+    variable = pt.dvector("phi")
+    function = pytensor.function([variable], op(variable, start, actions), trust_input=True)
+    wiggle = np.random.default_rng(3)
+
+    def other() -> np.ndarray:
+        return phi * (1.0 + 1e-6 * wiggle.random())
+
+    return (
+        timed(lambda: function(other())),
+        timed(lambda: op.simulator(other(), start, actions)),
+    )
+
+
+def touching(scene: Scene) -> float:
+    """Share of the apartment's transitions in which shapes come close enough to touch."""
+    layout = build_layout(scene)
+    phi, start, actions = apartment_data(scene, TRANSITIONS)
+    one, two = (Simulator(scene, layout, extrapolate=each)(phi, start, actions) for each in (0, 1))
+    return float((one == two).all(axis=(1, 2, 3)).mean())
+
+
+def machine() -> str:
+    """What this was measured on."""
+    model = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.exists():
+        lines = [line for line in info.read_text().splitlines() if "model name" in line]
+        model = lines[0].split(":")[1].strip() if lines else model
+    return (
+        f"{model}, {os.cpu_count()} cores; Python {platform.python_version()},"
+        f" pymunk {pymunk.version}, numba {numba.__version__}, numpy {np.__version__},"
+        f" pytensor {version('pytensor')}"
+    )
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    as_json = parser.parse_args().json
+    measured = {row.key: (row, row.measure()) for row in rows()}
+    if as_json:
+        print(json.dumps({key: value for key, (_, value) in measured.items()}))
+        return
+    print(f"{machine()}\n")
+    print("| what | bound | measured |\n|---|---|---|")
+    for key, (row, value) in measured.items():
+        shown = f"{100 * value:.1f} %" if row.bound.endswith("%") else f"{value:.3g}"
+        print(f"| {row.what} [`{key}`] | {row.bound} | {shown} |")
+    share = touching(Scene.load(APARTMENT))
+    print(
+        f"\n{TRANSITIONS} transitions x {SUBSTEPS} substeps, one wheeled body, one thread unless it"
+        f" says\notherwise; medians of {ROUNDS}. In the apartment, shapes come close enough to"
+        f" touch in {100 * share:.0f} %\nof the transitions."
+    )
+
+
+if __name__ == "__main__":
+    main()
