@@ -135,8 +135,8 @@ def find_modes(
     priors = problem.layout.priors
     if problem.layout.discrete.any():
         raise FitError(
-            "which bodies a joint of the scene joins is unknown, and a fit does not search over that"
-            " yet; name its bodies in the scene, or sample the model with pm.sample"
+            "which bodies a joint of the scene joins is unknown, and a fit does not search over"
+            " that yet; name its bodies in the scene, or sample the model with pm.sample"
         )
     if initial is not None:
         return [_finish(problem, *_search(problem, inside(priors, initial)))]

@@ -172,6 +172,8 @@ def test_friction_of_a_hinge_needs_to_know_what_hangs_in_it() -> None:
 # -- the prior and the model -----------------------------------------------------------------------
 
 
+# PyMC 6 draws from a truncated normal with numba's object mode
+@pytest.mark.filterwarnings("ignore:Numba will use object mode:UserWarning")
 def test_anchors_are_bounded_by_the_body_that_holds_them() -> None:
     """Table 1: on the bounds of the body; in the world on those of the scene."""
     free = scene(Joint("hinge", known=False), walls=True)

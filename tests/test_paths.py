@@ -148,6 +148,19 @@ def test_plain_and_compiled_agree(case) -> None:
     np.testing.assert_allclose(got, expected[:2, :n], rtol=TOLERANCE[name], atol=TOLERANCE[name])
 
 
+def test_paths_agree_on_a_heavy_link_below_a_light_one() -> None:
+    """Both take more solver iterations there."""
+    sim, start, actions = chain()
+    phi = proposals(sim.layout, 2)
+    phi[:, sim.layout.index("mass", "upper")] = 0.05
+    phi[:, sim.layout.index("mass", "lower")] = [4.0, 10.0]
+    expected = sim(phi, start[:5], actions[:5])
+    got = like(sim, path="plain")(phi, start[:5], actions[:5])
+    np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
+    # one proposal's iterations are not the next one's
+    np.testing.assert_array_equal(sim(phi[::-1], start[:5], actions[:5]), expected[::-1])
+
+
 @pytest.mark.parametrize("threads", [2, 3])
 def test_threads_change_nothing(case, threads) -> None:
     _, sim, phi, start, actions, expected = case

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import platform
 import time
@@ -102,7 +101,6 @@ def naive(start: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """What one would write first: a new Space for each transition, stepped from Python."""
     out = np.empty((len(start), 1, 1, 6))
     step = TIME_STEP / SUBSTEPS
-    c, s = 10.0 * math.cos(CART["w_theta"]), 10.0 * math.sin(CART["w_theta"])
     wheel = CART["w_x"], CART["w_y"]
     for t, (state, action) in enumerate(zip(start[:, 0], actions[:, 0, 0], strict=True)):
         space = pymunk.Space()
@@ -111,23 +109,19 @@ def naive(start: np.ndarray, actions: np.ndarray) -> np.ndarray:
         shape = pymunk.Poly(body, BOX.outline)
         shape.elasticity, shape.friction = CART["r"], CART["mu_c"]
         ground = space.static_body
-        rolls = pymunk.GrooveJoint(
-            body, ground, (wheel[0] - c, wheel[1] - s), (wheel[0] + c, wheel[1] + s), (0, 0)
-        )
-        drags = pymunk.GrooveJoint(
-            body, ground, (wheel[0] + s, wheel[1] - c), (wheel[0] - s, wheel[1] + c), (0, 0)
-        )
-        rolls.max_bias = drags.max_bias = 0.0
-        rolls.max_force = CART["mu_y"] * CART["mass"] * G
-        drags.max_force = CART["mu_x"] * CART["mass"] * G
-        space.add(body, shape, rolls, drags)
+        along_x, along_y = (pymunk.PinJoint(body, ground, wheel, (0, 0)) for _ in range(2))
+        along_x.max_bias = along_y.max_bias = 0.0
+        along_x.max_force = CART["mu_x"] * CART["mass"] * G
+        along_y.max_force = CART["mu_y"] * CART["mass"] * G
+        space.add(body, shape, along_x, along_y)
         body.position, body.angle = (state[0], state[1]), state[2]
         body.velocity, body.angular_velocity = (state[3], state[4]), state[5]
         for _ in range(SUBSTEPS):
             body.force, body.torque = (action[0], action[1]), action[2]
             theta = body.angle + body.angular_velocity * step
             here = pymunk.Vec2d(*wheel).rotated(theta) + body.position + body.velocity * step
-            rolls.anchor_b = drags.anchor_b = here
+            axis = pymunk.Vec2d(1.0, 0.0).rotated(theta + CART["w_theta"])
+            along_x.anchor_b, along_y.anchor_b = here + axis, here + axis.perpendicular()
             space.step(step)
         out[t, 0, 0] = (*body.position, body.angle, *body.velocity, body.angular_velocity)
     return out

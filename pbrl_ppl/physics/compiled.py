@@ -23,7 +23,14 @@ from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.effects.base import Force
 from pbrl_ppl.physics.properties import COLUMNS, JOINT_COLUMNS
-from pbrl_ppl.physics.world import DIVERGED, FAR, GROOVE, TINY, World
+from pbrl_ppl.physics.world import (
+    DIVERGED,
+    FAR,
+    ITERATIONS_A_RATIO,
+    MOST_ITERATIONS,
+    TINY,
+    World,
+)
 
 #: The engine's functions in use, each by the name of its address.
 Functions = namedtuple(
@@ -48,9 +55,6 @@ Functions = namedtuple(
         "cpShapeSetElasticity",
         "cpShapeSetFriction",
         "cpConstraintSetMaxForce",
-        "cpGrooveJointSetGrooveA",
-        "cpGrooveJointSetGrooveB",
-        "cpGrooveJointSetAnchorB",
         "cpPivotJointSetAnchorA",
         "cpPivotJointSetAnchorB",
         "cpPinJointSetAnchorA",
@@ -192,11 +196,12 @@ class Pointers(NamedTuple):
 
     space: int
     iterations: int
+    chained: NDArray[np.bool_]
     padding: int
     bodies: NDArray[np.int64]
     shapes: NDArray[np.int64]
     shape_body: NDArray[np.int64]
-    wheels: NDArray[np.int64]  # (2, wheel): the groove along x, the groove along y
+    wheels: NDArray[np.int64]  # (2, wheel): the rod along x, the rod along y
     wheel_body: NDArray[np.int64]
     links: NDArray[np.int64]
     link_joint: NDArray[np.int64]
@@ -221,7 +226,8 @@ def pointers(world: World) -> Pointers:
     wheels, links, pivots = world.wheels, world.links, world.pivots
     return Pointers(
         space=int(ffi.cast("intptr_t", world.space._space)),
-        iterations=world.space.iterations,
+        iterations=world.iterations,
+        chained=world.chained,
         padding=world.padding,
         bodies=at([body._body for body in world.bodies]),
         shapes=at([shape._shape for _, shape in world.shapes]),
@@ -250,6 +256,18 @@ def pointers(world: World) -> Pointers:
 
 
 @numba.njit(nogil=True, cache=True)
+def _iterations(world, bodies):  # type: ignore[no-untyped-def]
+    """Solver iterations for these masses, as in World.set_properties."""
+    lightest, heaviest = np.inf, 0.0
+    for i in range(len(world.chained)):
+        if world.chained[i]:
+            lightest = min(lightest, bodies[i, _MASS])
+            heaviest = max(heaviest, bodies[i, _MASS])
+    enough = min(ITERATIONS_A_RATIO * (heaviest / lightest), MOST_ITERATIONS)
+    return max(world.iterations, int(enough))
+
+
+@numba.njit(nogil=True, cache=True)
 def _set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     for i in range(len(world.bodies)):
         _call1(fn.cpBodySetMass, world.bodies[i], bodies[i, _MASS])
@@ -260,13 +278,8 @@ def _set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
         _call1(fn.cpShapeSetFriction, world.shapes[j], row[_MU_C])
     for j in range(len(world.wheel_body)):
         row = bodies[world.wheel_body[j]]
-        x, y = row[_W_X], row[_W_Y]
-        c, s = GROOVE * math.cos(row[_W_THETA]), GROOVE * math.sin(row[_W_THETA])
-        along_x, along_y = world.wheels[0, j], world.wheels[1, j]
-        _call2(fn.cpGrooveJointSetGrooveA, along_x, x - c, y - s)
-        _call2(fn.cpGrooveJointSetGrooveB, along_x, x + c, y + s)
-        _call2(fn.cpGrooveJointSetGrooveA, along_y, x + s, y - c)
-        _call2(fn.cpGrooveJointSetGrooveB, along_y, x - s, y + c)
+        for wheel in world.wheels[:, j]:
+            _call2(fn.cpPinJointSetAnchorA, wheel, row[_W_X], row[_W_Y])
     for j in range(len(world.links)):
         link, row = world.links[j], joints[world.link_joint[j]]
         if world.link_rod[j]:
@@ -287,8 +300,8 @@ def _set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-un
     for j in range(len(world.wheel_body)):
         row = bodies[world.wheel_body[j]]
         load = on * row[_MASS] * normal_gravity
-        _call1(fn.cpConstraintSetMaxForce, world.wheels[0, j], row[_MU_Y] * load)
-        _call1(fn.cpConstraintSetMaxForce, world.wheels[1, j], row[_MU_X] * load)
+        _call1(fn.cpConstraintSetMaxForce, world.wheels[0, j], row[_MU_X] * load)
+        _call1(fn.cpConstraintSetMaxForce, world.wheels[1, j], row[_MU_Y] * load)
     for j in range(len(world.links)):
         _call1(fn.cpConstraintSetMaxForce, world.links[j], np.inf if on else 0.0)
     for j in range(len(world.pivot_body)):
@@ -306,7 +319,7 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
     joint's stored impulse is clipped to its greatest force, here zero.
     """
     if touched == _FREE and len(world.wheel_body) == 0 and len(world.links) == 0:
-        return
+        return  # nothing to forget
     for i in range(len(world.bodies)):
         if touched:
             _call2(fn.cpBodySetPosition, world.bodies[i], FAR * (i + 1.0), FAR)
@@ -326,7 +339,7 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
     _set_strengths(fn, world, bodies, normal_gravity, 0.0)
     _call_int(fn.cpSpaceSetIterations, world.space, 1)
     _call1(fn.cpSpaceStep, world.space, TINY)
-    _call_int(fn.cpSpaceSetIterations, world.space, world.iterations)
+    _call_int(fn.cpSpaceSetIterations, world.space, _iterations(world, bodies))
     _set_strengths(fn, world, bodies, normal_gravity, 1.0)
 
 
@@ -399,8 +412,10 @@ def _transition(  # type: ignore[no-untyped-def]
                 w_x, w_y = bodies[i, _W_X], bodies[i, _W_Y]
                 x = state[i, 0] + state[i, 3] * step + c * w_x - s * w_y
                 y = state[i, 1] + state[i, 4] * step + s * w_x + c * w_y
-                _call2(fn.cpGrooveJointSetAnchorB, world.wheels[0, j], x, y)
-                _call2(fn.cpGrooveJointSetAnchorB, world.wheels[1, j], x, y)
+                theta += bodies[i, _W_THETA]
+                c, s = math.cos(theta), math.sin(theta)
+                _call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x + c, y + s)
+                _call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x - s, y + c)
             _call1(fn.cpSpaceStep, world.space, step)
             for i in range(k):
                 body = world.bodies[i]

@@ -89,17 +89,16 @@ def _state(world: World, i: int) -> Array:
 
 
 def _place_wheels(world: World, bodies: Array, step: float) -> None:
-    """Put the ground's points where the wheels will be when the engine solves for velocities."""
+    """Put the rods' ends on the wheels' axes, as they will be when the engine solves for forces."""
     for wheel in world.wheels:
         body, row = world.bodies[wheel.body], bodies[wheel.body]
         theta = body.angle + body.angular_velocity * step
         c, s = math.cos(theta), math.sin(theta)
         x, y = row[COLUMN["w_x"]], row[COLUMN["w_y"]]
-        point = (
-            body.position.x + body.velocity.x * step + c * x - s * y,
-            body.position.y + body.velocity.y * step + s * x + c * y,
-        )
-        wheel.along_x.anchor_b = wheel.along_y.anchor_b = point
+        at_x = body.position.x + body.velocity.x * step + c * x - s * y
+        at_y = body.position.y + body.velocity.y * step + s * x + c * y
+        c, s = math.cos(theta + row[COLUMN["w_theta"]]), math.sin(theta + row[COLUMN["w_theta"]])
+        wheel.along_x.anchor_b, wheel.along_y.anchor_b = (at_x + c, at_y + s), (at_x - s, at_y + c)
 
 
 def near_contact(world: World) -> bool:

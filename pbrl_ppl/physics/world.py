@@ -14,12 +14,12 @@ from pbrl_ppl.physics.properties import COLUMN, Array
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 
 #: Solver iterations: one body with nothing to touch needs few (its wheel or hinge is then solved to
-#: rounding), a body among others the engine's default, a chain of joints more.
+#: rounding), a body among others the engine's default, a chain of joints more: about as many as a
+#: body is heavier than another (with fewer, a heavy link below a light one gains energy).
 ITERATIONS_ALONE, ITERATIONS, ITERATIONS_CHAINED = 5, 10, 30
+ITERATIONS_A_RATIO, MOST_ITERATIONS = 2, 2000
 #: Allowed overlap of shapes (m); the engine's default is meant for pixels.
 COLLISION_SLOP = 1e-4
-#: Half the length of a wheel's groove (m): the wheel never leaves it within a substep.
-GROOVE = 10.0
 #: Where bodies are parked (m), and for how long (s).
 FAR, TINY = 1e5, 1e-9
 #: Sizes of the engine's hash tables: the least that is more than what it holds.
@@ -30,14 +30,16 @@ DIVERGED = 1e6
 
 @dataclass
 class Wheel:
-    """J_w: two grooves in the body that slide along a point of the ground.
+    """J_w: two rods from the wheel to the ground, each of which resists motion along itself.
 
-    The point is put under the wheel every substep.
+    Their far ends are put on the wheel's axes, 1 m away, every substep; a rod is the engine's one
+    joint that acts along a line and leaves motion across it alone. (Its groove joint does not:
+    off-centre, it turns motion along the groove into a force across.)
     """
 
     body: int
-    along_x: pymunk.GrooveJoint  # lets the wheel roll along its x axis, resists across
-    along_y: pymunk.GrooveJoint
+    along_x: pymunk.PinJoint
+    along_y: pymunk.PinJoint
 
 
 @dataclass
@@ -105,10 +107,11 @@ class World:
         self._add_shapes()
         self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
         self._add_joints(hinges, joined)
-        chained = not self.can_touch.all()
+        #: Which bodies are joined to other moving ones.
+        self.chained = np.logical_not(self.can_touch.all(axis=1))
         alone = len(scene.bodies) == 1 and not scene.walls
-        self.space.iterations = (
-            ITERATIONS_CHAINED if chained else ITERATIONS_ALONE if alone else ITERATIONS
+        self.iterations = (
+            ITERATIONS_CHAINED if self.chained.any() else ITERATIONS_ALONE if alone else ITERATIONS
         )
         #: What the near-contact test needs: circles about bodies, and segments with a radius.
         self.radii = np.array([bounding_radius(body) for body in scene.dynamic])
@@ -158,9 +161,7 @@ class World:
 
     def _add_wheel(self, index: int, body: pymunk.Body) -> None:
         ground = self.space.static_body
-        along_x, along_y = (
-            pymunk.GrooveJoint(body, ground, (-GROOVE, 0), (GROOVE, 0), (0, 0)) for _ in range(2)
-        )
+        along_x, along_y = (pymunk.PinJoint(body, ground, (0, 0), (0, 0)) for _ in range(2))
         for joint in (along_x, along_y):
             joint.max_bias = 0.0  # friction resists motion; it does not pull back
             joint.max_force = 0.0
@@ -203,6 +204,10 @@ class World:
 
     def set_properties(self, bodies: Array, joints: Array) -> None:
         """Give the engine its numbers; shapes (body, column) and (joint, column)."""
+        mass = bodies[self.chained, COLUMN["mass"]]
+        ratio = mass.max() / mass.min() if len(mass) else 0.0
+        enough = min(ITERATIONS_A_RATIO * ratio, MOST_ITERATIONS)
+        self.space.iterations = max(self.iterations, int(enough))
         for i, body in enumerate(self.bodies):
             body.mass = bodies[i, COLUMN["mass"]]
             body.moment = bodies[i, COLUMN["moment"]]
@@ -212,12 +217,10 @@ class World:
         for wheel in self.wheels:
             row = bodies[wheel.body]
             load = row[COLUMN["mass"]] * self.scene.normal_gravity
-            x, y, theta = (row[COLUMN[name]] for name in ("w_x", "w_y", "w_theta"))
-            c, s = GROOVE * math.cos(theta), GROOVE * math.sin(theta)
-            wheel.along_x.groove_a, wheel.along_x.groove_b = (x - c, y - s), (x + c, y + s)
-            wheel.along_y.groove_a, wheel.along_y.groove_b = (x + s, y - c), (x - s, y + c)
-            wheel.along_x.max_force = row[COLUMN["mu_y"]] * load
-            wheel.along_y.max_force = row[COLUMN["mu_x"]] * load
+            place = row[COLUMN["w_x"]], row[COLUMN["w_y"]]
+            wheel.along_x.anchor_a = wheel.along_y.anchor_a = place
+            wheel.along_x.max_force = row[COLUMN["mu_x"]] * load
+            wheel.along_y.max_force = row[COLUMN["mu_y"]] * load
         for link in self.links:
             a_x, a_y, b_x, b_y, length = joints[link.joint]
             link.constraint.anchor_a, link.constraint.anchor_b = (a_x, a_y), (b_x, b_y)
