@@ -15,6 +15,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -172,6 +173,9 @@ def rows() -> list[Row]:
     )
     proposals = phi * (1 + 0.01 * np.arange(30))[:, None]
 
+    both = [bare(plain, phi, many[0]) for _ in range(2)]
+    pool = ThreadPoolExecutor(2)
+
     apartment = Scene.load(APARTMENT)
     rooms = Simulator(apartment, build_layout(apartment), extrapolate=False)
     furniture = apartment_data(apartment, TRANSITIONS)
@@ -187,6 +191,9 @@ def rows() -> list[Row]:
             "<= 1.7", timed(lambda: plain(phi, start, actions)), timed(bare(plain, phi, start))),
         Row("two_threads", "two threads / one thread, throughput, 10,000 transitions",
             ">= 1.7", timed(lambda: usual(phi, *many)), timed(lambda: two(phi, *many))),
+        Row("two_threads_c", "the same of the bare C stepping: what the machine gives", "",
+            lambda: seconds(lambda: [run() for run in both]),
+            lambda: seconds(lambda: list(pool.map(lambda run: run(), both)))),
         Row("linear", "10,000 transitions / 100 transitions",
             "<= 105", timed(lambda: usual(phi, *many)), timed(lambda: usual(phi, start, actions))),
         Row("apartment_per_body", f"{bodies}-body apartment, a transition and body / single body",

@@ -320,15 +320,12 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
     """
     if touched == _FREE and len(world.wheel_body) == 0 and len(world.links) == 0:
         return  # nothing to forget
-    for i in range(len(world.bodies)):
-        if touched:
+    if touched:
+        for i in range(len(world.bodies)):
             _call2(fn.cpBodySetPosition, world.bodies[i], FAR * (i + 1.0), FAR)
             _call1(fn.cpBodySetAngle, world.bodies[i], 0.0)
-        _call2(fn.cpBodySetVelocity, world.bodies[i], 0.0, 0.0)
-        _call1(fn.cpBodySetAngularVelocity, world.bodies[i], 0.0)
-        _call2(fn.cpBodySetForce, world.bodies[i], 0.0, 0.0)
-        _call1(fn.cpBodySetTorque, world.bodies[i], 0.0)
-    if touched:
+            _call2(fn.cpBodySetVelocity, world.bodies[i], 0.0, 0.0)
+            _call1(fn.cpBodySetAngularVelocity, world.bodies[i], 0.0)
         for shape in world.shapes:
             _call_pointer(fn.cpSpaceRemoveShape, world.space, shape)
         for _ in range(world.padding):  # see World._add_shapes
@@ -376,6 +373,10 @@ def _transition(  # type: ignore[no-untyped-def]
     state = start.copy()
     command = np.zeros(3)
     wrench = np.zeros((k, 3))
+    axes = np.empty((len(world.wheel_body), 2))
+    for j in range(len(axes)):
+        turn = bodies[world.wheel_body[j], _W_THETA]
+        axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
     touched = _FREE
     watch = len(world.obstacles) > 0 or k > 1
     for i in range(k):
@@ -412,8 +413,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 w_x, w_y = bodies[i, _W_X], bodies[i, _W_Y]
                 x = state[i, 0] + state[i, 3] * step + c * w_x - s * w_y
                 y = state[i, 1] + state[i, 4] * step + s * w_x + c * w_y
-                theta += bodies[i, _W_THETA]
-                c, s = math.cos(theta), math.sin(theta)
+                c, s = c * axes[j, 0] - s * axes[j, 1], s * axes[j, 0] + c * axes[j, 1]
                 _call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x + c, y + s)
                 _call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x - s, y + c)
             _call1(fn.cpSpaceStep, world.space, step)

@@ -6,6 +6,7 @@ import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
+from queue import SimpleQueue
 
 import numpy as np
 from numpy.typing import NDArray
@@ -242,9 +243,6 @@ class Simulator:
     def _run_compiled(
         self, joined: Joined, given: EngineInput, start: Array, actions: Array, out: Array
     ) -> None:
-        # a chunk a thread; with few items a thread costs more than it gives
-        workers = min(self.threads, max(1, len(out) // 8))
-        edges = np.linspace(0, len(out), workers + 1).astype(int)
         shared = (
             given.bodies, given.joints, given.laws, *self._forces, start, actions,
             self.scene.time_step, self.scene.normal_gravity, *self.levels,
@@ -260,6 +258,7 @@ class Simulator:
                     engine.renew(self._new_world(joined))
                 first = stop + 1
 
+        workers = min(self.threads, max(1, len(out) // 8))  # fewer items are not worth a thread
         with self._lock:
             engines = self._worlds.setdefault(joined, [])
             self._worlds.move_to_end(joined)
@@ -270,8 +269,22 @@ class Simulator:
             if workers == 1:
                 run(engines[0], 0, len(out))
                 return
+            # chunks, so that a thread which the machine slows down takes fewer of them
+            chunks = min(8 * workers, max(workers, len(out) // 64))
+            edges = np.linspace(0, len(out), chunks + 1).astype(int)
+            idle: SimpleQueue[_Engine] = SimpleQueue()
+            for engine in engines[:workers]:
+                idle.put(engine)
+
+            def serve(first: int, last: int) -> None:
+                engine = idle.get()
+                try:
+                    run(engine, first, last)
+                finally:
+                    idle.put(engine)
+
             with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(run, engines, edges[:-1], edges[1:]))
+                list(pool.map(serve, edges[:-1], edges[1:]))
 
 
 class _Engine:
