@@ -1,133 +1,221 @@
-"""Metropolis with a multivariate proposal that learns the posterior's shape while tuning."""
+"""Metropolis in blocks that learn the posterior's shape, with a cheap posterior to look ahead."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 from pymc.blocking import RaveledVars
-from pymc.step_methods.metropolis import MetropolisState
+from pymc.pytensorf import compile as compile_function
+from pymc.pytensorf import join_nonshared_inputs
+from pymc.step_methods.arraystep import ArrayStepShared
+from pymc.step_methods.compound import StepMethodState
 from pymc.step_methods.state import dataclass_state
+from pymc.util import get_value_vars_from_user_vars
 from scipy.linalg import solve_triangular
 
 Array = NDArray[np.float64]
 
 #: Best acceptance rate of a random walk in many dimensions (Roberts, Gelman and Gilks, 1997).
 TARGET_ACCEPTANCE = 0.234
-#: The Laplace covariance counts as much as this many draws.
-_PRIOR_DRAWS = 300
+#: The first guess of a covariance counts as much as this many steps.
+_GUESS = 300
 _LARGEST_BETA = float(np.log(0.95))
 
 
-@dataclass_state
-class AdaptiveState(MetropolisState):
-    """What a chain must not inherit from the one before it."""
-
-    factor: Array
-    covariance: Array
-    mean: Array
-    log_scale: float
-    log_beta: float
-    seen: int
-
-
-class AdaptiveMetropolis(pm.Metropolis):
-    """Blocked Metropolis, adapted as in algorithm 4 of Andrieu and Thoms (2008).
+@dataclass(eq=False)
+class Gaussian:
+    """What is known of a block's posterior, in the sampler's unconstrained space, and its moves.
 
     Two proposals take turns at random: a random walk, which finds its way anywhere, and a
-    Crank-Nicolson step that is reversible for the Gaussian learned so far (Rudolf and Sprungk,
-    2018), which makes large moves where the posterior is close to one. Mean, covariance and both
-    step sizes learn from the chain while tuning and are fixed afterwards. One draw is the last of
-    ``thin`` steps.
+    Crank-Nicolson step that is reversible for this Gaussian (Rudolf and Sprungk, 2018), which makes
+    large moves where the posterior is close to one. Mean, covariance and both step sizes learn as
+    in algorithm 4 of Andrieu and Thoms (2008).
+
+    Parameters
+    ----------
+    places : ndarray
+        Places of the block's d entries in the vector of all variables, shape (d,).
+    mean, covariance : ndarray
+        First guess, shapes (d,) and (d, d).
+    cheap : bool
+        Whether moves cost nothing to speak of, as those of the noise do: then there is no need to
+        look ahead.
+    """
+
+    places: NDArray[np.intp]
+    mean: Array
+    covariance: Array
+    cheap: bool = False
+    factor: Array = field(init=False)
+    log_scale: float = field(init=False)
+    log_beta: float = float(np.log(0.6))
+    seen: int = 0
+
+    def __post_init__(self) -> None:
+        """Start from the best scale for a Gaussian."""
+        self.factor = np.asarray(np.linalg.cholesky(self.covariance), dtype=float)
+        self.log_scale = float(np.log(2.38 / np.sqrt(max(len(self.places), 1))))
+
+    def depth(self, x: Array) -> float:
+        """Minus the log-density, up to a constant."""
+        z = solve_triangular(self.factor, x - self.mean, lower=True)
+        return float(0.5 * z @ z)
+
+    def propose(self, x: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, float]:
+        """A proposal, and the logarithm of the Hastings ratio."""
+        noise = self.factor @ rng.standard_normal(len(x))
+        if walk:
+            return x + np.exp(self.log_scale) * noise, 0.0
+        beta = np.exp(self.log_beta)
+        proposal = self.mean + np.sqrt(1 - beta**2) * (x - self.mean) + beta * noise
+        return proposal, self.depth(proposal) - self.depth(x)
+
+    def learn(self, x: Array, rate: float, walk: bool) -> None:
+        """Take account of where the chain is, and of the last proposal's acceptance rate."""
+        self.seen += 1
+        gain = 1.0 / (self.seen + _GUESS)
+        change = (rate - TARGET_ACCEPTANCE) * self.seen**-0.6
+        if walk:
+            self.log_scale += change
+        else:
+            self.log_beta = min(self.log_beta + change, _LARGEST_BETA)
+        off = x - self.mean
+        self.mean = self.mean + gain * off
+        self.covariance = self.covariance + gain * (np.outer(off, off) - self.covariance)
+        if self.seen % 50 == 0:
+            ridge = 1e-9 * np.diag(np.diag(self.covariance))
+            factor = np.linalg.cholesky(self.covariance + ridge)
+            self.factor = np.asarray(factor, dtype=float)
+
+
+@dataclass_state
+class AdaptiveState(StepMethodState):
+    """What a chain must not inherit from the one before it."""
+
+    tune: bool
+    blocks: list[Gaussian]
+
+
+class AdaptiveMetropolis(ArrayStepShared):
+    """Adaptive Metropolis, block by block, that looks ahead with a cheap posterior.
+
+    With ``rough``, a block makes ``inner`` steps under that cheap posterior, and where they end is
+    accepted or not by the exact one
+    (while tuning, always): the surrogate transition method (Liu, 2001, section 9.4.3;
+    delayed acceptance, Christen and Fox, 2005, is the case of one step). The result is exact
+    whatever ``rough`` is; a good one gives nearly independent draws.
 
     Parameters
     ----------
     vars : list
-        Random variables of the block.
-    mean, covariance : ndarray
-        First guess of the block's posterior in the sampler's unconstrained space.
+        The model's random variables, all of them.
+    blocks : list of Gaussian
+        What moves together, and a first guess of its posterior; together they hold every entry.
+    rough : callable, optional
+        Log-density of the cheap posterior, up to a constant, at a vector of all variables in the
+        sampler's unconstrained space.
+    inner : int
+        Steps under it for each one that is judged exactly.
     thin : int
-        Metropolis steps a draw.
+        Rounds over the blocks a draw.
+    model : pymc.Model, optional
+        The context's by default.
+    initial_point : dict, optional
+        As PyMC's samplers pass it.
+    rng : Generator or int, optional
+        Source of randomness.
     **kwargs
-        As for :class:`pymc.Metropolis`.
+        What else PyMC passes to step methods.
     """
 
     name = "adaptive_metropolis"
     default_blocked = True
     stats_dtypes_shapes: ClassVar[dict[str, tuple[type, list[int]]]] = {
         "accept": (np.float64, []),
-        "accepted": (np.float64, []),
-        "scaling": (np.float64, []),
-        "beta": (np.float64, []),
+        "look_ahead_accept": (np.float64, []),
+        "tune": (bool, []),
     }
     _state_class = AdaptiveState
 
     def __init__(
-        self, vars: Any, *, mean: Array, covariance: Array, thin: int = 1, **kwargs: Any
+        self,
+        vars: Any,
+        *,
+        blocks: list[Gaussian],
+        rough: Callable[[Array], float] | None = None,
+        inner: int = 10,
+        thin: int = 1,
+        model: pm.Model | None = None,
+        initial_point: dict[str, Array] | None = None,
+        rng: Any = None,
+        **kwargs: Any,
     ) -> None:
-        super().__init__(vars, S=covariance, **{"blocked": True, **kwargs})
-        self.elemwise_update = False  # all dimensions move together
-        self.enum_dims = np.arange(1)
-        self.accept_rate_iter = np.zeros(1)
-        self.accepted_iter = np.zeros(1, dtype=bool)
-        self.accepted_sum = np.zeros(1, dtype=int)
-        self.thin = thin
-        self.covariance = covariance.copy()
-        self.factor = np.linalg.cholesky(covariance)
-        self.mean = mean.copy()
-        self.log_scale = float(np.log(2.38 / np.sqrt(len(covariance))))
-        self.log_beta = float(np.log(0.6))
-        self.seen = 0
+        model = pm.modelcontext(model)
+        point = model.initial_point() if initial_point is None else initial_point
+        values = get_value_vars_from_user_vars(vars, model)
+        self.tune = True
+        self.blocks, self.rough, self.inner, self.thin = blocks, rough, inner, thin
+        shared = pm.make_shared_replacements(point, values, model)
+        (logp,), joined = join_nonshared_inputs(
+            point=point, outputs=[model.logp()], inputs=values, shared_inputs=shared
+        )
+        self.logp = compile_function([joined], logp)
+        self.logp.trust_input = True
+        super().__init__(values, shared, blocked=True, rng=rng)
 
     def astep(self, q0: RaveledVars) -> tuple[RaveledVars, list[dict[str, Any]]]:
-        """Take ``thin`` Metropolis steps."""
-        q = q0.data
-        accepted = 0
+        """Go ``thin`` times over the blocks."""
+        q = q0.data.copy()
+        # the exact posterior is for the draws that are kept: tuning makes do with the rough one
+        near = self.logp if self.rough is None or not self.tune else self.rough
+        here = float(near(q))
+        rates, exact = [], []
         for _ in range(self.thin):
-            walk = self.rng.uniform() < 0.5
-            noise = self.factor @ self.rng.standard_normal(len(q))
-            if walk:
-                proposal = q + np.exp(self.log_scale) * noise
-                correction = 0.0
-            else:
-                beta = np.exp(self.log_beta)
-                proposal = self.mean + np.sqrt(1 - beta**2) * (q - self.mean) + beta * noise
-                correction = self._depth(proposal) - self._depth(q)
-            log_ratio = float(self.delta_logp(proposal, q)) + correction
-            rate = float(np.exp(min(0.0, log_ratio))) if np.isfinite(log_ratio) else 0.0
-            if self.rng.uniform() < rate:
-                q = proposal
-                accepted += 1
-            if self.tune:
-                self._learn(q, rate, walk)
-        self.accept_rate_iter = np.array([rate])
-        self.scaling = np.atleast_1d(np.exp(self.log_scale))
+            for block in self.blocks:
+                if self.rough is None or block.cheap:
+                    q, here, rate = self._move(block, q, here, near)
+                    rates.append(rate)
+                    continue
+                begin = rough = here if near is self.rough else self.rough(q)
+                y = q
+                for _ in range(self.inner):
+                    y, rough, rate = self._move(block, y, rough, self.rough)
+                    rates.append(rate)
+                if near is self.rough:
+                    q, here = y, rough
+                elif y is not q:
+                    there = float(self.logp(y))
+                    exact.append(_rate((there - here) - (rough - begin)))
+                    if self.rng.uniform() < exact[-1]:
+                        q, here = y, there
         stats = {
-            "scaling": float(np.exp(self.log_scale)),
-            "beta": float(np.exp(self.log_beta)),
-            "accept": rate,
-            "accepted": accepted / self.thin,
+            "accept": float(np.mean(rates)),
+            "look_ahead_accept": float(np.mean(exact)) if exact else np.nan,
+            "tune": self.tune,
         }
         return RaveledVars(q, q0.point_map_info), [stats]
 
-    def _depth(self, q: Array) -> float:
-        """Minus the log-density of the learned Gaussian, up to a constant."""
-        z = solve_triangular(self.factor, q - self.mean, lower=True)
-        return float(0.5 * z @ z)
+    def _move(
+        self, block: Gaussian, q: Array, here: float, density: Callable[[Array], Any]
+    ) -> tuple[Array, float, float]:
+        """One Metropolis step of a block: where it ends, the density there, the acceptance rate."""
+        walk = bool(self.rng.uniform() < 0.5)
+        moved = q.copy()
+        moved[block.places], correction = block.propose(q[block.places], walk, self.rng)
+        there = float(density(moved))
+        rate = _rate(there - here + correction)
+        if self.rng.uniform() < rate:
+            q, here = moved, there
+        if self.tune:
+            block.learn(q[block.places], rate, walk)
+        return q, here, rate
 
-    def _learn(self, q: Array, rate: float, walk: bool) -> None:
-        self.seen += 1
-        gain = 1.0 / (self.seen + _PRIOR_DRAWS)
-        change = (rate - TARGET_ACCEPTANCE) * self.seen**-0.6
-        if walk:
-            self.log_scale += change
-        else:
-            self.log_beta = min(self.log_beta + change, _LARGEST_BETA)
-        off = q - self.mean
-        self.mean = self.mean + gain * off
-        self.covariance = self.covariance + gain * (np.outer(off, off) - self.covariance)
-        if self.seen % 50 == 0:
-            ridge = 1e-9 * np.diag(np.diag(self.covariance))
-            self.factor = np.linalg.cholesky(self.covariance + ridge)
+
+def _rate(log_ratio: float) -> float:
+    """Probability to accept; none where a density is not a number."""
+    return float(np.exp(min(0.0, log_ratio))) if not np.isnan(log_ratio) else 0.0

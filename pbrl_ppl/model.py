@@ -12,6 +12,7 @@ import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 
+from pbrl_ppl.coupling import Parts, independent_parts
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, Segments
@@ -26,11 +27,14 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.op import SimulatorOp
 from pbrl_ppl.parameters import Block, Layout
-from pbrl_ppl.physics import Simulator, check_history
+from pbrl_ppl.physics import PartedSimulator, check_history
 from pbrl_ppl.prior import build_layout, random_variable
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
+
+#: Engine steps an interval where a rough answer will do.
+COARSE = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +59,8 @@ class Problem:
         Spread of the start state's noise over the predictions.
     threads : int
         Engine worlds that run side by side.
+    extrapolate : bool
+        Whether the engine's leading errors are cancelled.
     """
 
     scene: Scene
@@ -65,6 +71,7 @@ class Problem:
     scalar_sigma: bool = False
     noise: StartNoise | None = None
     threads: int = 1
+    extrapolate: bool = True
     layout: Layout = field(init=False)
 
     def __post_init__(self) -> None:
@@ -88,23 +95,47 @@ class Problem:
         return Observations.of(self.segments)
 
     @cached_property
-    def simulator(self) -> Simulator:
+    def parts(self) -> Parts:
+        """Moving bodies that have to do with each other, together."""
+        return independent_parts(self.scene, self.history)
+
+    @cached_property
+    def simulator(self) -> PartedSimulator:
         """The engine for this scene with these effects."""
-        return Simulator(
-            self.scene, self.layout, self.effects, substeps=self.substeps, threads=self.threads
+        return PartedSimulator(
+            self.scene,
+            self.layout,
+            self.effects,
+            self.parts,
+            substeps=self.substeps,
+            threads=self.threads,
+            extrapolate=self.extrapolate,
         )
 
-    def predict(self, phi: Array) -> Array:
+    @cached_property
+    def coarse(self) -> PartedSimulator:
+        """The same with few substeps: it costs little, and its derivative is nearly right."""
+        return PartedSimulator(
+            self.scene,
+            self.layout,
+            self.effects,
+            self.parts,
+            substeps=min(COARSE, self.substeps),
+            threads=self.threads,
+            extrapolate=False,
+        )
+
+    def predict(self, phi: Array, engine: PartedSimulator | None = None) -> Array:
         """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""
-        return self.simulator(phi, self.segments.start, self.segments.actions)
+        return (engine or self.simulator)(phi, self.segments.start, self.segments.actions)
 
-    def residual(self, phi: Array) -> Array:
+    def residual(self, phi: Array, engine: PartedSimulator | None = None) -> Array:
         """Measured minus predicted, shape (..., transition, H, body, state)."""
-        return self.observations.residual(self.predict(phi))
+        return self.observations.residual(self.predict(phi, engine))
 
-    def whitened(self, phi: Array, sigma: Array) -> Array:
+    def whitened(self, phi: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
         """Residuals in units of their noise, shape (..., transition, cell)."""
-        return whiten(self.residual(phi), sigma, self.noise)
+        return whiten(self.residual(phi, engine), sigma, self.noise)
 
     def sensitivity(self, phi: Array, steps: Array) -> Array:
         """Derivative of the predictions by the measured start state, F.
@@ -226,7 +257,7 @@ def build_model(problem: Problem) -> pm.Model:
     """Declare the pm.Model of a problem; see :func:`physics_model`."""
     observations, segments, layout = problem.observations, problem.segments, problem.layout
     simulate = SimulatorOp(
-        problem.scene, layout, problem.effects, problem.substeps, problem.threads
+        problem.scene, layout, problem.effects, problem.substeps, problem.threads, problem.parts
     )
     with pm.Model(coords=_coords(problem)) as model:
         start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))

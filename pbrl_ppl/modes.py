@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +14,9 @@ from scipy.optimize import least_squares, minimize
 from pbrl_ppl.differences import differentiate
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import StartNoise, estimate_sigma, log_density, whiten
-from pbrl_ppl.model import Problem
+from pbrl_ppl.model import COARSE, Problem
 from pbrl_ppl.parameters import Prior
+from pbrl_ppl.physics import PartedSimulator
 
 Array = NDArray[np.float64]
 
@@ -23,7 +25,12 @@ _MARGIN = 1e-6
 #: A residual beyond this many noise units says no more about where the mode is.
 _SCREEN_CLIP = 1e3
 #: Transitions used to tell basins apart, and how many of the best are searched with all data.
-_PART, _POLISHED = 100, 2
+_PART, _POLISHED = 60, 2
+#: Gains in log-posterior: less is not worth another round; more shows that the coarse derivative
+#: had not led to the top. (Friction makes the top rough: some units are within its grain.)
+_STALLED, _WORTHWHILE = 0.02, 5.0
+#: Parameters this close, as a share of their scale, are the same mode.
+_SAME = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,37 +146,55 @@ def find_modes(
             " that yet; name its bodies in the scene, or sample the model with pm.sample"
         )
     if initial is not None:
-        return [_finish(problem, *_search(problem, inside(priors, initial)))]
+        near = _climb(problem, inside(priors, initial), problem.coarse)
+        return [_finish(problem, *_polish(problem, near))]
     if not priors:  # everything is known but the noise
-        return [_finish(problem, *_search(problem, np.zeros(0)))]
+        return [_finish(problem, *_climb(problem, np.zeros(0), problem.coarse))]
     rng = np.random.default_rng(seed)
     draws = np.stack([prior.sample(rng, screened) for prior in priors], axis=1)
     draws = np.vstack([[prior.centre for prior in priors], draws])
     draws = inside(priors, draws)
-    # the basins show in a part of the data already
+    # the basins show in a part of the data already, and with few engine steps
     part = _part(problem, _PART)
     residual = part.residual(draws)
     sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations.measured, None)
     z = np.nan_to_num(residual / sigma, nan=_SCREEN_CLIP).reshape(len(draws), -1)
     # log(1 + z^2): a good start fits most transitions, not the worst one
     order = np.argsort(np.log1p(np.minimum(z, _SCREEN_CLIP) ** 2).sum(axis=1))
-    rough = [_search(part, draws[i]) for i in order[:starts]]
+    rough = [_climb(part, draws[i], part.simulator) for i in order[:starts]]
     rough.sort(key=lambda result: -result[2])
-    found = [_search(problem, phi) for phi, _, _ in rough[:_POLISHED]]
+    found: list[tuple[Array, Array, float]] = []
+    for phi, _, _ in _distinct(problem, rough)[:_POLISHED]:
+        found.append(_climb(problem, phi, problem.coarse))
     found.sort(key=lambda result: -result[2])
-    return [_finish(problem, *result) for result in found]
+    best = _polish(problem, found[0])
+    return [_finish(problem, *result) for result in (best, *found[1:])]
+
+
+def _distinct(
+    problem: Problem, found: list[tuple[Array, Array, float]]
+) -> list[tuple[Array, Array, float]]:
+    """Leave out what is another description of one before it, or has climbed to the same place."""
+    kept: list[tuple[Array, Array, float]] = []
+    for result in found:
+        phi = fold_wheels(problem, result[0])
+        scale = _SAME * problem.layout.scale(phi)
+        if not any((np.abs(fold_wheels(problem, one[0]) - phi) < scale).all() for one in kept):
+            kept.append(result)
+    return kept
 
 
 def _part(problem: Problem, transitions: int) -> Problem:
-    """The problem on evenly chosen trajectories that hold about so many transitions."""
+    """The problem, roughly, on evenly chosen trajectories of about so many transitions."""
     history = problem.history
+    rough = replace(problem, substeps=min(COARSE, problem.substeps), extrapolate=False)
     share = transitions / max(problem.segments.n, 1)
     count = max(2, math.ceil(share * history.n_trajectories))
     if problem.noise is not None or count >= history.n_trajectories:
-        return problem
+        return rough
     chosen = np.linspace(0, history.n_trajectories - 1, count).astype(int)
-    part = replace(problem, history=history.select(chosen))
-    return part if part.observations.columns == problem.observations.columns else problem
+    part = replace(rough, history=history.select(chosen))
+    return part if part.observations.columns == problem.observations.columns else rough
 
 
 def find_mode(
@@ -179,48 +204,68 @@ def find_mode(
     return find_modes(problem, seed=seed, initial=initial)[0]
 
 
-def _search(problem: Problem, phi: Array) -> tuple[Array, Array, float]:
-    """Alternate between phi by least squares and sigma by maximum likelihood."""
+def _polish(problem: Problem, found: tuple[Array, Array, float]) -> tuple[Array, Array, float]:
+    """Go on by the exact engine's derivative, as far as that leads."""
+    if not problem.layout.size:
+        return found
+    exact = _climb(problem, found[0], problem.simulator, rounds=1, tries=2)
+    if exact[2] < found[2] + _WORTHWHILE:
+        return max(found, exact, key=lambda result: result[2])
+    return _climb(problem, exact[0], problem.simulator)
+
+
+def _climb(
+    problem: Problem, phi: Array, slope: PartedSimulator, rounds: int = 40, tries: int = 4
+) -> tuple[Array, Array, float]:
+    """Alternate between phi by least squares and sigma by maximum likelihood.
+
+    Derivatives are taken through the engine ``slope``.
+    """
     priors = problem.layout.priors
     lower, upper = _box(priors)
-    sigma = profile_sigma(problem, problem.residual(phi))
+    sigma, value = _at(problem, phi)
     if not priors:
-        return phi, sigma, _log_posterior(problem, phi, sigma)
+        return phi, sigma, value
     steps = 1e-3 * problem.layout.scale(phi)
-    value = -np.inf
-    for _ in range(40):
 
-        def residual(points: Array, sigma: Array = sigma) -> Array:
-            z = problem.whitened(points, sigma).reshape(*points.shape[:-1], -1)
-            z = np.nan_to_num(z, nan=_SCREEN_CLIP, posinf=_SCREEN_CLIP, neginf=-_SCREEN_CLIP)
-            return np.concatenate([z, prior_residual(priors, points)], axis=-1)
+    def whole(points: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
+        z = problem.whitened(points, sigma, engine).reshape(*points.shape[:-1], -1)
+        z = np.nan_to_num(z, nan=_SCREEN_CLIP, posinf=_SCREEN_CLIP, neginf=-_SCREEN_CLIP)
+        return np.concatenate([z, prior_residual(priors, points)], axis=-1)
 
-        def jacobian(
-            point: Array, residual: Callable[[Array], Array] = residual, steps: Array = steps
-        ) -> Array:
+    for _ in range(rounds):
+
+        def residual(point: Array, sigma: Array = sigma) -> Array:
+            return whole(point, sigma)
+
+        def jacobian(point: Array, sigma: Array = sigma, steps: Array = steps) -> Array:
             size = np.minimum(steps, 0.1 * np.maximum(np.abs(point), steps))
-            return differentiate(residual, point, size, lower, upper)
+            return differentiate(
+                lambda points: whole(points, sigma, slope), point, size, lower, upper
+            )
 
         result = least_squares(
-            residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=4,
+            residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=tries,
             ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
-        phi = result.x
+        sigma, improved = _at(problem, result.x)
+        if improved < value:
+            sigma = _at(problem, phi)[0]
+            break
+        phi, gain, value = result.x, improved - value, improved
+        if gain < _STALLED:
+            break
         size = np.sqrt((result.jac**2).sum(axis=0))
         steps = np.clip(1.0 / np.maximum(size, 1e-12), 1e-6, 0.1)
-        sigma = profile_sigma(problem, problem.residual(phi))
-        improved = _log_posterior(problem, phi, sigma)
-        if improved - value < 0.02:
-            break
-        value = improved
-    return phi, sigma, improved
+    return phi, sigma, value
 
 
-def _log_posterior(problem: Problem, phi: Array, sigma: Array) -> float:
-    residual = problem.residual(phi)
-    measured = problem.observations.measured
+def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
+    """The most likely sigma at phi, and the log-posterior there."""
+    residual, measured = problem.residual(phi), problem.observations.measured
+    sigma = profile_sigma(problem, residual)
     likelihood = log_density(residual, sigma, problem.noise, measured).sum()
-    return float(likelihood - 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum())
+    return sigma, float(likelihood - 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum())
 
 
 def profile_sigma(problem: Problem, residual: Array) -> Array:
@@ -259,12 +304,13 @@ def _finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) ->
         return Mode(problem, phi, sigma, np.zeros((cells, 0)), np.zeros((0, 0)), log_posterior)
     lower, upper = _box(priors)
 
-    def residual(points: Array) -> Array:
-        z = problem.whitened(points, sigma).reshape(len(points), -1)
+    def residual(points: Array, engine: PartedSimulator | None = None) -> Array:
+        z = problem.whitened(points, sigma, engine).reshape(len(points), -1)
         return np.concatenate([np.nan_to_num(z), prior_residual(priors, points)], axis=-1)
 
     begin = 1e-3 * problem.layout.scale(phi)
-    jacobian, _ = posterior_steps(residual, phi, lower, upper, begin)
+    _, steps = posterior_steps(partial(residual, engine=problem.coarse), phi, lower, upper, begin)
+    jacobian = differentiate(residual, phi, steps, lower, upper)
     precision = jacobian.T @ jacobian
     covariance = np.linalg.pinv(precision, hermitian=True)
     n_cells = len(jacobian) - len(phi)

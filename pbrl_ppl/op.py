@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,19 +17,18 @@ from pytensor.link.numba.dispatch.basic import numba_funcify
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
-_REMEMBERED = 4
+Parts = tuple[tuple[str, ...], ...]
 
 
 class _EngineOp(Op):
-    """What the prediction and its derivative share: inputs, and a memory of the last results."""
+    """What the prediction and its derivative share: inputs and how impossible ones are answered."""
 
-    __props__ = ("scene", "layout", "effects", "substeps", "threads")
+    __props__ = ("scene", "layout", "effects", "substeps", "threads", "parts")
 
     def __init__(
         self,
@@ -39,16 +37,14 @@ class _EngineOp(Op):
         effects: tuple[Attached, ...] = (),
         substeps: int | None = None,
         threads: int = 1,
+        parts: Parts | None = None,
     ) -> None:
-        self.scene, self.layout, self.effects = scene, layout, effects
+        self.scene, self.layout, self.effects, self.parts = scene, layout, effects, parts
         self.substeps = scene.substeps if substeps is None else substeps
         self.threads = threads
-        self.simulator = Simulator(scene, layout, effects, substeps=self.substeps, threads=threads)
-        self._memory: OrderedDict[tuple[object, ...], Array] = OrderedDict()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave the memory behind when the Op goes to another process."""
-        return self.__dict__ | {"_memory": OrderedDict()}
+        self.simulator = PartedSimulator(
+            scene, layout, effects, parts, substeps=self.substeps, threads=threads
+        )
 
     @property
     def _last(self) -> tuple[int, ...]:
@@ -96,25 +92,11 @@ class _EngineOp(Op):
         outputs[0][0] = self.predict(*inputs)
 
     def predict(self, phi: Array, start: Array, actions: Array) -> Array:
-        """Run the engine, or recall what it said of these very inputs a moment ago."""
-        key = (
-            start.shape,
-            actions.shape,
-            hash(start.tobytes()),
-            hash(actions.tobytes()),
-            phi.tobytes(),
-        )
-        if key in self._memory:
-            self._memory.move_to_end(key)
-            return self._memory[key].copy()
+        """Run the engine."""
         try:
-            result = self._compute(phi, start, actions)
+            return self._compute(phi, start, actions)
         except ParameterError:  # a sampler may look there; nothing can be observed of it
-            result = np.full((*actions.shape[:2], *self._last), np.nan)
-        self._memory[key] = result
-        if len(self._memory) > _REMEMBERED:
-            self._memory.popitem(last=False)
-        return result.copy()
+            return np.full((*actions.shape[:2], *self._last), np.nan)
 
 
 class SimulatorOp(_EngineOp):
@@ -138,6 +120,9 @@ class SimulatorOp(_EngineOp):
         Engine steps an interval; the scene's by default.
     threads : int
         Worlds that run side by side.
+    parts : tuple of tuple of str, optional
+        Moving bodies in parts that never touch and share no joint, each with an engine of its own;
+        see :func:`pbrl_ppl.coupling.independent_parts`.
     """
 
     @property
@@ -145,7 +130,7 @@ class SimulatorOp(_EngineOp):
         return len(self.scene.dynamic), 6
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
-        return self.simulator(phi, start, actions)
+        return self.simulator.recall(phi, start, actions)
 
     def pullback(
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]

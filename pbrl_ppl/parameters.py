@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,6 +164,23 @@ class Layout:
     """
 
     blocks: tuple[Block, ...]
+
+    def subset(self, owners: Iterable[str]) -> Layout:
+        """The parameters of these bodies and joints alone."""
+        kept = set(owners)
+        blocks = []
+        for block in self.blocks:
+            of = [i for i, owner in enumerate(block.owners) if owner in kept]
+            if of:
+                blocks.append(
+                    replace(
+                        block,
+                        owners=tuple(block.owners[i] for i in of),
+                        priors=tuple(block.priors[i] for i in of),
+                        conditional=tuple(block.conditional[i] for i in of if block.conditional),
+                    )
+                )
+        return Layout(tuple(blocks))
 
     @property
     def size(self) -> int:

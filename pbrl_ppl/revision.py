@@ -15,13 +15,14 @@ from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.evaluation import HeldOut, standard_error
 from pbrl_ppl.findings import Added, Estimate, Findings, Numerical
-from pbrl_ppl.fitting import fit, versions
+from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode, find_mode, inside, with_start_noise
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.posterior import interval
+from pbrl_ppl.record import versions
 from pbrl_ppl.remainder import find_remainder
 from pbrl_ppl.scene import Scene
 
@@ -274,11 +275,14 @@ class _Loop:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
         problem = mode.problem
         if draws is None:
-            steps = problem.segments.n * problem.horizon * int(problem.simulator.levels[0].sum())
+            steps = problem.segments.n * problem.horizon * problem.simulator.steps
             draws = DRAWS if steps < LONG else DRAWS // 2
         model = build_model(replace(problem, threads=1))
         tune = max(LEAST_TUNE, 5 * draws // 8)
-        return fit(model, seed=self.seed, draws=draws, tune=tune, start=mode, progress=False)
+        fitted = fit(model, seed=self.seed, draws=draws, tune=tune, start=mode, progress=False)
+        if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
+            raise KeyboardInterrupt
+        return fitted
 
     def findings(
         self,

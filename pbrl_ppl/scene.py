@@ -7,6 +7,7 @@ from a TOML file or from Python.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -99,6 +100,9 @@ class Scene:
 
     def _check_joints(self) -> None:
         names = [WORLD, *(body.name for body in self.bodies)]
+        for name in self.joint_names:
+            if self.joint_names.count(name) > 1:
+                raise SceneError(f'scene: two joints are called "{name}"; rename one')
         for position, joint in enumerate(self.joints, start=1):
             where = f"[[joint]] number {position}"
             for name in joint.bodies or ():
@@ -183,8 +187,10 @@ class Scene:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """One name a joint: ``joint1``, ``joint2``, ... in the order of the file."""
-        return tuple(f"joint{number}" for number in range(1, len(self.joints) + 1))
+        """One name a joint: its own, or ``joint1``, ``joint2``, ... by its place in the file."""
+        return tuple(
+            joint.name or f"joint{number}" for number, joint in enumerate(self.joints, start=1)
+        )
 
     @property
     def extent(self) -> tuple[float, float, float, float] | None:
@@ -218,6 +224,24 @@ class Scene:
     def replace(self, **changes: Any) -> Scene:
         """Return a scene with these attributes changed, checked again."""
         return dataclasses.replace(self, **changes)
+
+    def subset(self, names: Iterable[str]) -> Scene:
+        """Return the scene without its other moving bodies, and without the joints that hold those.
+
+        Raises
+        ------
+        SceneError
+            If a name is no moving body's.
+        """
+        kept = {self.body(name).name for name in names}
+        bodies = tuple(body for body in self.bodies if body.static or body.name in kept)
+        there = {WORLD, *(body.name for body in bodies)}
+        joints = tuple(
+            dataclasses.replace(joint, name=name)
+            for name, joint in zip(self.joint_names, self.joints, strict=True)
+            if joint.bodies is None or set(joint.bodies) <= there
+        )
+        return self.replace(bodies=bodies, joints=joints)
 
     def with_effects(self, body_name: str, *names: str) -> Scene:
         """Return a scene in which this body has these effects declared as well.

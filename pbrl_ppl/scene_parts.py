@@ -123,6 +123,8 @@ class Joint:
         not known these are the centres of the anchors' priors, or None for the default.
     known : bool
         Whether the anchors are given (True) or to be inferred.
+    name : str, optional
+        What its parameters are labelled with; by default its place in the scene: ``joint1``, ...
 
     Raises
     ------
@@ -140,8 +142,11 @@ class Joint:
     anchor_a: Point | None = None
     anchor_b: Point | None = None
     known: bool = True
+    name: str | None = None
 
     def __post_init__(self) -> None:
+        if self.name is not None:
+            label(self.name, "joint: name")
         if self.kind not in ("hinge", "distance"):
             raise SceneError(
                 f'joint: kind is {self.kind!r}, expected "hinge" or "distance"'

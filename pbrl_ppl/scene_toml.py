@@ -21,7 +21,7 @@ KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "shape": (("kind",), ("size", "radius", "vertices")),
     "wall": (("from", "to"), ()),
-    "joint": (("kind",), ("bodies", "anchor_a", "anchor_b", "known")),
+    "joint": (("kind",), ("bodies", "anchor_a", "anchor_b", "known", "name")),
 }
 """Required and optional keys of each table."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -92,6 +93,13 @@ class Shape:
         if self.vertices is not None:
             return self.vertices if _moments(self.vertices)[0] > 0 else self.vertices[::-1]
         return None
+
+    @property
+    def bounding_radius(self) -> float:
+        """Radius of the circle about the origin that holds the whole shape (m)."""
+        if self.outline is None:
+            return float(self.radius or 0.0)
+        return max(math.hypot(x, y) for x, y in self.outline)
 
     @property
     def bounds(self) -> tuple[float, float, float, float]:

@@ -8,15 +8,17 @@ import numpy as np
 import pymc as pm
 import pytest
 
-from pbrl_ppl import fitting
+from pbrl_ppl import record
 from pbrl_ppl.effects import catalogue
-from pbrl_ppl.errors import ConvergenceWarning, FitError
-from pbrl_ppl.fitting import MAX_RHAT, MIN_ESS, fit, unconstrain
+from pbrl_ppl.errors import ConvergenceWarning, FitError, PosteriorError
+from pbrl_ppl.fitting import METHODS, fit
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import az, convergence, draws, group, groups, load_posterior, scene_of
 from pbrl_ppl.posterior import save_posterior as save
+from pbrl_ppl.record import MAX_RHAT, MIN_ESS
+from pbrl_ppl.starts import unconstrain
 from tests.test_model import CART, NOISE, cart_scene, simulated_history
 
 PARAMETERS = ("mass", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
@@ -69,7 +71,7 @@ def test_groups_are_complete(model, fitted) -> None:
     assert data["observed_data"]["next_state"].dims == cells
     assert data["posterior_predictive"]["next_state"].dims == ("chain", "draw", *cells)
     assert set(data["constant_data"].data_vars) == {"start", "actions"}
-    for name in ("accepted", "scaling", "beta"):
+    for name in ("accept", "look_ahead_accept"):
         assert data["sample_stats"][name].sizes["draw"] == 200
     np.testing.assert_array_equal(
         data["observed_data"]["next_state"].values, model.problem.segments.observed
@@ -91,7 +93,7 @@ def test_origin(model, fitted) -> None:
     versions = json.loads(attrs["versions"])
     assert versions["pymc"] == pm.__version__
     assert versions["numpy"] == np.__version__
-    assert set(versions) == {"python", *fitting.PACKAGES}
+    assert set(versions) == {"python", *record.PACKAGES}
 
 
 def test_convergence_is_stored(fitted) -> None:
@@ -272,14 +274,93 @@ def test_unconstrain_is_pymc_s_transform(prior, distribution) -> None:
         assert slope == pytest.approx((forward(x + 1e-5) - forward(x - 1e-5)) / 2e-5, rel=1e-6)
 
 
-def test_an_interrupted_sampler_is_no_posterior(monkeypatch):
-    """PyMC swallows an interrupt and returns what it has; or says that it has nothing."""
-    scene = cart_scene()
-    model = physics_model(scene, simulated_history(scene, CART, seed=8))
+def test_an_early_interrupt_leaves_nothing(model, mode, monkeypatch):
+    """PyMC's answer to an interrupt before the first draws."""
 
     def nothing(**options):
         raise ValueError("Not enough samples to build a trace.")
 
     monkeypatch.setattr("pbrl_ppl.fitting.pm.sample", nothing)
     with pytest.raises(KeyboardInterrupt):
-        fit(model, draws=10, tune=10, progress=False)
+        fit(model, draws=10, tune=10, start=mode, progress=False)
+
+
+@pytest.fixture(scope="module")
+def interrupted(model, mode):
+    """PyMC swallows an interrupt and returns the draws so far; here, 30 of 50."""
+    sample = pm.sample
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            "pbrl_ppl.fitting.pm.sample", lambda **options: sample(**(options | {"draws": 30}))
+        )
+        with (
+            pytest.warns(ConvergenceWarning, match="have not converged"),
+            pytest.warns(ConvergenceWarning, match="after 30 of 50 draws.*start="),
+        ):
+            return fit(model, seed=4, start=mode, **(QUICK | {"draws": 50}))
+
+
+def test_an_interrupt_keeps_the_draws(interrupted) -> None:
+    assert group(interrupted, "posterior").sizes["draw"] == 30
+    assert interrupted.attrs["interrupted"] == 1
+    assert "interrupted" in json.loads(interrupted.attrs["warnings"])[0]
+    assert group(interrupted, "log_likelihood").sizes["draw"] == 30
+
+
+def test_an_interrupted_fit_goes_on(model, interrupted) -> None:
+    """New draws follow the old ones, which stay."""
+    with pytest.warns(ConvergenceWarning, match="not converged"):
+        whole = fit(model, seed=5, start=interrupted, **(QUICK | {"draws": 170, "tune": 0}))
+    assert "interrupted" not in whole.attrs
+    posterior = group(whole, "posterior")
+    assert dict(posterior.sizes) == {"chain": 2, "draw": 200, "body": 1, "state": 6}
+    for name in PARAMETERS:
+        before = group(interrupted, "posterior")[name].values
+        np.testing.assert_array_equal(posterior[name].values[:, :30], before)
+
+
+def test_a_start_of_another_model_is_refused(model, interrupted) -> None:
+    scene = cart_scene()  # r and mu_c are unknown here
+    other = physics_model(scene, model.problem.history)
+    with pytest.raises(PosteriorError, match="has no r, mu_c"):
+        fit(other, start=interrupted, progress=False)
+
+
+def test_unknown_method(model) -> None:
+    with pytest.raises(FitError, match="method is 'gibbs', expected one of metropolis, paper"):
+        fit(model, method="gibbs")
+
+
+def test_the_mode_alone(model, mode) -> None:
+    idata = fit(model, method="map", start=mode, progress=False)
+    np.testing.assert_allclose(draws(idata)["mass"], [[mode.phi[0]]])
+    assert idata.attrs["method"] == "map"
+    assert np.isfinite(group(idata, "log_likelihood")["next_state"].values).all()
+    assert group(idata, "posterior")["mass"].attrs["units"] == "kg"
+
+
+@pytest.fixture(scope="module")
+def puck():
+    """Its mass is all there is to learn of the cart."""
+    scene = cart_scene(known={name: CART[name] for name in CART if name != "mass"})
+    history = simulated_history(scene, CART, seed=9, trajectories=2, intervals=4)
+    return physics_model(scene, history, substeps=4)
+
+
+@pytest.mark.parametrize("method", [name for name in METHODS if name not in ("map", "nuts")])
+def test_methods_agree(puck, method) -> None:
+    """Each sampler's mean mass is the mode, within 4 Monte Carlo errors and 0.3 sd for skewness."""
+    mode = find_mode(puck.problem, seed=1)
+    deviation = float(np.sqrt(mode.covariance[0, 0]))
+    options = {"draws": 300, "chains": 2, "cores": 1, "progress": False}
+    if method == "paper":
+        options |= {"tune": 500, "thin": 4}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        idata = fit(puck, method=method, seed=6, start=mode, **options)
+    assert idata.attrs["method"] == method
+    mass = group(idata, "posterior")["mass"].values[..., 0]
+    assert mass.shape == (2, 300)
+    error = mass.std() / np.sqrt(float(az.ess(mass)))
+    assert abs(mass.mean() - mode.phi[0]) < 4 * error + 0.3 * deviation
+    assert 0.6 < mass.std() / deviation < 1.7

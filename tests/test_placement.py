@@ -2,6 +2,7 @@
 
 import re
 import time
+from contextlib import suppress
 
 import numpy as np
 import pymunk
@@ -321,12 +322,12 @@ def engine_depth(one: Body, other: Body, at_one, at_other) -> float:
     for a in placed[0]:
         for b in placed[1]:
             a.cache_bb(), b.cache_bb()
-            try:
-                points = a.shapes_collide(b).points
-            except AssertionError:  # pymunk's, of some pairs that do not touch
-                continue
-            # the engine turns the sign where it takes a pair the other way round
-            deepest = max(deepest, *(abs(point.distance) for point in points))
+            for first, second in ((a, b), (b, a)):
+                # pymunk asserts on pairs that do not touch, and now and then on one that does
+                with suppress(AssertionError):
+                    points = first.shapes_collide(second).points
+                    # the engine turns the sign where it takes a pair the other way round
+                    deepest = max(deepest, *(abs(point.distance) for point in points))
     return deepest
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics.properties import Array
-from pbrl_ppl.physics.world import _shapes, bounding_radius
+from pbrl_ppl.physics.world import _shapes
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 
 #: What is put down to noise and resting contact: a share of the smaller body's size.
@@ -118,7 +118,7 @@ def _apart(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
         ]
         length = _anchor_distance(joint, fixed)[0] if joint.kind == "distance" else 0.0
         found = _anchor_distance(joint, now)
-        smaller = min(bounding_radius(scene.body(n)) for n in joint.bodies if n in moving)
+        smaller = min(scene.body(n).shape.bounding_radius for n in joint.bodies if n in moving)
         off = np.flatnonzero(np.abs(found - length) > ALLOWED * smaller)
         if len(off):
             a, b = (name if name == WORLD else f'"{name}"' for name in joint.bodies)
@@ -199,7 +199,7 @@ def _solid(body: Body) -> _Solid:
     width = min(x_max - x_min, y_max - y_min)
     if len(parts) > 1:  # no part of a thin frame can lie as deep as the whole is wide
         width = min(width, max(float(np.ptp(corners, axis=0).min()) for corners, _ in parts))
-    return _Solid(body.name, tuple(parts), np.zeros((2, 2)), bounding_radius(body), width)
+    return _Solid(body.name, tuple(parts), np.zeros((2, 2)), body.shape.bounding_radius, width)
 
 
 def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:

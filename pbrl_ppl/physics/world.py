@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,10 +113,10 @@ class World:
             ITERATIONS_CHAINED if self.chained.any() else ITERATIONS_ALONE if alone else ITERATIONS
         )
         #: What the near-contact test needs: circles about bodies, and segments with a radius.
-        self.radii = np.array([bounding_radius(body) for body in scene.dynamic])
+        self.radii = np.array([body.shape.bounding_radius for body in scene.dynamic])
         fixed = [(*wall.start, *wall.end, 0.0) for wall in scene.walls]
         fixed += [
-            (*body.pose[:2], *body.pose[:2], bounding_radius(body))
+            (*body.pose[:2], *body.pose[:2], body.shape.bounding_radius)
             for body in scene.bodies
             if body.static and body.pose is not None
         ]
@@ -249,11 +248,3 @@ def _is_convex(outline: tuple[tuple[float, float], ...]) -> bool:
         if (bx - ax) * (cy - by) - (by - ay) * (cx - bx) < -1e-12:
             return False
     return True
-
-
-def bounding_radius(body: Body) -> float:
-    """Radius of the circle about the origin that holds the whole body (m)."""
-    outline = body.shape.outline
-    if outline is None:
-        return float(body.shape.radius or 0.0)
-    return max(math.hypot(x, y) for x, y in outline)

@@ -1,0 +1,144 @@
+"""A scene whose bodies fall into parts that never touch: one engine a part, each with a memory."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.parameters import Layout
+from pbrl_ppl.physics.properties import Array
+from pbrl_ppl.physics.simulator import Simulator
+from pbrl_ppl.scene import Scene
+
+#: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
+_REMEMBERED = 4
+
+
+@dataclass(eq=False)
+class Part:
+    """One part: its engine, and where its parameters and bodies are in the whole."""
+
+    simulator: Simulator
+    places: NDArray[np.intp]
+    bodies: NDArray[np.intp]
+    memory: OrderedDict[tuple[object, ...], Array] = field(default_factory=OrderedDict)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave the memory behind when it goes to another process."""
+        return self.__dict__ | {"memory": OrderedDict()}
+
+
+class PartedSimulator:
+    """As :class:`Simulator`, for parts whose bodies neither touch each other nor share a joint.
+
+    Proposals that agree in a part's parameters are simulated once for it: a derivative, or a
+    sampler that moves one part at a time, costs for many bodies what it costs for each alone.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry.
+    layout : Layout
+        Order of the unknown parameters in phi.
+    effects : tuple of Attached
+        All effects of the model.
+    parts : tuple of tuple of str
+        Every moving body's name once; see :func:`pbrl_ppl.coupling.independent_parts`. None for a
+        scene in one part.
+    substeps, threads, extrapolate
+        As for :class:`Simulator`.
+
+    Raises
+    ------
+    SimulationError
+        If ``parts`` does not hold every moving body once.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        layout: Layout,
+        effects: tuple[Attached, ...] = (),
+        parts: tuple[tuple[str, ...], ...] | None = None,
+        *,
+        substeps: int | None = None,
+        threads: int = 1,
+        extrapolate: bool = True,
+    ) -> None:
+        names = [body.name for body in scene.dynamic]
+        parts = (tuple(names),) if parts is None else parts
+        given = [name for part in parts for name in part]
+        if sorted(given) != sorted(names):
+            raise SimulationError(
+                f"parts hold {', '.join(given)}, expected each moving body once: {', '.join(names)}"
+            )
+        labels = layout.labels
+        self._size = len(labels)
+        self.parts = []
+        for part in parts:
+            own = scene if len(parts) == 1 else scene.subset(part)
+            chosen = layout if len(parts) == 1 else layout.subset((*part, *own.joint_names))
+            simulator = Simulator(
+                own,
+                chosen,
+                tuple(one for one in effects if one.body in part),
+                substeps=substeps,
+                threads=threads,
+                extrapolate=extrapolate,
+            )
+            places = np.array([labels.index(label) for label in chosen.labels], dtype=int)
+            bodies = np.array([names.index(body.name) for body in own.dynamic], dtype=int)
+            self.parts.append(Part(simulator, places, bodies))
+
+    @property
+    def steps(self) -> int:
+        """Engine steps an interval, of all parts and all runs that are combined."""
+        return int(sum(part.simulator.levels[0].sum() for part in self.parts))
+
+    def __call__(self, phi: Array, start: Array, actions: Array) -> Array:
+        """Predict as :class:`Simulator` does: (transition, H, body, 6), or with proposals first."""
+        if len(self.parts) == 1:
+            return self.parts[0].simulator(phi, start, actions)
+        phi = np.asarray(phi, dtype=float)
+        proposals = np.atleast_2d(phi)
+        out = np.empty((len(proposals), *actions.shape[:-1], 6))
+        for part in self.parts:
+            own, which = np.unique(proposals[:, part.places], axis=0, return_inverse=True)
+            states = part.simulator(own, *_of(part, start, actions))
+            out[..., part.bodies, :] = states[which.ravel()]
+        return out if phi.ndim == 2 else out[0]
+
+    def recall(self, phi: Array, start: Array, actions: Array) -> Array:
+        """Predict for one phi, or recall what was said of these very inputs a moment ago."""
+        if len(self.parts) > 1 and phi.shape != (self._size,):
+            raise SimulationError(f"phi has shape {phi.shape}, expected ({self._size},)")
+        data = start.shape, actions.shape, hash(start.tobytes()), hash(actions.tobytes())
+        out = np.empty((*actions.shape[:-1], 6))
+        for part in self.parts:
+            own = phi[part.places] if len(self.parts) > 1 else phi
+            key = (*data, own.tobytes())
+            if key in part.memory:
+                part.memory.move_to_end(key)
+            else:
+                part.memory[key] = part.simulator(own, *_of(part, start, actions))
+                if len(part.memory) > _REMEMBERED:
+                    part.memory.popitem(last=False)
+            out[..., part.bodies, :] = part.memory[key]
+        return out
+
+    def jacobian(self, phi: Array, start: Array, actions: Array) -> Array:
+        """Derivative by phi, shape (transition, H, body, 6, p); see :meth:`Simulator.jacobian`."""
+        out = np.zeros((*actions.shape[:-1], 6, len(phi)))
+        for part in self.parts:
+            own = part.simulator.jacobian(phi[part.places], *_of(part, start, actions))
+            out[:, :, part.bodies[:, None, None], np.arange(6)[:, None], part.places] = own
+        return out
+
+
+def _of(part: Part, start: Array, actions: Array) -> tuple[Array, Array]:
+    return start[:, part.bodies], actions[:, :, part.bodies]
