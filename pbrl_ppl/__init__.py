@@ -14,14 +14,18 @@ if TYPE_CHECKING:
     from pbrl_ppl.findings import Findings
     from pbrl_ppl.fitting import fit
     from pbrl_ppl.history import History, Segments
+    from pbrl_ppl.identifiability import Identifiability
+    from pbrl_ppl.identification import identify, uninformed
     from pbrl_ppl.model import physics_model
     from pbrl_ppl.op import SimulatorOp
     from pbrl_ppl.parameters import Prior
     from pbrl_ppl.physics import Simulator
     from pbrl_ppl.posterior import load_posterior, save_posterior
+    from pbrl_ppl.prior_check import PriorCheck, prior_predictive_check
     from pbrl_ppl.report import Loop, close_loop
     from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
     from pbrl_ppl.transition import Transition
+    from pbrl_ppl.updated_prior import updated_scene
 
 __version__ = "0.1.0"
 
@@ -32,10 +36,12 @@ __all__ = [
     "EffectParameter",
     "Findings",
     "History",
+    "Identifiability",
     "Joint",
     "Loop",
     "PbrlError",
     "Prior",
+    "PriorCheck",
     "Scene",
     "Segments",
     "Shape",
@@ -46,9 +52,13 @@ __all__ = [
     "catalogue",
     "close_loop",
     "fit",
+    "identify",
     "load_posterior",
     "physics_model",
+    "prior_predictive_check",
     "save_posterior",
+    "uninformed",
+    "updated_scene",
 ]
 
 _MODULES = {
@@ -57,14 +67,18 @@ _MODULES = {
     "findings": ("Findings",),
     "fitting": ("fit",),
     "history": ("History", "Segments"),
+    "identifiability": ("Identifiability",),
+    "identification": ("identify", "uninformed"),
     "model": ("physics_model",),
     "op": ("SimulatorOp",),
     "parameters": ("Prior",),
     "physics": ("Simulator",),
     "posterior": ("load_posterior", "save_posterior"),
+    "prior_check": ("PriorCheck", "prior_predictive_check"),
     "report": ("Loop", "close_loop"),
     "scene": ("Body", "Joint", "Scene", "Shape", "Wall"),
     "transition": ("Transition",),
+    "updated_prior": ("updated_scene",),
 }
 
 

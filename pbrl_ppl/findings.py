@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.identifiability import Identifiability
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
@@ -206,6 +207,8 @@ class Findings:
         Intervals of ``rollout_rmse``.
     provenance : dict
         Seed, versions, hash of the data, number of transitions, horizons.
+    identifiability : Identifiability or None
+        Which parameters of the model after revision the data inform.
     """
 
     scene: Scene
@@ -225,6 +228,7 @@ class Findings:
     horizon: int
     rollout_horizon: int
     provenance: Mapping[str, Any]
+    identifiability: Identifiability | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of ``report.json``; numbers that are not finite become null."""
@@ -263,6 +267,7 @@ class Findings:
                     "after": vars(self.after),
                     "noise_floor": vars(self.noise_floor),
                 },
+                "identifiability": self.identifiability and self.identifiability.to_dict(),
                 "provenance": self.provenance,
             }
         )

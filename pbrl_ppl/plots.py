@@ -22,7 +22,8 @@ from scipy.stats import chi2, gaussian_kde, norm
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.findings import Findings
 from pbrl_ppl.history import STATE, STATE_UNITS
-from pbrl_ppl.posterior import DATATREE, HDI_PROB, group
+from pbrl_ppl.posterior import DATATREE, HDI_PROB, scalars
+from pbrl_ppl.prior_check import PriorCheck
 
 Array = NDArray[np.float64]
 
@@ -37,33 +38,6 @@ MOST_CANDIDATES, MOST_PARAMETERS = 20, 6
 
 # Okabe and Ito's colours: told apart by colour-blind readers and in grey print
 _BEFORE, _AFTER, _PLAIN, _BAND = "#D55E00", "#0072B2", "#999999", "#e9e9e9"
-
-
-def scalars(posterior: Any) -> xr.Dataset:
-    """One variable per scalar parameter, called ``name[coordinate]``.
-
-    Parameters
-    ----------
-    posterior : InferenceData or DataTree
-        With a group ``posterior``.
-
-    Returns
-    -------
-    xarray.Dataset
-        Variables of dims (chain, draw).
-    """
-    flat: dict[str, xr.DataArray] = {}
-    for name, variable in group(posterior, "posterior").data_vars.items():
-        others = [dim for dim in variable.dims if dim not in ("chain", "draw")]
-        for place in np.ndindex(*(variable.sizes[dim] for dim in others)):
-            one = variable.isel(dict(zip(others, place, strict=True)))
-            labels = [
-                str(one.coords[d].item()) if d in one.coords else str(i)
-                for d, i in zip(others, place, strict=True)
-            ]
-            label = f"{name}[{', '.join(labels)}]" if labels else str(name)
-            flat[label] = one.reset_coords(drop=True).transpose("chain", "draw")
-    return xr.Dataset(flat)
 
 
 def summary(posterior: Any) -> pd.DataFrame:
@@ -297,6 +271,29 @@ def plot_errors(findings: Findings) -> Figure:
     colours = [_BEFORE, _AFTER] if findings.added else [_AFTER]
     handles = [Patch(color=c, label=n) for c, n in zip(colours, labels, strict=True)]
     figure.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False)
+    return figure
+
+
+def plot_prior_check(check: PriorCheck) -> Figure:
+    """Measured changes of state over a segment beside those that the prior predicts."""
+    bodies, states = check.dataset["body"].values, check.dataset["state"].values
+    rows = len(bodies) * -(-len(states) // 2)
+    figure, panels = _figure(8.0, 0.8 + 1.3 * rows, rows, 2, grid="x")
+    pairs = [(body, state) for body in bodies for state in states]
+    for axes, (body, state) in zip(panels, pairs, strict=False):
+        one = check.dataset.sel(body=body, state=state)
+        for place, (name, colour) in enumerate((("predicted", _PLAIN), ("measured", _AFTER))):
+            low, lower, middle, upper, high = one[name].to_numpy()
+            axes.plot([low, high], [place] * 2, color=colour, linewidth=2)
+            axes.plot([lower, upper], [place] * 2, color=colour, linewidth=7)
+            axes.plot(middle, place, "o", color="white", markeredgecolor=colour)
+        axes.set_yticks([0, 1], ["prior", "measured"])
+        axes.set_ylim(1.6, -0.6)
+        share = float(one["share_inside"])
+        axes.set_title(f"{state} of {body}: {100 * share:.0f} % as expected", fontsize=9)
+        axes.set_xlabel(f"change in {check.seconds:g} s ({UNITS[str(state)]})", fontsize=8)
+    for axes in panels[len(pairs) :]:
+        axes.set_visible(False)
     return figure
 
 

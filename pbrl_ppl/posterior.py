@@ -214,6 +214,33 @@ def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Array]:
     return {str(name): stacked[name].values[chosen] for name in stacked.data_vars}
 
 
+def scalars(posterior: Any) -> xr.Dataset:
+    """One variable per scalar parameter, called ``name[coordinate]``.
+
+    Parameters
+    ----------
+    posterior : InferenceData or DataTree
+        With a group ``posterior``.
+
+    Returns
+    -------
+    xarray.Dataset
+        Variables of dims (chain, draw).
+    """
+    flat: dict[str, xr.DataArray] = {}
+    for name, variable in group(posterior, "posterior").data_vars.items():
+        others = [dim for dim in variable.dims if dim not in ("chain", "draw")]
+        for place in np.ndindex(*(variable.sizes[dim] for dim in others)):
+            one = variable.isel(dict(zip(others, place, strict=True)))
+            labels = [
+                str(one.coords[d].item()) if d in one.coords else str(i)
+                for d, i in zip(others, place, strict=True)
+            ]
+            label = f"{name}[{', '.join(labels)}]" if labels else str(name)
+            flat[label] = one.reset_coords(drop=True).transpose("chain", "draw")
+    return xr.Dataset(flat)
+
+
 def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     """Rank-normalised R-hat, and the smaller of bulk and tail ESS, of every scalar parameter.
 
@@ -227,23 +254,18 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     r_hat, ess : dict of str to float
         By label, such as ``mass[cart]``.
     """
-    posterior = group(idata, "posterior")
-    names = list(posterior.data_vars)
-    r_hat: dict[str, float] = {}
-    ess: dict[str, float] = {}
+    flat = scalars(idata)
     # the generations differ in the tail that they look at by default
-    measures = (
-        _dataset(az.rhat(posterior)),
-        _dataset(az.ess(posterior, method="bulk")),
-        _dataset(az.ess(posterior, method="tail", prob=(0.05, 0.95))),
+    hat, bulk, tail = (
+        _dataset(measure)
+        for measure in (
+            az.rhat(flat),
+            az.ess(flat, method="bulk"),
+            az.ess(flat, method="tail", prob=(0.05, 0.95)),
+        )
     )
-    for name in names:
-        hat, bulk, tail = (measure[name] for measure in measures)
-        for index in np.ndindex(hat.shape):
-            parts = [str(hat[dim].values[i]) for dim, i in zip(hat.dims, index, strict=True)]
-            label = f"{name}[{','.join(parts)}]" if parts else str(name)
-            r_hat[label] = float(hat.values[index])
-            ess[label] = float(min(bulk.values[index], tail.values[index]))
+    r_hat = {str(name): float(hat[name]) for name in flat.data_vars}
+    ess = {str(name): float(min(bulk[name], tail[name])) for name in flat.data_vars}
     return r_hat, ess
 
 

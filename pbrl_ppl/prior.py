@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+from numpy.typing import NDArray
+from scipy.special import i0e
 
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import ParameterError
@@ -20,10 +22,15 @@ from pbrl_ppl.parameters import (
     Prior,
 )
 from pbrl_ppl.scene import WORLD, Body, Scene
+from pbrl_ppl.scene_checks import nearest
+
+Array = NDArray[np.float64]
 
 #: Half the side of the square in which a joint's anchor in the world is sought where the scene has
 #: neither walls nor poses (m).
 _UNBOUNDED = 10.0
+#: Above this concentration PyMC 5's von Mises density overflows.
+_SHARP = 500.0
 
 
 def table1(body: Body) -> dict[str, Prior]:
@@ -42,7 +49,7 @@ def table1(body: Body) -> dict[str, Prior]:
     Raises
     ------
     ParameterError
-        If a hyper-parameter does not belong to the parameter's family.
+        If a hyper-parameter does not belong to the parameter's family, or makes no distribution.
 
     Examples
     --------
@@ -62,23 +69,38 @@ def table1(body: Body) -> dict[str, Prior]:
         "mu_x": share,
         "mu_y": share,
     }
-    for name, hyper in body.prior:
-        allowed = ("mu", "kappa") if priors[name].family == "von_mises" else ("mu", "sigma")
-        for key, _ in hyper:
-            if key not in allowed:
-                raise ParameterError(
-                    f"body {body.name!r}: prior of {name} has {key!r}, expected"
-                    f" {' and '.join(allowed)} ({priors[name].family})"
-                )
-        values = dict(hyper)
-        prior = priors[name]
-        priors[name] = replace(
-            prior,
-            mu=values.get("mu", prior.mu),
-            sigma=values.get("sigma", prior.sigma),
-            kappa=values.get("kappa", prior.kappa),
-        )
-    return priors
+    return {name: declared_prior(body, name, prior) for name, prior in priors.items()}
+
+
+def declared_prior(body: Body, name: str, default: Prior) -> Prior:
+    """A parameter's prior with the hyper-parameters that the scene declares for it.
+
+    Parameters
+    ----------
+    body : Body
+        Its ``prior`` is looked at.
+    name : str
+        A parameter of Table 1, or an effect's variable such as ``linear_drag_coefficient``.
+    default : Prior
+        Gives the family, the support and what the scene leaves out.
+
+    Raises
+    ------
+    ParameterError
+        If a hyper-parameter does not belong to the family, or makes no distribution.
+    """
+    hyper: dict[str, Any] = dict(dict(body.prior).get(name, ()))
+    where = f"body {body.name!r}: prior of {name}"
+    for key in hyper:
+        if key not in default.hyper_names:
+            raise ParameterError(
+                f"{where} has {key!r}, expected {' and '.join(default.hyper_names)}"
+                f" ({default.family})"
+            )
+    try:
+        return replace(default, **hyper)
+    except ParameterError as error:
+        raise ParameterError(f"{where}: {error}") from None
 
 
 def anchor_prior(scene: Scene, holder: str, axis: int, centre: float | None = None) -> Prior:
@@ -147,7 +169,24 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
         Parameters that it names as known are left out, and a wheel's where there is none.
     effects : tuple of Attached
         All effects of the model.
+
+    Raises
+    ------
+    ParameterError
+        If a body's ``prior`` names a parameter that neither it nor its effects have, or makes no
+        distribution.
     """
+    for body in scene.dynamic:
+        names = [
+            *BODY_PARAMETERS,
+            *(v for one in effects if one.body == body.name for v in one.variables),
+        ]
+        for name, _ in body.prior:
+            if name not in names:
+                raise ParameterError(
+                    f"body {body.name!r}: prior has {name!r}, which is no parameter of it or its"
+                    f" effects{nearest(name, names)}"
+                )
     blocks = []
     for name, unit in BODY_PARAMETERS.items():
         bodies = [
@@ -161,10 +200,10 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
     blocks += _joint_blocks(scene)
     for effect in dict.fromkeys(one.effect for one in effects):
         on = tuple(one.body for one in effects if one.effect == effect)
-        blocks += [
-            Block(effect.variable(each), on, each.unit, (each.prior,) * len(on), effect=effect.name)
-            for each in effect.parameters
-        ]
+        for each in effect.parameters:
+            name = effect.variable(each)
+            priors = tuple(declared_prior(scene.body(owner), name, each.prior) for owner in on)
+            blocks.append(Block(name, on, each.unit, priors, effect=effect.name))
     return Layout(tuple(blocks))
 
 
@@ -211,10 +250,12 @@ def random_variable(
         lower, upper = hyper("lower"), hyper("upper")
         return pm.TruncatedNormal(name, mu=mu, sigma=sigma, lower=lower, upper=upper, dims=dims)
     if family == "von_mises":
-        return pm.VonMises(name, mu=mu, kappa=hyper("kappa"), dims=dims)
+        return _von_mises(name, np.array(mu), np.array(hyper("kappa")), dims)
     if family == "normal":
         return pm.Normal(name, mu=mu, sigma=sigma, dims=dims)
     if family == "half_normal":
+        if any(mu):
+            return pm.TruncatedNormal(name, mu=mu, sigma=sigma, lower=0.0, dims=dims)
         return pm.HalfNormal(name, sigma=sigma, dims=dims)
     if family == "categorical":
         n = int(priors[0].upper) + 1
@@ -222,4 +263,19 @@ def random_variable(
     raise ParameterError(
         f"prior of {name}: family {family!r} is unknown; use log_normal, truncated_normal, normal,"
         " half_normal, von_mises or categorical"
+    )
+
+
+def _von_mises(name: str, mu: Array, kappa: Array, dims: str) -> Any:
+    """PyMC's von Mises, or the same density written so that a sharp one does not overflow."""
+    if kappa.max() <= _SHARP:
+        return pm.VonMises(name, mu=mu, kappa=kappa, dims=dims)
+    log_norm = np.log(2 * np.pi * i0e(kappa))
+    return pm.CustomDist(
+        name,
+        mu,
+        kappa,
+        logp=lambda value, mu, kappa: kappa * (pm.math.cos(value - mu) - 1.0) - log_norm,
+        dist=lambda mu, kappa, size: pm.VonMises.dist(mu, kappa, size=size),
+        dims=dims,
     )

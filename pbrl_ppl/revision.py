@@ -17,6 +17,7 @@ from pbrl_ppl.evaluation import HeldOut, standard_error
 from pbrl_ppl.findings import Added, Estimate, Findings, Numerical
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import History
+from pbrl_ppl.identification import identify
 from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode, find_mode, inside, with_start_noise
@@ -336,6 +337,7 @@ class _Loop:
                 "rollout_horizon": rollout,
                 "rollout_seconds": rollout * self.scene.time_step,
             },
+            identifiability=identify(after, mode=revised),
         )
 
 

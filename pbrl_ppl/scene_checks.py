@@ -114,14 +114,18 @@ def known_parameters(value: object, where: str) -> tuple[tuple[str, float], ...]
 
 
 def hyper_parameters(
-    value: object, where: str
+    value: object, where: str, effects: tuple[str, ...]
 ) -> tuple[tuple[str, tuple[tuple[str, float], ...]], ...]:
-    """Return the priors' hyper-parameters of a body in Table 1's order."""
+    """Return the priors' hyper-parameters of a body: in Table 1's order, then its effects'."""
     prior: dict[str, tuple[tuple[str, float], ...]] = {}
     for name, table in _items(value, f"{where}: prior"):
-        if name not in PARAMETER_NAMES:
+        # which parameters an effect has is known where the catalogue is: `prior.build_layout`
+        if name not in PARAMETER_NAMES and not str(name).startswith(
+            tuple(f"{effect}_" for effect in effects)
+        ):
             raise SceneError(
                 f'unknown parameter "{name}" in prior of {where}{nearest(name, PARAMETER_NAMES)}'
+                " (an effect's parameter needs the effect among the body's effects)"
             )
         hyper: dict[str, float] = {}
         for key, item in _items(table, f"{where}: prior {name}"):
@@ -132,4 +136,5 @@ def hyper_parameters(
             check = finite if key == "mu" else positive
             hyper[key] = check(item, f"{where}: prior {name} {key}")
         prior[name] = tuple((key, hyper[key]) for key in HYPER_NAMES if key in hyper)
-    return tuple((name, prior[name]) for name in PARAMETER_NAMES if name in prior)
+    order = (*PARAMETER_NAMES, *sorted(prior.keys() - set(PARAMETER_NAMES)))
+    return tuple((name, prior[name]) for name in order if name in prior)

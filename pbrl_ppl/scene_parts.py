@@ -38,8 +38,9 @@ class Body:
     known : tuple of (str, float)
         Parameters that are given, not inferred; a mapping is accepted.
     prior : tuple of (str, tuple of (str, float))
-        Hyper-parameters (``mu``, ``sigma``, ``kappa``) that replace the defaults; a mapping of
-        mappings is accepted.
+        Hyper-parameters (``mu``, ``sigma``, ``kappa``) that replace the defaults, of Table 1's
+        parameters and of declared effects' (``linear_drag_coefficient``); a mapping of mappings is
+        accepted.
     effects : tuple of str
         Effects of the catalogue that are declared from the start.
     pose : tuple of float, optional
@@ -75,15 +76,15 @@ class Body:
         flag(self.wheel, f"{where}: wheel")
         flag(self.static, f"{where}: static")
         object.__setattr__(self, "known", known_parameters(self.known, where))
-        object.__setattr__(self, "prior", hyper_parameters(self.prior, where))
-        for name in dict(self.known).keys() & dict(self.prior).keys():
-            raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
         if isinstance(self.effects, str) or not isinstance(self.effects, Iterable):
             raise SceneError(f"{where}: effects is {self.effects!r}, expected a list of names")
         effects = tuple(label(effect, f"{where}: effects") for effect in self.effects)
         if len(set(effects)) < len(effects):
             raise SceneError(f"{where}: effects {list(effects)} names one twice; drop it")
         object.__setattr__(self, "effects", effects)
+        object.__setattr__(self, "prior", hyper_parameters(self.prior, where, effects))
+        for name in dict(self.known).keys() & dict(self.prior).keys():
+            raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
         if self.pose is not None:
             object.__setattr__(self, "pose", vector(self.pose, 3, f"{where}: pose"))
         if self.static and self.pose is None:

@@ -23,6 +23,7 @@ from pbrl_ppl.findings import (
     Rollout,
     Unexplained,
 )
+from pbrl_ppl.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.report import FILES, Loop, number, render, verdict_in_words
 from pbrl_ppl.scene import Body, Scene, Shape
 
@@ -264,6 +265,36 @@ def test_page_where_something_is_unexplained() -> None:
     assert "once in 500 times (p = 0.0020)" in text
 
 
+def test_page_says_what_the_data_do_not() -> None:
+    widths = (
+        Width("mass[cart]", 1.5, 0.015, 0.01, "informed"),
+        Width("r[cart]", 1.0, 0.99, 0.99, "prior only"),
+    )
+    pair = Direction((("mass[cart]", 0.6), ("push_gain_gain[cart]", -0.8)), 0.01)
+    said = Identifiability(widths, ("r[cart]", "inertia_scale_scale[cart]"), (pair,))
+    findings = replace(made_up(), identifiability=said)
+    words = " ".join(" ".join(Page(render(findings)).words).split())
+    assert "What the data say" in words
+    assert "The data say nothing about r[cart]: record contacts" in words
+    assert "nothing about inertia_scale_scale[cart]: record the body turning" in words
+    assert "mass[cart] up with push_gain_gain[cart] down" in words
+    assert "say nothing beyond the prior" in words
+    kept = findings.to_dict()["identifiability"]
+    assert kept["parameters"][1] == {
+        "parameter": "r[cart]",
+        "prior_sd": 1.0,
+        "posterior_sd": 0.99,
+        "ratio": 0.99,
+        "verdict": "prior only",
+    }
+    assert kept["directions"][0]["weights"] == {"mass[cart]": 0.6, "push_gain_gain[cart]": -0.8}
+    fine = replace(findings, identifiability=Identifiability(widths[:1], (), ()))
+    assert "Predictions depend on every parameter" in render(fine)
+    without = made_up()
+    assert "What the data say" not in render(without)
+    assert without.to_dict()["identifiability"] is None
+
+
 def test_page_says_what_did_not_converge() -> None:
     text = Page(render(made_up("adequate", stuck=True))).text
     assert "1 of 9 parameters did not converge" in text
@@ -393,6 +424,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "candidates",
         "unexplained",
         "error",
+        "identifiability",
         "provenance",
     ]
     assert list(got["added"][0]) == [

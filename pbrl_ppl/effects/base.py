@@ -132,6 +132,11 @@ class Attached:
     effect: Effect
     body: str
 
+    @property
+    def variables(self) -> tuple[str, ...]:
+        """Names of its parameters' random variables in a model."""
+        return tuple(self.effect.variable(each) for each in self.effect.parameters)
+
 
 def is_pivoted(scene: Scene, body: Body) -> bool:
     """Whether the body hangs in a hinge; the friction of a hinge belongs to the body that does."""
