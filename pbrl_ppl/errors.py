@@ -37,5 +37,13 @@ class ConvergenceWarning(UserWarning):
     """A fit whose R-hat or effective sample size is not good enough to rely on."""
 
 
+class BoundWarning(UserWarning):
+    """A fit that presses a parameter against the end of its support."""
+
+
+class UninformedWarning(UserWarning):
+    """A fit in which the data say nothing about a parameter: its posterior is its prior."""
+
+
 class FitError(PbrlError, ValueError):
     """A model that cannot be fitted as asked."""

@@ -216,6 +216,10 @@ def fit(
     ConvergenceWarning
         If an R-hat is over 1.01 or an effective sample size under 400, or if sampling was
         interrupted.
+    BoundWarning
+        If a parameter is pressed against the end of its support.
+    UninformedWarning
+        If the data say nothing about a parameter.
     """
     problem = getattr(model, "problem", None)
     if not isinstance(problem, Problem):

@@ -14,10 +14,12 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.errors import ConvergenceWarning
+from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
+from pbrl_ppl.identification import uninformed
 from pbrl_ppl.likelihood import log_density, next_state_random
 from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import attributes, convergence, draws, from_groups, group, groups
+from pbrl_ppl.wheel_symmetry import fold_draws
 
 Array = NDArray[np.float64]
 
@@ -26,6 +28,8 @@ MAX_RHAT, MIN_ESS = 1.01, 400
 _PREDICTIVE_DRAWS = 50
 #: With fewer, nothing can be said of convergence.
 _LEAST_DRAWS = 4
+#: A parameter is stuck if this share of its draws is within this share of its support's end.
+_STUCK, _NEAR = 0.5, 0.01
 PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
 
 
@@ -52,8 +56,8 @@ def complete(
     InferenceData or DataTree
         The posterior.
     """
-    phi, sigma = parameter_draws(problem, trace)
-    posterior = group(trace, "posterior")
+    posterior = _folded(problem, trace)
+    phi, sigma = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
     chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
     measured = problem.observations.measured
     likelihood = np.empty((chains * n, problem.segments.n))
@@ -100,7 +104,7 @@ def complete(
         "constant_data": data["constant_data"],
     }
     idata = from_groups(result, _origin(problem, seed) | {"method": method})
-    return _checked(idata, asked)
+    return _checked(problem, idata, asked)
 
 
 def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
@@ -116,6 +120,19 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
     )
     sigma = named["sigma"].reshape(n, -1)
     return phi, np.broadcast_to(sigma, (len(phi), len(problem.observations.columns)))
+
+
+def _folded(problem: Problem, trace: Any) -> xr.Dataset:
+    """The posterior with each wheel in one of its equal descriptions, the same in all chains."""
+    posterior = group(trace, "posterior").copy(deep=True)
+    layout = problem.layout
+    phi, _ = parameter_draws(problem, trace)
+    folded = fold_draws(layout, dict(zip(layout.labels, phi.T, strict=True)))
+    for block in layout.blocks:
+        for i, owner in enumerate(block.owners):
+            values = posterior[block.name].values
+            values[..., i] = folded[f"{block.name}[{owner}]"].reshape(values.shape[:2])
+    return posterior
 
 
 def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
@@ -157,23 +174,26 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _checked(idata: Any, asked: int | None) -> Any:
-    """Store how far the chains have converged, and warn where that is not far enough."""
-    found = list(_trouble(idata, asked))
-    idata.attrs["warnings"] = json.dumps(found)
-    for message in found:
-        warnings.warn(message, ConvergenceWarning, stacklevel=4)
+def _checked(problem: Problem, idata: Any, asked: int | None) -> Any:
+    """Store what is wrong with a posterior, and warn of it."""
+    found = list(_trouble(problem, idata, asked))
+    idata.attrs["warnings"] = json.dumps([message for _, message in found])
+    for kind, message in found:
+        warnings.warn(message, kind, stacklevel=4)
     return idata
 
 
-def _trouble(idata: Any, asked: int | None) -> Iterator[str]:
-    """What is wrong with the chains, and the cure."""
+def _trouble(
+    problem: Problem, idata: Any, asked: int | None
+) -> Iterator[tuple[type[Warning], str]]:
+    """What is wrong, and the cure."""
     sizes = group(idata, "posterior").sizes
     if asked is not None:
         idata.attrs["interrupted"] = 1
         yield (
+            ConvergenceWarning,
             f"sampling was interrupted after {sizes['draw']} of {asked} draws a chain, which are"
-            " kept; to go on, pass this posterior as start= to fit"
+            " kept; to go on, pass this posterior as start= to fit",
         )
     if sizes["draw"] < _LEAST_DRAWS:  # a mode alone
         return
@@ -182,7 +202,30 @@ def _trouble(idata: Any, asked: int | None) -> Iterator[str]:
     idata.attrs["max_rhat"], idata.attrs["min_ess"] = r_hat[worst_hat], ess[worst_ess]
     if not (r_hat[worst_hat] <= MAX_RHAT and ess[worst_ess] >= MIN_ESS):
         yield (
+            ConvergenceWarning,
             f"the chains have not converged: R-hat is {r_hat[worst_hat]:.3f} for {worst_hat}"
             f" (want <= {MAX_RHAT}), effective sample size {ess[worst_ess]:.0f} for {worst_ess}"
-            f" (want >= {MIN_ESS}); raise draws= or thin=, or go on with start= this posterior"
+            f" (want >= {MIN_ESS}); raise draws= or thin=, or go on with start= this posterior",
+        )
+    phi, _ = parameter_draws(problem, idata)
+    for label, prior, values in zip(
+        problem.layout.labels, problem.layout.priors, phi.T, strict=True
+    ):
+        lower, upper = prior.support
+        margin = _NEAR * (upper - lower)
+        for bound in (lower, upper):
+            share = float((np.abs(values - bound) < margin).mean())
+            if np.isfinite(margin) and not prior.discrete and share > _STUCK:
+                yield (
+                    BoundWarning,
+                    f"{label} is pressed against the end of its support, {bound:g}: {share:.0%} of"
+                    " the draws are there; check the shape and the frame of the body, or look for"
+                    " an effect that the model lacks (pbrl-ppl close-loop)",
+                )
+    silent = uninformed(idata, effects={one.effect for one in problem.effects})
+    if silent:
+        yield (
+            UninformedWarning,
+            f"the data say nothing about {', '.join(silent)}: the posterior is the prior; record"
+            " motions that depend on it, or give it in the scene (known = ...)",
         )

@@ -3,6 +3,7 @@
 import json
 import pickle
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pymc as pm
@@ -10,14 +11,30 @@ import pytest
 
 from pbrl_ppl import record
 from pbrl_ppl.effects import catalogue
-from pbrl_ppl.errors import ConvergenceWarning, FitError, PosteriorError
+from pbrl_ppl.errors import (
+    BoundWarning,
+    ConvergenceWarning,
+    FitError,
+    PosteriorError,
+    UninformedWarning,
+)
 from pbrl_ppl.fitting import METHODS, fit
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import az, convergence, draws, group, groups, load_posterior, scene_of
+from pbrl_ppl.posterior import (
+    az,
+    convergence,
+    draws,
+    from_groups,
+    group,
+    groups,
+    load_posterior,
+    scene_of,
+)
 from pbrl_ppl.posterior import save_posterior as save
-from pbrl_ppl.record import MAX_RHAT, MIN_ESS
+from pbrl_ppl.record import MAX_RHAT, MIN_ESS, complete
+from pbrl_ppl.scene import Shape
 from pbrl_ppl.starts import unconstrain
 from tests.test_model import CART, NOISE, cart_scene, simulated_history
 
@@ -324,6 +341,55 @@ def test_a_start_of_another_model_is_refused(model, interrupted) -> None:
     other = physics_model(scene, model.problem.history)
     with pytest.raises(PosteriorError, match="has no r, mu_c"):
         fit(other, start=interrupted, progress=False)
+
+
+def test_chains_in_equal_descriptions_of_a_wheel_agree(model, fitted) -> None:
+    """w_theta a quarter turn on, mu_x and mu_y swapped, is the same wheel: R-hat must not mind."""
+    turned = {
+        name: data.copy(deep=True)
+        for name, data in groups(fitted).items()
+        if name in ("posterior", "sample_stats", "observed_data", "constant_data")
+    }
+    posterior = turned["posterior"]
+    posterior["w_theta"].values[1] += np.pi / 2
+    mu_x = posterior["mu_x"].values[1].copy()
+    posterior["mu_x"].values[1] = posterior["mu_y"].values[1]
+    posterior["mu_y"].values[1] = mu_x
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        again = complete(model.problem, from_groups(turned, {}), seed=1, method="metropolis")
+    for name in PARAMETERS:
+        np.testing.assert_allclose(draws(again)[name], draws(fitted)[name], atol=1e-12)
+    np.testing.assert_allclose(
+        group(again, "log_likelihood")["next_state"].values,
+        group(fitted, "log_likelihood")["next_state"].values,
+    )
+
+
+def test_a_parameter_at_its_bound_is_named(model) -> None:
+    """The scene claims a cart so small that the wheel cannot be where it is."""
+    known = {name: CART[name] for name in ("mass", "r", "mu_c", "w_y", "w_theta", "mu_x", "mu_y")}
+    scene = cart_scene(known=known)
+    small = replace(scene.bodies[0], shape=Shape.box(0.7 * abs(CART["w_x"]), 0.5))
+    with (
+        pytest.warns(ConvergenceWarning),
+        pytest.warns(BoundWarning, match=r"w_x\[cart\] is pressed against .*close-loop"),
+    ):
+        idata = fit(
+            physics_model(scene.replace(bodies=(small,)), model.problem.history), seed=1, **QUICK
+        )
+    assert any("w_x[cart]" in each for each in json.loads(idata.attrs["warnings"]))
+
+
+def test_a_parameter_that_the_data_say_nothing_about_is_named(model) -> None:
+    known = {name: CART[name] for name in CART if name not in ("mass", "r")}
+    scene = cart_scene(known=known)
+    with (
+        pytest.warns(UninformedWarning, match=r"nothing about r\[cart\]: .*known"),
+        warnings.catch_warnings(),
+    ):
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fit(physics_model(scene, model.problem.history), seed=1, **QUICK)
 
 
 def test_unknown_method(model) -> None:
