@@ -148,7 +148,7 @@ def _thinned(trace: Any, thin: int) -> Any:
 
 #: The samplers by name. Of the paper's schedule only the kind is known to us; its lengths are ours.
 METHODS: Mapping[str, Method] = {
-    "metropolis": Method(_metropolis, draws=1000, tune=500, thin=2),
+    "metropolis": Method(_metropolis, draws=1500, tune=500, thin=1),
     "paper": Method(_paper, draws=1000, tune=5000, thin=10),
     "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),
     "smc": Method(_smc, draws=1000, tune=0, thin=1),

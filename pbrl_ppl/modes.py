@@ -24,8 +24,9 @@ Array = NDArray[np.float64]
 _MARGIN = 1e-6
 #: A residual beyond this many noise units says no more about where the mode is.
 _SCREEN_CLIP = 1e3
-#: Transitions used to tell basins apart, and how many of the best are searched with all data.
-_PART, _POLISHED = 60, 2
+#: Transitions used to tell basins apart, and how many of the best are searched with all data; with
+#: no more than so many transitions, all are.
+_PART, _POLISHED, _FEW = 60, 2, 20
 #: Gains in log-posterior: less is not worth another round; more shows that the coarse derivative
 #: had not led to the top. (Friction makes the top rough: some units are within its grain.)
 _STALLED, _WORTHWHILE = 0.02, 5.0
@@ -110,8 +111,8 @@ def find_modes(
     problem: Problem,
     *,
     seed: int | np.random.Generator = 0,
-    starts: int = 4,
-    screened: int = 48,
+    starts: int | None = None,
+    screened: int | None = None,
     initial: Array | None = None,
 ) -> list[Mode]:
     """Search for modes from several starts, best first.
@@ -122,10 +123,9 @@ def find_modes(
         What to fit.
     seed : int or Generator
         Of the draws from the prior.
-    starts : int
-        Local searches.
-    screened : int
-        Draws from the prior among which the starts are chosen.
+    starts, screened : int, optional
+        Local searches, and draws from the prior among which their starts are chosen. With few data
+        there are more by default: they cost little there, and more hills look alike.
     initial : ndarray, optional
         Where to begin, shape (p,); then there is one local search.
 
@@ -150,12 +150,15 @@ def find_modes(
         return [_finish(problem, *_polish(problem, near))]
     if not priors:  # everything is known but the noise
         return [_finish(problem, *_climb(problem, np.zeros(0), problem.coarse))]
+    few = problem.segments.n <= _FEW
+    starts = (16 if few else 4) if starts is None else starts
+    screened = (1000 if few else 48) if screened is None else screened
     rng = np.random.default_rng(seed)
     draws = np.stack([prior.sample(rng, screened) for prior in priors], axis=1)
     draws = np.vstack([[prior.centre for prior in priors], draws])
     draws = inside(priors, draws)
     # the basins show in a part of the data already, and with few engine steps
-    part = _part(problem, _PART)
+    part = problem if few else _part(problem, _PART)
     residual = part.residual(draws)
     sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations.measured, None)
     z = np.nan_to_num(residual / sigma, nan=_SCREEN_CLIP).reshape(len(draws), -1)
@@ -163,9 +166,9 @@ def find_modes(
     order = np.argsort(np.log1p(np.minimum(z, _SCREEN_CLIP) ** 2).sum(axis=1))
     rough = [_climb(part, draws[i], part.simulator) for i in order[:starts]]
     rough.sort(key=lambda result: -result[2])
-    found: list[tuple[Array, Array, float]] = []
-    for phi, _, _ in _distinct(problem, rough)[:_POLISHED]:
-        found.append(_climb(problem, phi, problem.coarse))
+    found = _distinct(problem, rough)
+    if not few:
+        found = [_climb(problem, phi, problem.coarse) for phi, _, _ in found[:_POLISHED]]
     found.sort(key=lambda result: -result[2])
     best = _polish(problem, found[0])
     return [_finish(problem, *result) for result in (best, *found[1:])]

@@ -67,7 +67,8 @@ def complete(
     wide = replace(problem, threads=max(problem.threads, 2))
     for begin in range(0, len(phi), 64):
         part = slice(begin, begin + 64)
-        states = wide.predict(phi[part])
+        own, which = np.unique(phi[part], axis=0, return_inverse=True)  # a chain stays put at times
+        states = wide.predict(own)[which.ravel()]
         residual = problem.observations.residual(states)
         likelihood[part] = log_density(residual, sigma[part], problem.noise, measured)
         predictive += [

@@ -1,0 +1,294 @@
+"""How good and how quick inference is, measured on data whose truth is known.
+
+    python analysis/benchmarks/inference.py                    # a table
+    python analysis/benchmarks/inference.py --json             # one JSON object
+    python analysis/benchmarks/inference.py --only cart map    # some of it
+
+Data are simulated by Eq. 13 from fixed seeds, each transition from its own start state, so that the
+model is true. Seconds are this machine's; the ratios compare both sides in one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pymc as pm
+import pymunk
+import pytensor.tensor as pt
+from pytensor.graph.basic import Apply
+from pytensor.graph.op import Op
+
+import pbrl_ppl as pp
+from pbrl_ppl.likelihood import next_state_logp
+from pbrl_ppl.model import Problem
+from pbrl_ppl.modes import find_mode
+from pbrl_ppl.physics import PartedSimulator
+from pbrl_ppl.posterior import az, convergence, group
+from pbrl_ppl.prior import build_layout
+
+sys.path.insert(0, str(Path(__file__).parent))
+from engine import ROUNDS, machine
+
+MODELS = Path(__file__).parents[2] / "models"
+G = 9.81
+NOISE = np.array([0.002, 0.002, 0.004, 0.01, 0.01, 0.02])  # of motion capture
+CART = {"mass": 8.0, "r": 0.3, "mu_c": 0.3, "w_x": -0.25, "w_y": 0.05, "w_theta": 0.3}
+CART |= {"mu_x": 0.04, "mu_y": 0.45}
+Row = tuple[str, str, str, float]  # key, what, bound, measured
+
+
+# -- data ------------------------------------------------------------------------------------------
+
+
+def simulate(
+    scene: pp.Scene,
+    phi: np.ndarray,
+    start: np.ndarray,
+    actions: np.ndarray,
+    noise: np.ndarray,
+    seed: int,
+) -> pp.History:
+    """A history of single transitions (n, k, 6) under wrenches (n, k, 3), by Eq. 13."""
+    rng = np.random.default_rng(seed)
+    n, k = start.shape[:2]
+    end = PartedSimulator(scene, build_layout(scene))(phi, start, actions[:, None])[:, 0]
+    end = end + noise * rng.standard_normal(end.shape)
+    states = np.stack([start, end], axis=1).reshape(-1, 6)
+    wrenches = np.stack([actions, np.full_like(actions, np.nan)], axis=1).reshape(-1, 3)
+    rows = pd.DataFrame(states, columns=["x", "y", "theta", "vx", "vy", "omega"])
+    rows[["force_x", "force_y", "torque"]] = wrenches
+    rows["body"] = [body.name for body in scene.dynamic] * (2 * n)
+    rows["time"] = np.tile(np.repeat([0.0, scene.time_step], k), n)
+    rows["trajectory"] = np.repeat(np.arange(n), 2 * k)
+    return pp.History.from_dataframe(rows, scene)
+
+
+def cart(n: int, noise: np.ndarray = NOISE, seed: int = 0) -> tuple[pp.Scene, pp.History]:
+    """The shopping cart, pushed at random; all of phi unknown; 20 substeps."""
+    scene = pp.Scene.load(MODELS / "shopping_cart" / "scene.toml").replace(substeps=20)
+    rng = np.random.default_rng(seed)
+    start = rng.normal(0, [1.0, 1.0, 1.5, 1.2, 1.2, 0.8], (n, 1, 6))
+    actions = rng.normal(0, [12.0, 12.0, 2.0], (n, 1, 3))
+    phi = build_layout(scene).to_vector(CART)
+    return scene, simulate(scene, phi, start, actions, noise, seed + 1)
+
+
+def apartment(n: int) -> tuple[pp.Scene, pp.History]:
+    """Eleven bodies, all pushed at once, n times; Table 1's continuous prior for each."""
+    scene = pp.Scene.load(MODELS / "apartment" / "scene.toml")
+    layout = build_layout(scene)
+    rng = np.random.default_rng(3)
+    k = len(scene.dynamic)
+    phi = np.array([prior.centre for prior in layout.priors])
+    for name, low, high in (("w_theta", -1.4, 1.4), ("mu_x", 0.02, 0.1), ("mu_y", 0.3, 0.6)):
+        for i, label in enumerate(layout.labels):
+            if label.startswith(f"{name}["):
+                phi[i] = rng.uniform(low, high)
+    for i, (label, prior) in enumerate(zip(layout.labels, layout.priors, strict=True)):
+        if label.startswith(("w_x[", "w_y[")):
+            phi[i] = rng.uniform(*(0.6 * np.array(prior.support)))
+    start = rng.normal(0, [0.01, 0.01, 0.1, 0.6, 0.6, 0.8], (n, k, 6))
+    start[..., :3] += [body.pose for body in scene.dynamic]
+    mass = phi[[layout.index("mass", body.name) for body in scene.dynamic]]
+    actions = rng.normal(0, [3.0, 3.0, 0.8], (n, k, 3)) * mass[:, None]
+    return scene, simulate(scene, phi, start, actions, NOISE, 4)
+
+
+# -- what is measured ------------------------------------------------------------------------------
+
+
+def seconds(function: Callable[[], object]) -> tuple[float, object]:
+    """Time of one call, and what it gave."""
+    begin = time.perf_counter()
+    result = function()
+    return time.perf_counter() - begin, result
+
+
+def sampled(scene: pp.Scene, history: pp.History, **options) -> tuple[float, float, float]:
+    """Seconds of a whole fit, mode and compilation included; largest R-hat; least ESS."""
+    took, idata = seconds(
+        lambda: pp.fit(
+            pp.physics_model(scene, history, threads=1), seed=1, progress=False, **options
+        )
+    )
+    r_hat, ess = convergence(idata)
+    return took, max(r_hat.values()), min(ess.values())
+
+
+def measure_cart() -> Iterator[Row]:
+    """All of phi and sigma from 360 transitions."""
+    took, r_hat, ess = sampled(*cart(360))
+    what = "cart, 360 transitions x 20 substeps, 4 chains"
+    yield "cart_seconds", f"{what}: seconds, mode and compilation included", "<= 60", took
+    yield "cart_max_rhat", f"{what}: largest R-hat", "<= 1.01", r_hat
+    yield "cart_min_ess", f"{what}: least bulk or tail ESS", ">= 400", ess
+
+
+def measure_apartment() -> Iterator[Row]:
+    """Eleven bodies under the continuous prior."""
+    scene, history = apartment(30)
+    took, r_hat, ess = sampled(scene, history, draws=2000, tune=1500)
+    what = "11 bodies, continuous prior, 30 transitions a body"
+    yield "apartment_seconds", f"{what}: seconds", "<= 600", took
+    yield "apartment_max_rhat", f"{what}: largest R-hat", "<= 1.01", r_hat
+    yield "apartment_min_ess", f"{what}: least bulk or tail ESS", ">= 400", ess
+
+
+def measure_map() -> Iterator[Row]:
+    """The mode alone, two threads."""
+    scene, history = cart(360)
+    model = pp.physics_model(scene, history, threads=2)
+    find_mode(model.problem, seed=0)  # compiled code and worlds are there
+    took = float(
+        np.median([seconds(lambda: find_mode(model.problem, seed=1))[0] for _ in range(ROUNDS)])
+    )
+    yield "map_seconds", "mode of the same data: seconds", "< 1", took
+
+
+def measure_noise_free() -> Iterator[Row]:
+    """Two random transitions without noise; the worst of ten histories."""
+    errors, friction = [], []
+    for seed in range(10):
+        scene, history = cart(2, noise=np.zeros(6), seed=seed)
+        mode = find_mode(pp.physics_model(scene, history).problem, seed=1)
+        found = dict(zip(mode.problem.layout.labels, mode.phi, strict=True))
+        errors.append(abs(found["mass[cart]"] / CART["mass"] - 1))
+        friction += [abs(found[f"{name}[cart]"] - CART[name]) for name in ("mu_x", "mu_y")]
+    what = "noise-free cart, two transitions, worst of ten: error of"
+    yield "noise_free_mass_error", f"{what} the mass (share)", "<= 0.001", max(errors)
+    yield "noise_free_friction_error", f"{what} mu_x, mu_y", "<= 0.01", max(friction)
+
+
+class PythonLoop(Op):
+    """What one would write first: pymunk stepped from Python, a new Space a transition."""
+
+    __props__ = ()
+
+    def __init__(self, problem: Problem) -> None:
+        self.problem = problem
+
+    def make_node(self, phi: pt.TensorVariable) -> Apply:
+        """Phi in, next states (transition, 1, 1, 6) out."""
+        return Apply(self, [pt.as_tensor_variable(phi)], [pt.dtensor4()])
+
+    def perform(self, node: Apply, inputs: list, outputs: list) -> None:
+        """Step every transition."""
+        problem = self.problem
+        values = dict(zip((b.name for b in problem.layout.blocks), inputs[0], strict=True))
+        segments, step = problem.segments, problem.scene.time_step / problem.substeps
+        shape, out = problem.scene.dynamic[0].shape, np.empty((problem.segments.n, 1, 1, 6))
+        for t in range(segments.n):
+            state, action = segments.start[t, 0], segments.actions[t, 0, 0]
+            space = pymunk.Space()
+            body = pymunk.Body(values["mass"], values["mass"] * shape.unit_moment)
+            poly = pymunk.Poly(body, shape.outline)
+            poly.elasticity, poly.friction = values["r"], values["mu_c"]
+            wheel = values["w_x"], values["w_y"]
+            rods = [pymunk.PinJoint(body, space.static_body, wheel, (0, 0)) for _ in range(2)]
+            for rod, mu in zip(rods, (values["mu_x"], values["mu_y"]), strict=True):
+                rod.max_bias, rod.max_force = 0.0, mu * values["mass"] * G
+            walls = [
+                pymunk.Segment(space.static_body, w.start, w.end, 0) for w in problem.scene.walls
+            ]
+            space.add(body, poly, *rods, *walls)
+            body.position, body.angle = tuple(state[:2]), state[2]
+            body.velocity, body.angular_velocity = tuple(state[3:5]), state[5]
+            for _ in range(problem.substeps):
+                body.force, body.torque = tuple(action[:2]), action[2]
+                theta = body.angle + body.angular_velocity * step
+                here = pymunk.Vec2d(*wheel).rotated(theta) + body.position + body.velocity * step
+                axis = pymunk.Vec2d(1.0, 0.0).rotated(theta + values["w_theta"])
+                rods[0].anchor_b, rods[1].anchor_b = here + axis, here + axis.perpendicular()
+                space.step(step)
+            out[t, 0, 0] = (*body.position, body.angle, *body.velocity, body.angular_velocity)
+        outputs[0][0] = out
+
+
+def plain_model(model: pm.Model) -> pm.Model:
+    """The same model on the Python loop."""
+    problem = model.problem
+    loop = PythonLoop(problem)
+    with pm.Model(coords=model.coords) as plain:
+        from pbrl_ppl.model import sigma_prior
+        from pbrl_ppl.prior import random_variable
+
+        phi = pt.concatenate(
+            [random_variable(b.name, b.priors, "body") for b in problem.layout.blocks]
+        )
+        median, spread = sigma_prior(problem.observations, problem.segments)
+        sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
+        logp = next_state_logp(
+            problem.observations.values, loop(phi), sigma, problem.observations, None
+        )
+        pm.Potential("likelihood", logp.sum())
+    return plain
+
+
+def measure_ratio() -> Iterator[Row]:
+    """Effective draws a second: ours over pm.Metropolis on the Python loop.
+
+    How many draws of pm.Metropolis an effective one takes is the sampler's affair: measured on the
+    fast Op. How long a draw takes on the Python loop is measured on the Python loop.
+    """
+    scene, history = cart(360)
+    model = pp.physics_model(scene, history)
+    took, _, ess = sampled(scene, history)
+    mode = find_mode(model.problem, seed=1)
+    point = model.problem.layout.to_dict(mode.phi) | {"sigma": mode.sigma}
+    quiet = {"chains": 2, "cores": 1, "progressbar": False, "compute_convergence_checks": False}
+    with model:
+        trace = pm.sample(
+            draws=1500, tune=1500, step=pm.Metropolis(), initvals=point, random_seed=1, **quiet
+        )
+    least = min(float(v.min()) for v in az.ess(group(trace, "posterior")).data_vars.values())
+    share = least / 3000
+    with plain_model(model):
+        step = pm.Metropolis()
+        short = {"step": step, "initvals": point, "random_seed": 1} | quiet | {"chains": 1}
+        few, _ = seconds(lambda: pm.sample(draws=2, tune=0, **short))
+        more, _ = seconds(lambda: pm.sample(draws=8, tune=0, **short))
+    a_draw = (more - few) / 6
+    ratio = (ess / took) / (share / a_draw)
+    yield (
+        "ess_per_second_ratio",
+        f"ESS a second / pm.Metropolis on a Python loop ({a_draw:.2g} s a draw, ESS {share:.2g})",
+        ">= 100",
+        ratio,
+    )
+
+
+PARTS: dict[str, Callable[[], Iterator[Row]]] = {
+    "cart": measure_cart,
+    "map": measure_map,
+    "noise_free": measure_noise_free,
+    "ratio": measure_ratio,
+    "apartment": measure_apartment,
+}
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    rows = [row for name in arguments.only for row in PARTS[name]()]
+    if arguments.json:
+        print(json.dumps({key: value for key, _, _, value in rows}))
+        return
+    print(f"{machine()}\n\n| what | bound | measured |\n|---|---|---|")
+    for key, what, bound, value in rows:
+        print(f"| {what} [`{key}`] | {bound} | {value:.3g} |")
+
+
+if __name__ == "__main__":
+    main()
