@@ -124,14 +124,30 @@ def _map(job: Job) -> Any:
         name: (("chain", "draw", *dims[name]), np.asarray(value)[None, None])
         for name, value in values.items()
     }
-    named = {dim for each in dims.values() for dim in each}
-    coords = {dim: list(job.model.coords[dim]) for dim in named}
-    posterior = xr.Dataset(data, {"chain": [0], "draw": [0], **coords})
-    # observed and constant data as PyMC records them
-    prior = pm.sample_prior_predictive(draws=1, model=job.model, random_seed=job.seed)
-    kept = {name: groups(prior)[name] for name in ("observed_data", "constant_data")}
-    log_posterior = xr.Dataset({"lp": (("chain", "draw"), [[job.mode.log_posterior]])})
-    return from_groups({"posterior": posterior, "sample_stats": log_posterior, **kept}, {})
+    segments = problem.segments
+    given = {
+        "start": (("transition", "body", "full_state"), segments.start),
+        "actions": (("transition", "step", "body", "wrench"), segments.actions),
+    }
+    observed = {
+        "next_state": (("transition", "step", "body", "state"), problem.observations.values)
+    }
+
+    def dataset(variables: dict[str, Any], **more: Any) -> xr.Dataset:
+        used = {dim for each, _ in variables.values() for dim in each if dim in job.model.coords}
+        return xr.Dataset(variables, more | {dim: list(job.model.coords[dim]) for dim in used})
+
+    log_posterior = {"lp": (("chain", "draw"), [[job.mode.log_posterior]])}
+    one = {"chain": [0], "draw": [0]}
+    return from_groups(
+        {
+            "posterior": dataset(data, **one),
+            "sample_stats": dataset(log_posterior, **one),
+            "observed_data": dataset(observed),
+            "constant_data": dataset(given),
+        },
+        {},
+    )
 
 
 def _thinned(trace: Any, thin: int) -> Any:
@@ -250,6 +266,8 @@ def fit(
     with model, warnings.catch_warnings():
         # convergence is checked and reported in this package's own words
         warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
+        # draws from the prior, of which SMC needs some, are not compiled on the newer stack
+        warnings.filterwarnings("ignore", message="Numba will use object mode")
         trace = chosen.run(job)
     done = group(trace, "posterior").sizes["draw"]
     asked = job.draws if method != "map" else 1

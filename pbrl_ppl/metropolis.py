@@ -160,13 +160,12 @@ class AdaptiveMetropolis(ArrayStepShared):
         values = get_value_vars_from_user_vars(vars, model)
         self.tune = True
         self.blocks, self.rough, self.inner, self.thin = blocks, rough, inner, thin
-        shared = pm.make_shared_replacements(point, values, model)
         (logp,), joined = join_nonshared_inputs(
-            point=point, outputs=[model.logp()], inputs=values, shared_inputs=shared
+            point=point, outputs=[model.logp()], inputs=values, shared_inputs={}
         )
         self.logp = compile_function([joined], logp)
         self.logp.trust_input = True
-        super().__init__(values, shared, blocked=True, rng=rng)
+        super().__init__(values, {}, blocked=True, rng=rng)
 
     def astep(self, q0: RaveledVars) -> tuple[RaveledVars, list[dict[str, Any]]]:
         """Go ``thin`` times over the blocks."""
