@@ -12,7 +12,7 @@ from scipy.special import logsumexp
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.findings import Errors, Rollout
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import STATE_UNITS, StartNoise, log_density
+from pbrl_ppl.likelihood import STATE_UNITS, StartNoise
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, inside
 from pbrl_ppl.record import parameter_draws
@@ -107,9 +107,7 @@ class HeldOut:
 
         problem = self.problem(mode)
         measured = problem.observations.measured
-        at_mode = log_density(
-            np.zeros_like(problem.observations.values), mode.sigma, problem.noise, measured
-        )
+        at_mode = problem.log_density(np.zeros_like(problem.observations.values), mode.sigma)
         return Errors(
             one_step_rmse=expected(self.problem(mode, 1)),
             rollout_rmse=expected(self.problem(mode, rollout)),
@@ -162,8 +160,7 @@ def _laplace_draws(mode: Mode, rng: np.random.Generator) -> tuple[Array, Array]:
 
 def _elpd(problem: Problem, phi: Array, sigma: Array) -> Array:
     """Log predictive density of each held-out transition, shape (transition,)."""
-    measured = problem.observations.measured
-    density = log_density(problem.residual(phi), sigma, problem.noise, measured)
+    density = problem.log_density(problem.residual(phi), sigma)
     return np.asarray(logsumexp(density, axis=0) - np.log(len(phi)))
 
 

@@ -1,4 +1,4 @@
-"""Eqs. 11 and 12: Gaussian next states, and what noise at a segment's start adds to them."""
+"""Eqs. 11 and 12: Gaussian or Student-t next states, and what noise at a start adds to them."""
 
 from __future__ import annotations
 
@@ -166,7 +166,13 @@ def whiten(residual: Array, sigma: Array, noise: StartNoise | None) -> Array:
     return np.asarray(np.einsum("tij,...tj->...ti", noise.unmix, flat / noise.gain))
 
 
-def log_density(residual: Array, sigma: Array, noise: StartNoise | None, measured: Bools) -> Array:
+def log_density(
+    residual: Array,
+    sigma: Array,
+    noise: StartNoise | None,
+    measured: Bools,
+    nu: float | None = None,
+) -> Array:
     """Log-likelihood of each transition (Eq. 11), in numpy.
 
     Parameters
@@ -179,6 +185,8 @@ def log_density(residual: Array, sigma: Array, noise: StartNoise | None, measure
         Spread of the start state's noise.
     measured : ndarray
         Shape (transition, H, body, state).
+    nu : float, optional
+        Degrees of freedom of a Student-t distribution; without it, Gaussian.
 
     Returns
     -------
@@ -188,10 +196,37 @@ def log_density(residual: Array, sigma: Array, noise: StartNoise | None, measure
     z = whiten(residual, sigma, noise)
     log_sigma = np.where(measured, np.log(sigma)[..., None, None, None, :], 0.0).sum((-1, -2, -3))
     count = measured.sum((-1, -2, -3))
-    result = -0.5 * (z**2).sum(-1) - log_sigma - 0.5 * count * math.log(2 * math.pi)
+    result = -0.5 * (robust(z, nu) ** 2).sum(-1) - log_sigma + count * log_norm(nu)
     if noise is not None:
         result = result - noise.log_det
     return np.where(np.isnan(result), -np.inf, result)
+
+
+def robust(z: Array, nu: float | None) -> Array:
+    """Whitened residuals of which half the squares are the negative log-density, up to a constant.
+
+    Parameters
+    ----------
+    z : ndarray
+        Residuals in units of their noise, any shape.
+    nu : float or None
+        Degrees of freedom; None for a Gaussian, whose residuals stay as they are.
+
+    Examples
+    --------
+    >>> robust(np.array([0.1, 30.0]), 4.0).round(2)
+    array([0.11, 5.2 ])
+    """
+    if nu is None:
+        return z
+    return np.asarray(np.sign(z) * np.sqrt((nu + 1) * np.log1p(z**2 / nu)))
+
+
+def log_norm(nu: float | None) -> float:
+    """Logarithm of a standard Student-t's (or normal's) density at zero."""
+    if nu is None:
+        return -0.5 * math.log(2 * math.pi)
+    return math.lgamma((nu + 1) / 2) - math.lgamma(nu / 2) - 0.5 * math.log(nu * math.pi)
 
 
 def estimate_sigma(residual: Array, measured: Bools, sensitivity: Array | None) -> Array:
@@ -234,7 +269,12 @@ def estimate_sigma(residual: Array, measured: Bools, sensitivity: Array | None) 
 
 
 def next_state_logp(
-    value: Any, predicted: Any, sigma: Any, observations: Observations, noise: StartNoise | None
+    value: Any,
+    predicted: Any,
+    sigma: Any,
+    observations: Observations,
+    noise: StartNoise | None,
+    nu: float | None = None,
 ) -> Any:
     """Eq. 11 as a pytensor expression, one log-density a transition.
 
@@ -248,6 +288,8 @@ def next_state_logp(
         Says which cells were measured.
     noise : StartNoise or None
         Spread of the start state's noise.
+    nu : float, optional
+        Degrees of freedom of a Student-t distribution; without it, Gaussian.
     """
     measured = observations.measured
     n = len(measured)
@@ -261,7 +303,8 @@ def next_state_logp(
         z = (pt.as_tensor(noise.unmix) @ (z / noise.gain)[:, :, None])[:, :, 0]
     log_sigma = (pt.log(sigma) * measured).sum(axis=(1, 2, 3))
     count = measured.sum(axis=(1, 2, 3))
-    logp = -0.5 * (z**2).sum(axis=1) - log_sigma - 0.5 * count * math.log(2 * math.pi)
+    square = z**2 if nu is None else (nu + 1) * pt.log1p(z**2 / nu)
+    logp = -0.5 * square.sum(axis=1) - log_sigma + count * log_norm(nu)
     if noise is not None:
         logp = logp - noise.log_det
     return pt.switch(pt.isnan(logp), -np.inf, logp)
@@ -273,10 +316,12 @@ def next_state_random(
     noise: StartNoise | None,
     rng: np.random.Generator,
     size: Any = None,
+    nu: float | None = None,
 ) -> Array:
     """Draw next states by Eq. 13, shape as ``predicted``: (..., transition, H, body, state)."""
     predicted = np.asarray(predicted)
-    z = rng.standard_normal(predicted.shape)
+    shape = predicted.shape
+    z = rng.standard_normal(shape) if nu is None else rng.standard_t(nu, shape)
     if noise is not None:
         flat = z.reshape(*z.shape[:-3], -1)
         mixed = np.linalg.solve(noise.unmix, flat[..., None])[..., 0] * noise.gain

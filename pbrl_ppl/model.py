@@ -21,6 +21,7 @@ from pbrl_ppl.likelihood import (
     STATE,
     Observations,
     StartNoise,
+    log_density,
     next_state_logp,
     next_state_random,
     whiten,
@@ -61,6 +62,8 @@ class Problem:
         Engine worlds that run side by side.
     extrapolate : bool
         Whether the engine's leading errors are cancelled.
+    nu : float, optional
+        Degrees of freedom of Student-t noise; Gaussian without it.
     """
 
     scene: Scene
@@ -72,6 +75,7 @@ class Problem:
     noise: StartNoise | None = None
     threads: int = 1
     extrapolate: bool = True
+    nu: float | None = None
     layout: Layout = field(init=False)
 
     def __post_init__(self) -> None:
@@ -137,6 +141,23 @@ class Problem:
         """Residuals in units of their noise, shape (..., transition, cell)."""
         return whiten(self.residual(phi, engine), sigma, self.noise)
 
+    def log_density(self, residual: Array, sigma: Array) -> Array:
+        """Log-likelihood of each transition, shape (..., transition); see `likelihood`.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Shape (..., transition, H, body, state).
+        sigma : ndarray
+            Shape (..., state).
+        """
+        return log_density(residual, sigma, self.noise, self.observations.measured, self.nu)
+
+    def next_states(self, states: Array, sigma: Array, rng: np.random.Generator) -> Array:
+        """Draw measured next states by Eq. 13 about predictions (..., transition, H, body, 6)."""
+        predicted = states[..., self.observations.columns]
+        return next_state_random(predicted, sigma, self.noise, rng, nu=self.nu)
+
     def sensitivity(self, phi: Array, steps: Array) -> Array:
         """Derivative of the predictions by the measured start state, F.
 
@@ -182,6 +203,7 @@ def physics_model(
     *,
     horizon: int = 1,
     sigma: str = "per_dimension",
+    nu: float | None = None,
     substeps: int | None = None,
     noise: StartNoise | None = None,
     threads: int = 1,
@@ -200,6 +222,9 @@ def physics_model(
         Intervals predicted from one measured state; 1 is Eq. 11.
     sigma : str
         ``per_dimension`` or ``scalar`` (the paper's Eq. 11).
+    nu : float, optional
+        Degrees of freedom of Student-t noise, for recordings full of contacts, whose residuals have
+        heavy tails; 4 is usual. Sigma is then its scale. Gaussian without it.
     substeps : int, optional
         Engine steps an interval; the scene's by default.
     noise : StartNoise, optional
@@ -222,7 +247,7 @@ def physics_model(
     SimulationError
         If bodies start deep inside each other or a wall, or a hinge's bodies apart.
     ValueError
-        If ``sigma`` is neither option or ``horizon`` is below 1.
+        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0.
 
     Examples
     --------
@@ -240,6 +265,8 @@ def physics_model(
         raise ValueError(f"sigma is {sigma!r}, expected 'per_dimension' or 'scalar'")
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected at least 1")
+    if nu is not None and not 0 < nu < np.inf:
+        raise ValueError(f"nu is {nu}, expected degrees of freedom above 0, or None for a Gaussian")
     problem = Problem(
         scene=scene,
         history=history,
@@ -249,6 +276,7 @@ def physics_model(
         scalar_sigma=sigma == "scalar",
         noise=noise,
         threads=threads,
+        nu=nu,
     )
     return build_model(problem)
 
@@ -285,8 +313,10 @@ def build_model(problem: Problem) -> pm.Model:
             "next_state",
             predicted,
             sigma,
-            logp=partial(next_state_logp, observations=observations, noise=problem.noise),
-            random=partial(_random, noise=problem.noise),
+            logp=partial(
+                next_state_logp, observations=observations, noise=problem.noise, nu=problem.nu
+            ),
+            random=partial(_random, noise=problem.noise, nu=problem.nu),
             signature="(h,k,d),(d)->(h,k,d)",
             observed=np.nan_to_num(observations.values),
             dims=("transition", "step", "body", "state"),
@@ -309,10 +339,11 @@ def _random(
     predicted: Any,
     sigma: Any,
     noise: StartNoise | None,
+    nu: float | None,
     rng: np.random.Generator | None = None,
     size: Any = None,
 ) -> Any:
-    return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size)
+    return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size, nu)
 
 
 def sigma_prior(observations: Observations, segments: Segments) -> tuple[Array, float]:

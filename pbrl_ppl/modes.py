@@ -13,7 +13,7 @@ from scipy.optimize import least_squares, minimize
 
 from pbrl_ppl.differences import differentiate
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import StartNoise, estimate_sigma, log_density, whiten
+from pbrl_ppl.likelihood import StartNoise, estimate_sigma, robust, whiten
 from pbrl_ppl.model import COARSE, Problem
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import PartedSimulator
@@ -233,6 +233,7 @@ def _climb(
 
     def whole(points: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
         z = problem.whitened(points, sigma, engine).reshape(*points.shape[:-1], -1)
+        z = robust(z, problem.nu)
         z = np.nan_to_num(z, nan=_SCREEN_CLIP, posinf=_SCREEN_CLIP, neginf=-_SCREEN_CLIP)
         return np.concatenate([z, prior_residual(priors, points)], axis=-1)
 
@@ -265,9 +266,9 @@ def _climb(
 
 def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
     """The most likely sigma at phi, and the log-posterior there."""
-    residual, measured = problem.residual(phi), problem.observations.measured
+    residual = problem.residual(phi)
     sigma = profile_sigma(problem, residual)
-    likelihood = log_density(residual, sigma, problem.noise, measured).sum()
+    likelihood = problem.log_density(residual, sigma).sum()
     return sigma, float(likelihood - 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum())
 
 
@@ -284,18 +285,23 @@ def profile_sigma(problem: Problem, residual: Array) -> Array:
     measured, noise = problem.observations.measured, problem.noise
     residual = np.nan_to_num(residual, nan=_SCREEN_CLIP)
     sigma = estimate_sigma(residual, measured, None)
-    if problem.scalar_sigma:
+    gaussian = problem.nu is None
+    if problem.scalar_sigma and gaussian:
         z = whiten(residual, np.ones_like(sigma), noise)
         return np.full_like(sigma, max(np.sqrt((z**2).sum() / measured.sum()), 1e-9))
-    if noise is None:
+    if noise is None and gaussian:
         return sigma
-    begin = np.log(sigma / np.median(noise.gain))
+    begin = np.log(sigma if noise is None else sigma / np.median(noise.gain))
+    every = np.ones_like(sigma)
+    if problem.scalar_sigma:
+        begin = begin.mean(keepdims=True)
 
     def cost(log_sigma: Array) -> float:
-        return -float(log_density(residual, np.exp(log_sigma), noise, measured).sum())
+        return -float(problem.log_density(residual, np.exp(log_sigma) * every).sum())
 
     bounds = [(b - 6, b + 6) for b in begin]
-    return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x))
+    found = minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x
+    return np.asarray(np.exp(found) * every)
 
 
 def _finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> Mode:
@@ -308,7 +314,7 @@ def _finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) ->
     lower, upper = _box(priors)
 
     def residual(points: Array, engine: PartedSimulator | None = None) -> Array:
-        z = problem.whitened(points, sigma, engine).reshape(len(points), -1)
+        z = robust(problem.whitened(points, sigma, engine), problem.nu).reshape(len(points), -1)
         return np.concatenate([np.nan_to_num(z), prior_residual(priors, points)], axis=-1)
 
     begin = 1e-3 * problem.layout.scale(phi)

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
 from pbrl_ppl.identification import uninformed
-from pbrl_ppl.likelihood import log_density, next_state_random
 from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import attributes, convergence, draws, from_groups, group, groups
 from pbrl_ppl.wheel_symmetry import fold_draws
@@ -59,7 +58,6 @@ def complete(
     posterior = _folded(problem, trace)
     phi, sigma = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
     chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
-    measured = problem.observations.measured
     likelihood = np.empty((chains * n, problem.segments.n))
     predictive = []
     rng = np.random.default_rng(seed)
@@ -70,11 +68,9 @@ def complete(
         own, which = np.unique(phi[part], axis=0, return_inverse=True)  # a chain stays put at times
         states = wide.predict(own)[which.ravel()]
         residual = problem.observations.residual(states)
-        likelihood[part] = log_density(residual, sigma[part], problem.noise, measured)
+        likelihood[part] = problem.log_density(residual, sigma[part])
         predictive += [
-            next_state_random(
-                states[i - begin][..., problem.observations.columns], sigma[i], problem.noise, rng
-            )
+            problem.next_states(states[i - begin], sigma[i], rng)
             for i in range(begin, min(begin + 64, len(phi)))
             if i in keep
         ]
@@ -158,6 +154,7 @@ def _origin(problem: Problem, seed: int) -> dict[str, Any]:
         effects=[[one.effect.name, one.body] for one in problem.effects],
         seed=seed,
         horizon=problem.horizon,
+        **({} if problem.nu is None else {"nu": problem.nu}),
         substeps=problem.substeps,
         data_sha256=problem.history.data_sha256,
         versions=versions(),

@@ -18,7 +18,6 @@ from pbrl_ppl.findings import Added, Estimate, Findings, Numerical
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import History
 from pbrl_ppl.identification import identify
-from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode, find_mode, inside, with_start_noise
 from pbrl_ppl.posterior import draws as posterior_draws
@@ -395,5 +394,4 @@ def shift(mode: Mode) -> float:
 def _log_likelihood(mode: Mode) -> float:
     problem = mode.problem
     residual = problem.residual(mode.phi)
-    measured = problem.observations.measured
-    return float(log_density(residual, mode.sigma, problem.noise, measured).sum())
+    return float(problem.log_density(residual, mode.sigma).sum())

@@ -11,7 +11,6 @@ from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
 
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, inside
 from pbrl_ppl.physics import PartedSimulator
@@ -89,8 +88,7 @@ class Surrogate:
         """Sum over transitions, shape (...), for phi (..., p) and sigma (state,)."""
         problem = self.problem
         residual = problem.observations.residual(self._coarse(phi) + self.correction)
-        measured = problem.observations.measured
-        return np.asarray(log_density(residual, sigma, problem.noise, measured).sum(axis=-1))
+        return np.asarray(problem.log_density(residual, sigma).sum(axis=-1))
 
     def __call__(self, q: Array) -> float:
         """Log-density at the sampler's vector."""
@@ -126,8 +124,7 @@ def surrogate(model: pm.Model, mode: Mode, seed: int) -> Surrogate | None:
     noise: Any = np.random.default_rng(seed).standard_normal((_DRAWS, len(mode.phi)))
     factor = np.linalg.cholesky(mode.covariance + 1e-15 * np.eye(len(mode.phi)))
     draws = inside(problem.layout.priors, mode.phi + noise @ factor.T)
-    measured = problem.observations.measured
-    exact = log_density(problem.residual(draws), mode.sigma, problem.noise, measured).sum(axis=-1)
+    exact = problem.log_density(problem.residual(draws), mode.sigma).sum(axis=-1)
     unpack = Unpack(model, problem)
     for substeps in _SUBSTEPS:
         if 2 * substeps > problem.substeps:
