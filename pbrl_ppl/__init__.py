@@ -9,6 +9,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pbrl_ppl.calibration import calibrate
     from pbrl_ppl.effects import Attached, Effect, EffectParameter, catalogue
     from pbrl_ppl.errors import PbrlError
     from pbrl_ppl.findings import Findings
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.physics import Simulator
     from pbrl_ppl.posterior import load_posterior, save_posterior
     from pbrl_ppl.prior_check import PriorCheck, prior_predictive_check
+    from pbrl_ppl.ranks import Calibration
     from pbrl_ppl.report import Loop, close_loop
     from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
     from pbrl_ppl.transition import Transition
@@ -32,6 +34,7 @@ __version__ = "0.1.0"
 __all__ = [
     "Attached",
     "Body",
+    "Calibration",
     "Effect",
     "EffectParameter",
     "Findings",
@@ -49,6 +52,7 @@ __all__ = [
     "SimulatorOp",
     "Transition",
     "Wall",
+    "calibrate",
     "catalogue",
     "close_loop",
     "fit",
@@ -62,6 +66,7 @@ __all__ = [
 ]
 
 _MODULES = {
+    "calibration": ("calibrate",),
     "effects": ("Attached", "Effect", "EffectParameter", "catalogue"),
     "errors": ("PbrlError",),
     "findings": ("Findings",),
@@ -75,6 +80,7 @@ _MODULES = {
     "physics": ("Simulator",),
     "posterior": ("load_posterior", "save_posterior"),
     "prior_check": ("PriorCheck", "prior_predictive_check"),
+    "ranks": ("Calibration",),
     "report": ("Loop", "close_loop"),
     "scene": ("Body", "Joint", "Scene", "Shape", "Wall"),
     "transition": ("Transition",),

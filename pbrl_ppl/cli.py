@@ -1,4 +1,4 @@
-"""Command line: ``pbrl-ppl close-loop`` and ``pbrl-ppl check``.
+"""Command line: ``pbrl-ppl close-loop``, ``pbrl-ppl check`` and ``pbrl-ppl calibrate``.
 
 Imports of the package stand inside the functions: PyMC takes seconds to load, and ``--help`` or a
 mistyped path should not wait for it.
@@ -23,11 +23,14 @@ from rich.table import Table
 from pbrl_ppl.errors import PbrlError
 
 if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
     from pbrl_ppl.history import History
+    from pbrl_ppl.ranks import Calibration
     from pbrl_ppl.scene import Scene
 
-#: Exit codes: bad input as for bad usage, and an interruption as the shell has it.
-BAD_INPUT, INTERRUPTED = 2, 130
+#: Exit codes: a failed calibration, bad input as for bad usage, an interrupt as the shell has it.
+FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
 
 app = typer.Typer(
     name="pbrl-ppl",
@@ -58,7 +61,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0; 2 for bad usage or bad input, with one message on stderr; 130 if interrupted.
+        0; 1 for a calibration that failed; 2 for bad usage or bad input, with one message on
+        stderr; 130 if interrupted.
     """
     try:
         with _warnings_in_a_line():
@@ -171,6 +175,72 @@ def check(
         console.print(_cells(loaded))
 
 
+@app.command()
+def calibrate(
+    scene: _SceneFile,
+    history: Annotated[
+        Path, typer.Argument(metavar="HISTORY", help="History whose design is kept (.csv, ...).")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="DIR", help="Folder for results; goes on there."),
+    ],
+    replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    draws: Annotated[int, typer.Option(min=100, help="Posterior draws of each chain.")] = 1500,
+    estimate_velocities: _Velocities = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+) -> None:
+    """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
+    with _interruptible(f"finished replications are in {output}; the same command goes on"):
+        declared, design = _load(scene, history, estimate_velocities)
+        os.environ.setdefault("MPLBACKEND", "Agg")
+        from pbrl_ppl import calibration, plots
+        from pbrl_ppl.history_files import write_atomically
+
+        with _pool(jobs) as executor:
+            result = calibration.calibrate(
+                declared, design, replications=replications, seed=seed, draws=draws, folder=output,
+                executor=executor, progress=not quiet,
+            )  # fmt: skip
+        result.save(output / "ranks.nc")
+        write_atomically(output / "table.csv", result.table().to_csv)
+        picture = plots.png(plots.plot_calibration(result))
+        write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
+    typer.echo(_calibrated(result))
+    typer.echo(f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}")
+    if not result.passed:
+        raise typer.Exit(FAILED)
+
+
+@contextmanager
+def _pool(jobs: int) -> Iterator[Executor | None]:
+    """Fresh processes: PyMC's threads do not survive a fork."""
+    if jobs == 1:
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield pool
+
+
+def _calibrated(calibration: Calibration) -> str:
+    """The table's columns that matter, and what they should be."""
+    rows, data = calibration.table(), calibration.dataset
+    head = rows.iloc[0]
+    columns = ["p_holm", "coverage_50", "coverage_90", "ess", "r_hat", "passed"]
+    short = int((data["size"] < data["size"].max()).any("parameter").sum())
+    ranges = (f"{head[f'low_{level}']:.3g} to {head[f'high_{level}']:.3g}" for level in (50, 90))
+    return (
+        rows[columns].to_string(float_format="{:.4g}".format, index_names=False)
+        + f"\n{data.sizes['replication']} replications, {short} with too few effective draws;"
+        " expected of a right sampler: p_holm at least 0.01, coverages in " + ", ".join(ranges)
+    )
+
+
 def _load(scene: Path, history: Path, estimate_velocities: bool) -> tuple[Scene, History]:
     from pbrl_ppl.scene import Scene
 
@@ -230,16 +300,16 @@ def _stages(quiet: bool) -> Iterator[Callable[[str], None]]:
 
 
 @contextmanager
-def _interruptible() -> Iterator[None]:
-    """Say that nothing was written; results are renamed into place as the last thing."""
+def _interruptible(state: str = "nothing was written") -> Iterator[None]:
+    """Say what is left; results are renamed into place as the last thing."""
     try:
         yield
     except KeyboardInterrupt:
-        raise typer.Exit(_interrupted()) from None
+        raise typer.Exit(_interrupted(state)) from None
 
 
-def _interrupted() -> int:
-    print("interrupted; nothing was written", file=sys.stderr)  # noqa: T201
+def _interrupted(state: str = "nothing was written") -> int:
+    print(f"interrupted; {state}", file=sys.stderr)  # noqa: T201
     return INTERRUPTED
 
 

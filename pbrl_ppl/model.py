@@ -62,8 +62,14 @@ class Problem:
         Engine worlds that run side by side.
     extrapolate : bool
         Whether the engine's leading errors are cancelled.
+<<<<<<< ours
     nu : float, optional
         Degrees of freedom of Student-t noise; Gaussian without it.
+=======
+    sigma_prior : tuple or None
+        Medians of sigma's prior, one a measured state dimension, and its log-scale; by default
+        :func:`sigma_prior` takes them from the data.
+>>>>>>> theirs
     """
 
     scene: Scene
@@ -75,7 +81,11 @@ class Problem:
     noise: StartNoise | None = None
     threads: int = 1
     extrapolate: bool = True
+<<<<<<< ours
     nu: float | None = None
+=======
+    sigma_prior: tuple[tuple[float, ...], float] | None = None
+>>>>>>> theirs
     layout: Layout = field(init=False)
 
     def __post_init__(self) -> None:
@@ -301,7 +311,7 @@ def build_model(problem: Problem) -> pm.Model:
             )
         phi = pt.concatenate(list(table1.values())) if table1 else pt.zeros(0)
         # P(sigma)
-        median, spread = sigma_prior(observations, segments)
+        median, spread = problem.sigma_prior or sigma_prior(observations, segments)
         if problem.scalar_sigma:
             scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
             sigma = pt.ones(len(median)) * scalar

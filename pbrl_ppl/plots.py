@@ -17,13 +17,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
-from scipy.stats import chi2, gaussian_kde, norm
+from scipy.stats import binom, chi2, gaussian_kde, norm
 
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.findings import Findings
 from pbrl_ppl.history import STATE, STATE_UNITS
 from pbrl_ppl.posterior import DATATREE, HDI_PROB, scalars
 from pbrl_ppl.prior_check import PriorCheck
+from pbrl_ppl.ranks import Calibration, bins
 
 Array = NDArray[np.float64]
 
@@ -321,6 +322,42 @@ def plot_trace(findings: Findings, parameters: Sequence[str] | None = None) -> F
 def plot_rank(findings: Findings, parameters: Sequence[str] | None = None) -> Figure:
     """ArviZ's rank picture of the parameters of most interest, after revision."""
     return _arviz(findings, "rank", parameters)
+
+
+def plot_calibration(calibration: Calibration) -> Figure:
+    """Rank histograms of a simulation-based calibration, one panel a parameter.
+
+    Parameters
+    ----------
+    calibration : Calibration
+        As made by :func:`pbrl_ppl.calibrate`.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The band holds 99 % of each bar's heights if ranks are uniform; failed parameters stand out.
+    """
+    table, positions = calibration.table(), calibration.dataset["position"]
+    n, columns = positions.sizes["replication"], min(4, len(table))
+    rows = -(-len(table) // columns)
+    figure, panels = _figure(2.6 * columns, 1.7 * rows + 0.6, rows, columns)
+    count = bins(n)
+    low, high = binom.interval(0.99, n, 1 / count)
+    for axes, (label, row) in zip(panels, table.iterrows(), strict=False):
+        axes.axhspan(low, high, color=_BAND)
+        axes.axhline(n / count, color=_PLAIN, linewidth=1)
+        color = _AFTER if row["passed"] else _BEFORE
+        axes.hist(
+            positions.sel(parameter=label), bins=count, range=(0, 1), histtype="step", color=color
+        )
+        verdict = "" if row["passed"] else ", failed"
+        axes.set_title(f"{label}: p = {row['p_holm']:.2g}{verdict}", fontsize=9, color=color)
+        axes.set_ylim(bottom=0)
+    for axes in panels[len(table) :]:
+        axes.set_axis_off()
+    figure.supxlabel("rank of the true value among posterior draws, as a share", fontsize=9)
+    figure.supylabel("replications", fontsize=9)
+    return figure
 
 
 def _arviz(findings: Findings, kind: str, parameters: Sequence[str] | None) -> Figure:
