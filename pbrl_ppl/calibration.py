@@ -46,6 +46,7 @@ def calibrate(
     executor: Executor | None = None,
     horizon: int = 1,
     sigma: str = "per_dimension",
+    nu: float | None = None,
     substeps: int | None = None,
     draws: int = 1500,
     tune: int = 500,
@@ -78,7 +79,7 @@ def calibrate(
         there, with more replications if more are asked for. Made if missing.
     executor : concurrent.futures.Executor, optional
         Where replications are run; by default here, one after another.
-    horizon, sigma, substeps : optional
+    horizon, sigma, nu, substeps : optional
         As of :func:`pbrl_ppl.physics_model`.
     draws, tune, chains : int
         As of :func:`pbrl_ppl.fit`. A fit with fewer than 99 effective draws is done again with four
@@ -119,7 +120,9 @@ def calibrate(
     """
     if replications < 2:
         raise ValueError(f"replications is {replications}, expected at least 2, better 200")
-    model = physics_model(scene, history, effects, horizon=horizon, sigma=sigma, substeps=substeps)
+    model = physics_model(
+        scene, history, effects, horizon=horizon, sigma=sigma, nu=nu, substeps=substeps
+    )
     design: Problem = model.problem
     if design.layout.discrete.any():
         raise FitError("calibrate: which bodies a joint joins is unknown; name them in the scene")
@@ -205,6 +208,7 @@ def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str,
         "horizon": design.horizon,
         "substeps": design.substeps,
         "scalar_sigma": design.scalar_sigma,
+        "nu": design.nu,
         "sigma_prior": design.sigma_prior,
         "seed": seed,
         "settings": dict(settings),

@@ -62,14 +62,11 @@ class Problem:
         Engine worlds that run side by side.
     extrapolate : bool
         Whether the engine's leading errors are cancelled.
-<<<<<<< ours
     nu : float, optional
         Degrees of freedom of Student-t noise; Gaussian without it.
-=======
     sigma_prior : tuple or None
         Medians of sigma's prior, one a measured state dimension, and its log-scale; by default
         :func:`sigma_prior` takes them from the data.
->>>>>>> theirs
     """
 
     scene: Scene
@@ -81,11 +78,8 @@ class Problem:
     noise: StartNoise | None = None
     threads: int = 1
     extrapolate: bool = True
-<<<<<<< ours
     nu: float | None = None
-=======
     sigma_prior: tuple[tuple[float, ...], float] | None = None
->>>>>>> theirs
     layout: Layout = field(init=False)
 
     def __post_init__(self) -> None:

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import STATE, WRENCH, History
-from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group
@@ -179,8 +178,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
             break
         settings |= {key: _LONGER * settings[key] for key in ("draws", "tune")}
     residual = problem.residual(truth.phi)
-    measured = problem.observations.measured
-    of_truth = log_density(residual, truth.sigma, None, measured).sum(keepdims=True)
+    of_truth = problem.log_density(residual, truth.sigma).sum(keepdims=True)
     true = _quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
     ranks = [
         rank(column, value, each)
