@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pandas as pd
+import pytensor.tensor as pt
 import pytest
 from scipy.stats import kstest
 from scipy.stats import t as student
@@ -56,9 +57,8 @@ def test_the_model_s_density_is_the_same(scene, clean) -> None:
     """PyTensor's expression against numpy's, at one point."""
     problem = physics_model(scene, clean, nu=NU).problem
     predicted = problem.predict(problem.layout.to_vector(CART))[..., problem.observations.columns]
-    found = next_state_logp(
-        problem.observations.values, predicted, NOISE, problem.observations, None, NU
-    ).eval()
+    value, mean = (pt.as_tensor(each) for each in (problem.observations.values, predicted))
+    found = next_state_logp(value, mean, np.array(NOISE), problem.observations, None, NU).eval()
     residual = problem.residual(problem.layout.to_vector(CART))
     np.testing.assert_allclose(found, problem.log_density(residual, np.array(NOISE)))
 
