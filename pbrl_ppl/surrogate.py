@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
@@ -13,8 +11,7 @@ from pymc.pytensorf import join_nonshared_inputs
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode, inside
-from pbrl_ppl.physics import PartedSimulator
+from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
 
@@ -73,10 +70,7 @@ class Surrogate:
 
     def __init__(self, problem: Problem, phi: Array, unpack: Unpack, substeps: int) -> None:
         self.problem, self.unpack = problem, unpack
-        self.engine = PartedSimulator(
-            problem.scene, problem.layout, problem.effects, problem.parts,
-            substeps=substeps, extrapolate=False,
-        )  # fmt: skip
+        self.engine = problem.engine(substeps, threads=1, extrapolate=False)
         self.correction = problem.predict(phi) - self._coarse(phi)
 
     def _coarse(self, phi: Array) -> Array:
@@ -123,9 +117,7 @@ def surrogate(model: pm.Model, mode: Mode, seed: int) -> Surrogate | None:
     problem = mode.problem
     if not len(mode.phi) or problem.layout.discrete.any():
         return None
-    noise: Any = np.random.default_rng(seed).standard_normal((_DRAWS, len(mode.phi)))
-    factor = np.linalg.cholesky(mode.covariance + 1e-15 * np.eye(len(mode.phi)))
-    draws = inside(problem.layout.priors, mode.phi + noise @ factor.T)
+    draws = mode.draws(np.random.default_rng(seed), _DRAWS)
     measured = problem.observations.measured
     exact = log_density(problem.residual(draws), mode.sigma, problem.noise, measured).sum(axis=-1)
     unpack = Unpack(model, problem)
