@@ -14,7 +14,7 @@ from pbrl_ppl.findings import Errors, Rollout
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import STATE_UNITS, StartNoise
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode, inside
+from pbrl_ppl.modes import Mode
 from pbrl_ppl.record import parameter_draws
 
 Array = NDArray[np.float64]
@@ -149,12 +149,10 @@ def standard_error(gains: Array) -> float:
 
 def _laplace_draws(mode: Mode, rng: np.random.Generator) -> tuple[Array, Array]:
     """Draws of phi and sigma from the Laplace approximation, cut at the supports."""
-    n, p = _DRAWS, len(mode.phi)
-    factor = np.linalg.cholesky(mode.covariance + 1e-15 * np.eye(p))
     # directions that the data say nothing about do not matter for prediction
-    phi = inside(mode.problem.layout.priors, mode.phi + rng.standard_normal((n, p)) @ factor.T)
+    phi = mode.draws(rng, _DRAWS)
     counts = np.maximum(mode.problem.observations.measured.sum((0, 1, 2)), 1)
-    sigma = mode.sigma * np.exp(rng.standard_normal((n, len(counts))) * np.sqrt(0.5 / counts))
+    sigma = mode.sigma * np.exp(rng.standard_normal((_DRAWS, len(counts))) * np.sqrt(0.5 / counts))
     return phi, sigma
 
 

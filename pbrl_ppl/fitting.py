@@ -55,12 +55,12 @@ class Job:
     progress: bool
     starts: list[dict[str, Any]]
 
-    def sample(self, step: Any, *, draws: int | None = None, tune: int | None = None) -> Any:
+    def sample(self, step: Any, steps_a_draw: int = 1) -> Any:
         """``pm.sample`` from the starts; how it converged is judged elsewhere."""
         try:
-            return pm.sample(
-                draws=self.draws if draws is None else draws,
-                tune=self.tune if tune is None else tune,
+            trace = pm.sample(
+                draws=self.draws * steps_a_draw,
+                tune=self.tune,
                 chains=self.chains,
                 cores=self.cores,
                 step=step,
@@ -75,6 +75,7 @@ class Job:
             if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
                 raise KeyboardInterrupt from error
             raise
+        return _thinned(trace, steps_a_draw)
 
 
 def _metropolis(job: Job) -> Any:
@@ -88,18 +89,17 @@ def _metropolis(job: Job) -> Any:
 def _paper(job: Job) -> Any:
     """One random-walk Metropolis step a variable, as PyMC 2 did: burn in, then keep each n-th."""
     steps = [pm.Metropolis([variable]) for variable in job.model.free_RVs]
-    return _thinned(job.sample(steps, draws=job.draws * job.thin, tune=job.tune), job.thin)
+    return job.sample(steps, job.thin)
 
 
 def _demetropolisz(job: Job) -> Any:
     """Differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
-    step = pm.DEMetropolisZ(job.model.free_RVs)
-    return _thinned(job.sample(step, draws=job.draws * job.thin), job.thin)
+    return job.sample(pm.DEMetropolisZ(job.model.free_RVs), job.thin)
 
 
 def _nuts(job: Job) -> Any:
     """NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
-    return _thinned(job.sample(pm.NUTS(job.model.free_RVs), draws=job.draws * job.thin), job.thin)
+    return job.sample(pm.NUTS(job.model.free_RVs), job.thin)
 
 
 def _smc(job: Job) -> Any:
@@ -117,8 +117,7 @@ def _smc(job: Job) -> Any:
 def _map(job: Job) -> Any:
     """The mode alone, as a posterior of one draw."""
     problem = job.mode.problem
-    values = problem.layout.to_dict(job.mode.phi)
-    values["sigma"] = job.mode.sigma[0] if problem.scalar_sigma else job.mode.sigma
+    values = problem.named(job.mode.phi, job.mode.sigma)
     dims = {v.name: job.model.named_vars_to_dims.get(v.name, ()) for v in job.model.free_RVs}
     data = {
         name: (("chain", "draw", *dims[name]), np.asarray(value)[None, None])
@@ -249,8 +248,7 @@ def fit(
         chains = len(starts)
     else:
         mode = find_mode(problem, seed=seed) if start is None else start
-        rng = np.random.default_rng(seed)
-        starts = [dispersed(problem, mode, rng) for _ in range(chains)]
+        starts = dispersed(mode, np.random.default_rng(seed), chains)
     job = Job(
         model=model,
         mode=mode,

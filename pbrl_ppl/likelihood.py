@@ -64,6 +64,13 @@ class Observations:
         """Whether a cell was measured, shape as ``values``."""
         return np.isfinite(self.values)
 
+    def wrapped(self, difference: Array) -> Array:
+        """Differences of states, shape (..., state), with angles wrapped in place to (-pi, pi]."""
+        for i, d in enumerate(self.columns):
+            if d == _THETA:
+                difference[..., i] = np.pi - np.mod(np.pi - difference[..., i], 2 * np.pi)
+        return difference
+
     def residual(self, predicted: Array) -> Array:
         """Measured minus predicted, angles wrapped to (-pi, pi], 0 where missing.
 
@@ -77,10 +84,7 @@ class Observations:
         ndarray
             Shape (..., transition, H, body, state).
         """
-        difference = self.values - predicted[..., self.columns]
-        for i, d in enumerate(self.columns):
-            if d == _THETA:
-                difference[..., i] = np.pi - np.mod(np.pi - difference[..., i], 2 * np.pi)
+        difference = self.wrapped(self.values - predicted[..., self.columns])
         difference[..., ~self.measured] = 0.0
         return np.asarray(difference)
 

@@ -110,28 +110,30 @@ class Problem:
     @cached_property
     def simulator(self) -> PartedSimulator:
         """The engine for this scene with these effects."""
-        return PartedSimulator(
-            self.scene,
-            self.layout,
-            self.effects,
-            self.parts,
-            substeps=self.substeps,
-            threads=self.threads,
-            extrapolate=self.extrapolate,
-        )
+        return self.engine(self.substeps, threads=self.threads, extrapolate=self.extrapolate)
 
     @cached_property
     def coarse(self) -> PartedSimulator:
         """The same with few substeps: it costs little, and its derivative is nearly right."""
+        substeps = min(COARSE, self.substeps)
+        return self.engine(substeps, threads=self.threads, extrapolate=False)
+
+    def engine(self, substeps: int, *, threads: int, extrapolate: bool) -> PartedSimulator:
+        """A new engine for this scene with these effects; arguments as of the simulator."""
         return PartedSimulator(
             self.scene,
             self.layout,
             self.effects,
             self.parts,
-            substeps=min(COARSE, self.substeps),
-            threads=self.threads,
-            extrapolate=False,
+            substeps=substeps,
+            threads=threads,
+            extrapolate=extrapolate,
         )
+
+    def named(self, phi: Array, sigma: Array) -> dict[str, Array]:
+        """The model's variables at phi, shape (p,), and sigma, shape (state,)."""
+        noise = {"sigma": sigma[0] if self.scalar_sigma else sigma}
+        return self.layout.to_dict(phi) | noise
 
     def predict(self, phi: Array, engine: PartedSimulator | None = None) -> Array:
         """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""

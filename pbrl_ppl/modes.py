@@ -19,6 +19,8 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import PartedSimulator
 
 Array = NDArray[np.float64]
+#: Where a climb ended: phi, sigma and the log-posterior there.
+Peak = tuple[Array, Array, float]
 
 #: How far inside a bound the search stays, as a share of the interval or of one unit.
 _MARGIN = 1e-6
@@ -65,6 +67,17 @@ class Mode:
     def values(self) -> dict[str, Array]:
         """Parameters by name, shape (body,) each."""
         return self.problem.layout.to_dict(self.phi)
+
+    @property
+    def factor(self) -> Array:
+        """Cholesky factor of the covariance, shape (p, p)."""
+        jitter = 1e-15 * np.eye(len(self.phi))
+        return np.asarray(np.linalg.cholesky(self.covariance + jitter), dtype=float)
+
+    def draws(self, rng: np.random.Generator, n: int) -> Array:
+        """Draws of phi from the Laplace approximation, cut at the supports, shape (n, p)."""
+        moved = self.phi + rng.standard_normal((n, len(self.phi))) @ self.factor.T
+        return inside(self.problem.layout.priors, moved)
 
     @property
     def whitened(self) -> Array:
@@ -174,11 +187,9 @@ def find_modes(
     return [_finish(problem, *result) for result in (best, *found[1:])]
 
 
-def _distinct(
-    problem: Problem, found: list[tuple[Array, Array, float]]
-) -> list[tuple[Array, Array, float]]:
+def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
     """Leave out what is another description of one before it, or has climbed to the same place."""
-    kept: list[tuple[Array, Array, float]] = []
+    kept: list[Peak] = []
     for result in found:
         phi = fold_wheels(problem, result[0])
         scale = _SAME * problem.layout.scale(phi)
@@ -207,7 +218,7 @@ def find_mode(
     return find_modes(problem, seed=seed, initial=initial)[0]
 
 
-def _polish(problem: Problem, found: tuple[Array, Array, float]) -> tuple[Array, Array, float]:
+def _polish(problem: Problem, found: Peak) -> Peak:
     """Go on by the exact engine's derivative, as far as that leads."""
     if not problem.layout.size:
         return found
@@ -219,7 +230,7 @@ def _polish(problem: Problem, found: tuple[Array, Array, float]) -> tuple[Array,
 
 def _climb(
     problem: Problem, phi: Array, slope: PartedSimulator, rounds: int = 40, tries: int = 4
-) -> tuple[Array, Array, float]:
+) -> Peak:
     """Alternate between phi by least squares and sigma by maximum likelihood.
 
     Derivatives are taken through the engine ``slope``.
@@ -252,11 +263,10 @@ def _climb(
             residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=tries,
             ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
-        sigma, improved = _at(problem, result.x)
+        better, improved = _at(problem, result.x)
         if improved < value:
-            sigma = _at(problem, phi)[0]
             break
-        phi, gain, value = result.x, improved - value, improved
+        phi, sigma, gain, value = result.x, better, improved - value, improved
         if gain < _STALLED:
             break
         size = np.sqrt((result.jac**2).sum(axis=0))

@@ -14,6 +14,7 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_funcify
 
+from pbrl_ppl.coupling import Parts
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.parameters import Layout
@@ -21,8 +22,6 @@ from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
-
-Parts = tuple[tuple[str, ...], ...]
 
 
 class _EngineOp(Op):

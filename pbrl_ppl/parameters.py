@@ -303,6 +303,11 @@ class Layout:
             vector[place] = value.ravel()
         return vector
 
+    def to_vectors(self, draws: Mapping[str, Array], n: int) -> Array:
+        """Stack ``n`` named draws, shape (n, owner) each, into vectors, shape (n, p)."""
+        columns = [draws[block.name].reshape(n, -1) for block in self.blocks]
+        return np.concatenate([np.zeros((n, 0)), *columns], axis=1)
+
     def to_dict(self, vector: Array) -> dict[str, Array]:
         """Split phi, shape (..., p), into named arrays, shape (..., owner)."""
         return {block.name: vector[..., place] for block, place in self.slices()}

@@ -128,7 +128,7 @@ def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) 
     columns = list(observations.columns)
     noise = sigma_prior(observations, segments)[0]
     first = segments.start[..., columns]
-    measured = _change(observations.values[:, -1] - first, observations.names)
+    measured = observations.wrapped(observations.values[:, -1] - first)
     phi = _prior_draws(model, problem, draws, rng)
     ends = np.concatenate(
         [
@@ -143,7 +143,7 @@ def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) 
             " from the prior; narrow the prior's hyper-parameters, or use more substeps"
         )
     ends = ends[good] + noise * rng.standard_normal(ends[good].shape)
-    predicted = _change(ends - first, observations.names)
+    predicted = observations.wrapped(ends - first)
     dataset = _compare(predicted, measured)
     coords = {
         "body": [body.name for body in problem.scene.dynamic],
@@ -168,7 +168,7 @@ def _prior_draws(model: pm.Model, problem: Problem, draws: int, rng: np.random.G
             draws, model=model, var_names=names, random_seed=int(rng.integers(2**31))
         )
     prior = group(idata, "prior")
-    return np.concatenate([prior[name].to_numpy().reshape(draws, -1) for name in names], axis=1)
+    return problem.layout.to_vectors({name: prior[name].to_numpy() for name in names}, draws)
 
 
 @contextmanager
@@ -183,14 +183,6 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logger.setLevel(level)
-
-
-def _change(difference: Array, names: tuple[str, ...]) -> Array:
-    """Differences of states, shape (..., state), angles wrapped to (-pi, pi]."""
-    if "theta" in names:
-        i = names.index("theta")
-        difference[..., i] = np.pi - np.mod(np.pi - difference[..., i], 2 * np.pi)
-    return difference
 
 
 def _compare(predicted: Array, measured: Array) -> xr.Dataset:

@@ -108,13 +108,7 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
     """Draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
     named = draws(trace)
     n = len(named["sigma"])
-    phi = np.concatenate(
-        [
-            np.zeros((n, 0)),
-            *(named[block.name].reshape(n, -1) for block in problem.layout.blocks),
-        ],
-        axis=1,
-    )
+    phi = problem.layout.to_vectors(named, n)
     sigma = named["sigma"].reshape(n, -1)
     return phi, np.broadcast_to(sigma, (len(phi), len(problem.observations.columns)))
 

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
     """One block a part of the scene, and one for the noise; guessed at by the Laplace method."""
-    problem, labels = mode.problem, mode.problem.layout.labels
+    problem = mode.problem
     places, offset = {}, 0
     point = model.initial_point()
     for variable in model.continuous_value_vars:
@@ -32,11 +32,9 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
     where = np.concatenate([np.zeros(0, int), *(places[b.name] for b in problem.layout.blocks)])
     mean, covariance = _laplace(problem, mode)
     blocks = []
-    for part in problem.parts:
-        joints = problem.scene.subset(part).joint_names if len(problem.parts) > 1 else ()
-        owners = set((*part, *(joints or problem.scene.joint_names)))
-        own = [i for i, label in enumerate(labels) if label[:-1].split("[")[1] in owners]
-        if own:
+    for part in problem.simulator.parts:
+        own = part.places
+        if len(own):
             blocks.append(Gaussian(where[own], mean[own], covariance[np.ix_(own, own)]))
     noise = places["sigma"], *_sigma_laplace(problem, mode)
     if len(blocks) == 1:  # then the noise may as well move along
@@ -82,17 +80,17 @@ def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     return mean, np.diag(0.5 / np.maximum(counts, 1))
 
 
-def dispersed(problem: Problem, mode: Mode, rng: np.random.Generator) -> dict[str, Array]:
-    """A start about two posterior standard deviations from the mode."""
-    factor = np.linalg.cholesky(mode.covariance + 1e-15 * np.eye(len(mode.phi)))
-    priors = problem.layout.priors
-    low = np.array([_quantile(prior, 0.02) for prior in priors])
-    high = np.array([_quantile(prior, 0.98) for prior in priors])
-    moved = mode.phi + 2.0 * factor @ rng.standard_normal(len(mode.phi))
-    moved = np.where((moved < low) | (moved > high), mode.phi, moved)
-    values = problem.layout.to_dict(inside(priors, moved))
-    sigma = mode.sigma * np.exp(0.1 * rng.standard_normal(len(mode.sigma)))
-    return values | {"sigma": sigma[0] if problem.scalar_sigma else sigma}
+def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Array]]:
+    """Starts about two posterior standard deviations from the mode, one a chain."""
+    problem, priors = mode.problem, mode.problem.layout.priors
+    low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
+    factor, starts = mode.factor, []
+    for _ in range(chains):
+        moved = mode.phi + 2.0 * factor @ rng.standard_normal(len(mode.phi))
+        moved = np.where((moved < low) | (moved > high), mode.phi, moved)
+        sigma = mode.sigma * np.exp(0.1 * rng.standard_normal(len(mode.sigma)))
+        starts.append(problem.named(inside(priors, moved), sigma))
+    return starts
 
 
 def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, Array]]]:
@@ -138,6 +136,6 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
     return mode, [{name: last[name].values[chain] for name in names} for chain in chains]
 
 
-def _quantile(prior: Prior, q: float) -> float:
-    """Quantile of a prior, by simulation: it only limits where chains begin."""
-    return float(np.quantile(prior.sample(np.random.default_rng(0), 2000), q))
+def _range(prior: Prior) -> Array:
+    """Where most of a prior is, by simulation: it only limits where chains begin."""
+    return np.quantile(prior.sample(np.random.default_rng(0), 2000), [0.02, 0.98])

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
@@ -12,8 +10,7 @@ from pymc.pytensorf import join_nonshared_inputs
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode, inside
-from pbrl_ppl.physics import PartedSimulator
+from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
 
@@ -72,10 +69,7 @@ class Surrogate:
 
     def __init__(self, problem: Problem, phi: Array, unpack: Unpack, substeps: int) -> None:
         self.problem, self.unpack = problem, unpack
-        self.engine = PartedSimulator(
-            problem.scene, problem.layout, problem.effects, problem.parts,
-            substeps=substeps, extrapolate=False,
-        )  # fmt: skip
+        self.engine = problem.engine(substeps, threads=1, extrapolate=False)
         self.correction = problem.predict(phi) - self._coarse(phi)
 
     def _coarse(self, phi: Array) -> Array:
@@ -121,9 +115,7 @@ def surrogate(model: pm.Model, mode: Mode, seed: int) -> Surrogate | None:
     problem = mode.problem
     if not len(mode.phi) or problem.layout.discrete.any():
         return None
-    noise: Any = np.random.default_rng(seed).standard_normal((_DRAWS, len(mode.phi)))
-    factor = np.linalg.cholesky(mode.covariance + 1e-15 * np.eye(len(mode.phi)))
-    draws = inside(problem.layout.priors, mode.phi + noise @ factor.T)
+    draws = mode.draws(np.random.default_rng(seed), _DRAWS)
     exact = problem.log_density(problem.residual(draws), mode.sigma).sum(axis=-1)
     unpack = Unpack(model, problem)
     for substeps in _SUBSTEPS:

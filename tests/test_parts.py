@@ -7,9 +7,12 @@ import pytest
 from pbrl_ppl.coupling import independent_parts
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.modes import Mode, inside
 from pbrl_ppl.physics import PartedSimulator, Simulator
 from pbrl_ppl.prior import build_layout
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from pbrl_ppl.starts import gaussian_blocks
 from tests.conftest import COLUMNS, ROOT
 
 NAMES = ("a", "b", "c", "d")
@@ -153,6 +156,23 @@ def test_only_what_moved_is_simulated_again(worlds, monkeypatch) -> None:
     runs.clear()
     parted(np.stack([phi, moved, phi]), start, actions)
     assert sorted(runs) == [((0, 1), 1), ((2,), 1), ((3,), 2)]
+
+
+def test_each_parameter_is_in_one_block_of_the_sampler() -> None:
+    """Also where a part without joints stands beside one whose joint is inferred."""
+    scene = scene_of(Joint("hinge", ("a", "b"), (0.3, 0.0), (-0.3, 0.0), known=False))
+    places = {name: [(0.6 if name == "b" else 2.0 * i, 0.0)] * 3 for i, name in enumerate(NAMES)}
+    model = physics_model(scene, history_of(scene, places))
+    layout = model.problem.layout
+    phi = inside(layout.priors, np.array([prior.centre for prior in layout.priors]))
+    count = len(phi)
+    mode = Mode(
+        model.problem, phi, np.ones(6), np.zeros((0, count)), 1e-4 * np.eye(count), log_posterior=0
+    )
+    blocks = gaussian_blocks(model, mode)
+    assert len(blocks) == 4  # a and b, c, d, the noise
+    found = np.concatenate([block.places for block in blocks])
+    assert sorted(found) == list(range(count + 6))
 
 
 def test_labels_of_joints_survive() -> None:

@@ -14,7 +14,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
@@ -31,6 +31,7 @@ from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import compiled
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.prior import build_layout
+from pbrl_ppl.scene import Wall
 
 APARTMENT = Path(__file__).parents[2] / "models" / "apartment" / "scene.toml"
 G, TIME_STEP, SUBSTEPS, TRANSITIONS = 9.81, 0.1, 10, 100
@@ -98,30 +99,39 @@ def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.nda
     return phi, start, rng.normal(0, [60.0, 60.0, 10.0], (n, 1, k, 3))
 
 
-def naive(start: np.ndarray, actions: np.ndarray) -> np.ndarray:
+def naive(
+    start: np.ndarray,
+    actions: np.ndarray,
+    values: Mapping[str, float] = CART,
+    shape: Shape = BOX,
+    walls: Sequence[Wall] = (),
+    substeps: int = SUBSTEPS,
+) -> np.ndarray:
     """What one would write first: a new Space for each transition, stepped from Python."""
     out = np.empty((len(start), 1, 1, 6))
-    step = TIME_STEP / SUBSTEPS
-    wheel = CART["w_x"], CART["w_y"]
+    step = TIME_STEP / substeps
+    mass, wheel = values["mass"], (values["w_x"], values["w_y"])
+    iterations = 10 if walls else 5
     for t, (state, action) in enumerate(zip(start[:, 0], actions[:, 0, 0], strict=True)):
         space = pymunk.Space()
-        space.iterations = 5
-        body = pymunk.Body(CART["mass"], CART["mass"] * BOX.unit_moment)
-        shape = pymunk.Poly(body, BOX.outline)
-        shape.elasticity, shape.friction = CART["r"], CART["mu_c"]
+        space.iterations = iterations
+        body = pymunk.Body(mass, mass * shape.unit_moment)
+        box = pymunk.Poly(body, shape.outline)
+        box.elasticity, box.friction = values["r"], values["mu_c"]
         ground = space.static_body
         along_x, along_y = (pymunk.PinJoint(body, ground, wheel, (0, 0)) for _ in range(2))
         along_x.max_bias = along_y.max_bias = 0.0
-        along_x.max_force = CART["mu_x"] * CART["mass"] * G
-        along_y.max_force = CART["mu_y"] * CART["mass"] * G
-        space.add(body, shape, along_x, along_y)
+        along_x.max_force = values["mu_x"] * mass * G
+        along_y.max_force = values["mu_y"] * mass * G
+        segments = [pymunk.Segment(ground, wall.start, wall.end, 0) for wall in walls]
+        space.add(body, box, along_x, along_y, *segments)
         body.position, body.angle = (state[0], state[1]), state[2]
         body.velocity, body.angular_velocity = (state[3], state[4]), state[5]
-        for _ in range(SUBSTEPS):
+        for _ in range(substeps):
             body.force, body.torque = (action[0], action[1]), action[2]
             theta = body.angle + body.angular_velocity * step
             here = pymunk.Vec2d(*wheel).rotated(theta) + body.position + body.velocity * step
-            axis = pymunk.Vec2d(1.0, 0.0).rotated(theta + CART["w_theta"])
+            axis = pymunk.Vec2d(1.0, 0.0).rotated(theta + values["w_theta"])
             along_x.anchor_b, along_y.anchor_b = here + axis, here + axis.perpendicular()
             space.step(step)
         out[t, 0, 0] = (*body.position, body.angle, *body.velocity, body.angular_velocity)

@@ -21,24 +21,22 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pymc as pm
-import pymunk
 import pytensor.tensor as pt
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 
 import pbrl_ppl as pp
 from pbrl_ppl.likelihood import next_state_logp
-from pbrl_ppl.model import Problem
+from pbrl_ppl.model import Problem, sigma_prior
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.posterior import az, convergence, group
-from pbrl_ppl.prior import build_layout
+from pbrl_ppl.prior import build_layout, random_variable
 
 sys.path.insert(0, str(Path(__file__).parent))
-from engine import ROUNDS, machine
+from engine import ROUNDS, machine, naive
 
 MODELS = Path(__file__).parents[2] / "models"
-G = 9.81
 NOISE = np.array([0.002, 0.002, 0.004, 0.01, 0.01, 0.02])  # of motion capture
 CART = {"mass": 8.0, "r": 0.3, "mu_c": 0.3, "w_x": -0.25, "w_y": 0.05, "w_theta": 0.3}
 CART |= {"mu_x": 0.04, "mu_y": 0.45}
@@ -123,23 +121,25 @@ def sampled(scene: pp.Scene, history: pp.History, **options) -> tuple[float, flo
     return took, max(r_hat.values()), min(ess.values())
 
 
+def fit_rows(key: str, what: str, most: int, measured: tuple[float, float, float]) -> Iterator[Row]:
+    """The three rows of a fit, from what ``sampled`` gives."""
+    took, r_hat, ess = measured
+    yield f"{key}_seconds", f"{what}: seconds, mode and compilation included", f"<= {most}", took
+    yield f"{key}_max_rhat", f"{what}: largest R-hat", "<= 1.01", r_hat
+    yield f"{key}_min_ess", f"{what}: least bulk or tail ESS", ">= 400", ess
+
+
 def measure_cart() -> Iterator[Row]:
     """All of phi and sigma from 360 transitions."""
-    took, r_hat, ess = sampled(*cart(360))
     what = "cart, 360 transitions x 20 substeps, 4 chains"
-    yield "cart_seconds", f"{what}: seconds, mode and compilation included", "<= 60", took
-    yield "cart_max_rhat", f"{what}: largest R-hat", "<= 1.01", r_hat
-    yield "cart_min_ess", f"{what}: least bulk or tail ESS", ">= 400", ess
+    yield from fit_rows("cart", what, 60, sampled(*cart(360)))
 
 
 def measure_apartment() -> Iterator[Row]:
     """Eleven bodies under the continuous prior."""
-    scene, history = apartment(30)
-    took, r_hat, ess = sampled(scene, history, draws=2000, tune=1500)
     what = "11 bodies, continuous prior, 30 transitions a body"
-    yield "apartment_seconds", f"{what}: seconds", "<= 600", took
-    yield "apartment_max_rhat", f"{what}: largest R-hat", "<= 1.01", r_hat
-    yield "apartment_min_ess", f"{what}: least bulk or tail ESS", ">= 400", ess
+    measured = sampled(*apartment(30), draws=2000, tune=1500)
+    yield from fit_rows("apartment", what, 600, measured)
 
 
 def measure_map() -> Iterator[Row]:
@@ -181,35 +181,16 @@ class PythonLoop(Op):
 
     def perform(self, node: Apply, inputs: list, outputs: list) -> None:
         """Step every transition."""
-        problem = self.problem
+        problem, segments = self.problem, self.problem.segments
         values = dict(zip((b.name for b in problem.layout.blocks), inputs[0], strict=True))
-        segments, step = problem.segments, problem.scene.time_step / problem.substeps
-        shape, out = problem.scene.dynamic[0].shape, np.empty((problem.segments.n, 1, 1, 6))
-        for t in range(segments.n):
-            state, action = segments.start[t, 0], segments.actions[t, 0, 0]
-            space = pymunk.Space()
-            body = pymunk.Body(values["mass"], values["mass"] * shape.unit_moment)
-            poly = pymunk.Poly(body, shape.outline)
-            poly.elasticity, poly.friction = values["r"], values["mu_c"]
-            wheel = values["w_x"], values["w_y"]
-            rods = [pymunk.PinJoint(body, space.static_body, wheel, (0, 0)) for _ in range(2)]
-            for rod, mu in zip(rods, (values["mu_x"], values["mu_y"]), strict=True):
-                rod.max_bias, rod.max_force = 0.0, mu * values["mass"] * G
-            walls = [
-                pymunk.Segment(space.static_body, w.start, w.end, 0) for w in problem.scene.walls
-            ]
-            space.add(body, poly, *rods, *walls)
-            body.position, body.angle = tuple(state[:2]), state[2]
-            body.velocity, body.angular_velocity = tuple(state[3:5]), state[5]
-            for _ in range(problem.substeps):
-                body.force, body.torque = tuple(action[:2]), action[2]
-                theta = body.angle + body.angular_velocity * step
-                here = pymunk.Vec2d(*wheel).rotated(theta) + body.position + body.velocity * step
-                axis = pymunk.Vec2d(1.0, 0.0).rotated(theta + values["w_theta"])
-                rods[0].anchor_b, rods[1].anchor_b = here + axis, here + axis.perpendicular()
-                space.step(step)
-            out[t, 0, 0] = (*body.position, body.angle, *body.velocity, body.angular_velocity)
-        outputs[0][0] = out
+        outputs[0][0] = naive(
+            segments.start,
+            segments.actions,
+            values,
+            problem.scene.dynamic[0].shape,
+            problem.scene.walls,
+            problem.substeps,
+        )
 
 
 def plain_model(model: pm.Model) -> pm.Model:
@@ -217,9 +198,6 @@ def plain_model(model: pm.Model) -> pm.Model:
     problem = model.problem
     loop = PythonLoop(problem)
     with pm.Model(coords=model.coords) as plain:
-        from pbrl_ppl.model import sigma_prior
-        from pbrl_ppl.prior import random_variable
-
         phi = pt.concatenate(
             [random_variable(b.name, b.priors, "body") for b in problem.layout.blocks]
         )

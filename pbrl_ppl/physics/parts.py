@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.coupling import Parts
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.parameters import Layout
@@ -64,7 +65,7 @@ class PartedSimulator:
         scene: Scene,
         layout: Layout,
         effects: tuple[Attached, ...] = (),
-        parts: tuple[tuple[str, ...], ...] | None = None,
+        parts: Parts | None = None,
         *,
         substeps: int | None = None,
         threads: int = 1,
@@ -77,8 +78,7 @@ class PartedSimulator:
             raise SimulationError(
                 f"parts hold {', '.join(given)}, expected each moving body once: {', '.join(names)}"
             )
-        labels = layout.labels
-        self._size = len(labels)
+        labels = self._labels = layout.labels
         self.parts = []
         for part in parts:
             own = scene if len(parts) == 1 else scene.subset(part)
@@ -115,12 +115,15 @@ class PartedSimulator:
 
     def recall(self, phi: Array, start: Array, actions: Array) -> Array:
         """Predict for one phi, or recall what was said of these very inputs a moment ago."""
-        if len(self.parts) > 1 and phi.shape != (self._size,):
-            raise SimulationError(f"phi has shape {phi.shape}, expected ({self._size},)")
+        if phi.shape != (len(self._labels),):
+            raise SimulationError(
+                f"phi has shape {phi.shape}, expected ({len(self._labels)},):"
+                f" {', '.join(self._labels)}"
+            )
         data = start.shape, actions.shape, hash(start.tobytes()), hash(actions.tobytes())
         out = np.empty((*actions.shape[:-1], 6))
         for part in self.parts:
-            own = phi[part.places] if len(self.parts) > 1 else phi
+            own = phi[part.places]
             key = (*data, own.tobytes())
             if key in part.memory:
                 part.memory.move_to_end(key)
