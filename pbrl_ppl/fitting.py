@@ -12,6 +12,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
+from pbrl_ppl.emulator import emulate
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.metropolis import AdaptiveMetropolis
 from pbrl_ppl.model import Problem
@@ -19,7 +20,12 @@ from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.posterior import from_groups, group, groups
 from pbrl_ppl.record import complete
 from pbrl_ppl.starts import dispersed, from_posterior, gaussian_blocks
-from pbrl_ppl.surrogate import surrogate
+from pbrl_ppl.surrogate import Residual, Surrogate, Unpack, coarse_engine
+
+#: Steps under the cheap posterior for an exact one: with an emulator, and otherwise.
+_FAR, _NEAR = 30, 10
+#: Engine steps that cost no more than these.
+_LITTLE = 2000
 
 
 @dataclass(frozen=True)
@@ -79,10 +85,29 @@ class Job:
 
 
 def _metropolis(job: Job) -> Any:
-    """Adaptive blocks that look ahead with a coarse engine; see AdaptiveMetropolis."""
-    rough = surrogate(job.model, job.mode, job.seed)
+    """Adaptive blocks that look ahead with a cheap posterior; see AdaptiveMetropolis."""
+    problem = job.mode.problem
     blocks = gaussian_blocks(job.model, job.mode)
-    step = AdaptiveMetropolis(job.model.free_RVs, blocks=blocks, rough=rough, thin=job.thin)
+    rough: Surrogate | None = None
+    inner = 1
+    if len(job.mode.phi) and not problem.layout.discrete.any():
+        unpack = Unpack(job.model, problem)
+        residual: Residual | None = emulate(job.mode, unpack, blocks, job.seed)
+        inner = _FAR
+        if residual is None:
+            residual, inner = coarse_engine(job.mode, job.seed), _NEAR
+        rough = None if residual is None else Surrogate(problem, unpack, residual)
+    # an exact step of one block, in engine steps
+    cost = problem.simulator.steps * problem.segments.n * problem.horizon / len(problem.parts)
+    plain = cost < _LITTLE
+    step = AdaptiveMetropolis(
+        job.model.free_RVs,
+        blocks=blocks,
+        rough=rough,
+        inner=min(inner, _NEAR) if plain else inner,
+        plain=plain,
+        thin=job.thin,
+    )
     return job.sample(step)
 
 
@@ -163,7 +188,7 @@ def _thinned(trace: Any, thin: int) -> Any:
 
 #: The samplers by name. Of the paper's schedule only the kind is known to us; its lengths are ours.
 METHODS: Mapping[str, Method] = {
-    "metropolis": Method(_metropolis, draws=1500, tune=500, thin=1),
+    "metropolis": Method(_metropolis, draws=1000, tune=500, thin=1),
     "paper": Method(_paper, draws=1000, tune=5000, thin=10),
     "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),
     "smc": Method(_smc, draws=1000, tune=0, thin=1),

@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 TARGET_ACCEPTANCE = 0.234
 #: The first guess of a covariance counts as much as this many steps.
 _GUESS = 300
+#: Steps a round of a block whose moves cost nothing to speak of.
+_CHEAP = 5
 _LARGEST_BETA = float(np.log(0.95))
 
 
@@ -75,6 +77,36 @@ class Gaussian:
         proposal = self.mean + np.sqrt(1 - beta**2) * (x - self.mean) + beta * noise
         return proposal, self.depth(proposal) - self.depth(x)
 
+    def move(
+        self,
+        q: Array,
+        here: float,
+        density: Callable[[Array], Any],
+        rng: np.random.Generator,
+        tune: bool,
+    ) -> tuple[Array, float, float]:
+        """One Metropolis step of the block in the vector q, whose log-density is ``here``.
+
+        Returns
+        -------
+        q : ndarray
+            Where it ends: the vector itself if the proposal was rejected.
+        here : float
+            The log-density there.
+        rate : float
+            With what probability the proposal was accepted.
+        """
+        walk = bool(rng.uniform() < 0.5)
+        moved = q.copy()
+        moved[self.places], correction = self.propose(q[self.places], walk, rng)
+        there = float(density(moved))
+        rate = _rate(there - here + correction)
+        if rng.uniform() < rate:
+            q, here = moved, there
+        if tune:
+            self.learn(q[self.places], rate, walk)
+        return q, here, rate
+
     def learn(self, x: Array, rate: float, walk: bool) -> None:
         """Take account of where the chain is, and of the last proposal's acceptance rate."""
         self.seen += 1
@@ -121,6 +153,10 @@ class AdaptiveMetropolis(ArrayStepShared):
         sampler's unconstrained space.
     inner : int
         Steps under it for each one that is judged exactly.
+    plain : bool
+        Whether a block also makes a step without looking ahead: it frees a chain from where
+        ``rough`` is far too low, and pays where an exact evaluation costs no more than ``inner``
+        rough ones.
     thin : int
         Rounds over the blocks a draw.
     model : pymc.Model, optional
@@ -149,6 +185,7 @@ class AdaptiveMetropolis(ArrayStepShared):
         blocks: list[Gaussian],
         rough: Callable[[Array], float] | None = None,
         inner: int = 10,
+        plain: bool = False,
         thin: int = 1,
         model: pm.Model | None = None,
         initial_point: dict[str, Array] | None = None,
@@ -159,7 +196,8 @@ class AdaptiveMetropolis(ArrayStepShared):
         point = model.initial_point() if initial_point is None else initial_point
         values = get_value_vars_from_user_vars(vars, model)
         self.tune = True
-        self.blocks, self.rough, self.inner, self.thin = blocks, rough, inner, thin
+        self.blocks, self.rough, self.inner, self.plain = blocks, rough, inner, plain
+        self.thin = thin
         (logp,), joined = join_nonshared_inputs(
             point=point, outputs=[model.logp()], inputs=values, shared_inputs={}
         )
@@ -177,13 +215,14 @@ class AdaptiveMetropolis(ArrayStepShared):
         for _ in range(self.thin):
             for block in self.blocks:
                 if self.rough is None or block.cheap:
-                    q, here, rate = self._move(block, q, here, near)
-                    rates.append(rate)
+                    for _ in range(_CHEAP if block.cheap else 1):
+                        q, here, rate = block.move(q, here, near, self.rng, self.tune)
+                        rates.append(rate)
                     continue
                 begin = rough = here if near is self.rough else self.rough(q)
                 y = q
                 for _ in range(self.inner):
-                    y, rough, rate = self._move(block, y, rough, self.rough)
+                    y, rough, rate = block.move(y, rough, self.rough, self.rng, self.tune)
                     rates.append(rate)
                 if near is self.rough:
                     q, here = y, rough
@@ -192,6 +231,8 @@ class AdaptiveMetropolis(ArrayStepShared):
                     exact.append(_rate((there - here) - (rough - begin)))
                     if self.rng.uniform() < exact[-1]:
                         q, here = y, there
+                if self.plain and near is not self.rough:
+                    q, here, _ = block.move(q, here, near, self.rng, tune=False)
         stats = {
             "accept": float(np.mean(rates)),
             "look_ahead_accept": float(np.mean(exact)) if exact else np.nan,
@@ -199,20 +240,40 @@ class AdaptiveMetropolis(ArrayStepShared):
         }
         return RaveledVars(q, q0.point_map_info), [stats]
 
-    def _move(
-        self, block: Gaussian, q: Array, here: float, density: Callable[[Array], Any]
-    ) -> tuple[Array, float, float]:
-        """One Metropolis step of a block: where it ends, the density there, the acceptance rate."""
-        walk = bool(self.rng.uniform() < 0.5)
-        moved = q.copy()
-        moved[block.places], correction = block.propose(q[block.places], walk, self.rng)
-        there = float(density(moved))
-        rate = _rate(there - here + correction)
-        if self.rng.uniform() < rate:
-            q, here = moved, there
-        if self.tune:
-            block.learn(q[block.places], rate, walk)
-        return q, here, rate
+
+def explore(
+    blocks: list[Gaussian],
+    density: Callable[[Array], float],
+    q: Array,
+    rounds: int,
+    rng: np.random.Generator,
+) -> Array:
+    """Where a chain of rounds over the blocks, which learn on the way, has been.
+
+    Parameters
+    ----------
+    blocks : list of Gaussian
+        Changed in place.
+    density : callable
+        Log-density.
+    q : ndarray
+        Where it begins, shape (d,).
+    rounds : int
+        Steps of each block.
+    rng : Generator
+        Source of randomness.
+
+    Returns
+    -------
+    ndarray
+        Shape (rounds, d).
+    """
+    here, chain = density(q), np.empty((rounds, len(q)))
+    for i in range(rounds):
+        for block in blocks:
+            q, here, _ = block.move(q, here, density, rng, tune=True)
+        chain[i] = q
+    return chain
 
 
 def _rate(log_ratio: float) -> float:

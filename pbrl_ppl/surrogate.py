@@ -1,6 +1,8 @@
-"""A cheap posterior for a sampler to look ahead with: few engine steps, corrected at the mode."""
+"""A cheap posterior for a sampler to look ahead with, and a coarse engine as one of its kinds."""
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 import pymc as pm
@@ -13,10 +15,13 @@ from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
+Residual = Callable[[Array], Array]
 
 #: Numbers of engine steps an interval to try, and how far (standard deviation) the log-likelihood
 #: may then be off among draws of the Laplace approximation: 1 still lets half of the moves pass.
-_SUBSTEPS, _CLOSE, _DRAWS = (4, 8), 1.0, 32
+_SUBSTEPS, CLOSE, _DRAWS = (4, 8), 1.0, 32
+#: Where the exact posterior's tails are the heavier, a chain would stick: this covers them.
+_FLATTER = 0.9
 
 
 class Unpack:
@@ -53,36 +58,20 @@ class Unpack:
 
 
 class Surrogate:
-    """The log-posterior with a coarser engine whose error at the mode is taken off everywhere.
+    """The log-posterior with residuals that cost less than the engine's.
 
     Parameters
     ----------
     problem : Problem
         The exact problem.
-    phi : ndarray
-        The mode, shape (p,).
     unpack : Unpack
         Of the problem's model.
-    substeps : int
-        Engine steps an interval.
+    residual : callable
+        From phi, shape (p,), to residuals as of :meth:`Problem.residual`.
     """
 
-    def __init__(self, problem: Problem, phi: Array, unpack: Unpack, substeps: int) -> None:
-        self.problem, self.unpack = problem, unpack
-        self.engine = problem.engine(substeps, threads=1, extrapolate=False)
-        self.correction = problem.predict(phi) - self._coarse(phi)
-
-    def _coarse(self, phi: Array) -> Array:
-        segments = self.problem.segments
-        if phi.ndim == 1:
-            return self.engine.recall(phi, segments.start, segments.actions)
-        return self.engine(phi, segments.start, segments.actions)
-
-    def log_likelihood(self, phi: Array, sigma: Array) -> Array:
-        """Sum over transitions, shape (...), for phi (..., p) and sigma (state,)."""
-        problem = self.problem
-        residual = problem.observations.residual(self._coarse(phi) + self.correction)
-        return np.asarray(problem.log_density(residual, sigma).sum(axis=-1))
+    def __init__(self, problem: Problem, unpack: Unpack, residual: Residual) -> None:
+        self.problem, self.unpack, self.residual = problem, unpack, residual
 
     def __call__(self, q: Array) -> float:
         """Log-density at the sampler's vector."""
@@ -90,18 +79,43 @@ class Surrogate:
         if not np.isfinite(prior):
             return -np.inf
         try:
-            return prior + float(self.log_likelihood(phi, sigma))
+            density = self.problem.log_density(self.residual(phi), sigma)
         except ParameterError:  # impossible, such as a mass that underflows
             return -np.inf
+        return prior + _FLATTER * float(density.sum())
 
 
-def surrogate(model: pm.Model, mode: Mode, seed: int) -> Surrogate | None:
-    """Find the cheapest surrogate that follows the posterior about its mode.
+class CoarseEngine:
+    """Residuals by an engine of few steps, whose error at the mode is taken off everywhere.
 
     Parameters
     ----------
-    model : pymc.Model
-        Of the mode's problem.
+    problem : Problem
+        The exact problem.
+    phi : ndarray
+        The mode, shape (p,).
+    substeps : int
+        Engine steps an interval.
+    """
+
+    def __init__(self, problem: Problem, phi: Array, substeps: int) -> None:
+        self.problem = problem
+        self.engine = problem.engine(substeps, threads=1, extrapolate=False)
+        self.correction = problem.predict(phi) - problem.predict(phi, self.engine)
+
+    def __call__(self, phi: Array) -> Array:
+        """Residuals for phi of shape (..., p)."""
+        segments = self.problem.segments
+        run = self.engine.recall if phi.ndim == 1 else self.engine
+        predicted = run(phi, segments.start, segments.actions)
+        return self.problem.observations.residual(predicted + self.correction)
+
+
+def coarse_engine(mode: Mode, seed: int) -> CoarseEngine | None:
+    """Find the fewest engine steps that follow the posterior about its mode.
+
+    Parameters
+    ----------
     mode : Mode
         Where it is to be right.
     seed : int
@@ -109,20 +123,17 @@ def surrogate(model: pm.Model, mode: Mode, seed: int) -> Surrogate | None:
 
     Returns
     -------
-    Surrogate or None
+    CoarseEngine or None
         None where there is none that is close enough and much cheaper, as with hard contacts.
     """
     problem = mode.problem
-    if not len(mode.phi) or problem.layout.discrete.any():
-        return None
     draws = mode.draws(np.random.default_rng(seed), _DRAWS)
     exact = problem.log_density(problem.residual(draws), mode.sigma).sum(axis=-1)
-    unpack = Unpack(model, problem)
     for substeps in _SUBSTEPS:
         if 2 * substeps > problem.substeps:
             break
-        rough = Surrogate(problem, mode.phi, unpack, substeps)
-        off = rough.log_likelihood(draws, mode.sigma) - exact
-        if np.isfinite(off).all() and off.std() < _CLOSE:
-            return rough
+        residual = CoarseEngine(problem, mode.phi, substeps)
+        off = problem.log_density(residual(draws), mode.sigma).sum(axis=-1) - exact
+        if np.isfinite(off).all() and off.std() < CLOSE:
+            return residual
     return None
