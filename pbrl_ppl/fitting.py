@@ -20,11 +20,9 @@ from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.posterior import from_groups, group, groups
 from pbrl_ppl.record import complete
 from pbrl_ppl.starts import dispersed, from_posterior, gaussian_blocks
-from pbrl_ppl.surrogate import Residual, Surrogate, Unpack, coarse_engine
+from pbrl_ppl.surrogate import Surrogate, Unpack, coarse_engine
 
-#: Steps under the cheap posterior for an exact one: with an emulator, and otherwise.
-_FAR, _NEAR = 30, 10
-#: Engine steps that cost no more than these.
+#: Engine steps that cost no more than what samplers do beside them.
 _LITTLE = 2000
 
 
@@ -86,29 +84,20 @@ class Job:
 
 def _metropolis(job: Job) -> Any:
     """Adaptive blocks that look ahead with a cheap posterior; see AdaptiveMetropolis."""
-    problem = job.mode.problem
-    blocks = gaussian_blocks(job.model, job.mode)
-    rough: Surrogate | None = None
-    inner = 1
-    if len(job.mode.phi) and not problem.layout.discrete.any():
-        unpack = Unpack(job.model, problem)
-        residual: Residual | None = emulate(job.mode, unpack, blocks, job.seed)
-        inner = _FAR
-        if residual is None:
-            residual, inner = coarse_engine(job.mode, job.seed), _NEAR
-        rough = None if residual is None else Surrogate(problem, unpack, residual)
-    # an exact step of one block, in engine steps
+    problem, model = job.mode.problem, job.model
+    blocks = gaussian_blocks(model, job.mode)
+    options: dict[str, Any] = {"inner": 10}
+    # an exact step of one block, in engine steps; where that is little, looking ahead is no use
     cost = problem.simulator.steps * problem.segments.n * problem.horizon / len(problem.parts)
-    plain = cost < _LITTLE
-    step = AdaptiveMetropolis(
-        job.model.free_RVs,
-        blocks=blocks,
-        rough=rough,
-        inner=min(inner, _NEAR) if plain else inner,
-        plain=plain,
-        thin=job.thin,
-    )
-    return job.sample(step)
+    if cost > _LITTLE and not problem.layout.discrete.any():
+        unpack = Unpack(model, problem)
+        if emulator := emulate(job.mode, unpack, blocks, job.seed):
+            options = {"rough": Surrogate(problem, unpack, emulator), "inner": 30, "plain": 0.25}
+        elif engine := coarse_engine(job.mode, job.seed):
+            options["rough"] = Surrogate(problem, unpack, engine)
+        else:
+            options["inner"] = 1
+    return job.sample(AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, **options))
 
 
 def _paper(job: Job) -> Any:

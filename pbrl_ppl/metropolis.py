@@ -152,11 +152,11 @@ class AdaptiveMetropolis(ArrayStepShared):
         Log-density of the cheap posterior, up to a constant, at a vector of all variables in the
         sampler's unconstrained space.
     inner : int
-        Steps under it for each one that is judged exactly.
-    plain : bool
-        Whether a block also makes a step without looking ahead: it frees a chain from where
-        ``rough`` is far too low, and pays where an exact evaluation costs no more than ``inner``
-        rough ones.
+        Steps of a block a round: under ``rough`` for each one that is judged exactly, where there
+        is one.
+    plain : float
+        Probability of one more step that does not look ahead: it frees a chain from where
+        ``rough`` is far too low.
     thin : int
         Rounds over the blocks a draw.
     model : pymc.Model, optional
@@ -185,7 +185,7 @@ class AdaptiveMetropolis(ArrayStepShared):
         blocks: list[Gaussian],
         rough: Callable[[Array], float] | None = None,
         inner: int = 10,
-        plain: bool = False,
+        plain: float = 0.0,
         thin: int = 1,
         model: pm.Model | None = None,
         initial_point: dict[str, Array] | None = None,
@@ -214,24 +214,22 @@ class AdaptiveMetropolis(ArrayStepShared):
         rates, exact = [], []
         for _ in range(self.thin):
             for block in self.blocks:
-                if self.rough is None or block.cheap:
-                    for _ in range(_CHEAP if block.cheap else 1):
+                if self.rough is None or block.cheap or self.tune:
+                    for _ in range(_CHEAP if block.cheap else self.inner):
                         q, here, rate = block.move(q, here, near, self.rng, self.tune)
                         rates.append(rate)
                     continue
-                begin = rough = here if near is self.rough else self.rough(q)
+                begin = rough = self.rough(q)
                 y = q
                 for _ in range(self.inner):
-                    y, rough, rate = block.move(y, rough, self.rough, self.rng, self.tune)
+                    y, rough, rate = block.move(y, rough, self.rough, self.rng, tune=False)
                     rates.append(rate)
-                if near is self.rough:
-                    q, here = y, rough
-                elif y is not q:
+                if y is not q:
                     there = float(self.logp(y))
                     exact.append(_rate((there - here) - (rough - begin)))
                     if self.rng.uniform() < exact[-1]:
                         q, here = y, there
-                if self.plain and near is not self.rough:
+                if self.rng.uniform() < self.plain:
                     q, here, _ = block.move(q, here, near, self.rng, tune=False)
         stats = {
             "accept": float(np.mean(rates)),
