@@ -10,12 +10,14 @@ from numpy.typing import NDArray
 from pbrl_ppl.metropolis import Gaussian, explore
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.surrogate import CLOSE, Surrogate, Unpack
+from pbrl_ppl.surrogate import Surrogate, Unpack
 
 Array = NDArray[np.float64]
 
 #: Degrees to try; engine runs a coefficient, at least and at most; rounds of each.
 _DEGREES, _A_COEFFICIENT, _LEAST, _MOST, _ROUNDS = (1, 2), 4, 100, 400, 4
+#: How far off (standard deviation) the log-likelihood may be: half of the moves still pass.
+_CLOSE = 1.0
 #: Steps of the exploring chain between two runs.
 _APART = 20
 
@@ -97,7 +99,7 @@ def emulate(
     for block in blocks:
         q[block.places] = block.mean
     widest = max(len(part.places) for part in problem.simulator.parts)
-    close = CLOSE * np.sqrt(len(problem.parts))  # each part is judged alone
+    close = _CLOSE * np.sqrt(len(problem.parts))  # each part is judged alone
     for degree in _DEGREES:
         runs = max(_LEAST, _A_COEFFICIENT * _terms(np.zeros(widest), degree).size)
         if runs > _MOST:

@@ -20,7 +20,7 @@ from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.posterior import from_groups, group, groups
 from pbrl_ppl.record import complete
 from pbrl_ppl.starts import dispersed, from_posterior, gaussian_blocks
-from pbrl_ppl.surrogate import Surrogate, Unpack, coarse_engine
+from pbrl_ppl.surrogate import Surrogate, Unpack
 
 #: Engine steps that cost no more than what samplers do beside them.
 _LITTLE = 2000
@@ -93,10 +93,6 @@ def _metropolis(job: Job) -> Any:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
             options = {"rough": Surrogate(problem, unpack, emulator), "inner": 30, "plain": 0.25}
-        elif engine := coarse_engine(job.mode, job.seed):
-            options["rough"] = Surrogate(problem, unpack, engine)
-        else:
-            options["inner"] = 1
     return job.sample(AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, **options))
 
 

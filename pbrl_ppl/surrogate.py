@@ -1,4 +1,4 @@
-"""A cheap posterior for a sampler to look ahead with, and a coarse engine as one of its kinds."""
+"""A cheap posterior for a sampler to look ahead with."""
 
 from __future__ import annotations
 
@@ -12,14 +12,10 @@ from pymc.pytensorf import join_nonshared_inputs
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
 Residual = Callable[[Array], Array]
 
-#: Numbers of engine steps an interval to try, and how far (standard deviation) the log-likelihood
-#: may then be off among draws of the Laplace approximation: 1 still lets half of the moves pass.
-_SUBSTEPS, CLOSE, _DRAWS = (4, 8), 1.0, 32
 #: Where the exact posterior's tails are the heavier, a chain would stick: this covers them.
 _FLATTER = 0.9
 
@@ -83,57 +79,3 @@ class Surrogate:
         except ParameterError:  # impossible, such as a mass that underflows
             return -np.inf
         return prior + _FLATTER * float(density.sum())
-
-
-class CoarseEngine:
-    """Residuals by an engine of few steps, whose error at the mode is taken off everywhere.
-
-    Parameters
-    ----------
-    problem : Problem
-        The exact problem.
-    phi : ndarray
-        The mode, shape (p,).
-    substeps : int
-        Engine steps an interval.
-    """
-
-    def __init__(self, problem: Problem, phi: Array, substeps: int) -> None:
-        self.problem = problem
-        self.engine = problem.engine(substeps, threads=1, extrapolate=False)
-        self.correction = problem.predict(phi) - problem.predict(phi, self.engine)
-
-    def __call__(self, phi: Array) -> Array:
-        """Residuals for phi of shape (..., p)."""
-        segments = self.problem.segments
-        run = self.engine.recall if phi.ndim == 1 else self.engine
-        predicted = run(phi, segments.start, segments.actions)
-        return self.problem.observations.residual(predicted + self.correction)
-
-
-def coarse_engine(mode: Mode, seed: int) -> CoarseEngine | None:
-    """Find the fewest engine steps that follow the posterior about its mode.
-
-    Parameters
-    ----------
-    mode : Mode
-        Where it is to be right.
-    seed : int
-        Of the draws that it is tried on.
-
-    Returns
-    -------
-    CoarseEngine or None
-        None where there is none that is close enough and much cheaper, as with hard contacts.
-    """
-    problem = mode.problem
-    draws = mode.draws(np.random.default_rng(seed), _DRAWS)
-    exact = problem.log_density(problem.residual(draws), mode.sigma).sum(axis=-1)
-    for substeps in _SUBSTEPS:
-        if 2 * substeps > problem.substeps:
-            break
-        residual = CoarseEngine(problem, mode.phi, substeps)
-        off = problem.log_density(residual(draws), mode.sigma).sum(axis=-1) - exact
-        if np.isfinite(off).all() and off.std() < CLOSE:
-            return residual
-    return None
