@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
     from pbrl_ppl.transition import Transition
     from pbrl_ppl.updated_prior import updated_scene
+    from pbrl_ppl.updating import update
 
 __version__ = "0.1.0"
 
@@ -62,6 +63,7 @@ __all__ = [
     "prior_predictive_check",
     "save_posterior",
     "uninformed",
+    "update",
     "updated_scene",
 ]
 
@@ -85,6 +87,7 @@ _MODULES = {
     "scene": ("Body", "Joint", "Scene", "Shape", "Wall"),
     "transition": ("Transition",),
     "updated_prior": ("updated_scene",),
+    "updating": ("update",),
 }
 
 

@@ -67,6 +67,8 @@ class Problem:
     sigma_prior : tuple or None
         Medians of sigma's prior, one a measured state dimension, and its log-scale; by default
         :func:`sigma_prior` takes them from the data.
+    columns : tuple of int, optional
+        State dimensions that the likelihood is over; those measured anywhere by default.
     """
 
     scene: Scene
@@ -80,6 +82,7 @@ class Problem:
     extrapolate: bool = True
     nu: float | None = None
     sigma_prior: tuple[tuple[float, ...], float] | None = None
+    columns: tuple[int, ...] | None = None
     layout: Layout = field(init=False)
 
     def __post_init__(self) -> None:
@@ -100,7 +103,7 @@ class Problem:
     @cached_property
     def observations(self) -> Observations:
         """What was measured at the segments' steps."""
-        return Observations.of(self.segments)
+        return Observations.of(self.segments, self.columns)
 
     @cached_property
     def parts(self) -> Parts:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import tempfile
@@ -267,6 +268,36 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     r_hat = {str(name): float(hat[name]) for name in flat.data_vars}
     ess = {str(name): float(min(bulk[name], tail[name])) for name in flat.data_vars}
     return r_hat, ess
+
+
+def smoothed(log_weights: Array) -> tuple[Array, float]:
+    """Pareto-smoothed importance weights that add up to one, and the shape k of their tail.
+
+    Parameters
+    ----------
+    log_weights : ndarray
+        Shape (draw,), up to a constant.
+
+    Returns
+    -------
+    weights : ndarray
+        Shape (draw,).
+    k : float
+        Above 0.7 the weights are not to be relied on (Vehtari et al., 2024); infinite where there
+        are too few different ones to say.
+    """
+    result, k = log_weights, np.inf
+    # in the tail are values that differ, or ArviZ refuses
+    with contextlib.suppress(ValueError):
+        if DATATREE:
+            from arviz_stats.base import array_stats
+
+            # it takes log-likelihoods, whose inverse is the weight in leave-one-out
+            result, k = array_stats.psislw(-log_weights, axis=-1)
+        else:
+            result, k = az.psislw(log_weights)
+    weights = np.exp(np.asarray(result) - np.max(result))
+    return weights / weights.sum(), float(k)
 
 
 def _dataset(value: Any) -> xr.Dataset:
