@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pbrl_ppl.history import History, Segments
     from pbrl_ppl.identifiability import Identifiability
     from pbrl_ppl.identification import identify, uninformed
+    from pbrl_ppl.learned_modes import learned_modes, mode_probabilities
+    from pbrl_ppl.mode_prior import Modes
     from pbrl_ppl.model import physics_model
     from pbrl_ppl.op import SimulatorOp
     from pbrl_ppl.parameters import Prior
@@ -43,6 +45,7 @@ __all__ = [
     "Identifiability",
     "Joint",
     "Loop",
+    "Modes",
     "PbrlError",
     "Prior",
     "PriorCheck",
@@ -58,7 +61,9 @@ __all__ = [
     "close_loop",
     "fit",
     "identify",
+    "learned_modes",
     "load_posterior",
+    "mode_probabilities",
     "physics_model",
     "prior_predictive_check",
     "save_posterior",
@@ -76,6 +81,8 @@ _MODULES = {
     "history": ("History", "Segments"),
     "identifiability": ("Identifiability",),
     "identification": ("identify", "uninformed"),
+    "learned_modes": ("learned_modes", "mode_probabilities"),
+    "mode_prior": ("Modes",),
     "model": ("physics_model",),
     "op": ("SimulatorOp",),
     "parameters": ("Prior",),

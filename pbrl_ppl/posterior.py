@@ -255,7 +255,10 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     r_hat, ess : dict of str to float
         By label, such as ``mass[cart]``.
     """
-    flat = scalars(idata)
+    every = scalars(idata)
+    # what is the same in all draws, such as an index without doubt, is 0 / 0 and has converged
+    fixed = {name for name, each in every.data_vars.items() if not np.ptp(each.to_numpy())}
+    flat = every.drop_vars(fixed)
     # the generations differ in the tail that they look at by default
     hat, bulk, tail = (
         _dataset(measure)
@@ -265,8 +268,10 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
             az.ess(flat, method="tail", prob=(0.05, 0.95)),
         )
     )
-    r_hat = {str(name): float(hat[name]) for name in flat.data_vars}
-    ess = {str(name): float(min(bulk[name], tail[name])) for name in flat.data_vars}
+    r_hat, ess = {}, {}
+    for name, each in every.data_vars.items():
+        r_hat[str(name)] = 1.0 if name in fixed else float(hat[name])
+        ess[str(name)] = float(each.size if name in fixed else min(bulk[name], tail[name]))
     return r_hat, ess
 
 

