@@ -256,7 +256,12 @@ def fit(
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
     if problem.modes is not None:
-        return _fit_modes(model, problem, method, start, seed, draws, chains)
+        if method != _DEFAULT or start is not None:
+            raise FitError(
+                "fit: a model of modes is summed over exactly; leave out method= and start="
+            )
+        trace = _summed(model, METHODS[method].draws if draws is None else draws, chains, seed)
+        return complete(problem, trace, seed=seed, method="exact sum over modes")
     chosen = METHODS[method]
     earlier = None if start is None or isinstance(start, Mode) else start
     if earlier is not None:
@@ -291,31 +296,13 @@ def fit(
     return complete(problem, trace, seed=seed, method=method, asked=asked if done < asked else None)
 
 
-def _fit_modes(
-    model: pm.Model,
-    problem: Problem,
-    method: str,
-    start: Any,
-    seed: int,
-    draws: int | None,
-    chains: int,
-) -> Any:
-    """The posterior of modes, by summing over them."""
-    if method != _DEFAULT or start is not None:
-        raise FitError("fit: a model of modes is summed over exactly; leave out method= and start=")
-    n = METHODS[method].draws if draws is None else draws
-    sigma, mode, accepted = choose_modes(problem, n, chains, seed)
-    names = [body.name for body in problem.scene.dynamic]
-    table = problem.modes.table(problem.layout, problem.scene) if problem.modes else np.zeros((0,))
-    values: dict[str, Any] = {
-        block.name: table[place][
-            np.arange(len(block.owners)), mode[..., [names.index(each) for each in block.owners]]
-        ]
-        for block, place in problem.layout.slices()
-    }
+def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:
+    """Draws of a model of modes, by summing over them."""
+    problem = model.problem
+    phi, sigma, mode, accepted = choose_modes(problem, draws, chains, seed)
+    values: dict[str, Any] = problem.layout.to_dict(phi)
     values |= {"mode": mode, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
-    trace = as_trace(model, values, {"accept": accepted})
-    return complete(problem, trace, seed=seed, method="exact sum over modes")
+    return as_trace(model, values, {"accept": accepted})
 
 
 def _appended(earlier: Any, trace: Any) -> Any:

@@ -72,7 +72,9 @@ class _Combinations:
         return np.asarray(result + self.log_prior)
 
 
-def choose_modes(problem: Problem, draws: int, chains: int, seed: int) -> tuple[Array, Ints, Array]:
+def choose_modes(
+    problem: Problem, draws: int, chains: int, seed: int
+) -> tuple[Array, Array, Ints, Array]:
     """Draw sigma from its marginal posterior, and the modes given sigma.
 
     Given sigma, bodies that have nothing to do with each other are independent, and the sum over
@@ -90,6 +92,8 @@ def choose_modes(problem: Problem, draws: int, chains: int, seed: int) -> tuple[
 
     Returns
     -------
+    phi : ndarray
+        Parameters, shape (chain, draw, p).
     sigma : ndarray
         Shape (chain, draw, state), or (chain, draw, 1) for a scalar sigma.
     modes : ndarray of int
@@ -148,7 +152,12 @@ def choose_modes(problem: Problem, draws: int, chains: int, seed: int) -> tuple[
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
             modes[:, part.bodies] = own.indices[which]
         chosen.append(modes)
-    return np.stack(sigmas), np.stack(chosen), np.stack(accepted)
+    names = [body.name for body in problem.scene.dynamic]
+    owners = [owner for block in problem.layout.blocks for owner in block.owners]
+    every_mode = np.stack(chosen)
+    of = every_mode[..., [names.index(owner) for owner in owners]]
+    phi = table[np.arange(len(owners)), of]
+    return phi, np.stack(sigmas), every_mode, np.stack(accepted)
 
 
 def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> Array:

@@ -245,5 +245,7 @@ def _accepted(log_ratio: Array, rng: np.random.Generator) -> Bools:
 
 def _spread(points: Array, columns: NDArray[np.intp]) -> Array:
     """Covariance of some columns, never singular."""
+    if not len(columns):  # of a part whose parameters are known
+        return np.zeros((0, 0))
     covariance = np.cov(points[:, columns], rowvar=False).reshape(2 * (len(columns),))
     return covariance + 1e-9 * np.diag(np.diag(covariance)) + 1e-12 * np.eye(len(columns))

@@ -146,13 +146,15 @@ def _updated(
     data = _with_data(idata, problem)
     base = _with_new(base, likelihood, predictive).assign_coords(data["observed_data"].coords)
     log_weights = base["log_weight"].to_numpy().ravel()
-    share, k = 0.0, np.inf
+    weights, share, k = np.zeros(len(log_weights)), 0.0, np.inf
     if np.isfinite(log_weights.max()):
         weights, k = smoothed(log_weights)
         share = 1.0 / (len(weights) * float((weights**2).sum()))
     how = {"share": share, "pareto_k": k if np.isfinite(k) else None}
     heavy = np.isfinite(k) and k > _HEAVY
-    if share >= _MOVE and not heavy:
+    # a chain that the data speak against sits where the others do not: then they must mix
+    of_chains = weights.reshape(base.sizes["chain"], -1).sum(axis=1) * base.sizes["chain"]
+    if min(share, of_chains.min()) >= _MOVE and not heavy:
         result = _reweighted(base, weights, data, idata.attrs, rng)
         if not _worn(base, result):
             return checked(problem, result), how | {"did": "reweighted"}
@@ -183,7 +185,7 @@ def _updated(
 
 def _worn(base: xr.Dataset, result: Any) -> bool:
     """Whether there are too few effective draws by now, of which there were enough."""
-    if base.attrs.get("min_ess", 0.0) < MIN_ESS:
+    if float(base["min_ess"]) < MIN_ESS:
         return False
     return min(convergence(result)[1].values()) < MIN_ESS
 
@@ -197,14 +199,11 @@ def _reweighted(
 ) -> Any:
     """Equally weighted draws: those of the fit, repeated or left out within their chain."""
     chains, n = base.sizes["chain"], base.sizes["draw"]
-    table = weights.reshape(chains, n)
-    # a chain without weight has nothing to resample: it is as good as the others are
-    table = np.where(table.sum(axis=1, keepdims=True) > 0, table, 1.0)
-    ancestor = np.stack([_systematic(each, n, rng) for each in table])
+    ancestor = np.stack([_systematic(each, n, rng) for each in weights.reshape(chains, n)])
     where = xr.DataArray(ancestor, dims=("chain", "draw"))
     drawn = base.isel(chain=xr.DataArray(np.arange(chains), dims="chain"), draw=where)
     drawn = drawn.assign_coords(chain=base["chain"], draw=base["draw"])
-    own = ("log_likelihood", "log_weight", "next_state")
+    own = ("log_likelihood", "log_weight", "next_state", "min_ess")
     posterior = drawn[[str(v) for v in base.data_vars if v not in own]]
     rows = _systematic(weights[base["row"].to_numpy()] + 1e-300, base.sizes["row"], rng)
     predictive = base["next_state"].isel(row=rows).rename(row="draw")
@@ -248,12 +247,12 @@ def _base(idata: Any, problem: Problem) -> xr.Dataset:
     predictive = group(idata, "posterior_predictive")["next_state"]
     predictive = predictive.stack(row=("chain", "draw")).transpose("row", *CELLS)
     variables = {
+        "min_ess": ((), float(idata.attrs.get("min_ess", 0.0))),
         "log_likelihood": (("chain", "draw", "transition"), likelihood.to_numpy()),
         "log_weight": (("chain", "draw"), np.zeros((chains, draws))),
         "next_state": (("row", *CELLS), predictive.to_numpy()),
     }
-    base = posterior.assign(variables).assign_coords(row=predictive_rows(chains * draws))
-    return base.assign_attrs(min_ess=float(idata.attrs.get("min_ess", 0.0)))
+    return posterior.assign(variables).assign_coords(row=predictive_rows(chains * draws))
 
 
 def _with_new(base: xr.Dataset, likelihood: Array, predictive: Array) -> xr.Dataset:

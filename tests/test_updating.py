@@ -332,6 +332,21 @@ def test_an_effect_of_one_s_own(parts) -> None:
     assert did(quiet(update, idata, new, effects=(*catalogue, own), progress=False)) != []
 
 
+@pytest.mark.parametrize("known", ["b", "ab"])
+def test_bodies_of_which_all_is_known(known, monkeypatch) -> None:
+    """Nothing to move of them but the noise."""
+    free, given = {"known": KNOWN}, {"known": KNOWN | {"mass": 3.0}}
+    shape = Shape.circle(0.1)
+    bodies = tuple(Body(n, shape, **(given if n in known else free)) for n in "ab")
+    scene = Scene(time_step=0.1, substeps=4, bodies=bodies)
+    truth = {} if known == "ab" else {"mass": 2.0}
+    history = simulated_history(scene, truth, seed=1, trajectories=31, intervals=1, substeps=8)
+    idata = quiet(fit, physics_model(scene, history.select(range(30))), seed=1,
+                  **(QUICK | {"draws": 200, "tune": 50}))  # fmt: skip
+    monkeypatch.setattr("pbrl_ppl.updating._MOVE", 1.0)
+    assert did(quiet(update, idata, history.select([30]))) == ["moved"]
+
+
 def test_refused_histories(parts, first) -> None:
     scene, _, b, _ = parts
     others = pucks("xy")
