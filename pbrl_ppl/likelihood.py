@@ -220,7 +220,7 @@ def robust(z: Array, nu: float | None) -> Array:
     Examples
     --------
     >>> robust(np.array([0.1, 30.0]), 4.0).round(2)
-    array([0.11, 5.2 ])
+    array([0.11, 5.21])
     """
     if nu is None:
         return z
