@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pbrl_ppl.history import History, Segments
     from pbrl_ppl.identifiability import Identifiability
     from pbrl_ppl.identification import identify, uninformed
+    from pbrl_ppl.learned_modes import learned_modes, mode_probabilities
+    from pbrl_ppl.mode_prior import Modes
     from pbrl_ppl.model import physics_model
     from pbrl_ppl.op import SimulatorOp
     from pbrl_ppl.parameters import Prior
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
     from pbrl_ppl.transition import Transition
     from pbrl_ppl.updated_prior import updated_scene
+    from pbrl_ppl.updating import update
 
 __version__ = "0.1.0"
 
@@ -42,6 +45,7 @@ __all__ = [
     "Identifiability",
     "Joint",
     "Loop",
+    "Modes",
     "PbrlError",
     "Prior",
     "PriorCheck",
@@ -57,11 +61,14 @@ __all__ = [
     "close_loop",
     "fit",
     "identify",
+    "learned_modes",
     "load_posterior",
+    "mode_probabilities",
     "physics_model",
     "prior_predictive_check",
     "save_posterior",
     "uninformed",
+    "update",
     "updated_scene",
 ]
 
@@ -74,6 +81,8 @@ _MODULES = {
     "history": ("History", "Segments"),
     "identifiability": ("Identifiability",),
     "identification": ("identify", "uninformed"),
+    "learned_modes": ("learned_modes", "mode_probabilities"),
+    "mode_prior": ("Modes",),
     "model": ("physics_model",),
     "op": ("SimulatorOp",),
     "parameters": ("Prior",),
@@ -85,6 +94,7 @@ _MODULES = {
     "scene": ("Body", "Joint", "Scene", "Shape", "Wall"),
     "transition": ("Transition",),
     "updated_prior": ("updated_scene",),
+    "updating": ("update",),
 }
 
 

@@ -1,4 +1,4 @@
-"""Command line: ``pbrl-ppl close-loop``, ``pbrl-ppl check`` and ``pbrl-ppl calibrate``.
+"""Command line: ``pbrl-ppl close-loop``, ``check``, ``calibrate`` and ``update``.
 
 Imports of the package stand inside the functions: PyMC takes seconds to load, and ``--help`` or a
 mistyped path should not wait for it.
@@ -6,6 +6,7 @@ mistyped path should not wait for it.
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 import time
@@ -20,7 +21,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from pbrl_ppl.errors import PbrlError
+from pbrl_ppl.errors import OutputError, PbrlError
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -212,6 +213,47 @@ def calibrate(
     typer.echo(f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}")
     if not result.passed:
         raise typer.Exit(FAILED)
+
+
+@app.command()
+def update(
+    posterior: Annotated[
+        Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); it has the scene.")
+    ],
+    history: Annotated[
+        Path, typer.Argument(metavar="HISTORY", help="What was recorded since (.csv, ...).")
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE", help="The new posterior file.")
+    ],
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace a file that exists.")
+    ] = False,
+    estimate_velocities: _Velocities = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+) -> None:
+    """Bring a posterior up to date with new transitions, without a fit from scratch."""
+    with _interruptible(), _stages(quiet) as progress:
+        if output.exists() and not overwrite:
+            raise OutputError(f"{output}: it exists; choose another file, or pass --overwrite")
+        progress("reading the posterior and the history")
+        from pbrl_ppl.history import History
+        from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
+
+        idata = load_posterior(posterior)
+        new = History.load(history, scene_of(idata), estimate_velocities=estimate_velocities)
+        progress("updating")
+        from pbrl_ppl import updating
+
+        idata = updating.update(idata, new, seed=seed, progress=False)
+        save_posterior(idata, output)
+        (*_, last) = json.loads(idata.attrs["updates"])
+    typer.echo(
+        f"{last['did']}: {last['transitions']} transitions, the weights worth {last['share']:.0%}"
+        " of the draws"
+    )
+    typer.echo(f"posterior: {output}")
 
 
 @contextmanager

@@ -45,5 +45,9 @@ class UninformedWarning(UserWarning):
     """A fit in which the data say nothing about a parameter: its posterior is its prior."""
 
 
+class RefitWarning(UserWarning):
+    """An update for which the earlier draws were no use, so that all data were fitted anew."""
+
+
 class FitError(PbrlError, ValueError):
     """A model that cannot be fitted as asked."""

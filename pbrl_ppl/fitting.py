@@ -15,6 +15,7 @@ import xarray as xr
 from pbrl_ppl.emulator import emulate
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.metropolis import AdaptiveMetropolis
+from pbrl_ppl.mode_choice import choose_modes
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.posterior import from_groups, group, groups
@@ -126,14 +127,32 @@ def _smc(job: Job) -> Any:
 
 def _map(job: Job) -> Any:
     """The mode alone, as a posterior of one draw."""
-    problem = job.mode.problem
-    values = problem.named(job.mode.phi, job.mode.sigma)
-    dims = {v.name: job.model.named_vars_to_dims.get(v.name, ()) for v in job.model.free_RVs}
-    data = {
-        name: (("chain", "draw", *dims[name]), np.asarray(value)[None, None])
-        for name, value in values.items()
-    }
-    segments = problem.segments
+    values = job.mode.problem.named(job.mode.phi, job.mode.sigma)
+    draws = {name: np.asarray(value)[None, None] for name, value in values.items()}
+    return as_trace(job.model, draws, {"lp": np.array([[job.mode.log_posterior]])})
+
+
+def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
+    """Draws as PyMC gives them, made by other means.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        Of ``physics_model``; says what each variable runs over.
+    draws : mapping of str to ndarray
+        By the variables' names, shape (chain, draw, ...).
+    stats : mapping of str to ndarray
+        What the sampler says of each draw, shape (chain, draw).
+    """
+    problem = model.problem
+    segments, per_draw = problem.segments, ("chain", "draw")
+    n = {dim: np.arange(size) for dim, size in zip(per_draw, draws["sigma"].shape, strict=False)}
+
+    def dataset(variables: dict[str, Any], **more: Any) -> xr.Dataset:
+        used = {dim for each, _ in variables.values() for dim in each if dim in model.coords}
+        return xr.Dataset(variables, more | {dim: list(model.coords[dim]) for dim in used})
+
+    dims = {name: (*per_draw, *(model.named_vars_to_dims.get(name) or ())) for name in draws}
     given = {
         "start": (("transition", "body", "full_state"), segments.start),
         "actions": (("transition", "step", "body", "wrench"), segments.actions),
@@ -141,17 +160,10 @@ def _map(job: Job) -> Any:
     observed = {
         "next_state": (("transition", "step", "body", "state"), problem.observations.values)
     }
-
-    def dataset(variables: dict[str, Any], **more: Any) -> xr.Dataset:
-        used = {dim for each, _ in variables.values() for dim in each if dim in job.model.coords}
-        return xr.Dataset(variables, more | {dim: list(job.model.coords[dim]) for dim in used})
-
-    log_posterior = {"lp": (("chain", "draw"), [[job.mode.log_posterior]])}
-    one = {"chain": [0], "draw": [0]}
     return from_groups(
         {
-            "posterior": dataset(data, **one),
-            "sample_stats": dataset(log_posterior, **one),
+            "posterior": dataset({name: (dims[name], v) for name, v in draws.items()}, **n),
+            "sample_stats": dataset({name: (per_draw, v) for name, v in stats.items()}, **n),
             "observed_data": dataset(observed),
             "constant_data": dataset(given),
         },
@@ -171,6 +183,7 @@ def _thinned(trace: Any, thin: int) -> Any:
     return from_groups(data, {})
 
 
+_DEFAULT = "metropolis"
 #: The samplers by name. Of the paper's schedule only the kind is known to us; its lengths are ours.
 METHODS: Mapping[str, Method] = {
     "metropolis": Method(_metropolis, draws=1000, tune=500, thin=1),
@@ -185,7 +198,7 @@ METHODS: Mapping[str, Method] = {
 def fit(
     model: pm.Model,
     *,
-    method: str = "metropolis",
+    method: str = _DEFAULT,
     seed: int = 0,
     draws: int | None = None,
     tune: int | None = None,
@@ -197,7 +210,8 @@ def fit(
 ) -> Any:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
-    Multi-start least squares finds the mode, from about which the chains start.
+    Multi-start least squares finds the mode, from about which the chains start. A model with
+    ``modes`` needs no chain: all choices are summed over.
 
     Parameters
     ----------
@@ -251,6 +265,13 @@ def fit(
         raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
+    if problem.modes is not None:
+        if method != _DEFAULT or start is not None:
+            raise FitError(
+                "fit: a model of modes is summed over exactly; leave out method= and start="
+            )
+        trace = _summed(model, METHODS[method].draws if draws is None else draws, chains, seed)
+        return complete(problem, trace, seed=seed, method="exact sum over modes")
     chosen = METHODS[method]
     earlier = None if start is None or isinstance(start, Mode) else start
     if earlier is not None:
@@ -283,6 +304,15 @@ def fit(
         trace = _appended(earlier, trace)
     # PyMC ends an interrupted run quietly, with the draws so far
     return complete(problem, trace, seed=seed, method=method, asked=asked if done < asked else None)
+
+
+def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:
+    """Draws of a model of modes, by summing over them."""
+    problem = model.problem
+    phi, sigma, mode, accepted = choose_modes(problem, draws, chains, seed)
+    values: dict[str, Any] = problem.layout.to_dict(phi)
+    values |= {"mode": mode, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
+    return as_trace(model, values, {"accept": accepted})
 
 
 def _appended(earlier: Any, trace: Any) -> Any:

@@ -38,8 +38,8 @@ class Observations:
     columns: tuple[int, ...]
 
     @classmethod
-    def of(cls, segments: Segments) -> Observations:
-        """Take the dimensions that were measured anywhere.
+    def of(cls, segments: Segments, columns: tuple[int, ...] | None = None) -> Observations:
+        """Take the dimensions that were measured anywhere, or these.
 
         Raises
         ------
@@ -47,11 +47,12 @@ class Observations:
             If nothing was measured.
         """
         observed = segments.observed
-        columns = tuple(
+        measured = tuple(
             d for d in range(6) if observed.size and np.isfinite(observed[..., d]).any()
         )
-        if not columns:
+        if not measured:
             raise HistoryError("history: it has no measured next state; record at least two rows")
+        columns = measured if columns is None else columns
         return cls(observed[..., columns], columns)
 
     @property
@@ -219,7 +220,7 @@ def robust(z: Array, nu: float | None) -> Array:
     Examples
     --------
     >>> robust(np.array([0.1, 30.0]), 4.0).round(2)
-    array([0.11, 5.2 ])
+    array([0.11, 5.21])
     """
     if nu is None:
         return z

@@ -63,16 +63,16 @@ class Gaussian:
         self.factor = np.asarray(np.linalg.cholesky(self.covariance), dtype=float)
         self.log_scale = float(np.log(2.38 / np.sqrt(max(len(self.places), 1))))
 
-    def depth(self, x: Array) -> float:
-        """Minus the log-density, up to a constant."""
-        z = solve_triangular(self.factor, x - self.mean, lower=True)
-        return float(0.5 * z @ z)
+    def depth(self, x: Array) -> Any:
+        """Minus the log-density at points (..., d), up to a constant."""
+        z = solve_triangular(self.factor, (x - self.mean).T, lower=True)
+        return 0.5 * (z**2).sum(axis=0)
 
-    def propose(self, x: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, float]:
-        """A proposal, and the logarithm of the Hastings ratio."""
-        noise = self.factor @ rng.standard_normal(len(x))
+    def propose(self, x: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, Any]:
+        """A proposal from each point (..., d), and the logarithm of the Hastings ratio."""
+        noise = rng.standard_normal(x.shape) @ self.factor.T
         if walk:
-            return x + np.exp(self.log_scale) * noise, 0.0
+            return x + np.exp(self.log_scale) * noise, np.zeros(x.shape[:-1])
         beta = np.exp(self.log_beta)
         proposal = self.mean + np.sqrt(1 - beta**2) * (x - self.mean) + beta * noise
         return proposal, self.depth(proposal) - self.depth(x)
@@ -107,15 +107,18 @@ class Gaussian:
             self.learn(q[self.places], rate, walk)
         return q, here, rate
 
-    def learn(self, x: Array, rate: float, walk: bool) -> None:
-        """Take account of where the chain is, and of the last proposal's acceptance rate."""
-        self.seen += 1
-        gain = 1.0 / (self.seen + _GUESS)
-        change = (rate - TARGET_ACCEPTANCE) * self.seen**-0.6
+    def lengthen(self, change: float, walk: bool) -> None:
+        """Lengthen the moves of one kind by about this share, or shorten them."""
         if walk:
             self.log_scale += change
         else:
             self.log_beta = min(self.log_beta + change, _LARGEST_BETA)
+
+    def learn(self, x: Array, rate: float, walk: bool) -> None:
+        """Take account of where the chain is, and of the last proposal's acceptance rate."""
+        self.seen += 1
+        gain = 1.0 / (self.seen + _GUESS)
+        self.lengthen((rate - TARGET_ACCEPTANCE) * self.seen**-0.6, walk)
         off = x - self.mean
         self.mean = self.mean + gain * off
         self.covariance = self.covariance + gain * (np.outer(off, off) - self.covariance)

@@ -26,6 +26,7 @@ from pbrl_ppl.likelihood import (
     next_state_random,
     whiten,
 )
+from pbrl_ppl.mode_prior import Modes
 from pbrl_ppl.op import SimulatorOp
 from pbrl_ppl.parameters import Block, Layout
 from pbrl_ppl.physics import PartedSimulator, check_history
@@ -67,6 +68,10 @@ class Problem:
     sigma_prior : tuple or None
         Medians of sigma's prior, one a measured state dimension, and its log-scale; by default
         :func:`sigma_prior` takes them from the data.
+    columns : tuple of int, optional
+        State dimensions that the likelihood is over; those measured anywhere by default.
+    modes : Modes, optional
+        Parameter sets of which each body has one, in place of Table 1.
     """
 
     scene: Scene
@@ -80,6 +85,8 @@ class Problem:
     extrapolate: bool = True
     nu: float | None = None
     sigma_prior: tuple[tuple[float, ...], float] | None = None
+    columns: tuple[int, ...] | None = None
+    modes: Modes | None = None
     layout: Layout = field(init=False)
 
     def __post_init__(self) -> None:
@@ -100,7 +107,7 @@ class Problem:
     @cached_property
     def observations(self) -> Observations:
         """What was measured at the segments' steps."""
-        return Observations.of(self.segments)
+        return Observations.of(self.segments, self.columns)
 
     @cached_property
     def parts(self) -> Parts:
@@ -213,6 +220,7 @@ def physics_model(
     substeps: int | None = None,
     noise: StartNoise | None = None,
     threads: int = 1,
+    modes: Modes | None = None,
 ) -> pm.Model:
     """Declare the model of the paper's section 3.2 for a scene and a history.
 
@@ -238,6 +246,9 @@ def physics_model(
         exact, as in the paper.
     threads : int
         Engine worlds that run side by side within one evaluation.
+    modes : Modes, optional
+        Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
+        ``mode`` holds the bodies' choices, and the parameters follow from it.
 
     Returns
     -------
@@ -253,7 +264,10 @@ def physics_model(
     SimulationError
         If bodies start deep inside each other or a wall, or a hinge's bodies apart.
     ValueError
-        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0.
+        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0, or both
+        ``modes`` and ``noise`` are given.
+    ParameterError
+        If ``modes`` do not fit the scene's bodies.
 
     Examples
     --------
@@ -273,9 +287,12 @@ def physics_model(
         raise ValueError(f"horizon is {horizon}, expected at least 1")
     if nu is not None and not 0 < nu < np.inf:
         raise ValueError(f"nu is {nu}, expected degrees of freedom above 0, or None for a Gaussian")
+    if modes is not None and noise is not None:
+        raise ValueError("modes and noise are given; modes take start states as exact: drop noise")
     problem = Problem(
         scene=scene,
         history=history,
+        modes=modes,
         effects=attach(scene, effects),
         horizon=horizon,
         substeps=scene.substeps if substeps is None else substeps,
@@ -300,11 +317,14 @@ def build_model(problem: Problem) -> pm.Model:
         )
         # Table 1
         table1: dict[str, Any] = {}
-        for block in layout.blocks:
-            index = _index(block, layout, table1)
-            table1[block.name] = random_variable(
-                block.name, block.priors, _dim(problem, block), block.conditional, index
-            )
+        if problem.modes is not None:
+            table1 = _chosen(problem, problem.modes)
+        else:
+            for block in layout.blocks:
+                index = _index(block, layout, table1)
+                table1[block.name] = random_variable(
+                    block.name, block.priors, _dim(problem, block), block.conditional, index
+                )
         phi = pt.concatenate(list(table1.values())) if table1 else pt.zeros(0)
         # P(sigma)
         median, spread = problem.sigma_prior or sigma_prior(observations, segments)
@@ -329,6 +349,19 @@ def build_model(problem: Problem) -> pm.Model:
         )
     model.problem = problem
     return model
+
+
+def _chosen(problem: Problem, modes: Modes) -> dict[str, Any]:
+    """Which mode each body has, and the parameters that follow from that."""
+    names = [body.name for body in problem.scene.dynamic]
+    table = modes.table(problem.layout, problem.scene)
+    mode = pm.Categorical("mode", p=np.stack([modes.prior(name) for name in names]), dims="body")
+    result = {}
+    for block, place in problem.layout.slices():
+        own = mode[[names.index(owner) for owner in block.owners]]
+        value = pt.as_tensor(table[place])[np.arange(len(block.owners)), own]
+        result[block.name] = pm.Deterministic(block.name, value, dims=_dim(problem, block))
+    return result
 
 
 def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:

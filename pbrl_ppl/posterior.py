@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import tempfile
@@ -254,7 +255,10 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     r_hat, ess : dict of str to float
         By label, such as ``mass[cart]``.
     """
-    flat = scalars(idata)
+    every = scalars(idata)
+    # what is the same in all draws, such as an index without doubt, is 0 / 0 and has converged
+    fixed = {name for name, each in every.data_vars.items() if not np.ptp(each.to_numpy())}
+    flat = every.drop_vars(fixed)
     # the generations differ in the tail that they look at by default
     hat, bulk, tail = (
         _dataset(measure)
@@ -264,9 +268,41 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
             az.ess(flat, method="tail", prob=(0.05, 0.95)),
         )
     )
-    r_hat = {str(name): float(hat[name]) for name in flat.data_vars}
-    ess = {str(name): float(min(bulk[name], tail[name])) for name in flat.data_vars}
+    r_hat, ess = {}, {}
+    for name, each in every.data_vars.items():
+        r_hat[str(name)] = 1.0 if name in fixed else float(hat[name])
+        ess[str(name)] = float(each.size if name in fixed else min(bulk[name], tail[name]))
     return r_hat, ess
+
+
+def smoothed(log_weights: Array) -> tuple[Array, float]:
+    """Pareto-smoothed importance weights that add up to one, and the shape k of their tail.
+
+    Parameters
+    ----------
+    log_weights : ndarray
+        Shape (draw,), up to a constant.
+
+    Returns
+    -------
+    weights : ndarray
+        Shape (draw,).
+    k : float
+        Above 0.7 the weights are not to be relied on (Vehtari et al., 2024); infinite where there
+        are too few different ones to say.
+    """
+    result, k = log_weights, np.inf
+    # in the tail are values that differ, or ArviZ refuses
+    with contextlib.suppress(ValueError):
+        if DATATREE:
+            from arviz_stats.base import array_stats
+
+            # it takes log-likelihoods, whose inverse is the weight in leave-one-out
+            result, k = array_stats.psislw(-log_weights, axis=-1)
+        else:
+            result, k = az.psislw(log_weights)
+    weights = np.exp(np.asarray(result) - np.max(result))
+    return weights / weights.sum(), float(k)
 
 
 def _dataset(value: Any) -> xr.Dataset:

@@ -6,7 +6,7 @@ import importlib.metadata
 import json
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -14,10 +14,23 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
+from pbrl_ppl.history import STATE, History, Segments
+from pbrl_ppl.history_again import from_segments
 from pbrl_ppl.identification import uninformed
-from pbrl_ppl.model import Problem
-from pbrl_ppl.posterior import attributes, convergence, draws, from_groups, group, groups
+from pbrl_ppl.likelihood import Observations
+from pbrl_ppl.mode_prior import Modes
+from pbrl_ppl.model import Problem, sigma_prior
+from pbrl_ppl.posterior import (
+    attributes,
+    convergence,
+    draws,
+    from_groups,
+    group,
+    groups,
+    scene_of,
+)
 from pbrl_ppl.wheel_symmetry import fold_draws
 
 Array = NDArray[np.float64]
@@ -25,6 +38,8 @@ Array = NDArray[np.float64]
 #: What a posterior needs before its summaries can be relied on (Vehtari et al., 2021).
 MAX_RHAT, MIN_ESS = 1.01, 400
 _PREDICTIVE_DRAWS = 50
+#: Draws are simulated in groups: of so many, or more if that makes fewer transitions.
+_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE = 64, 20_000
 #: With fewer, nothing can be said of convergence.
 _LEAST_DRAWS = 4
 #: A parameter is stuck if this share of its draws is within this share of its support's end.
@@ -58,22 +73,8 @@ def complete(
     posterior = _folded(problem, trace)
     phi, sigma = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
     chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
-    likelihood = np.empty((chains * n, problem.segments.n))
-    predictive = []
     rng = np.random.default_rng(seed)
-    keep = set(np.linspace(0, chains * n - 1, min(_PREDICTIVE_DRAWS, chains * n)).astype(int))
-    wide = replace(problem, threads=max(problem.threads, 2))
-    for begin in range(0, len(phi), 64):
-        part = slice(begin, begin + 64)
-        own, which = np.unique(phi[part], axis=0, return_inverse=True)  # a chain stays put at times
-        states = wide.predict(own)[which.ravel()]
-        residual = problem.observations.residual(states)
-        likelihood[part] = problem.log_density(residual, sigma[part])
-        predictive += [
-            problem.next_states(states[i - begin], sigma[i], rng)
-            for i in range(begin, min(begin + 64, len(phi)))
-            if i in keep
-        ]
+    likelihood, predictive = evaluate(problem, phi, sigma, predictive_rows(chains * n), rng)
     data = groups(trace)
     dims = ("transition", "step", "body", "state")
     coords = {dim: data["observed_data"][dim].values for dim in dims}
@@ -94,14 +95,109 @@ def complete(
             },
         ),
         "posterior_predictive": xr.Dataset(
-            {"next_state": (("chain", "draw", *dims), np.stack(predictive)[None])},
+            {"next_state": (("chain", "draw", *dims), predictive[None])},
             {"chain": [0], "draw": np.arange(len(predictive)), **coords},
         ),
         "observed_data": xr.Dataset({"next_state": (dims, problem.observations.values)}, coords),
         "constant_data": data["constant_data"],
     }
     idata = from_groups(result, _origin(problem, seed) | {"method": method})
-    return _checked(problem, idata, asked)
+    return checked(problem, idata, asked)
+
+
+def predictive_rows(draws: int) -> NDArray[np.intp]:
+    """Which of so many draws, chains joined, the stored predictions are made with."""
+    return np.linspace(0, draws - 1, min(_PREDICTIVE_DRAWS, draws)).astype(int)
+
+
+def evaluate(
+    problem: Problem, phi: Array, sigma: Array, rows: Any, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Log-likelihoods of the transitions at draws, and next states drawn from some of them.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says which transitions.
+    phi, sigma : ndarray
+        Shapes (draw, p) and (draw, state).
+    rows : sequence of int
+        Draws to predict with, in increasing order.
+    rng : Generator
+        Of the predictions.
+
+    Returns
+    -------
+    likelihood : ndarray
+        Shape (draw, transition).
+    predictive : ndarray
+        Shape (row, transition, H, body, state).
+    """
+    likelihood = np.empty((len(phi), problem.segments.n))
+    predictive = []
+    wide = replace(problem, threads=max(problem.threads, 2))
+    size = max(_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE // problem.segments.n)
+    for begin in range(0, len(phi), size):
+        part = slice(begin, begin + size)
+        own, which = np.unique(phi[part], axis=0, return_inverse=True)  # a chain stays put at times
+        states = wide.predict(own)[which.ravel()]
+        likelihood[part] = problem.log_density(problem.observations.residual(states), sigma[part])
+        predictive += [
+            problem.next_states(states[i - begin], sigma[i], rng)
+            for i in rows
+            if begin <= i < begin + size
+        ]
+    return likelihood, np.stack(predictive)
+
+
+def problem_of(
+    idata: Any, effects: Iterable[Effect] = catalogue, history: History | None = None
+) -> Problem:
+    """The problem that a posterior was fitted to, from what the posterior holds.
+
+    Start noise and a user's own effects are not in it.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+    effects : iterable of Effect
+        Where the names of its effects are looked up.
+    history : History, optional
+        Other data for the same problem, the noise's prior included.
+
+    Raises
+    ------
+    PosteriorError
+        If it holds no scene or lacks a group.
+    EffectError
+        If an effect is not among ``effects``.
+    """
+    attrs, scene = idata.attrs, scene_of(idata)
+    given, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
+    values = measured.transpose("transition", "step", "body", "state").to_numpy()
+    columns = tuple(STATE.index(str(name)) for name in measured["state"].values)
+    start, actions = given["start"].to_numpy(), given["actions"].to_numpy()
+    observed = np.full((*values.shape[:3], len(STATE)), np.nan)
+    observed[..., columns] = values
+    if "sigma_prior" in attrs:
+        median, spread = json.loads(str(attrs["sigma_prior"]))
+    else:  # a file of an older version
+        none = np.zeros(len(start), dtype=np.int64)
+        segments = Segments(start, actions, observed, none, none)
+        median, spread = sigma_prior(Observations(values, columns), segments)
+    return Problem(
+        scene=scene,
+        history=from_segments(scene, start, actions, observed) if history is None else history,
+        effects=attach(scene, (), effects),
+        horizon=int(attrs["horizon"]),
+        substeps=int(attrs["substeps"]),
+        scalar_sigma="state" not in group(idata, "posterior")["sigma"].dims,
+        nu=float(attrs["nu"]) if "nu" in attrs else None,
+        sigma_prior=(tuple(float(each) for each in median), float(spread)),
+        columns=columns,
+        modes=Modes.from_json(str(attrs["modes"])) if "modes" in attrs else None,
+    )
 
 
 def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
@@ -116,6 +212,8 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
 def _folded(problem: Problem, trace: Any) -> xr.Dataset:
     """The posterior with each wheel in one of its equal descriptions, the same in all chains."""
     posterior = group(trace, "posterior").copy(deep=True)
+    if problem.modes is not None:  # the draws are the modes' own
+        return posterior
     layout = problem.layout
     phi, _ = parameter_draws(problem, trace)
     folded = fold_draws(layout, dict(zip(layout.labels, phi.T, strict=True)))
@@ -136,6 +234,7 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
 
 def _origin(problem: Problem, seed: int) -> dict[str, Any]:
     scene = problem.scene
+    prior = problem.sigma_prior or sigma_prior(problem.observations, problem.segments)
     for body in scene.dynamic:
         new = [
             one.effect.name
@@ -149,7 +248,10 @@ def _origin(problem: Problem, seed: int) -> dict[str, Any]:
         seed=seed,
         horizon=problem.horizon,
         **({} if problem.nu is None else {"nu": problem.nu}),
+        **({} if problem.modes is None else {"modes": problem.modes.to_json()}),
         substeps=problem.substeps,
+        sigma_prior=[[float(median) for median in prior[0]], float(prior[1])],
+        start_noise=int(problem.noise is not None),
         data_sha256=problem.history.data_sha256,
         versions=versions(),
     )
@@ -166,13 +268,20 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _checked(problem: Problem, idata: Any, asked: int | None) -> Any:
+def checked(problem: Problem, idata: Any, asked: int | None = None) -> Any:
     """Store what is wrong with a posterior, and warn of it."""
     found = list(_trouble(problem, idata, asked))
     idata.attrs["warnings"] = json.dumps([message for _, message in found])
     for kind, message in found:
         warnings.warn(message, kind, stacklevel=4)
     return idata
+
+
+def _more(idata: Any) -> str:
+    """How to get more effective draws; resampled ones are no chain that could go on."""
+    if "updates" in idata.attrs:
+        return "these draws were reweighted by update; fit all data anew"
+    return "raise draws= or thin=, or go on with start= this posterior"
 
 
 def _trouble(
@@ -197,8 +306,10 @@ def _trouble(
             ConvergenceWarning,
             f"the chains have not converged: R-hat is {r_hat[worst_hat]:.3f} for {worst_hat}"
             f" (want <= {MAX_RHAT}), effective sample size {ess[worst_ess]:.0f} for {worst_ess}"
-            f" (want >= {MIN_ESS}); raise draws= or thin=, or go on with start= this posterior",
+            f" (want >= {MIN_ESS}); {_more(idata)}",
         )
+    if problem.modes is not None:  # what follows compares with Table 1
+        return
     phi, _ = parameter_draws(problem, idata)
     for label, prior, values in zip(
         problem.layout.labels, problem.layout.priors, phi.T, strict=True

@@ -8,14 +8,14 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-import pandas as pd
 import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
 from pbrl_ppl.fitting import fit
-from pbrl_ppl.history import STATE, WRENCH, History
+from pbrl_ppl.history import STATE
+from pbrl_ppl.history_again import from_segments
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group
@@ -114,24 +114,10 @@ def simulated(design: Problem, values: Array) -> Problem:
         Next states, shape (transition, H, body, state), SI units.
     """
     segments, observations = design.segments, design.observations
-    n, h, k = segments.actions.shape[:3]
-    states = np.full((n, h + 1, k, len(STATE)), np.nan)
-    states[:, 0] = segments.start
-    states[:, 1:][..., list(observations.columns)] = np.where(observations.measured, values, np.nan)
-    actions = np.full((n, h + 1, k, len(WRENCH)), np.nan)
-    actions[:, :-1] = segments.actions
-    trajectory, step, body = np.indices((n, h + 1, k)).reshape(3, -1)
-    frame = pd.DataFrame(
-        {
-            "trajectory": trajectory,
-            "step": step,
-            "time": step * design.scene.time_step,
-            "body": np.array([each.name for each in design.scene.dynamic])[body],
-            **dict(zip(STATE, states.reshape(-1, len(STATE)).T, strict=True)),
-            **dict(zip(WRENCH, actions.reshape(-1, len(WRENCH)).T, strict=True)),
-        }
-    )
-    return replace(design, history=History.from_dataframe(frame, design.scene))
+    observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)
+    observed[..., list(observations.columns)] = np.where(observations.measured, values, np.nan)
+    history = from_segments(design.scene, segments.start, segments.actions, observed)
+    return replace(design, history=history)
 
 
 def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, Any]) -> Record:

@@ -8,6 +8,7 @@ import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
+from scipy.special import expit
 
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.metropolis import Gaussian
@@ -49,14 +50,26 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
     return [*blocks, Gaussian(*noise, cheap=True)]
 
 
-def unconstrain(prior: Prior, x: float) -> tuple[float, float]:
-    """PyMC's unconstraining transform of a prior's variable at x, and its derivative."""
+def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
+    """PyMC's unconstraining transform of a prior's variable at x, and its derivative there.
+
+    Numbers or arrays of any shape.
+    """
     if prior.family in ("log_normal", "half_normal"):
-        return float(np.log(x)), 1.0 / x
+        return np.log(x), 1.0 / x
     if prior.family == "truncated_normal":
         left, right = x - prior.lower, prior.upper - x
-        return float(np.log(left / right)), 1.0 / left + 1.0 / right
-    return x, 1.0
+        return np.log(left / right), 1.0 / left + 1.0 / right
+    return x, np.ones_like(x)
+
+
+def constrain(prior: Prior, u: Any) -> Any:
+    """The way back from :func:`unconstrain`."""
+    if prior.family in ("log_normal", "half_normal"):
+        return np.exp(u)
+    if prior.family == "truncated_normal":
+        return prior.lower + (prior.upper - prior.lower) * expit(u)
+    return u
 
 
 def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:

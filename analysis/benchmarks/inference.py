@@ -16,6 +16,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -110,13 +111,22 @@ def seconds(function: Callable[[], object]) -> tuple[float, object]:
     return time.perf_counter() - begin, result
 
 
-def sampled(scene: pp.Scene, history: pp.History, **options) -> tuple[float, float, float]:
-    """Seconds of a whole fit, mode and compilation included; largest R-hat; least ESS."""
-    took, idata = seconds(
+def fitted(scene: pp.Scene, history: pp.History, **options) -> tuple[float, object]:
+    """Seconds of a whole fit, mode and compilation included; and the posterior."""
+    return seconds(
         lambda: pp.fit(
             pp.physics_model(scene, history, threads=1), seed=1, progress=False, **options
         )
     )
+
+
+def sampled(scene: pp.Scene, history: pp.History, **options) -> tuple[float, float, float]:
+    """Seconds of a whole fit; largest R-hat; least ESS."""
+    return judged(*fitted(scene, history, **options))
+
+
+def judged(took: float, idata: object) -> tuple[float, float, float]:
+    """The same of a fit that there is."""
     r_hat, ess = convergence(idata)
     return took, max(r_hat.values()), min(ess.values())
 
@@ -132,7 +142,25 @@ def fit_rows(key: str, what: str, most: int, measured: tuple[float, float, float
 def measure_cart() -> Iterator[Row]:
     """All of phi and sigma from 360 transitions."""
     what = "cart, 360 transitions x 20 substeps, 4 chains"
-    yield from fit_rows("cart", what, 60, sampled(*cart(360)))
+    yield from fit_rows("cart", what, 60, judged(*cart_posterior()))
+
+
+@cache
+def cart_posterior() -> tuple[float, object]:
+    """The cart's fit, once for all rows that need it."""
+    return fitted(*cart(360))
+
+
+def measure_update() -> Iterator[Row]:
+    """One more transition for the cart's posterior."""
+    _, idata = cart_posterior()
+    _, more = cart(1, seed=2)
+    times = [
+        seconds(lambda i=i: pp.update(idata, more, seed=i, progress=False))[0]
+        for i in range(ROUNDS)
+    ]
+    what = "cart posterior of 4 x 1500 draws and 360 transitions, one more: seconds"
+    yield "update_seconds", what, "<= 1", float(np.median(times))
 
 
 def measure_apartment() -> Iterator[Row]:
@@ -245,6 +273,7 @@ def measure_ratio() -> Iterator[Row]:
 
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "cart": measure_cart,
+    "update": measure_update,
     "map": measure_map,
     "noise_free": measure_noise_free,
     "ratio": measure_ratio,
