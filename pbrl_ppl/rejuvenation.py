@@ -195,7 +195,7 @@ class _Mover:
     def _learn(self, rates: Array, walk: bool) -> None:
         """Lengthen or shorten the parts' steps; many particles say at once how many pass."""
         for block, rate in zip(self.blocks, rates, strict=True):
-            block.step(rate - TARGET_ACCEPTANCE, walk)
+            block.lengthen(rate - TARGET_ACCEPTANCE, walk)
 
     def _ahead(self, u: Array, noise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
         """Where several steps under the coarse posterior lead, and what undoes its preference.
