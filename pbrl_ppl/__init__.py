@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pbrl_ppl.calibration import calibrate
+    from pbrl_ppl.configurations import joint_probabilities
     from pbrl_ppl.effects import Attached, Effect, EffectParameter, catalogue
     from pbrl_ppl.errors import PbrlError
     from pbrl_ppl.findings import Findings
@@ -57,6 +58,7 @@ __all__ = [
     "close_loop",
     "fit",
     "identify",
+    "joint_probabilities",
     "load_posterior",
     "physics_model",
     "prior_predictive_check",
@@ -67,6 +69,7 @@ __all__ = [
 
 _MODULES = {
     "calibration": ("calibrate",),
+    "configurations": ("joint_probabilities",),
     "effects": ("Attached", "Effect", "EffectParameter", "catalogue"),
     "errors": ("PbrlError",),
     "findings": ("Findings",),
