@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pbrl_ppl.calibration import calibrate
+    from pbrl_ppl.configurations import joint_probabilities
     from pbrl_ppl.effects import Attached, Effect, EffectParameter, catalogue
     from pbrl_ppl.errors import PbrlError
     from pbrl_ppl.findings import Findings
@@ -61,6 +62,7 @@ __all__ = [
     "close_loop",
     "fit",
     "identify",
+    "joint_probabilities",
     "learned_modes",
     "load_posterior",
     "mode_probabilities",
@@ -74,6 +76,7 @@ __all__ = [
 
 _MODULES = {
     "calibration": ("calibrate",),
+    "configurations": ("joint_probabilities",),
     "effects": ("Attached", "Effect", "EffectParameter", "catalogue"),
     "errors": ("PbrlError",),
     "findings": ("Findings",),

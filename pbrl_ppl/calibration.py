@@ -125,7 +125,10 @@ def calibrate(
     )
     design: Problem = model.problem
     if design.layout.discrete.any():
-        raise FitError("calibrate: which bodies a joint joins is unknown; name them in the scene")
+        raise FitError(
+            "calibrate: which bodies a joint joins is unknown, and ranks are for parameters that"
+            " are not whole numbers; name the bodies in the scene"
+        )
     median, spread = sigma_prior(design.observations, design.segments)
     # a prior that looked at the simulated data would not be the one they were simulated from
     design = replace(design, sigma_prior=(tuple(median.tolist()), spread))

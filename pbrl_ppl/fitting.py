@@ -14,7 +14,9 @@ import xarray as xr
 
 from pbrl_ppl.emulator import emulate
 from pbrl_ppl.errors import FitError
+from pbrl_ppl.joint_search import weigh
 from pbrl_ppl.metropolis import AdaptiveMetropolis
+from pbrl_ppl.mixture import check_joint_fit, mix, posterior_dataset
 from pbrl_ppl.mode_choice import choose_modes
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, find_mode
@@ -144,15 +146,14 @@ def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]
     stats : mapping of str to ndarray
         What the sampler says of each draw, shape (chain, draw).
     """
-    problem = model.problem
-    segments, per_draw = problem.segments, ("chain", "draw")
-    n = {dim: np.arange(size) for dim, size in zip(per_draw, draws["sigma"].shape, strict=False)}
+    problem, posterior = model.problem, posterior_dataset(model, draws)
+    segments = problem.segments
 
-    def dataset(variables: dict[str, Any], **more: Any) -> xr.Dataset:
+    def dataset(variables: dict[str, Any]) -> xr.Dataset:
         used = {dim for each, _ in variables.values() for dim in each if dim in model.coords}
-        return xr.Dataset(variables, more | {dim: list(model.coords[dim]) for dim in used})
+        return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})
 
-    dims = {name: (*per_draw, *(model.named_vars_to_dims.get(name) or ())) for name in draws}
+    per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
     given = {
         "start": (("transition", "body", "full_state"), segments.start),
         "actions": (("transition", "step", "body", "wrench"), segments.actions),
@@ -162,8 +163,8 @@ def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]
     }
     return from_groups(
         {
-            "posterior": dataset({name: (dims[name], v) for name, v in draws.items()}, **n),
-            "sample_stats": dataset({name: (per_draw, v) for name, v in stats.items()}, **n),
+            "posterior": posterior,
+            "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
             "observed_data": dataset(observed),
             "constant_data": dataset(given),
         },
@@ -210,7 +211,9 @@ def fit(
 ) -> Any:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
-    Multi-start least squares finds the mode, from about which the chains start. A model with
+    Multi-start least squares finds the mode, from about which the chains start. Where the scene
+    does not say which bodies a joint joins, every choice is fitted by itself, and their draws are
+    mixed by their evidences; :func:`pbrl_ppl.joint_probabilities` gives those. A model with
     ``modes`` needs no chain: all choices are summed over.
 
     Parameters
@@ -248,13 +251,14 @@ def fit(
     Raises
     ------
     FitError
-        If the model was not made by ``physics_model``, or there is no such method.
+        If the model was not made by ``physics_model``, or there is no such method; for joints of
+        unknown bodies, if there are too many choices, or with ``smc`` or ``start``.
 
     Warns
     -----
     ConvergenceWarning
-        If an R-hat is over 1.01 or an effective sample size under 400, or if sampling was
-        interrupted.
+        If an R-hat is over 1.01 or an effective sample size under 400, if sampling was
+        interrupted, or if an evidence is too rough for the probability of a joint.
     BoundWarning
         If a parameter is pressed against the end of its support.
     UninformedWarning
@@ -273,37 +277,47 @@ def fit(
         trace = _summed(model, METHODS[method].draws if draws is None else draws, chains, seed)
         return complete(problem, trace, seed=seed, method="exact sum over modes")
     chosen = METHODS[method]
+    draws = chosen.draws if draws is None else draws
+    if method == "map":
+        draws = chains = 1
+
+    def sampled(model: pm.Model, mode: Mode, starts: list[dict[str, Any]] | None = None) -> Any:
+        if starts is None:
+            starts = dispersed(mode, np.random.default_rng(seed), chains)
+        job = Job(
+            model=model,
+            mode=mode,
+            seed=seed,
+            draws=draws,
+            tune=chosen.tune if tune is None else tune,
+            chains=len(starts),
+            thin=chosen.thin if thin is None else thin,
+            cores=min(len(starts), os.cpu_count() or 1) if cores is None else cores,
+            progress=progress,
+            starts=starts,
+        )
+        with model, warnings.catch_warnings():
+            # convergence is checked and reported in this package's own words
+            warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
+            # draws from the prior, of which SMC needs some, are not compiled on the newer stack
+            warnings.filterwarnings("ignore", message="Numba will use object mode")
+            return chosen.run(job)
+
     earlier = None if start is None or isinstance(start, Mode) else start
-    if earlier is not None:
-        mode, starts = from_posterior(problem, earlier)
-        chains = len(starts)
+    if problem.layout.discrete.any():
+        check_joint_fit(method, start)
+        found = weigh(problem, seed=seed, progress=progress)
+        trace = mix(model, problem, found, sampled, draws=draws, chains=chains, seed=seed)
+    elif earlier is not None:
+        trace = sampled(model, *from_posterior(problem, earlier))
     else:
-        mode = find_mode(problem, seed=seed) if start is None else start
-        starts = dispersed(mode, np.random.default_rng(seed), chains)
-    job = Job(
-        model=model,
-        mode=mode,
-        seed=seed,
-        draws=chosen.draws if draws is None else draws,
-        tune=chosen.tune if tune is None else tune,
-        chains=chains,
-        thin=chosen.thin if thin is None else thin,
-        cores=min(chains, os.cpu_count() or 1) if cores is None else cores,
-        progress=progress,
-        starts=starts,
-    )
-    with model, warnings.catch_warnings():
-        # convergence is checked and reported in this package's own words
-        warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
-        # draws from the prior, of which SMC needs some, are not compiled on the newer stack
-        warnings.filterwarnings("ignore", message="Numba will use object mode")
-        trace = chosen.run(job)
+        trace = sampled(model, find_mode(problem, seed=seed) if start is None else start)
     done = group(trace, "posterior").sizes["draw"]
-    asked = job.draws if method != "map" else 1
     if earlier is not None:
         trace = _appended(earlier, trace)
     # PyMC ends an interrupted run quietly, with the draws so far
-    return complete(problem, trace, seed=seed, method=method, asked=asked if done < asked else None)
+    asked = draws if done < draws else None
+    return complete(problem, trace, seed=seed, method=method, asked=asked)
 
 
 def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:

@@ -71,15 +71,15 @@ def fill_hinges(start: Floats, scene: Scene) -> None:
                 np.array([*(pose or ()), 0.0, 0.0, 0.0]), (*start.shape[:2], 6)
             )
         body = start[:, :, position[child]]
-        arm, arm_rate = _lever(origin, at_parent)
-        own, own_rate = _lever(body, at_child)
+        arm, arm_rate = lever(origin, at_parent)
+        own, own_rate = lever(body, at_child)
         place = origin[..., :2] + arm - own
         speed = origin[..., 3:5] + arm_rate - own_rate
         for columns, filled in ((slice(0, 2), place), (slice(3, 5), speed)):
             body[..., columns] = np.where(np.isnan(body[..., columns]), filled, body[..., columns])
 
 
-def _lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
+def lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
     """Return an anchor's offset from its body's origin in the world, and that offset's rate."""
     cos, sin = np.cos(state[..., 2]), np.sin(state[..., 2])
     x = cos * anchor[0] - sin * anchor[1]

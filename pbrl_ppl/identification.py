@@ -19,7 +19,7 @@ from pbrl_ppl.identifiability import (
 )
 from pbrl_ppl.likelihood import STATE, Observations, whiten
 from pbrl_ppl.modes import Mode, inside, posterior_steps
-from pbrl_ppl.parameters import Layout, Prior
+from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.posterior import group, scalars, scene_of
 from pbrl_ppl.prior import build_layout
@@ -62,7 +62,8 @@ def identify(
     Returns
     -------
     Identifiability
-        Which parameters that are whole numbers (a joint's indices) take no part in.
+        A joint whose bodies are unknown takes no part: what it joins is in
+        :func:`pbrl_ppl.joint_probabilities`, and its anchors are of whichever bodies that is.
 
     Raises
     ------
@@ -138,10 +139,16 @@ def _flat(idata: Any) -> dict[str, Array]:
 
 
 def _prior_draws(layout: Layout) -> dict[str, Array]:
-    """Draws of every continuous parameter by label, wheels folded as the posterior's are."""
+    """Draws of every parameter that takes part by label, wheels folded as the posterior's are."""
     rng = np.random.default_rng(0)
-    named = zip(layout.labels, layout.priors, strict=True)
-    draws = {label: p.sample(rng, _PRIOR_DRAWS) for label, p in named if not p.discrete}
+    # an anchor means something else in each body that may hold it
+    free = {owner for b in layout.blocks if b.name in JOINT_INDICES for owner in b.owners}
+    draws = {
+        f"{block.name}[{owner}]": prior.sample(rng, _PRIOR_DRAWS)
+        for block in layout.blocks
+        for owner, prior in zip(block.owners, block.priors, strict=True)
+        if owner not in free or block.of != "joint"
+    }
     return fold_draws(layout, draws)
 
 
@@ -168,7 +175,7 @@ def _width(label: str, prior_sd: float, posterior_sd: float, moved: float) -> Wi
 def _widths(
     layout: Layout, prior: Mapping[str, Array], posterior: Mapping[str, Array]
 ) -> tuple[Width, ...]:
-    """Widths of every continuous parameter, from draws."""
+    """Widths of every parameter that takes part, from draws."""
     folded = fold_draws(layout, posterior)
     widths = []
     for label, law in zip(layout.labels, layout.priors, strict=True):

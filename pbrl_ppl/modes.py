@@ -98,9 +98,10 @@ def inside(priors: tuple[Prior, ...], phi: Array) -> Array:
 
 
 def _box(priors: tuple[Prior, ...]) -> tuple[Array, Array]:
-    """Bounds of the search: the supports, less a margin."""
+    """Bounds of the search: the supports, less a margin; whole numbers may be at either end."""
     support = np.array([prior.support for prior in priors]).reshape(-1, 2)
     width = np.where(np.isfinite(np.ptp(support, axis=1)), np.ptp(support, axis=1), 1.0)
+    width[[prior.discrete for prior in priors]] = 0.0
     return support[:, 0] + _MARGIN * width, support[:, 1] - _MARGIN * width
 
 
@@ -127,6 +128,7 @@ def find_modes(
     starts: int | None = None,
     screened: int | None = None,
     initial: Array | None = None,
+    rounds: int | None = None,
 ) -> list[Mode]:
     """Search for modes from several starts, best first.
 
@@ -141,6 +143,8 @@ def find_modes(
         there are more by default: they cost little there, and more hills look alike.
     initial : ndarray, optional
         Where to begin, shape (p,); then there is one local search.
+    rounds : int, optional
+        With ``initial``, at most so many rounds, and no polish: a first look at where it leads.
 
     Returns
     -------
@@ -155,10 +159,14 @@ def find_modes(
     priors = problem.layout.priors
     if problem.layout.discrete.any():
         raise FitError(
-            "which bodies a joint of the scene joins is unknown, and a fit does not search over"
-            " that yet; name its bodies in the scene, or sample the model with pm.sample"
+            "which bodies a joint of the scene joins is unknown, and a mode is one of continuous"
+            " parameters; name the bodies in the scene: pbrl_ppl.fit finds them, and"
+            " joint_probabilities says which they are"
         )
     if initial is not None:
+        if rounds is not None:
+            first = _climb(problem, inside(priors, initial), problem.coarse, rounds)
+            return [_finish(problem, *first)]
         near = _climb(problem, inside(priors, initial), problem.coarse)
         return [_finish(problem, *_polish(problem, near))]
     if not priors:  # everything is known but the noise
@@ -212,10 +220,14 @@ def _part(problem: Problem, transitions: int) -> Problem:
 
 
 def find_mode(
-    problem: Problem, *, seed: int | np.random.Generator = 0, initial: Array | None = None
+    problem: Problem,
+    *,
+    seed: int | np.random.Generator = 0,
+    initial: Array | None = None,
+    rounds: int | None = None,
 ) -> Mode:
     """Best mode; see :func:`find_modes`."""
-    return find_modes(problem, seed=seed, initial=initial)[0]
+    return find_modes(problem, seed=seed, initial=initial, rounds=rounds)[0]
 
 
 def _polish(problem: Problem, found: Peak) -> Peak:

@@ -246,6 +246,26 @@ class Layout:
         support = np.array([prior.support for prior in self.priors]).reshape(-1, 2)
         return support[:, 0], support[:, 1]
 
+    def supports(self, phi: Array) -> tuple[Array, Array]:
+        """Ends of each entry's support at phi, shape (n, p) each; an anchor's depend on its index.
+
+        Parameters
+        ----------
+        phi : ndarray
+            Shape (n, p).
+        """
+        lower, upper = (np.tile(end, (len(phi), 1)) for end in self.bounds)
+        for block in self.blocks:
+            side = f"i_{block.name[0]}"
+            for owner, conditional in zip(block.owners, block.conditional, strict=False):
+                if f"{side}[{owner}]" not in self.labels:
+                    continue
+                place, index = self.index(block.name, owner), self.index(side, owner)
+                support = np.array([prior.support for prior in conditional])
+                held = support[phi[:, index].astype(int)]
+                lower[:, place], upper[:, place] = held.T
+        return lower, upper
+
     def scale(self, phi: Array) -> Array:
         """What is a large change of each entry of phi, shape (p,); zero of a discrete one."""
         least = np.array([0.0 if each.discrete else min(each.sigma, 1.0) for each in self.priors])

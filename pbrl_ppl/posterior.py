@@ -253,26 +253,29 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     Returns
     -------
     r_hat, ess : dict of str to float
-        By label, such as ``mass[cart]``.
+        By label, such as ``mass[cart]``. One that is the same in all draws, as the index of a joint
+        that is certain, has converged: 1, and the number of draws.
     """
     every = scalars(idata)
-    # what is the same in all draws, such as an index without doubt, is 0 / 0 and has converged
-    fixed = {name for name, each in every.data_vars.items() if not np.ptp(each.to_numpy())}
-    flat = every.drop_vars(fixed)
-    # the generations differ in the tail that they look at by default
-    hat, bulk, tail = (
-        _dataset(measure)
-        for measure in (
-            az.rhat(flat),
-            az.ess(flat, method="bulk"),
-            az.ess(flat, method="tail", prob=(0.05, 0.95)),
+    one = [str(name) for name, v in every.data_vars.items() if v.min() == v.max()]
+    constant = {name: float(every[name].size) for name in one}
+    flat = every.drop_vars(one)
+    if not flat.data_vars:
+        return dict.fromkeys(constant, 1.0), constant
+    # chains that each stand still at a place of their own have an infinite R-hat
+    with np.errstate(divide="ignore", invalid="ignore"):
+        # the generations differ in the tail that they look at by default
+        hat, bulk, tail = (
+            _dataset(measure)
+            for measure in (
+                az.rhat(flat),
+                az.ess(flat, method="bulk"),
+                az.ess(flat, method="tail", prob=(0.05, 0.95)),
+            )
         )
-    )
-    r_hat, ess = {}, {}
-    for name, each in every.data_vars.items():
-        r_hat[str(name)] = 1.0 if name in fixed else float(hat[name])
-        ess[str(name)] = float(each.size if name in fixed else min(bulk[name], tail[name]))
-    return r_hat, ess
+    r_hat = {str(name): float(hat[name]) for name in flat.data_vars}
+    ess = {str(name): float(min(bulk[name], tail[name])) for name in flat.data_vars}
+    return r_hat | dict.fromkeys(constant, 1.0), ess | constant
 
 
 def smoothed(log_weights: Array) -> tuple[Array, float]:

@@ -14,6 +14,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from pbrl_ppl.configurations import ATTRIBUTE, doubts
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
 from pbrl_ppl.history import STATE, History, Segments
@@ -101,7 +102,8 @@ def complete(
         "observed_data": xr.Dataset({"next_state": (dims, problem.observations.values)}, coords),
         "constant_data": data["constant_data"],
     }
-    idata = from_groups(result, _origin(problem, seed) | {"method": method})
+    found = {key: trace.attrs[key] for key in (ATTRIBUTE,) if key in trace.attrs}
+    idata = from_groups(result, _origin(problem, seed) | {"method": method} | found)
     return checked(problem, idata, asked)
 
 
@@ -277,25 +279,27 @@ def checked(problem: Problem, idata: Any, asked: int | None = None) -> Any:
     return idata
 
 
-def _more(idata: Any) -> str:
-    """How to get more effective draws; resampled ones are no chain that could go on."""
-    if "updates" in idata.attrs:
-        return "these draws were reweighted by update; fit all data anew"
-    return "raise draws= or thin=, or go on with start= this posterior"
-
-
 def _trouble(
     problem: Problem, idata: Any, asked: int | None
 ) -> Iterator[tuple[type[Warning], str]]:
     """What is wrong, and the cure."""
+    on = "go on with start= this posterior"
+    if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
+        on = "name the bodies that were found in the scene, fit that and go on with start="
+    more = f"raise draws= or thin=, or {on}"
+    if "updates" in idata.attrs:  # resampled draws are no chain that could go on
+        more = "these draws were reweighted by update; fit all data anew"
     sizes = group(idata, "posterior").sizes
     if asked is not None:
         idata.attrs["interrupted"] = 1
         yield (
             ConvergenceWarning,
             f"sampling was interrupted after {sizes['draw']} of {asked} draws a chain, which are"
-            " kept; to go on, pass this posterior as start= to fit",
+            f" kept; for more, {on}",
         )
+    rough = doubts(idata)
+    if rough is not None:
+        yield ConvergenceWarning, rough
     if sizes["draw"] < _LEAST_DRAWS:  # a mode alone
         return
     r_hat, ess = convergence(idata)
@@ -306,25 +310,24 @@ def _trouble(
             ConvergenceWarning,
             f"the chains have not converged: R-hat is {r_hat[worst_hat]:.3f} for {worst_hat}"
             f" (want <= {MAX_RHAT}), effective sample size {ess[worst_ess]:.0f} for {worst_ess}"
-            f" (want >= {MIN_ESS}); {_more(idata)}",
+            f" (want >= {MIN_ESS}); {more}",
         )
     if problem.modes is not None:  # what follows compares with Table 1
         return
     phi, _ = parameter_draws(problem, idata)
-    for label, prior, values in zip(
-        problem.layout.labels, problem.layout.priors, phi.T, strict=True
-    ):
-        lower, upper = prior.support
-        margin = _NEAR * (upper - lower)
-        for bound in (lower, upper):
-            share = float((np.abs(values - bound) < margin).mean())
-            if np.isfinite(margin) and not prior.discrete and share > _STUCK:
-                yield (
-                    BoundWarning,
-                    f"{label} is pressed against the end of its support, {bound:g}: {share:.0%} of"
-                    " the draws are there; check the shape and the frame of the body, or look for"
-                    " an effect that the model lacks (pbrl-ppl close-loop)",
-                )
+    ends = problem.layout.supports(phi)
+    margin = _NEAR * (ends[1] - ends[0])
+    watched = np.isfinite(margin).all(axis=0) & ~problem.layout.discrete
+    for bound in ends:
+        share = (np.abs(phi - bound) < margin).mean(axis=0)
+        for i in np.flatnonzero(watched & (share > _STUCK)):
+            yield (
+                BoundWarning,
+                f"{problem.layout.labels[i]} is pressed against the end of its support,"
+                f" {np.median(bound[:, i]):g}: {share[i]:.0%} of the draws are there; check the"
+                " shape and the frame of the body, or look for an effect that the model lacks"
+                " (pbrl-ppl close-loop)",
+            )
     silent = uninformed(idata, effects={one.effect for one in problem.effects})
     if silent:
         yield (

@@ -195,7 +195,7 @@ def test_anchors_are_bounded_by_the_body_that_holds_them() -> None:
     assert np.isfinite(logp(point))
 
 
-def test_a_fit_over_unknown_bodies_is_refused() -> None:
+def test_a_mode_over_unknown_bodies_is_refused() -> None:
     free = scene(Joint("hinge", known=False))
     with pytest.raises(FitError, match="which bodies a joint of the scene joins is unknown"):
         find_mode(physics_model(free, recorded(free)).problem)

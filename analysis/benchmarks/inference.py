@@ -16,7 +16,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -27,9 +27,11 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 
 import pbrl_ppl as pp
+from pbrl_ppl.history_start import lever
 from pbrl_ppl.likelihood import next_state_logp
 from pbrl_ppl.model import Problem, sigma_prior
 from pbrl_ppl.modes import find_mode
+from pbrl_ppl.parameters import WHEEL_PARAMETERS
 from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.posterior import az, convergence, group
 from pbrl_ppl.prior import build_layout, random_variable
@@ -99,6 +101,44 @@ def apartment(n: int) -> tuple[pp.Scene, pp.History]:
     mass = phi[[layout.index("mass", body.name) for body in scene.dynamic]]
     actions = rng.normal(0, [3.0, 3.0, 0.8], (n, k, 3)) * mass[:, None]
     return scene, simulate(scene, phi, start, actions, NOISE, 4)
+
+
+def furniture(n: int, joined: bool) -> tuple[pp.Scene, pp.History]:
+    """Four bodies on wheels, all of them pushed; a hinge, or nothing, couples cart and trailer.
+
+    The scene says nothing of what is joined, and all of phi is unknown. Either way they begin end
+    to end, and in motion.
+    """
+    # name: size, mass, pose, w_x, w_y, w_theta, mu_x, mu_y
+    table = {
+        "cart": ((0.9, 0.55), 8.0, (0.0, 0.0, 0.0), (-0.25, 0.05, 0.3, 0.04, 0.45)),
+        "trailer": ((0.8, 0.5), 5.0, (-0.79, 0.0, 0.0), (-0.2, 0.0, -0.2, 0.05, 0.4)),
+        "table": ((1.2, 0.7), 12.0, (2.3, 0.8, 0.2), (0.3, -0.1, 0.5, 0.03, 0.5)),
+        "shelf": ((0.9, 0.35), 6.0, (-0.3, 2.0, -0.2), (0.2, 0.05, 1.0, 0.06, 0.35)),
+    }
+    front, back = (-0.42, 0.0), (0.37, 0.0)  # anchors on the cart and on the trailer
+    bodies = tuple(
+        pp.Body(name, pp.Shape.box(*size), wheel=True, pose=pose)
+        for name, (size, _, pose, _) in table.items()
+    )
+    scene = pp.Scene(
+        time_step=0.1, normal_gravity=9.81, bodies=bodies, joints=(pp.Joint("hinge", known=False),)
+    )
+    hinge = pp.Joint("hinge", ("cart", "trailer"), front, back)
+    truth = scene.replace(joints=(hinge,) if joined else ())
+    layout = build_layout(truth)
+    mass = np.array([row[1] for row in table.values()])
+    wheel = zip(WHEEL_PARAMETERS, np.transpose([row[3] for row in table.values()]), strict=True)
+    phi = layout.to_vector({"mass": mass, "r": 0.2, "mu_c": 0.3} | dict(wheel))
+    rng = np.random.default_rng(0)
+    start = np.zeros((n, 4, 6))
+    start[..., :3] = [row[2] for row in table.values()]
+    start[..., 2] += rng.normal(0, 0.12, (n, 4))
+    at_cart, at_trailer = lever(start[:, 0], front)[0], lever(start[:, 1], back)[0]
+    start[:, 1, :2] = start[:, 0, :2] + at_cart - at_trailer
+    pushes = rng.normal(0, [6.0, 6.0, 1.5], (2, n, 1, 4, 3)) * mass[:, None]
+    start = PartedSimulator(truth, layout)(phi, start, pushes[0])[:, 0]
+    return scene, simulate(truth, phi, start, pushes[1, :, 0], NOISE, 1)
 
 
 # -- what is measured ------------------------------------------------------------------------------
@@ -271,6 +311,19 @@ def measure_ratio() -> Iterator[Row]:
     )
 
 
+def measure_joint() -> Iterator[Row]:
+    """Which of four bodies are joined, with the default fit of all parameters at once."""
+    what = "which of four bodies a hinge joins, 20 transitions: probability of"
+    for key, joined in (("joint", "cart-trailer"), ("joint_null", "none")):
+        scene, history = furniture(20, joined != "none")
+        model = pp.physics_model(scene, history)
+        took, idata = seconds(partial(pp.fit, model, seed=1, progress=False))
+        found = pp.joint_probabilities(idata)["joint1"][joined]
+        r_hat = max(convergence(idata)[0].values())
+        yield f"{key}_probability", f"{what} the truth, {joined}", "> 0.99", found
+        yield f"{key}_seconds", f"the same: seconds (largest R-hat {r_hat:.2f})", "<= 120", took
+
+
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "cart": measure_cart,
     "update": measure_update,
@@ -278,6 +331,7 @@ PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "noise_free": measure_noise_free,
     "ratio": measure_ratio,
     "apartment": measure_apartment,
+    "joint": measure_joint,
 }
 
 
