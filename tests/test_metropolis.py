@@ -175,6 +175,7 @@ def test_state_is_restored() -> None:
         step = AdaptiveMetropolis(
             model.free_RVs,
             blocks=[block(np.zeros(3), np.eye(3))],
+            inner=1,
             rng=np.random.default_rng(1),
         )
     initial = step.sampling_state

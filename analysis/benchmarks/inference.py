@@ -199,7 +199,7 @@ def measure_update() -> Iterator[Row]:
         seconds(lambda i=i: pp.update(idata, more, seed=i, progress=False))[0]
         for i in range(ROUNDS)
     ]
-    what = "cart posterior of 4 x 1500 draws and 360 transitions, one more: seconds"
+    what = "cart posterior of 4 x 1000 draws and 360 transitions, one more: seconds"
     yield "update_seconds", what, "<= 1", float(np.median(times))
 
 
@@ -219,6 +219,14 @@ def measure_map() -> Iterator[Row]:
         np.median([seconds(lambda: find_mode(model.problem, seed=1))[0] for _ in range(ROUNDS)])
     )
     yield "map_seconds", "mode of the same data: seconds", "< 1", took
+    try:
+        from mujoco_sysid import sysid_seconds
+    except ImportError as error:
+        print(f"map_over_mujoco is left out: {error}; pip install 'mujoco[sysid]'", file=sys.stderr)
+        return
+    theirs = sysid_seconds()
+    what = "the same / MuJoCo's sysid, seven parameters of one body, as many steps"
+    yield "map_over_mujoco", f"{what} ({theirs:.2g} s)", "", took / theirs
 
 
 def measure_noise_free() -> Iterator[Row]:
@@ -286,7 +294,7 @@ def measure_ratio() -> Iterator[Row]:
     """
     scene, history = cart(360)
     model = pp.physics_model(scene, history)
-    took, _, ess = sampled(scene, history)
+    took, _, ess = judged(*cart_posterior())
     mode = find_mode(model.problem, seed=1)
     point = model.problem.layout.to_dict(mode.phi) | {"sigma": mode.sigma}
     quiet = {"chains": 2, "cores": 1, "progressbar": False, "compute_convergence_checks": False}
@@ -311,6 +319,28 @@ def measure_ratio() -> Iterator[Row]:
     )
 
 
+#: Draws, tuning draws and steps a draw of each method: what it needs, as far as patience goes.
+LENGTHS = {
+    "metropolis": {},
+    "paper": {"draws": 200, "tune": 1000},
+    "demetropolisz": {"draws": 500, "tune": 1000},
+    "smc": {"draws": 500},
+    "nuts": {"draws": 50, "tune": 100},
+}
+
+
+def measure_methods() -> Iterator[Row]:
+    """Effective draws a second of every method: which should be the default."""
+    scene, history = cart(60)
+    model = pp.physics_model(scene, history)
+    mode = find_mode(model.problem, seed=1)
+    for method, lengths in LENGTHS.items():
+        run = partial(pp.fit, model, method=method, seed=1, start=mode, progress=False, **lengths)
+        took, r_hat, ess = judged(*seconds(run))
+        what = f"cart, 60 transitions, {method}: least ESS a second ({took:.0f} s, ESS {ess:.0f}"
+        yield f"ess_per_second_{method}", f"{what}, R-hat {r_hat:.2f})", "", ess / took
+
+
 def measure_joint() -> Iterator[Row]:
     """Which of four bodies are joined, with the default fit of all parameters at once."""
     what = "which of four bodies a hinge joins, 20 transitions: probability of"
@@ -330,6 +360,7 @@ PARTS: dict[str, Callable[[], Iterator[Row]]] = {
     "map": measure_map,
     "noise_free": measure_noise_free,
     "ratio": measure_ratio,
+    "methods": measure_methods,
     "apartment": measure_apartment,
     "joint": measure_joint,
 }

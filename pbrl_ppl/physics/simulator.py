@@ -26,6 +26,8 @@ PATHS = ("compiled", "plain")
 _STEP, _FAR = 1e-5, 1e300
 #: Worlds kept, of different choices of the bodies that inferred joints hold.
 _KEPT = 64
+#: Engine steps worth a thread of their own.
+_A_THREAD = 1000
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]
 
@@ -258,7 +260,8 @@ class Simulator:
                     engine.renew(self._new_world(joined))
                 first = stop + 1
 
-        workers = min(self.threads, max(1, len(out) // 8))  # fewer items are not worth a thread
+        steps = len(out) * actions.shape[1] * int(self.levels[0].sum())
+        workers = min(self.threads, len(out), max(1, steps // _A_THREAD))
         with self._lock:
             engines = self._worlds.setdefault(joined, [])
             self._worlds.move_to_end(joined)
