@@ -1,0 +1,83 @@
+"""PyMC 5 with ArviZ 0.x and PyMC 6 with ArviZ 1.x: the same posterior, and files of each other.
+
+``data/`` holds a fit of each generation; ``python -m tests.test_stacks`` writes the running one's.
+"""
+
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.fitting import fit
+from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.posterior import az, draws, group, load_posterior, save_posterior, scene_of
+from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.updating import update
+from tests.test_model import simulated_history
+
+GENERATIONS = ("5", "6")
+DATA = Path(__file__).parent / "data"
+SCENE = Scene(
+    time_step=0.1,
+    normal_gravity=9.81,
+    bodies=(Body("puck", Shape.circle(0.2), known={"r": 0.5, "mu_c": 0.3}),),
+)
+
+
+def history(seed: int, trajectories: int = 3) -> History:
+    """A pushed puck."""
+    truth = {"mass": 2.0}
+    return simulated_history(SCENE, truth, seed=seed, trajectories=trajectories, intervals=4)
+
+
+def file(generation: str) -> Path:
+    return DATA / f"puck-pymc{generation}.nc"
+
+
+def fitted() -> Any:
+    """The puck's posterior on the running generation."""
+    return fit(physics_model(SCENE, history(1)), seed=3, draws=500, chains=2, progress=False)
+
+
+@pytest.fixture(scope="module")
+def here() -> Any:
+    return fitted()
+
+
+@pytest.mark.parametrize("generation", GENERATIONS)
+def test_posteriors_agree(here, generation: str) -> None:
+    """Mass and six sigmas, first and second moments, within 4 Monte Carlo errors.
+
+    False alarms: 0.1 % for each generation.
+    """
+    there = load_posterior(file(generation))
+    assert f'"pymc": "{generation}.' in str(there.attrs["versions"])
+    theirs, ours = group(there, "posterior"), group(here, "posterior")
+    for name in ("mass", "sigma"):
+        for power in (1, 2):
+            moments = [(each[name] - 2.0 * (name == "mass")) ** power for each in (ours, theirs)]
+            errors = [az.mcse(each.to_dataset(name=name))[name] for each in moments]
+            gap = np.abs(np.subtract(*(each.mean(("chain", "draw")).values for each in moments)))
+            assert (gap < 4 * np.hypot(*(each.values for each in errors))).all()
+
+
+@pytest.mark.parametrize("generation", GENERATIONS)
+def test_a_file_of_either_generation_is_whole_and_of_use(generation: str, tmp_path: Path) -> None:
+    there = load_posterior(file(generation))
+    assert scene_of(there) == SCENE
+    assert draws(there)["mass"].shape == (1000, 1)
+    likelihood = group(there, "log_likelihood")["next_state"]
+    assert likelihood.sizes == {"chain": 2, "draw": 500, "transition": 12}
+    further = update(there, history(2, trajectories=1))
+    assert group(further, "log_likelihood")["next_state"].sizes["transition"] == 16
+    save_posterior(further, tmp_path / "again.nc")
+    again = load_posterior(tmp_path / "again.nc")
+    np.testing.assert_array_equal(draws(again)["mass"], draws(further)["mass"])
+
+
+if __name__ == "__main__":
+    DATA.mkdir(exist_ok=True)
+    save_posterior(fitted(), file(version("pymc").split(".")[0]))
