@@ -32,8 +32,8 @@ _PART, _POLISHED, _FEW = 60, 2, 20
 #: Gains in log-posterior: less is not worth another round; more shows that the coarse derivative
 #: had not led to the top. (Friction makes the top rough: some units are within its grain.)
 _STALLED, _WORTHWHILE = 0.02, 5.0
-#: Parameters this close, as a share of their scale, are the same mode.
-_SAME = 0.05
+#: Predictions this close (sum of squares, in noise units) are of the same mode.
+_SAME = 10.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +187,7 @@ def find_modes(
     order = np.argsort(np.log1p(np.minimum(z, _SCREEN_CLIP) ** 2).sum(axis=1))
     rough = [_climb(part, draws[i], part.simulator) for i in order[:starts]]
     rough.sort(key=lambda result: -result[2])
-    found = _distinct(problem, rough)
+    found = _distinct(part, rough)
     if not few:
         found = [_climb(problem, phi, problem.coarse) for phi, _, _ in found[:_POLISHED]]
     found.sort(key=lambda result: -result[2])
@@ -196,14 +196,16 @@ def find_modes(
 
 
 def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
-    """Leave out what is another description of one before it, or has climbed to the same place."""
-    kept: list[Peak] = []
-    for result in found:
-        phi = fold_wheels(problem, result[0])
-        scale = _SAME * problem.layout.scale(phi)
-        if not any((np.abs(fold_wheels(problem, one[0]) - phi) < scale).all() for one in kept):
-            kept.append(result)
-    return kept
+    """Leave out what predicts the same as one before it: it is the same hill, or a wheel's other
+    description, or differs in what the data say nothing about.
+    """
+    z = problem.whitened(np.array([phi for phi, _, _ in found]), found[0][1])
+    z = np.nan_to_num(z, nan=_SCREEN_CLIP)
+    kept: list[int] = []
+    for i in range(len(found)):
+        if not any(((z[i] - z[j]) ** 2).sum() < _SAME for j in kept):
+            kept.append(i)
+    return [found[i] for i in kept]
 
 
 def _part(problem: Problem, transitions: int) -> Problem:
