@@ -196,8 +196,9 @@ def find_modes(
 
 
 def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
-    """Leave out what predicts the same as one before it: it is the same hill, or a wheel's other
-    description, or differs in what the data say nothing about.
+    """Leave out what predicts the same as one before it.
+
+    That is the same hill, or a wheel's other description, or differs where the data are silent.
     """
     z = problem.whitened(np.array([phi for phi, _, _ in found]), found[0][1])
     z = np.nan_to_num(z, nan=_SCREEN_CLIP)

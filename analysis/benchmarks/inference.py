@@ -206,7 +206,7 @@ def measure_update() -> Iterator[Row]:
 def measure_apartment() -> Iterator[Row]:
     """Eleven bodies under the continuous prior."""
     what = "11 bodies, continuous prior, 30 transitions a body"
-    measured = sampled(*apartment(30), draws=2000, tune=1500)
+    measured = sampled(*apartment(30))
     yield from fit_rows("apartment", what, 600, measured)
 
 
