@@ -261,7 +261,7 @@ class Simulator:
                 first = stop + 1
 
         steps = len(out) * actions.shape[1] * int(self.levels[0].sum())
-        workers = min(self.threads, len(out), max(1, steps // _A_THREAD))
+        workers = max(1, min(self.threads, len(out), steps // _A_THREAD))
         with self._lock:
             engines = self._worlds.setdefault(joined, [])
             self._worlds.move_to_end(joined)
