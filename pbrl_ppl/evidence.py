@@ -11,7 +11,6 @@ from scipy.special import gammaln, ndtr, ndtri
 from scipy.stats import truncnorm
 
 from pbrl_ppl.likelihood import robust
-from pbrl_ppl.model import sigma_prior
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import Prior
 
@@ -62,11 +61,10 @@ class Coordinates:
         self.problem = mode.problem
         priors = self.problem.layout.priors
         self._laws = [_Law(prior, x) for prior, x in zip(priors, mode.phi, strict=True)]
-        observations, segments = self.problem.observations, self.problem.segments
-        median, self._spread = self.problem.sigma_prior or sigma_prior(observations, segments)
+        median, self._spread = self.problem.noise_prior
         self._centre = np.log(median)
         sigma = np.log(mode.sigma)
-        self._counts = observations.measured.sum((0, 1, 2))
+        self._counts = self.problem.observations.measured.sum((0, 1, 2))
         if self.problem.scalar_sigma:
             self._centre, sigma = self._centre.mean(keepdims=True), sigma[:1]
             self._counts = self._counts.sum(keepdims=True)

@@ -16,7 +16,7 @@ from pbrl_ppl.emulator import emulate
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.joint_search import weigh
 from pbrl_ppl.metropolis import AdaptiveMetropolis
-from pbrl_ppl.mixture import check_joint_fit, mix, posterior_dataset
+from pbrl_ppl.mixture import check_joint_fit, labelled, mix, posterior_dataset
 from pbrl_ppl.mode_choice import choose_modes
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, find_mode
@@ -92,7 +92,7 @@ def _metropolis(job: Job) -> Any:
     options: dict[str, Any] = {"inner": 10}
     # an exact step of one block, in engine steps; where that is little, looking ahead is no use
     cost = problem.simulator.steps * problem.segments.n * problem.horizon / len(problem.parts)
-    if cost > _LITTLE and not problem.layout.discrete.any():
+    if cost > _LITTLE:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
             options = {"rough": Surrogate(problem, unpack, emulator), "inner": 30, "plain": 0.25}
@@ -149,10 +149,6 @@ def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]
     problem, posterior = model.problem, posterior_dataset(model, draws)
     segments = problem.segments
 
-    def dataset(variables: dict[str, Any]) -> xr.Dataset:
-        used = {dim for each, _ in variables.values() for dim in each if dim in model.coords}
-        return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})
-
     per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
     given = {
         "start": (("transition", "body", "full_state"), segments.start),
@@ -165,8 +161,8 @@ def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]
         {
             "posterior": posterior,
             "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
-            "observed_data": dataset(observed),
-            "constant_data": dataset(given),
+            "observed_data": labelled(model, observed),
+            "constant_data": labelled(model, given),
         },
         {},
     )
@@ -222,9 +218,9 @@ def fit(
         As made by ``physics_model``.
     method : str
         ``metropolis``: adaptive blocks that follow the scene's independent parts and look ahead
-        with a coarse engine; ``paper``: one random walk a variable, burnt in and thinned;
-        ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient; ``map``: the mode
-        alone, as one draw.
+        with polynomials where engine runs are dear; ``paper``: one random walk a variable, burnt
+        in and thinned; ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient;
+        ``map``: the mode alone, as one draw.
     seed : int
         The same seed gives the same posterior.
     draws, tune : int, optional

@@ -134,10 +134,14 @@ def posterior_dataset(model: pm.Model, values: Mapping[str, Array]) -> xr.Datase
         name: (("chain", "draw", *(model.named_vars_to_dims.get(name) or ())), value)
         for name, value in values.items()
     }
-    used = {dim for dims, _ in data.values() for dim in dims if dim in model.coords}
-    coords = {dim: list(model.coords[dim]) for dim in used}
     chains, draws = next(iter(values.values())).shape[:2]
-    return xr.Dataset(data, coords | {"chain": np.arange(chains), "draw": np.arange(draws)})
+    return labelled(model, data).assign_coords(chain=np.arange(chains), draw=np.arange(draws))
+
+
+def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
+    """Variables (dims, values) with the model's coordinates of their dimensions."""
+    used = {dim for dims, _ in variables.values() for dim in dims if dim in model.coords}
+    return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})
 
 
 def _values(

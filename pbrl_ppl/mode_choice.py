@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Observations, estimate_sigma, log_density
-from pbrl_ppl.model import Problem, sigma_prior
+from pbrl_ppl.model import Problem
 from pbrl_ppl.physics.parts import Part
 
 Array = NDArray[np.float64]
@@ -111,8 +111,8 @@ def choose_modes(
     rng = np.random.default_rng(seed)
     table = problem.modes.table(problem.layout, problem.scene)
     parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
-    median, spread = problem.sigma_prior or sigma_prior(problem.observations, problem.segments)
-    typical = np.log(np.asarray(median))
+    median, spread = problem.noise_prior
+    typical = np.log(median)
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
     every = np.ones(len(typical))
     if problem.scalar_sigma:
@@ -124,7 +124,7 @@ def choose_modes(
         prior = -0.5 * (((log_sigma - typical) / spread) ** 2).sum(axis=1)
         return np.asarray(np.sum(each, axis=0) + prior)
 
-    begin = np.log(_rough_sigma(problem, parts, np.asarray(median)))
+    begin = np.log(_rough_sigma(problem, parts, median))
     begin = begin.mean(keepdims=True) if problem.scalar_sigma else begin
     found = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
     # log sigma of n residuals has about this precision; wider, for modes that mix

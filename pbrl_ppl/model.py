@@ -115,6 +115,14 @@ class Problem:
         return Observations.of(self.segments, self.columns)
 
     @cached_property
+    def noise_prior(self) -> tuple[Array, float]:
+        """Medians of sigma's prior, shape (state,), and its log-scale; given, or from the data."""
+        if self.sigma_prior is None:
+            return sigma_prior(self.observations, self.segments)
+        median, spread = self.sigma_prior
+        return np.array(median), spread
+
+    @cached_property
     def parts(self) -> Parts:
         """Moving bodies that have to do with each other, together."""
         return independent_parts(self.scene, self.history)
@@ -332,7 +340,7 @@ def build_model(problem: Problem) -> pm.Model:
                 )
         phi = pt.concatenate(list(table1.values())) if table1 else pt.zeros(0)
         # P(sigma)
-        median, spread = problem.sigma_prior or sigma_prior(observations, segments)
+        median, spread = problem.noise_prior
         if problem.scalar_sigma:
             scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
             sigma = pt.ones(len(median)) * scalar

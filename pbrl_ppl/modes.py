@@ -354,7 +354,10 @@ def _finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) ->
 
 
 def fold_wheels(problem: Problem, phi: Array) -> Array:
-    """Choose one of a wheel's four equal descriptions: mu_x <= mu_y, w_theta in (-pi/2, pi/2]."""
+    """Choose one of a wheel's four equal descriptions, for phi of shape (..., p).
+
+    Namely mu_x <= mu_y and w_theta in (-pi/2, pi/2].
+    """
     phi = phi.copy()
     layout = problem.layout
     for body in problem.scene.dynamic:
@@ -362,10 +365,9 @@ def fold_wheels(problem: Problem, phi: Array) -> Array:
         if not all(name in layout.labels for name in names):
             continue
         angle, x, y = (layout.labels.index(name) for name in names)
-        if phi[x] > phi[y]:
-            phi[[x, y]] = phi[[y, x]]
-            phi[angle] += np.pi / 2
-        phi[angle] = np.pi / 2 - np.mod(np.pi / 2 - phi[angle], np.pi)
+        phi[..., angle] += np.where(phi[..., x] > phi[..., y], np.pi / 2, 0.0)
+        phi[..., [x, y]] = np.sort(phi[..., [x, y]], axis=-1)
+        phi[..., angle] = np.pi / 2 - np.mod(np.pi / 2 - phi[..., angle], np.pi)
     return phi
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import STATE, STATE_UNITS
-from pbrl_ppl.model import Problem, sigma_prior
+from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import HDI_PROB, group
 
 Array = NDArray[np.float64]
@@ -126,7 +126,7 @@ def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) 
     rng = np.random.default_rng(seed)
     observations, segments = problem.observations, problem.segments
     columns = list(observations.columns)
-    noise = sigma_prior(observations, segments)[0]
+    noise = problem.noise_prior[0]
     first = segments.start[..., columns]
     measured = observations.wrapped(observations.values[:, -1] - first)
     phi = _prior_draws(model, problem, draws, rng)

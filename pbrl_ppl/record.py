@@ -102,8 +102,9 @@ def complete(
         "observed_data": xr.Dataset({"next_state": (dims, problem.observations.values)}, coords),
         "constant_data": data["constant_data"],
     }
-    found = {key: trace.attrs[key] for key in (ATTRIBUTE,) if key in trace.attrs}
-    idata = from_groups(result, _origin(problem, seed) | {"method": method} | found)
+    idata = from_groups(result, _origin(problem, seed) | {"method": method})
+    if ATTRIBUTE in trace.attrs:
+        idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
     return checked(problem, idata, asked)
 
 
@@ -236,7 +237,7 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
 
 def _origin(problem: Problem, seed: int) -> dict[str, Any]:
     scene = problem.scene
-    prior = problem.sigma_prior or sigma_prior(problem.observations, problem.segments)
+    median, spread = problem.noise_prior
     for body in scene.dynamic:
         new = [
             one.effect.name
@@ -252,7 +253,7 @@ def _origin(problem: Problem, seed: int) -> dict[str, Any]:
         **({} if problem.nu is None else {"nu": problem.nu}),
         **({} if problem.modes is None else {"modes": problem.modes.to_json()}),
         substeps=problem.substeps,
-        sigma_prior=[[float(median) for median in prior[0]], float(prior[1])],
+        sigma_prior=[[float(each) for each in median], float(spread)],
         start_noise=int(problem.noise is not None),
         data_sha256=problem.history.data_sha256,
         versions=versions(),

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.metropolis import TARGET_ACCEPTANCE, Gaussian
-from pbrl_ppl.model import Problem, sigma_prior
+from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import inside, prior_residual
 from pbrl_ppl.starts import constrain, unconstrain
 
@@ -89,9 +89,7 @@ class _Mover:
         phi = inside(self.priors, phi)
         pairs = [unconstrain(prior, x) for prior, x in zip(self.priors, phi.T, strict=True)]
         self.u = np.array([u for u, _ in pairs]).reshape(-1, len(phi)).T.copy()
-        median, self.spread = problem.sigma_prior or sigma_prior(
-            problem.observations, problem.segments
-        )
+        median, self.spread = problem.noise_prior
         self.typical = np.log(median)
         self.noise = np.log(sigma)
         if problem.scalar_sigma:

@@ -181,10 +181,9 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
 
 def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
     """What is ranked, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
-    folded = np.array([fold_wheels(problem, each) for each in phi]).reshape(phi.shape)
     if problem.scalar_sigma:
         sigma = sigma[:, :1]
-    return np.hstack([folded, sigma, likelihood[:, None]])
+    return np.hstack([fold_wheels(problem, phi), sigma, likelihood[:, None]])
 
 
 def labels(problem: Problem) -> tuple[str, ...]:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
 
-from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.model import Problem
 
 Array = NDArray[np.float64]
@@ -74,8 +73,5 @@ class Surrogate:
         phi, sigma, prior = self.unpack(q)
         if not np.isfinite(prior):
             return -np.inf
-        try:
-            density = self.problem.log_density(self.residual(phi), sigma)
-        except ParameterError:  # impossible, such as a mass that underflows
-            return -np.inf
+        density = self.problem.log_density(self.residual(phi), sigma)
         return prior + _FLATTER * float(density.sum())
