@@ -51,3 +51,7 @@ class RefitWarning(UserWarning):
 
 class FitError(PbrlError, ValueError):
     """A model that cannot be fitted as asked."""
+
+
+class GoalError(PbrlError, ValueError):
+    """A goal, a start or a set of actions that cannot be."""

@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import differential_evolution, least_squares, minimize
 
 from pbrl_ppl.differences import differentiate
 from pbrl_ppl.errors import FitError
@@ -29,11 +29,16 @@ _SCREEN_CLIP = 1e3
 #: Transitions used to tell basins apart, and how many of the best are searched with all data; with
 #: no more than so many transitions, all are.
 _PART, _POLISHED, _FEW = 60, 2, 20
+#: Population and generations that look for the hill of few data, how many of them are climbed
+#: from, the most parameters that is for, and the most engine steps it may take.
+_POPULATION, _GENERATIONS, _EVOLVED, _MOST_EVOLVED, _AFFORDED = 200, 120, 8, 15, 2e7
 #: Gains in log-posterior: less is not worth another round; more shows that the coarse derivative
 #: had not led to the top. (Friction makes the top rough: some units are within its grain.)
 _STALLED, _WORTHWHILE = 0.02, 5.0
 #: Predictions this close (sum of squares, in noise units) are of the same mode.
 _SAME = 10.0
+#: How small the noise may seem beside its typical size while basins are compared.
+_EXACT = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,7 +145,8 @@ def find_modes(
         Of the draws from the prior.
     starts, screened : int, optional
         Local searches, and draws from the prior among which their starts are chosen. With few data
-        there are more by default: they cost little there, and more hills look alike.
+        there are more by default: they cost little there, and friction makes more hills. So it
+        does that differential evolution looks for the highest too.
     initial : ndarray, optional
         Where to begin, shape (p,); then there is one local search.
     rounds : int, optional
@@ -185,7 +191,11 @@ def find_modes(
     z = np.nan_to_num(residual / sigma, nan=_SCREEN_CLIP).reshape(len(draws), -1)
     # log(1 + z^2): a good start fits most transitions, not the worst one
     order = np.argsort(np.log1p(np.minimum(z, _SCREEN_CLIP) ** 2).sum(axis=1))
-    rough = [_climb(part, draws[i], part.simulator) for i in order[:starts]]
+    begin = draws[order[:starts]]
+    steps = problem.simulator.steps * problem.segments.n * problem.horizon
+    if few and len(priors) <= _MOST_EVOLVED and steps * _POPULATION * _GENERATIONS < _AFFORDED:
+        begin = np.vstack([begin, _evolve(problem, rng)])
+    rough = [_climb(part, phi, part.simulator) for phi in begin]
     rough.sort(key=lambda result: -result[2])
     found = _distinct(part, rough)
     if not few:
@@ -193,6 +203,38 @@ def find_modes(
     found.sort(key=lambda result: -result[2])
     best = _polish(problem, found[0])
     return [_finish(problem, *result) for result in (best, *found[1:])]
+
+
+def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
+    """The best that differential evolution finds, best first, shape (evolved, p).
+
+    Where few transitions slide, the top may be so narrow that no draw from the prior leads there.
+    It shows with the exact engine alone: one with fewer steps has its kinks elsewhere.
+    """
+    priors = problem.layout.priors
+    draws = np.stack([prior.sample(rng, _POPULATION) for prior in priors], axis=1)
+    measured = problem.observations.measured
+    counts = measured.sum((0, 1, 2))
+    # without a floor, an exact fit of one dimension would outweigh all others
+    floor = (_EXACT * problem.noise_prior[0]) ** 2
+
+    def cost(points: Array) -> Array:
+        phi = inside(priors, points.T)
+        residual = np.where(measured, np.nan_to_num(problem.residual(phi), nan=_SCREEN_CLIP), 0.0)
+        variance = np.maximum((residual**2).sum((1, 2, 3)) / counts, floor)
+        fit = (counts * np.log(variance)).sum(axis=-1)
+        return np.asarray(0.5 * (fit + (prior_residual(priors, phi) ** 2).sum(axis=-1)))
+
+    lower, upper = _box(priors)
+    lower = np.where(np.isfinite(lower), lower, draws.min(axis=0))
+    upper = np.where(np.isfinite(upper), upper, draws.max(axis=0))
+    found = differential_evolution(
+        cost, list(zip(lower, upper, strict=True)), init=draws, rng=rng,
+        strategy="rand1bin", recombination=0.9, maxiter=_GENERATIONS, polish=False,
+        vectorized=True, updating="deferred", tol=0.0, atol=_STALLED,
+    )  # fmt: skip
+    best = np.argsort(found.population_energies)[:_EVOLVED]
+    return inside(priors, found.population[best])
 
 
 def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:

@@ -101,6 +101,38 @@ def check_history(scene: Scene, history: History, segments: Segments) -> None:
     check_placement(scene, segments.start, where)
 
 
+def overlap(scene: Scene, poses: Array) -> Array:
+    """How deep the deepest two shapes are inside each other (m), shape (n,).
+
+    Negative where bodies are apart by so much at least, no more than their bounding circles are;
+    pairs that a joint joins do not count.
+
+    Parameters
+    ----------
+    scene : Scene
+        Shapes, walls, static bodies and joints.
+    poses : ndarray
+        Shape (n, body, 3), bodies in the order of ``scene.dynamic``: x, y, theta (m, m, rad).
+    """
+    world = _solids(scene)
+    poses = np.concatenate(
+        [poses, np.broadcast_to(world.fixed, (len(poses), *world.fixed.shape))], axis=1
+    )
+    deepest = np.full(len(poses), -np.inf)
+    if not world.pairs:
+        return deepest
+    circles = _circles(world, poses)
+    for pair, (i, j) in enumerate(world.pairs):
+        rows = np.flatnonzero(circles[:, pair] > 0)
+        own = circles[:, pair].copy()
+        if len(rows):
+            a, b = world.solids[i], world.solids[j]
+            at_a, at_b = poses[rows, i], poses[rows, j]
+            own[rows] = np.max([_depth(p, at_a, q, at_b) for p, q in product(a.parts, b.parts)], 0)
+        deepest = np.maximum(deepest, own)
+    return deepest
+
+
 # -- joints ----------------------------------------------------------------------------------------
 
 
@@ -233,13 +265,18 @@ def _near(world: _Solids, poses: Array) -> NDArray[np.bool_]:
 
     They overlap by no more than the circles about them, or about one and a wall's segment.
     """
+    return np.asarray(_circles(world, poses) > world.allowed)
+
+
+def _circles(world: _Solids, poses: Array) -> Array:
+    """How deep the circles about each pair are in each other, shape (transition, pair)."""
     i, j = np.array(world.pairs, dtype=int).reshape(-1, 2).T
     cores = np.array([solid.core for solid in world.solids])
     reach = np.array([solid.reach for solid in world.solids])
     edge = cores[j, 1] - cores[j, 0]
     arm = poses[:, i, :2] - poses[:, j, :2] - cores[j, 0]
     gap = _to_segment(arm, edge)
-    return np.asarray(gap + world.allowed < reach[i] + reach[j])
+    return np.asarray(reach[i] + reach[j] - gap)
 
 
 # -- geometry --------------------------------------------------------------------------------------

@@ -1,0 +1,244 @@
+"""What a planner may do: wrenches on bodies, and for how long."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import GoalError
+from pbrl_ppl.planning.goals import check_keys, read_toml
+from pbrl_ppl.posterior import group, scene_of
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene_checks import nearest
+
+Array = NDArray[np.float64]
+
+#: Of the recorded pushes, the size that a plan pushes with, and intervals for which it does.
+_QUANTILE, _INTERVALS = 0.9, (2, 5)
+
+
+@dataclass(frozen=True)
+class Action:
+    """A wrench at the origin of one body.
+
+    Attributes
+    ----------
+    body : str
+        Which is pushed.
+    force : tuple of float
+        N.
+    torque : float
+        N m.
+    frame : str
+        ``body``: the force turns with the body from interval to interval, as someone who pushes it
+        would; ``world``: it does not.
+
+    Raises
+    ------
+    GoalError
+        If a number is not finite, or the frame neither.
+    """
+
+    body: str
+    force: tuple[float, float] = (0.0, 0.0)
+    torque: float = 0.0
+    frame: str = "body"
+
+    def __post_init__(self) -> None:
+        given = np.array([*np.ravel(self.force), self.torque], dtype=object)
+        try:
+            numbers = given.astype(float)
+        except (TypeError, ValueError):
+            numbers = np.full(3, np.nan)
+        if numbers.shape != (3,) or not np.isfinite(numbers).all():
+            raise GoalError(
+                f"action on {self.body}: force is {self.force!r} and torque {self.torque!r},"
+                " expected two finite numbers (N) and one (N m)"
+            )
+        object.__setattr__(self, "force", (float(numbers[0]), float(numbers[1])))
+        object.__setattr__(self, "torque", float(numbers[2]))
+        if self.frame not in ("body", "world"):
+            raise GoalError(
+                f"action on {self.body}: frame is {self.frame!r}, expected body or world"
+            )
+
+
+@dataclass(frozen=True)
+class ActionSet:
+    """Wrenches, one of which acts at a time, and the times for which it does.
+
+    Attributes
+    ----------
+    actions : tuple of Action
+        At least one.
+    durations : tuple of float
+        s; whole numbers of sampling intervals. None: one interval.
+
+    Raises
+    ------
+    GoalError
+        If it is empty, or a duration is not positive.
+
+    Examples
+    --------
+    >>> pushes = ActionSet.box("cart", forces=(0.0, 15.0), torques=(-3.0, 0.0, 3.0))
+    >>> len(pushes.actions)
+    6
+    """
+
+    actions: tuple[Action, ...]
+    durations: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "actions", tuple(self.actions))
+        if not self.actions:
+            raise GoalError("actions: the set is empty; give at least one wrench on a body")
+        if self.durations is None:
+            return
+        object.__setattr__(self, "durations", tuple(self.durations))
+        if not self.durations:
+            raise GoalError("actions: there is no duration; give one (s)")
+        for value in self.durations:
+            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value:
+                raise GoalError(f"actions: a duration is {value!r}, expected a positive number (s)")
+
+    @classmethod
+    def box(
+        cls,
+        body: str,
+        *,
+        forces: Sequence[float] = (0.0,),
+        lateral: Sequence[float] = (0.0,),
+        torques: Sequence[float] = (0.0,),
+        frame: str = "body",
+        durations: Sequence[float] | None = None,
+    ) -> ActionSet:
+        """All combinations of forces along x, along y, and torques on one body (N, N, N m)."""
+        wrenches = product(forces, lateral, torques)
+        return cls(
+            tuple(Action(body, (fx, fy), torque, frame) for fx, fy, torque in wrenches),
+            None if durations is None else tuple(durations),
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> ActionSet:
+        """Read a TOML file: ``durations``, and an ``[[action]]`` for each wrench.
+
+        Raises
+        ------
+        GoalError
+            If it is missing, is not TOML, has an unknown key, or no action.
+        """
+        table = read_toml(path, "actions", ("durations", "action"))
+        actions = []
+        for given in table.get("action", []):
+            check_keys(given, [each.name for each in fields(Action)], f"{path}: [[action]]")
+            if "body" not in given:
+                raise GoalError(f"{path}: an [[action]] has no body; name one")
+            actions.append(Action(**given))
+        return cls(tuple(actions), table.get("durations"))
+
+    @classmethod
+    def recorded(cls, idata: Any) -> ActionSet:
+        """Such as the posterior's data were recorded with, so that the model knows what they do.
+
+        For each body that was pushed: a force along its x or y, either way, and a torque, either
+        way, alone and together, of the size that a tenth of the recorded ones exceed.
+
+        Parameters
+        ----------
+        idata : InferenceData or DataTree
+            A posterior.
+
+        Raises
+        ------
+        GoalError
+            If nothing was pushed.
+        """
+        scene = scene_of(idata)
+        given = group(idata, "constant_data")["actions"].to_numpy()
+        actions: list[Action] = []
+        for i, body in enumerate(scene.dynamic):
+            sizes = np.hypot(given[..., i, 0], given[..., i, 1]).ravel(), abs(given[..., i, 2])
+            force, torque = (
+                float(np.quantile(s[s > 0], _QUANTILE)) if (s > 0).any() else 0.0 for s in sizes
+            )
+            if not (force or torque):
+                continue
+            ways = [(0.0, 0.0), (force, 0.0), (-force, 0.0), (0.0, force), (0.0, -force)]
+            turns = (0.0, torque, -torque) if torque else (0.0,)
+            actions += [
+                Action(body.name, way, turn)
+                for way, turn in product(ways if force else ways[:1], turns)
+            ]
+        if not actions:
+            raise GoalError("actions: nothing was pushed in the posterior's data; give actions")
+        return cls(tuple(actions), tuple(scene.time_step * n for n in _INTERVALS))
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a body that the scene lacks, and durations between its sampling intervals.
+
+        Raises
+        ------
+        GoalError
+            It names the body or the duration.
+        """
+        moving = [body.name for body in scene.dynamic]
+        for action in self.actions:
+            if action.body not in moving:
+                raise GoalError(
+                    f'actions: the scene has no moving body "{action.body}"'
+                    f"{nearest(action.body, moving)}"
+                )
+        self.intervals(scene)
+
+    def intervals(self, scene: Scene) -> tuple[int, ...]:
+        """The durations as numbers of sampling intervals, in increasing order."""
+        found = set()
+        for duration in self.durations or (scene.time_step,):
+            count = duration / scene.time_step
+            if not math.isfinite(count) or round(count) < 1 or abs(count - round(count)) > 1e-6:
+                raise GoalError(
+                    f"actions: a duration is {duration:g} s, expected a whole number of sampling"
+                    f" intervals of {scene.time_step:g} s"
+                )
+            found.add(round(count))
+        return tuple(sorted(found))
+
+    def wrenches(self, scene: Scene, which: NDArray[np.intp], heading: Array) -> Array:
+        """World-frame wrenches of chosen actions, shape (n, body, 3).
+
+        Parameters
+        ----------
+        scene : Scene
+            Orders the bodies.
+        which : ndarray
+            Number of each action, shape (n,).
+        heading : ndarray
+            The bodies' angles, shape (n, body), rad.
+        """
+        names = [body.name for body in scene.dynamic]
+        own = np.array([names.index(action.body) for action in self.actions])[which]
+        given = np.array([(*action.force, action.torque) for action in self.actions])[which]
+        turns = np.array([action.frame == "body" for action in self.actions])[which]
+        rows = np.arange(len(which))
+        angle = np.where(turns, heading[rows, own], 0.0)
+        c, s = np.cos(angle), np.sin(angle)
+        out = np.zeros((len(which), len(names), 3))
+        out[rows, own, 0] = c * given[:, 0] - s * given[:, 1]
+        out[rows, own, 1] = s * given[:, 0] + c * given[:, 1]
+        out[rows, own, 2] = given[:, 2]
+        return out
+
+    def strongest(self, body: str) -> tuple[float, float]:
+        """The largest force (N) and torque (N m) on a body."""
+        own = [action for action in self.actions if action.body == body]
+        force = max((math.hypot(*action.force) for action in own), default=0.0)
+        return force, max((abs(action.torque) for action in own), default=0.0)

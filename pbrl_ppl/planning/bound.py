@@ -1,0 +1,173 @@
+"""How long it takes to the goal at least: the heuristic of A*."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, map_coordinates
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from pbrl_ppl.physics import overlap
+from pbrl_ppl.planning.actions import ActionSet
+from pbrl_ppl.planning.dynamics import Dynamics
+from pbrl_ppl.planning.goals import Goal, Target
+from pbrl_ppl.scene import Body, Scene, Shape
+
+Array = NDArray[np.float64]
+
+#: Cells of the grid on which distances around walls are found, along its longer side; and room
+#: beyond what is known of the scene, for one can go around the end of a wall (m).
+_CELLS, _ROOM = 160, 2.0
+#: Moves on the grid: to neighbours, and as a knight does, which cuts the error of eight directions.
+_MOVES = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
+
+
+class TimeToGo:
+    """Least time to the goal, for pushes as strong as the action set has them.
+
+    A body that is pushed covers a distance no faster than its own speed and the strongest push,
+    without friction, allow. Distances go around walls and static bodies on a grid. That is
+    admissible for pushed bodies as far as the grid is fine enough, but not for a body that is
+    moved by others, which may hit harder than they are pushed, and not where an effect drives
+    bodies.
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Masses.
+    goal : Goal
+        Targets.
+    actions : ActionSet
+        Strongest pushes.
+    start : ndarray
+        Shape (body, 6); the grid covers it.
+    """
+
+    def __init__(self, dynamics: Dynamics, goal: Goal, actions: ActionSet, start: Array) -> None:
+        scene = dynamics.scene
+        self.goal, self.scene = goal, scene
+        anyone = max(actions.strongest(body.name)[0] for body in scene.dynamic)
+        names = [body.name for body in scene.dynamic]
+        self._own = [names.index(t.body) for t in goal.targets]
+        self._fields, self._push, self._turn = [], [], []
+        for target, i in zip(goal.targets, self._own, strict=True):
+            force, torque = actions.strongest(target.body)
+            body, mass = scene.body(target.body), dynamics.mass(target.body)
+            force = force or anyone
+            self._push.append(force / mass + np.hypot(*scene.gravity))
+            # a wheel or a contact at the rim turns the body as hard as it is pushed
+            lever = body.shape.bounding_radius
+            self._turn.append((torque + force * lever) / (mass * body.shape.unit_moment))
+            self._fields.append(_distances(scene, body, target, start[i]))
+
+    def __call__(self, states: Array) -> Array:
+        """Seconds, shape (draw, n), from states of shape (draw, n, body, 6)."""
+        offset = self.goal.errors(self.scene, states)
+        least = np.zeros(states.shape[:2])
+        for j, (target, i) in enumerate(zip(self.goal.targets, self._own, strict=True)):
+            body = states[:, :, i]
+            push, turn = self._push[j][:, None], self._turn[j][:, None]
+            far = np.hypot(offset[..., j, 0], offset[..., j, 1])
+            towards = -(offset[..., j, :2] * body[..., 3:5]).sum(axis=-1) / np.maximum(far, 1e-9)
+            time = _time(far - target.tolerance, towards, push)
+            if self._fields[j] is not None:
+                around = self._fields[j](body[..., :2]) - target.tolerance
+                time = np.maximum(time, _time(around, np.hypot(body[..., 3], body[..., 4]), push))
+            angle = offset[..., j, 2]
+            towards = -np.sign(angle) * body[..., 5]
+            # either way round
+            turned = np.minimum(
+                _time(abs(angle) - target.angle_tolerance, towards, turn),
+                _time(2 * np.pi - abs(angle) - target.angle_tolerance, -towards, turn),
+            )
+            least = np.maximum(least, np.maximum(time, turned))
+        return least
+
+
+def _time(way: Array, speed: Array, push: Array) -> Array:
+    """Least time for a way at a speed and a largest acceleration; 0 for none."""
+    way = np.maximum(way, 0.0)
+    # without a push, at constant speed
+    push = np.maximum(push, 1e-6)
+    return np.asarray(np.where(way > 0, np.sqrt(speed**2 + 2 * push * way) - speed, 0.0) / push)
+
+
+class _Field:
+    """Distance to a target around obstacles, between the centres of a grid's cells."""
+
+    def __init__(self, values: Array, origin: Array, cell: float) -> None:
+        self.values, self.origin, self.cell = values, origin, cell
+
+    def __call__(self, places: Array) -> Array:
+        at = (places - self.origin) / self.cell
+        return np.asarray(
+            map_coordinates(self.values, np.moveaxis(at, -1, 0), order=1, mode="nearest")
+        )
+
+
+def _distances(scene: Scene, body: Body, target: Target, start: Array) -> _Field | None:
+    """Distances of a body's origin from its target around what does not move, if anything does."""
+    static = tuple(each for each in scene.bodies if each.static)
+    if (not scene.walls and not static) or target.x is None or target.y is None:
+        return None
+    points = np.array([start[:2], [target.x, target.y]])
+    if scene.extent is not None:
+        corners = np.reshape(scene.extent, (2, 2)).T
+        points = np.vstack([points, corners])
+    low, high = points.min(axis=0) - _ROOM, points.max(axis=0) + _ROOM
+    cell = float((high - low).max()) / _CELLS
+    shape = np.ceil((high - low) / cell).astype(int) + 1
+    centres = low + cell * np.stack(np.indices(shape), axis=-1).reshape(-1, 2)
+    # a circle that fits into the body wherever it turns, about its origin
+    probe = Body("probe", Shape.circle(max(_inner(body.shape), 0.5 * cell)))
+    alone = scene.replace(bodies=(probe, *static), joints=())
+    poses = np.concatenate([centres, np.zeros((len(centres), 1))], axis=1)[:, None]
+    free = (overlap(alone, poses) <= 0).reshape(shape)
+    last = tuple(((points[1] - low) / cell).round().astype(int))
+    free[last] = True
+    steps = dijkstra(_graph(free), directed=False, indices=np.ravel_multi_index(last, shape))
+    values = cell * steps.reshape(shape)
+    # eight directions and the knight's moves overestimate a straight line by 2.8 % at most
+    values = values / 1.028
+    # inside obstacles, where the body's rim may be, the distance is the nearest free cell's
+    reached = np.isfinite(values)
+    if not reached.all():
+        nearest = distance_transform_edt(~reached, return_distances=False, return_indices=True)
+        values = values[tuple(nearest)]
+    return _Field(values, low, cell)
+
+
+def _graph(free: NDArray[np.bool_]) -> coo_array:
+    """Moves between free cells; a knight's passes two others."""
+    number = np.arange(free.size).reshape(free.shape)
+    rows, columns, lengths = [], [], []
+    for dx, dy in _MOVES:
+        between = {
+            (round(dx * t), round(dy * t)) for t in np.linspace(0, 1, 2 * max(dx, abs(dy)) + 1)
+        }
+        size_x, size_y = free.shape[0] - dx, free.shape[1] - abs(dy)
+        from_y = max(-dy, 0)
+
+        def shifted(x: int, y: int, size=(size_x, size_y), from_y: int = from_y) -> tuple:
+            return slice(x, x + size[0]), slice(from_y + y, from_y + y + size[1])
+
+        possible = np.logical_and.reduce([free[shifted(x, y)] for x, y in between])
+        rows.append(number[shifted(0, 0)][possible])
+        columns.append(number[shifted(dx, dy)][possible])
+        lengths.append(np.full(int(possible.sum()), np.hypot(dx, dy)))
+    data = np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))
+    return coo_array(data, shape=(free.size, free.size)).tocsr()
+
+
+def _inner(shape: Shape) -> float:
+    """Radius of a circle about the origin that fits into the shape; 0 if the origin is outside."""
+    if shape.kind == "circle":
+        return float(shape.radius or 0.0)
+    corners = np.array(shape.outline)
+    after = np.roll(corners, -1, axis=0)
+    edge, arm = after - corners, -corners
+    share = np.clip((arm * edge).sum(1) / (edge**2).sum(1), 0, 1)
+    if (edge[:, 0] * arm[:, 1] - edge[:, 1] * arm[:, 0] < 0).any():
+        return 0.0
+    return float(np.hypot(*(arm - share[:, None] * edge).T).min())

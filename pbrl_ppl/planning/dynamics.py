@@ -1,0 +1,195 @@
+"""The transition model of a plan: Eq. 7 or 13 at posterior draws, each with its own states."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.effects import Attached, Effect, attach, catalogue
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.history import STATE
+from pbrl_ppl.likelihood import next_state_random
+from pbrl_ppl.modes import prior_residual
+from pbrl_ppl.physics import Simulator
+from pbrl_ppl.posterior import group
+from pbrl_ppl.prior import build_layout
+from pbrl_ppl.record import parameter_draws, problem_of
+from pbrl_ppl.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+class Dynamics:
+    """How bodies move under each of some parameter draws.
+
+    All moving bodies are in one world, whether or not they met in the data: a plan may push one
+    into another.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry.
+    phi : ndarray
+        Parameter draws in the layout's order, shape (draw, p).
+    effects : iterable of Effect or Attached
+        Effects beside those that the scene declares.
+    noise : tuple of ndarray, int and float, optional
+        Sigma (draw, state), the columns it is of, and the degrees of freedom or None: then
+        :meth:`noisy` works.
+    substeps, threads : int
+        Of the engine.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        phi: Array,
+        effects: Iterable[Effect | Attached] = (),
+        *,
+        noise: tuple[Array, tuple[int, ...], float | None] | None = None,
+        substeps: int | None = None,
+        threads: int = 2,
+    ) -> None:
+        attached = attach(scene, effects)
+        self.scene, self.layout, self._noise = scene, build_layout(scene, attached), noise
+        self.phi = np.atleast_2d(np.asarray(phi, dtype=float))
+        self._engine = Simulator(scene, self.layout, attached, substeps=substeps, threads=threads)
+
+    @classmethod
+    def known(
+        cls, scene: Scene, parameters: Mapping[str, object], effects: Any = (), **options: Any
+    ) -> Dynamics:
+        """Of parameters by name, as of :class:`pbrl_ppl.Transition`: the true model, say."""
+        layout = build_layout(scene, attach(scene, effects))
+        return cls(scene, layout.to_vector(parameters), effects, **options)
+
+    @classmethod
+    def of(
+        cls,
+        idata: Any,
+        draws: int | None = None,
+        *,
+        seed: int = 0,
+        effects: Iterable[Effect] = catalogue,
+        threads: int = 2,
+    ) -> Dynamics:
+        """Of a posterior.
+
+        Parameters
+        ----------
+        idata : InferenceData or DataTree
+            As made by :func:`pbrl_ppl.fit`, or loaded.
+        draws : int, optional
+            Chosen at random without replacement; without it, the single one of highest posterior
+            density (MAP).
+        seed : int
+            Of the choice.
+        effects : iterable of Effect
+            Where the names of its effects are looked up.
+        threads : int
+            Engine worlds side by side; the plan does not depend on it.
+
+        Raises
+        ------
+        PosteriorError
+            If it holds fewer draws.
+        """
+        problem = problem_of(idata, effects)
+        phi, sigma = parameter_draws(problem, idata)
+        if draws is None:
+            density = group(idata, "log_likelihood")["next_state"].sum("transition").values.ravel()
+            density = density - 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum(axis=-1)
+            chosen = np.array([np.argmax(density)])
+        elif not 1 <= draws <= len(phi):
+            raise PosteriorError(
+                f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}"
+            )
+        else:
+            chosen = np.random.default_rng(seed).choice(len(phi), draws, replace=False)
+        return cls(
+            problem.scene,
+            phi[chosen],
+            problem.effects,
+            noise=(sigma[chosen], problem.observations.columns, problem.nu),
+            substeps=problem.substeps,
+            threads=threads,
+        )
+
+    @property
+    def draws(self) -> int:
+        """How many."""
+        return len(self.phi)
+
+    def mass(self, body: str) -> Array:
+        """A body's mass under each draw, shape (draw,), kg."""
+        known = dict(self.scene.body(body).known)
+        if "mass" in known:
+            return np.full(self.draws, float(known["mass"]))
+        return self.phi[:, self.layout.index("mass", body)]
+
+    def step(self, states: Array, wrenches: Array) -> Array:
+        """States after one sampling interval.
+
+        Parameters
+        ----------
+        states : ndarray
+            Shape (draw, n, body, 6), SI units.
+        wrenches : ndarray
+            Shape (n, body, 3), world frame, N and N m; the same under each draw.
+
+        Returns
+        -------
+        ndarray
+            Shape (draw, n, body, 6); NaN where the engine diverged.
+        """
+        actions = wrenches[:, None]
+        # what had diverged stays so; the engine refuses it
+        lost = ~np.isfinite(states).all(axis=(-2, -1))
+        given = np.where(lost[..., None, None], 0.0, states) if lost.any() else states
+        out = np.stack(
+            [self._engine(p, s, actions)[:, 0] for p, s in zip(self.phi, given, strict=True)]
+        )
+        out[lost] = np.nan
+        return out
+
+    def noisy(self, states: Array, rng: np.random.Generator) -> Array:
+        """Add Eq. 13's noise to states of shape (draw, n, body, 6).
+
+        Raises
+        ------
+        PosteriorError
+            If the dynamics are known, and so without noise.
+        """
+        if self._noise is None:
+            raise PosteriorError("noise: these parameters are known, and have no sigma; leave it")
+        sigma, columns, nu = self._noise
+        out = states.copy()
+        for i, each in enumerate(sigma):
+            out[i][..., columns] = next_state_random(
+                states[i][..., columns], each, None, rng, nu=nu
+            )
+        return out
+
+    def rollout(self, start: Array, wrenches: Array, rng: np.random.Generator | None = None) -> Array:
+        """Play wrenches (time, body, 3) from a state (body, 6): shape (draw, time + 1, body, 6).
+
+        With a generator, Eq. 13's noise is added after each interval.
+        """
+        states = np.broadcast_to(start, (self.draws, 1, *start.shape))
+        every = [states]
+        for wrench in wrenches:
+            states = self.step(states, wrench[None])
+            if rng is not None:
+                states = self.noisy(states, rng)
+            every.append(states)
+        return np.concatenate(every, axis=1)
+
+
+def check_start(scene: Scene, start: Array) -> None:
+    """Refuse a start state of the wrong shape or with values that are missing."""
+    k = len(scene.dynamic)
+    if start.shape != (k, len(STATE)) or not np.isfinite(start).all():
+        raise PosteriorError(f"start: got shape {start.shape}, expected finite ({k}, {len(STATE)})")

@@ -1,0 +1,238 @@
+"""Goals: where bodies should be, how nearly, and whether they may touch anything on the way."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import GoalError
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene_checks import nearest
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Target:
+    """Where one body should be; a coordinate that is None is free.
+
+    Attributes
+    ----------
+    body : str
+        A moving body of the scene.
+    x, y, theta : float, optional
+        m, m, rad.
+    weight : float
+        In the L2 distance, beside other bodies.
+    tolerance, angle_tolerance : float
+        How far off is still there (m, rad).
+    speed : float, optional
+        The most it may move there, its rim included (m/s); any speed by default.
+
+    Raises
+    ------
+    GoalError
+        If a number is not finite, a weight or tolerance not positive, or nothing is asked for.
+    """
+
+    body: str
+    x: float | None = None
+    y: float | None = None
+    theta: float | None = None
+    weight: float = 1.0
+    tolerance: float = 0.1
+    angle_tolerance: float = 0.1
+    speed: float | None = None
+
+    def __post_init__(self) -> None:
+        for each in fields(self)[1:]:
+            value = getattr(self, each.name)
+            if value is None and each.default is None:
+                continue
+            if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+                raise GoalError(f"goal of {self.body}: {each.name} is {value!r}, expected a number")
+            positive = each.name not in ("x", "y", "theta")
+            if not math.isfinite(value) or (positive and value <= 0):
+                what = "a positive number" if positive else "a finite number"
+                raise GoalError(f"goal of {self.body}: {each.name} is {value}, expected {what}")
+        if self.x is None and self.y is None and self.theta is None:
+            raise GoalError(f"goal of {self.body}: x, y and theta are all free; give one")
+
+
+@dataclass(frozen=True)
+class Goal:
+    """What a plan is for.
+
+    Attributes
+    ----------
+    targets : tuple of Target
+        One or more bodies, each once.
+    contact_penalty : float
+        What a second in contact costs, beside the second itself; infinite if nothing may touch.
+        Contacts are looked for at the ends of the sampling intervals.
+
+    Raises
+    ------
+    GoalError
+        If there is no target, a body has two, or the penalty is negative.
+
+    Examples
+    --------
+    >>> goal = Goal.of({"cart": (3.0, 1.0, None)})  # any heading
+    >>> goal.targets[0].tolerance
+    0.1
+    """
+
+    targets: tuple[Target, ...]
+    contact_penalty: float = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "targets", tuple(self.targets))
+        if not self.targets:
+            raise GoalError("goal: it has no target; say where a body should be")
+        names = [target.body for target in self.targets]
+        for name in names:
+            if names.count(name) > 1:
+                raise GoalError(f"goal: {name} has {names.count(name)} targets; keep one")
+        if not self.contact_penalty >= 0:
+            raise GoalError(f"goal: contact_penalty is {self.contact_penalty}, expected 0 or more")
+
+    @classmethod
+    def of(cls, targets: Mapping[str, Sequence[float | None]], **options: float) -> Goal:
+        """Goal from poses by body name: ``{"cart": (x, y, theta)}``, None where free.
+
+        Parameters
+        ----------
+        targets : mapping
+            Pose of each body, m and rad.
+        **options
+            ``contact_penalty`` is the goal's, all others are every target's.
+
+        Raises
+        ------
+        GoalError
+            If a pose has not three values, or an option is unknown.
+        """
+        penalty = {k: options.pop(k) for k in ("contact_penalty",) if k in options}
+        known = [each.name for each in fields(Target)][4:]
+        for name in options:
+            if name not in known:
+                raise GoalError(f'goal: unknown option "{name}"{nearest(name, known)}')
+        for name, pose in targets.items():
+            if len(pose) != 3:
+                raise GoalError(f"goal of {name}: got {len(pose)} values, expected x, y, theta")
+        return cls(
+            tuple(Target(name, *pose, **options) for name, pose in targets.items()),  # type: ignore[misc]
+            **penalty,
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Goal:
+        """Read a TOML file: ``contact_penalty``, and a ``[[target]]`` for each body.
+
+        Raises
+        ------
+        GoalError
+            If it is missing, is not TOML, or has an unknown key.
+        """
+        table = read_toml(path, "goal", ("contact_penalty", "target"))
+        targets = []
+        for given in table.pop("target", []):
+            known = [each.name for each in fields(Target)]
+            check_keys(given, known, f"{path}: [[target]]")
+            if "body" not in given:
+                raise GoalError(f"{path}: a [[target]] has no body; name one")
+            targets.append(Target(**given))
+        return cls(tuple(targets), **table)
+
+    def check(self, scene: Scene) -> None:
+        """Refuse a goal for a body that the scene lacks, or that cannot move.
+
+        Raises
+        ------
+        GoalError
+            It names the body.
+        """
+        moving = [body.name for body in scene.dynamic]
+        for target in self.targets:
+            if target.body not in moving:
+                raise GoalError(
+                    f'goal: the scene has no moving body "{target.body}"'
+                    f"{nearest(target.body, moving)}"
+                )
+
+    def errors(self, scene: Scene, states: Array) -> Array:
+        """Offsets from the targets, 0 where free, shape (..., target, 3): m, m, rad.
+
+        Parameters
+        ----------
+        scene : Scene
+            Orders the bodies.
+        states : ndarray
+            Shape (..., body, 6).
+        """
+        poses = states[..., [_place(scene, t.body) for t in self.targets], :3]
+        wanted = np.array(
+            [[np.nan if v is None else v for v in (t.x, t.y, t.theta)] for t in self.targets]
+        )
+        offset = poses - wanted
+        offset[..., 2] = np.mod(offset[..., 2] + np.pi, 2 * np.pi) - np.pi
+        return np.where(np.isnan(wanted), 0.0, offset)
+
+    def distance(self, scene: Scene, states: Array) -> Array:
+        """Weighted L2 distance from the targets (m), angles at the bodies' rims, shape (...)."""
+        lever = np.array([scene.body(t.body).shape.bounding_radius for t in self.targets])
+        weight = np.array([t.weight for t in self.targets])
+        offset = self.errors(scene, states)
+        offset[..., 2] *= lever
+        return np.asarray(np.sqrt((weight[:, None] * offset**2).sum(axis=(-2, -1))))
+
+    def shortfall(self, scene: Scene, states: Array) -> Array:
+        """How far off in units of the tolerances, of the worst target; at most 1 is there."""
+        offset = self.errors(scene, states)
+        worst = np.zeros(offset.shape[:-2])
+        for i, t in enumerate(self.targets):
+            far = np.hypot(offset[..., i, 0], offset[..., i, 1]) / t.tolerance
+            worst = np.maximum(worst, np.maximum(far, abs(offset[..., i, 2]) / t.angle_tolerance))
+            if t.speed is not None:
+                body = states[..., _place(scene, t.body), :]
+                rim = scene.body(t.body).shape.bounding_radius * abs(body[..., 5])
+                worst = np.maximum(worst, (np.hypot(body[..., 3], body[..., 4]) + rim) / t.speed)
+        return worst
+
+
+def _place(scene: Scene, name: str) -> int:
+    return [body.name for body in scene.dynamic].index(name)
+
+
+def read_toml(path: str | Path, what: str, known: Iterable[str]) -> dict[str, Any]:
+    """Read a TOML file with these keys at most.
+
+    Raises
+    ------
+    GoalError
+        If it is missing, is not TOML, or has another key.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise GoalError(f"{what} {path}: there is no such file; check the path") from None
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise GoalError(f"{what} {path}: cannot be read as TOML: {error}") from None
+    check_keys(table, known, f"{what} {path}")
+    return table
+
+
+def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
+    """Refuse an unknown key, and name the nearest known one."""
+    known = list(known)
+    for key in table:
+        if key not in known:
+            raise GoalError(f'{where}: unknown key "{key}"{nearest(key, known)}')
