@@ -24,6 +24,11 @@ if TYPE_CHECKING:
     from pbrl_ppl.op import SimulatorOp
     from pbrl_ppl.parameters import Prior
     from pbrl_ppl.physics import Simulator
+    from pbrl_ppl.planning.acting import Acted, act
+    from pbrl_ppl.planning.actions import Action, ActionSet
+    from pbrl_ppl.planning.dynamics import Dynamics
+    from pbrl_ppl.planning.goals import Goal, Target
+    from pbrl_ppl.planning.plan import Plan, plan
     from pbrl_ppl.posterior import load_posterior, save_posterior
     from pbrl_ppl.prior_check import PriorCheck, prior_predictive_check
     from pbrl_ppl.ranks import Calibration
@@ -36,18 +41,24 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 __all__ = [
+    "Acted",
+    "Action",
+    "ActionSet",
     "Attached",
     "Body",
     "Calibration",
+    "Dynamics",
     "Effect",
     "EffectParameter",
     "Findings",
+    "Goal",
     "History",
     "Identifiability",
     "Joint",
     "Loop",
     "Modes",
     "PbrlError",
+    "Plan",
     "Prior",
     "PriorCheck",
     "Scene",
@@ -55,8 +66,10 @@ __all__ = [
     "Shape",
     "Simulator",
     "SimulatorOp",
+    "Target",
     "Transition",
     "Wall",
+    "act",
     "calibrate",
     "catalogue",
     "close_loop",
@@ -67,6 +80,7 @@ __all__ = [
     "load_posterior",
     "mode_probabilities",
     "physics_model",
+    "plan",
     "prior_predictive_check",
     "save_posterior",
     "uninformed",
@@ -90,6 +104,11 @@ _MODULES = {
     "op": ("SimulatorOp",),
     "parameters": ("Prior",),
     "physics": ("Simulator",),
+    "planning.acting": ("Acted", "act"),
+    "planning.actions": ("Action", "ActionSet"),
+    "planning.dynamics": ("Dynamics",),
+    "planning.goals": ("Goal", "Target"),
+    "planning.plan": ("Plan", "plan"),
     "posterior": ("load_posterior", "save_posterior"),
     "prior_check": ("PriorCheck", "prior_predictive_check"),
     "ranks": ("Calibration",),

@@ -106,7 +106,7 @@ class ActionSet:
         if not self.durations:
             raise GoalError("actions: there is no duration; give one (s)")
         for value in self.durations:
-            if isinstance(value, bool) or not isinstance(value, int | float) or not 0 < value:
+            if isinstance(value, bool) or not isinstance(value, int | float) or not value > 0:
                 raise GoalError(f"actions: a duration is {value!r}, expected a positive number (s)")
 
     @classmethod

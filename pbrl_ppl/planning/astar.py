@@ -5,98 +5,30 @@ from __future__ import annotations
 import heapq
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics import overlap
+from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.bound import TimeToGo
+from pbrl_ppl.planning.contact import contact_cost
 from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.goals import Goal
+from pbrl_ppl.planning.risk import tail_mean
+from pbrl_ppl.planning.search import Found
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
 
-#: Nodes expanded in one engine call, and cells of the closed set: m, rad, m/s, rad/s at one metre
-#: from the goal, in proportion to the distance between these limits.
+#: Nodes expanded in one engine call.
 _BATCH = 32
+#: Cells of the closed set one metre from the goal (m, m, rad, m/s, m/s, rad/s); further away and
+#: nearer they grow and shrink in proportion, between these limits (m).
 _CELLS = np.array([0.4, 0.4, 0.5, 0.8, 0.8, 1.0])
 _NEAR, _FAR = 0.25, 2.0
-#: Shapes this near touch (m): the engine lets bodies that rest on each other sink in a little.
-_TOUCH = 0.005
 #: Seconds between reports of progress.
 _REPORT = 0.5
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """What a search came to.
-
-    Attributes
-    ----------
-    wrenches : ndarray
-        World frame, one an interval, shape (time, body, 3), N and N m.
-    reached : bool
-        Whether the goal is reached, by the model.
-    stopped : str
-        ``goal``, ``nodes``, ``time``, ``exhausted`` or ``interrupted``.
-    nodes : int
-        States that were generated.
-    seconds : float
-        How long it took.
-    """
-
-    wrenches: Array
-    reached: bool
-    stopped: str
-    nodes: int
-    seconds: float
-
-
-def tail_mean(values: Array, tail: float) -> Array:
-    """Mean of the worst share ``tail`` of values over the first axis; 1 is the expectation."""
-    n = len(values)
-    worst = max(1, int(np.ceil(tail * n - 1e-9)))
-    if worst == n:
-        return np.asarray(values.mean(axis=0))
-    return np.asarray(np.partition(values, n - worst, axis=0)[n - worst :].mean(axis=0))
-
-
-class _Tree:
-    """States, parents, actions and costs of all nodes, in arrays that grow."""
-
-    def __init__(self, root: Array) -> None:
-        self.states = root[None]
-        self.parent = np.full(1, -1)
-        self.action = np.full(1, -1)
-        self.intervals = np.zeros(1, dtype=int)
-        self.cost = np.zeros(1)
-        self.n = 1
-
-    def add(
-        self, states: Array, parent: Array, action: Array, intervals: Array, cost: Array
-    ) -> range:
-        first, self.n = self.n, self.n + len(states)
-        for name, new in (
-            ("states", states), ("parent", parent), ("action", action),
-            ("intervals", intervals), ("cost", cost),
-        ):  # fmt: skip
-            old = getattr(self, name)
-            if len(old) < self.n:
-                room = np.empty((2 * self.n, *old.shape[1:]), old.dtype)
-                room[:first] = old[:first]
-                setattr(self, name, old := room)
-            old[first : self.n] = new
-        return range(first, self.n)
-
-    def path(self, node: int) -> list[tuple[int, int]]:
-        """Actions and intervals from the root to a node."""
-        steps = []
-        while self.parent[node] >= 0:
-            steps.append((int(self.action[node]), int(self.intervals[node])))
-            node = int(self.parent[node])
-        return steps[::-1]
 
 
 def astar(
@@ -107,9 +39,10 @@ def astar(
     *,
     tail: float = 1.0,
     weight: float = 3.0,
-    nodes: int = 1_000_000,
+    nodes: int = 5_000_000,
     seconds: float = 60.0,
     improve: bool = False,
+    noise: bool = False,
     rng: np.random.Generator | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> Found:
@@ -128,17 +61,20 @@ def astar(
     goal, actions
         As of :func:`pbrl_ppl.plan`.
     tail : float
-        The goal is reached where the mean of the worst share of draws is within the tolerances: 1
-        for the expectation, less for conditional value at risk.
+        The goal is reached where the mean shortfall of the worst share of draws is within the
+        tolerances: 1 for the expectation, less for conditional value at risk.
     weight : float
-        Of the heuristic; 1 is A*, more is quicker and costs at most so many times the least, as
-        far as the heuristic is admissible (see :class:`TimeToGo`).
+        Of the heuristic: 1 is A*; more is quicker, and as far as the heuristic is admissible and
+        cells hold one state, the plan costs at most so many times the least. See
+        :class:`pbrl_ppl.planning.bound.TimeToGo` for where it is.
     nodes, seconds : int, float
         Where to stop.
     improve : bool
         Whether to go on for a cheaper plan until a limit, or until there is none.
+    noise : bool
+        Whether Eq. 13's noise is added to every transition.
     rng : Generator, optional
-        Adds Eq. 13's noise to every transition.
+        Of the noise.
     progress : callable, optional
         Told how far the search is.
 
@@ -146,133 +82,175 @@ def astar(
     -------
     Found
         If the goal is not reached, the plan that ends nearest to it in L2 distance.
+
+    Raises
+    ------
+    GoalError
+        If the weight is below 1, or ``nodes`` below 1.
     """
-    scene = dynamics.scene
+    if weight < 1 or nodes < 1:
+        raise GoalError(f"A*: weight is {weight} and nodes {nodes}, expected at least 1 of each")
+    search = _Search(dynamics, start, goal, actions, tail, weight)
+    search.rng = (rng or np.random.default_rng(0)) if noise else None
     begin = told = time.monotonic()
-    tree = _Tree(np.repeat(start[None], dynamics.draws, axis=0))
-    to_go = TimeToGo(dynamics, goal, actions, start)
-    root = tree.states.transpose(1, 0, 2, 3)[:, :1] if False else tree.states[0][:, None]
-    best_distance = float(tail_mean(goal.distance(scene, root), tail)[0])
-    best, nearest, best_cost = None, ((0, 0)), np.inf
-    counts = actions.intervals(scene)
-    n_actions = len(actions.actions)
-    closed: dict[bytes, float] = {}
-    queue: list[tuple[float, int]] = [(0.0, 0)]
-    near_node: tuple[int, int, int] = (0, -1, 0)  # node, action, intervals
     stopped = "exhausted"
-    if float(tail_mean(goal.shortfall(scene, root), tail)[0]) <= 1.0:
-        return Found(np.zeros((0, len(start), 3)), True, "goal", 1, time.monotonic() - begin)
-    generated = 1
     try:
-        while queue:
-            if best is not None and not improve:
-                stopped = "goal"
-                break
-            if generated >= nodes:
-                stopped = "nodes"
-                break
+        while search.queue:
             now = time.monotonic()
-            if now - begin > seconds:
-                stopped = "time"
+            if search.best and not improve:
                 break
+            if search.generated >= nodes or now - begin > seconds:
+                stopped = "nodes" if search.generated >= nodes else "time"
+                break
+            search.expand()
             if progress is not None and now - told > _REPORT:
-                progress(f"{generated} states, nearest {best_distance:.2f} m from the goal")
                 told = now
-            batch = []
-            while queue and len(batch) < _BATCH:
-                priority, node = heapq.heappop(queue)
-                batch.append(node)
-            parents = np.repeat(batch, n_actions)
-            which = np.tile(np.arange(n_actions), len(batch))
-            states = np.moveaxis(tree.states[parents], 0, 1)
-            cost = tree.cost[parents]
-            for interval in range(1, counts[-1] + 1):
-                heading = _mean_angle(states[..., 2])
-                states = dynamics.step(states, actions.wrenches(scene, which, heading))
-                if rng is not None:
-                    states = dynamics.noisy(states, rng)
-                generated += len(parents)
-                cost = cost + scene.time_step
-                if goal.contact_penalty:
-                    cost = cost + scene.time_step * _contact(goal, dynamics, states)
-                there = tail_mean(goal.shortfall(scene, states), tail) <= 1.0
-                there &= cost < best_cost
-                if there.any():
-                    row = int(np.flatnonzero(there)[np.argmin(cost[there])])
-                    best_cost = float(cost[row])
-                    best = (int(parents[row]), int(which[row]), interval)
-                far = tail_mean(goal.distance(scene, states), tail)
-                far = np.where(np.isfinite(far) & np.isfinite(cost), far, np.inf)
-                row = int(np.argmin(far))
-                if far[row] < best_distance:
-                    best_distance = float(far[row])
-                    near_node = (int(parents[row]), int(which[row]), interval)
-                if interval not in counts:
-                    continue
-                ahead = tail_mean(to_go(states), tail)
-                total = cost + ahead
-                keep = np.isfinite(total) & (total < best_cost)
-                keys = _cells(states, far)
-                chosen = []
-                for row in np.flatnonzero(keep):
-                    key = keys[row].tobytes()
-                    if cost[row] < closed.get(key, np.inf) - 1e-9:
-                        closed[key] = cost[row]
-                        chosen.append(row)
-                if not chosen:
-                    continue
-                rows = np.array(chosen)
-                added = tree.add(
-                    np.moveaxis(states[:, rows], 1, 0), parents[rows], which[rows],
-                    np.full(len(rows), interval), cost[rows],
-                )  # fmt: skip
-                for node, priority in zip(added, cost[rows] + weight * ahead[rows], strict=True):
-                    heapq.heappush(queue, (float(priority), node))
+                progress(
+                    f"{search.generated} states, nearest to the goal {search.least_distance:.2f} m"
+                )
     except KeyboardInterrupt:
         stopped = "interrupted"
-    if best is not None and stopped == "exhausted":
+    reached = search.best is not None
+    if reached and stopped == "exhausted":
         stopped = "goal"
-    last = best or near_node
-    steps = [*tree.path(last[0]), *([last[1:]] if last[2] else [])]
-    wrenches = _played(dynamics, start, actions, steps)
-    return Found(wrenches, best is not None, stopped, generated, time.monotonic() - begin)
+    steps = search.path(search.best or search.nearest)
+    wrenches = played(dynamics, start, actions, steps)
+    return Found(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
 
 
-def _contact(goal: Goal, dynamics: Dynamics, states: Array) -> Array:
-    """Penalty of a second in contact, as a mean over the draws, shape (n,)."""
-    poses = states[..., :3].reshape(-1, *states.shape[2:3], 3)
-    touch = overlap(dynamics.scene, np.nan_to_num(poses)) > -_TOUCH
-    share = touch.reshape(states.shape[:2]).mean(axis=0)
-    return np.where(share > 0, goal.contact_penalty * np.maximum(share, 1e-300), 0.0)
+#: An edge of the tree: the node it starts from, the action, and for how many intervals.
+Edge = tuple[int, int, int]
 
 
-def _mean_angle(angle: Array) -> Array:
-    """Mean direction over the first axis."""
+class _Search:
+    """The tree, what is open and what is closed."""
+
+    def __init__(
+        self,
+        dynamics: Dynamics,
+        start: Array,
+        goal: Goal,
+        actions: ActionSet,
+        tail: float,
+        weight: float,
+    ) -> None:
+        self.dynamics, self.goal, self.actions = dynamics, goal, actions
+        self.tail, self.weight, self.scene = tail, weight, dynamics.scene
+        self.rng: np.random.Generator | None = None
+        self.counts = actions.intervals(self.scene)
+        self.to_go = TimeToGo(dynamics, goal, actions, start)
+        # the tree; it has room for more nodes than there are
+        self.states = np.repeat(start[None], dynamics.draws, axis=0)[None]
+        self.cost = np.zeros(1)
+        self.edges = np.array([[-1, -1, 0]])
+        self.size = self.generated = 1
+        self.queue: list[tuple[float, int]] = [(0.0, 0)]
+        self.closed: dict[bytes, float] = {}
+        # what was found
+        self.best: Edge | None = None
+        self.least_cost = np.inf
+        self.nearest: Edge = (0, -1, 0)
+        self.least_distance = np.inf
+        root = np.moveaxis(self.states, 0, 1)
+        self._look(root, np.zeros(1), np.zeros(1, int), np.zeros(1, int), 0)
+
+    def expand(self) -> None:
+        """Take the most promising nodes, and try all actions at each, in one engine call each."""
+        batch = [heapq.heappop(self.queue)[1] for _ in range(min(_BATCH, len(self.queue)))]
+        count = len(self.actions.actions)
+        parents = np.repeat(batch, count)
+        which = np.tile(np.arange(count), len(batch))
+        states = np.moveaxis(self.states[parents], 0, 1)
+        cost = self.cost[parents]
+        for interval in range(1, self.counts[-1] + 1):
+            wrenches = self.actions.wrenches(self.scene, which, mean_angle(states[..., 2]))
+            states = self.dynamics.step(states, wrenches)
+            if self.rng is not None:
+                states = self.dynamics.noisy(states, self.rng)
+            self.generated += len(parents)
+            cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
+            far = self._look(states, cost, parents, which, interval)
+            if interval in self.counts:
+                self._add(states, cost, far, parents, which, interval)
+
+    def _look(self, states: Array, cost: Array, parents: Ints, which: Ints, interval: int) -> Array:
+        """Note what reaches the goal, or comes nearer than anything before; L2 distances."""
+        possible = np.isfinite(states).all(axis=(0, 2, 3)) & np.isfinite(cost)
+        there = tail_mean(self.goal.shortfall(self.scene, states), self.tail) <= 1.0
+        there &= possible & (cost < self.least_cost)
+        far = tail_mean(self.goal.distance(self.scene, states), self.tail)
+        far = np.where(possible, far, np.inf)
+
+        def edge(row: int) -> Edge:
+            return int(parents.flat[row]), int(which.flat[row]), interval
+
+        if there.any():
+            row = int(np.argmin(np.where(there, cost, np.inf)))
+            self.best, self.least_cost = edge(row), float(cost[row])
+        row = int(np.argmin(far))
+        if far[row] < self.least_distance:
+            self.nearest, self.least_distance = edge(row), float(far[row])
+        return far
+
+    def _add(
+        self, states: Array, cost: Array, far: Array, parents: Ints, which: Ints, interval: int
+    ) -> None:
+        """Put on the tree what is in a new cell, or got there more cheaply."""
+        ahead = tail_mean(self.to_go(states), self.tail)
+        chosen = []
+        keys = self._cells(states, far)
+        for row in np.flatnonzero(np.isfinite(far) & (cost + ahead < self.least_cost)):
+            key = keys[row].tobytes()
+            if cost[row] < self.closed.get(key, np.inf):
+                self.closed[key] = cost[row]
+                chosen.append(row)
+        if not chosen:
+            return
+        first, self.size = self.size, self.size + len(chosen)
+        edges = np.stack([parents, which, np.full_like(parents, interval)], axis=1)
+        for name, new in (
+            ("states", np.moveaxis(states, 0, 1)), ("cost", cost), ("edges", edges)
+        ):  # fmt: skip
+            old = getattr(self, name)
+            if len(old) < self.size:
+                room = np.empty((2 * self.size, *old.shape[1:]), old.dtype)
+                room[:first] = old[:first]
+                setattr(self, name, old := room)
+            old[first : self.size] = new[chosen]
+        priority = (cost + self.weight * ahead)[chosen]
+        for node, value in enumerate(priority.tolist(), start=first):
+            heapq.heappush(self.queue, (value, node))
+
+    def _cells(self, states: Array, far: Array) -> NDArray[np.int32]:
+        """Cell of the closed set of each node, shape (n, number)."""
+        mean = np.nan_to_num(states.mean(axis=0))
+        mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))
+        level = np.floor(np.log2(np.clip(far, _NEAR, _FAR)))
+        cell = np.floor(mean / (_CELLS * 2.0 ** level[:, None, None])).reshape(len(mean), -1)
+        return np.concatenate([level[:, None], cell], axis=1).astype(np.int32)
+
+    def path(self, last: Edge) -> list[tuple[int, int]]:
+        """Actions and intervals from the root, to the end of an edge."""
+        steps, (node, action, intervals) = [], last
+        while intervals:
+            steps.append((action, intervals))
+            node, action, intervals = (int(each) for each in self.edges[node])
+        return steps[::-1]
+
+
+def mean_angle(angle: Array) -> Array:
+    """Mean direction over the first axis (rad)."""
     return np.asarray(np.arctan2(np.sin(angle).mean(axis=0), np.cos(angle).mean(axis=0)))
 
 
-def _cells(states: Array, far: Array) -> NDArray[np.int32]:
-    """Cell of the closed set of each node, shape (n, numbers)."""
-    mean = np.nan_to_num(states.mean(axis=0))
-    mean[..., 2] = _mean_angle(np.nan_to_num(states[..., 2]))
-    # powers of two, so that cells of one size meet
-    level = np.floor(np.log2(np.clip(np.nan_to_num(far, posinf=_FAR), _NEAR, _FAR)))
-    size = _CELLS * 2.0 ** level[:, None, None]
-    cell = np.floor(mean / size).reshape(len(mean), -1)
-    return np.concatenate([level[:, None], cell], axis=1).astype(np.int32)
-
-
-def _played(
+def played(
     dynamics: Dynamics, start: Array, actions: ActionSet, steps: list[tuple[int, int]]
 ) -> Array:
-    """World-frame wrenches of actions from the start, one an interval."""
-    states = np.repeat(start[None, None], dynamics.draws, axis=0)
-    wrenches = []
-    for action, intervals in steps:
-        for _ in range(intervals):
-            wrench = actions.wrenches(
-                dynamics.scene, np.array([action]), _mean_angle(states[..., 2])
-            )
-            states = dynamics.step(states, wrench)
-            wrenches.append(wrench[0])
-    return np.array(wrenches).reshape(-1, *start.shape[:1], 3)
+    """World-frame wrenches of actions from a start, one an interval, shape (time, body, 3)."""
+    scene, states = dynamics.scene, np.repeat(start[None, None], dynamics.draws, axis=0)
+    wrenches = np.zeros((sum(intervals for _, intervals in steps), len(start), 3))
+    each = [action for action, intervals in steps for _ in range(intervals)]
+    for i, action in enumerate(each):
+        wrenches[i] = actions.wrenches(scene, np.array([action]), mean_angle(states[..., 2]))[0]
+        states = dynamics.step(states, wrenches[i : i + 1])
+    return wrenches

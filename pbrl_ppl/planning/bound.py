@@ -71,8 +71,9 @@ class TimeToGo:
             far = np.hypot(offset[..., j, 0], offset[..., j, 1])
             towards = -(offset[..., j, :2] * body[..., 3:5]).sum(axis=-1) / np.maximum(far, 1e-9)
             time = _time(far - target.tolerance, towards, push)
-            if self._fields[j] is not None:
-                around = self._fields[j](body[..., :2]) - target.tolerance
+            field = self._fields[j]
+            if field is not None:
+                around = field(body[..., :2]) - target.tolerance
                 time = np.maximum(time, _time(around, np.hypot(body[..., 3], body[..., 4]), push))
             angle = offset[..., j, 2]
             towards = -np.sign(angle) * body[..., 5]
@@ -117,8 +118,8 @@ def _distances(scene: Scene, body: Body, target: Target, start: Array) -> _Field
         points = np.vstack([points, corners])
     low, high = points.min(axis=0) - _ROOM, points.max(axis=0) + _ROOM
     cell = float((high - low).max()) / _CELLS
-    shape = np.ceil((high - low) / cell).astype(int) + 1
-    centres = low + cell * np.stack(np.indices(shape), axis=-1).reshape(-1, 2)
+    shape = tuple(int(n) + 1 for n in np.ceil((high - low) / cell))
+    centres = low + cell * np.indices(shape).reshape(2, -1).T
     # a circle that fits into the body wherever it turns, about its origin
     probe = Body("probe", Shape.circle(max(_inner(body.shape), 0.5 * cell)))
     alone = scene.replace(bodies=(probe, *static), joints=())
@@ -146,18 +147,19 @@ def _graph(free: NDArray[np.bool_]) -> coo_array:
         between = {
             (round(dx * t), round(dy * t)) for t in np.linspace(0, 1, 2 * max(dx, abs(dy)) + 1)
         }
-        size_x, size_y = free.shape[0] - dx, free.shape[1] - abs(dy)
-        from_y = max(-dy, 0)
-
-        def shifted(x: int, y: int, size=(size_x, size_y), from_y: int = from_y) -> tuple:
-            return slice(x, x + size[0]), slice(from_y + y, from_y + y + size[1])
-
-        possible = np.logical_and.reduce([free[shifted(x, y)] for x, y in between])
-        rows.append(number[shifted(0, 0)][possible])
-        columns.append(number[shifted(dx, dy)][possible])
+        # cells from which the move stays on the grid
+        x, y = slice(0, free.shape[0] - dx), slice(max(-dy, 0), free.shape[1] - max(dy, 0))
+        passed = [free[_shift(x, i), _shift(y, j)] for i, j in between]
+        possible = np.logical_and.reduce(passed)
+        rows.append(number[x, y][possible])
+        columns.append(number[_shift(x, dx), _shift(y, dy)][possible])
         lengths.append(np.full(int(possible.sum()), np.hypot(dx, dy)))
     data = np.concatenate(lengths), (np.concatenate(rows), np.concatenate(columns))
     return coo_array(data, shape=(free.size, free.size)).tocsr()
+
+
+def _shift(span: slice, by: int) -> slice:
+    return slice(span.start + by, span.stop + by)
 
 
 def _inner(shape: Shape) -> float:

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.history import STATE
 from pbrl_ppl.likelihood import next_state_random
 from pbrl_ppl.modes import prior_residual
 from pbrl_ppl.physics import Simulator
@@ -147,7 +146,7 @@ class Dynamics:
         """
         actions = wrenches[:, None]
         # what had diverged stays so; the engine refuses it
-        lost = ~np.isfinite(states).all(axis=(-2, -1))
+        lost = np.asarray(~np.isfinite(states).all(axis=(-2, -1)))
         given = np.where(lost[..., None, None], 0.0, states) if lost.any() else states
         out = np.stack(
             [self._engine(p, s, actions)[:, 0] for p, s in zip(self.phi, given, strict=True)]
@@ -173,7 +172,9 @@ class Dynamics:
             )
         return out
 
-    def rollout(self, start: Array, wrenches: Array, rng: np.random.Generator | None = None) -> Array:
+    def rollout(
+        self, start: Array, wrenches: Array, rng: np.random.Generator | None = None
+    ) -> Array:
         """Play wrenches (time, body, 3) from a state (body, 6): shape (draw, time + 1, body, 6).
 
         With a generator, Eq. 13's noise is added after each interval.
@@ -186,10 +187,3 @@ class Dynamics:
                 states = self.noisy(states, rng)
             every.append(states)
         return np.concatenate(every, axis=1)
-
-
-def check_start(scene: Scene, start: Array) -> None:
-    """Refuse a start state of the wrong shape or with values that are missing."""
-    k = len(scene.dynamic)
-    if start.shape != (k, len(STATE)) or not np.isfinite(start).all():
-        raise PosteriorError(f"start: got shape {start.shape}, expected finite ({k}, {len(STATE)})")

@@ -128,10 +128,11 @@ class Goal:
         for name, pose in targets.items():
             if len(pose) != 3:
                 raise GoalError(f"goal of {name}: got {len(pose)} values, expected x, y, theta")
-        return cls(
-            tuple(Target(name, *pose, **options) for name, pose in targets.items()),  # type: ignore[misc]
-            **penalty,
+        each: Any = options
+        found = tuple(
+            Target(name, pose[0], pose[1], pose[2], **each) for name, pose in targets.items()
         )
+        return cls(found, **penalty)
 
     @classmethod
     def load(cls, path: str | Path) -> Goal:

@@ -1,0 +1,35 @@
+"""What a search for a plan comes to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a search came to.
+
+    Attributes
+    ----------
+    wrenches : ndarray
+        World frame, one an interval, shape (time, body, 3), N and N m.
+    reached : bool
+        Whether the goal is reached, by the model.
+    stopped : str
+        ``goal``, ``nodes``, ``time``, ``exhausted`` or ``interrupted``.
+    nodes : int
+        States that were generated.
+    seconds : float
+        How long it took.
+    """
+
+    wrenches: Array
+    reached: bool
+    stopped: str
+    nodes: int
+    seconds: float
