@@ -107,7 +107,8 @@ def act(
     scene = idata.scene if isinstance(idata, Dynamics) else scene_of(idata)
     goal = goal if isinstance(goal, Goal) else Goal.of(goal)
     goal.check(scene)
-    states, played, plans = [start_state(scene, start)], [], 0
+    states, plans = [start_state(scene, start)], 0
+    played: list[Array] = []
     while len(played) < intervals and not _there(scene, goal, states[-1]):
         ahead = plan(idata, states[-1], goal, actions, **options)
         plans += 1
