@@ -23,10 +23,12 @@ Ints = NDArray[np.int64]
 
 #: Nodes expanded in one engine call.
 _BATCH = 32
-#: Cells of the closed set one metre from the goal (m, m, rad, m/s, m/s, rad/s); further away and
-#: nearer they grow and shrink in proportion, between these limits (m).
-_CELLS = np.array([0.4, 0.4, 0.5, 0.8, 0.8, 1.0])
-_NEAR, _FAR = 0.25, 2.0
+#: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
+#: second; further away and nearer they grow and shrink in proportion, between these limits.
+_CELLS = np.array([4.0, 4.0, 5.0, 8.0, 8.0, 10.0])
+_TEN, _NEAR, _FAR = 10.0, 0.25, 2.0
+#: Times that the cells are halved where the search runs out of nodes.
+_REFINED = 8
 #: Seconds between reports of progress.
 _REPORT = 0.5
 
@@ -50,7 +52,8 @@ def astar(
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
     draws, to machine precision; of nodes in one cell of the closed set (the mean state, finer near
-    the goal) the cheapest is kept.
+    the goal, in proportion to its tolerance) the cheapest is kept. Where nothing is left to try,
+    the cells are halved and the search begins anew.
 
     Parameters
     ----------
@@ -93,12 +96,17 @@ def astar(
     search = _Search(dynamics, start, goal, actions, tail, weight)
     search.rng = (rng or np.random.default_rng(0)) if noise else None
     begin = told = time.monotonic()
-    stopped = "exhausted"
+    stopped, refined = "exhausted", 0
     try:
-        while search.queue:
-            now = time.monotonic()
-            if search.best and not improve:
+        while True:
+            if search.best and not (improve and search.queue):
                 break
+            if not search.queue:
+                if refined == _REFINED:
+                    break
+                refined += 1
+                search.begin(0.5**refined)
+            now = time.monotonic()
             if search.generated >= nodes or now - begin > seconds:
                 stopped = "nodes" if search.generated >= nodes else "time"
                 break
@@ -139,13 +147,22 @@ class _Search:
         self.rng: np.random.Generator | None = None
         self.counts = actions.intervals(self.scene)
         self.to_go = TimeToGo(dynamics, goal, actions, start)
+        self.root = np.repeat(start[None], dynamics.draws, axis=0)[None]
+        self.generated = 1
+        self.near = min(target.tolerance for target in goal.targets)
+        turn = min(target.angle_tolerance for target in goal.targets)
+        self.cells = _CELLS * np.array([self.near, self.near, turn] * 2)
+        self.begin(1.0)
+
+    def begin(self, fineness: float) -> None:
+        """Begin at the root, with cells of so much of their size."""
         # the tree; it has room for more nodes than there are
-        self.states = np.repeat(start[None], dynamics.draws, axis=0)[None]
-        self.cost = np.zeros(1)
+        self.states, self.cost = self.root.copy(), np.zeros(1)
         self.edges = np.array([[-1, -1, 0]])
-        self.size = self.generated = 1
+        self.size = 1
         self.queue: list[tuple[float, int]] = [(0.0, 0)]
         self.closed: dict[bytes, float] = {}
+        self.fineness = fineness
         # what was found
         self.best: Edge | None = None
         self.least_cost = np.inf
@@ -225,8 +242,9 @@ class _Search:
         """Cell of the closed set of each node, shape (n, number)."""
         mean = np.nan_to_num(states.mean(axis=0))
         mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))
-        level = np.floor(np.log2(np.clip(far, _NEAR, _FAR)))
-        cell = np.floor(mean / (_CELLS * 2.0 ** level[:, None, None])).reshape(len(mean), -1)
+        level = np.floor(np.log2(np.clip(far / (_TEN * self.near), _NEAR, _FAR)))
+        size = self.fineness * self.cells * 2.0 ** level[:, None, None]
+        cell = np.floor(mean / size).reshape(len(mean), -1)
         return np.concatenate([level[:, None], cell], axis=1).astype(np.int32)
 
     def path(self, last: Edge) -> list[tuple[int, int]]:

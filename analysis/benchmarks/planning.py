@@ -1,0 +1,146 @@
+"""How well and how quickly plans are found, and what they are worth in the world they are for.
+
+    python analysis/benchmarks/planning.py                    # a table
+    python analysis/benchmarks/planning.py --json             # one JSON object
+    python analysis/benchmarks/planning.py --only cart python # some of it
+
+Seconds are this machine's; the ratio compares both sides in one run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import heapq
+import json
+import sys
+import time
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+import pbrl_ppl as pp
+from pbrl_ppl.planning.astar import astar
+from pbrl_ppl.planning.bound import TimeToGo
+from pbrl_ppl.scene import Wall
+
+sys.path.insert(0, str(Path(__file__).parent))
+from engine import machine, naive
+from inference import CART, MODELS, Row
+
+STARTS = 20
+FORCE, TORQUE = 15.0, 3.0
+GOAL = pp.Goal.of({"cart": (3.0, 0.0, 0.0)})
+ACTIONS = pp.ActionSet.box(
+    "cart",
+    forces=(-FORCE, 0.0, FORCE),
+    lateral=(-FORCE, 0.0, FORCE),
+    torques=(-TORQUE, 0.0, TORQUE),
+    durations=(0.2, 0.5),
+)
+
+
+def walled() -> pp.Scene:
+    """The shopping cart's room with a wall of 4 m between the starts and the goal."""
+    scene = pp.Scene.load(MODELS / "shopping_cart" / "scene.toml")
+    return scene.replace(walls=(*scene.walls, Wall((0.0, -2.0), (0.0, 2.0))))
+
+
+def starts(seed: int = 0) -> Iterator[dict[str, tuple[float, float, float]]]:
+    """Places at random on the far side of the wall, any heading, at rest."""
+    rng = np.random.default_rng(seed)
+    for _ in range(STARTS):
+        place = rng.uniform([-4.0, -2.0, -np.pi], [-1.0, 2.0, np.pi])
+        yield {"cart": tuple(place)}
+
+
+def measure_cart() -> Iterator[Row]:
+    """A* with the true parameters, around the wall."""
+    dynamics = pp.Dynamics.known(walled(), CART)
+    plans = [pp.plan(dynamics, start, GOAL, ACTIONS) for start in starts()]
+    took = np.array([each.seconds for each in plans])
+    what = f"cart around a wall, {STARTS} starts, A*: "
+    yield (
+        "cart_success",
+        what + "share that reach 0.1 m, 0.1 rad",
+        "1",
+        np.mean([each.reached for each in plans]),
+    )
+    yield "cart_seconds_max", "the same: longest search (s)", "<= 60", took.max()
+    yield "cart_seconds_median", "the same: median search (s)", "", float(np.median(took))
+    rate = sum(each.nodes for each in plans) / took.sum()
+    yield "nodes_per_second", "the same: states generated a second", "", rate
+
+
+def python_astar(start: np.ndarray, nodes: int) -> float:
+    """A* as one would write it first: one node and one action at a time, pymunk from Python.
+
+    Returns states generated a second, with the same heuristic, actions and cells.
+    """
+    scene = walled()
+    dynamics = pp.Dynamics.known(scene, CART)
+    to_go = TimeToGo(dynamics, GOAL, ACTIONS, start)
+    shape, counts = scene.body("cart").shape, ACTIONS.intervals(scene)
+    cells = np.array([0.4, 0.4, 0.5, 0.8, 0.8, 1.0])
+    closed, generated, begin = {}, 1, time.perf_counter()
+    queue = [(0.0, 0, 0.0, start)]
+    while queue and generated < nodes:
+        _, _, cost, node = heapq.heappop(queue)
+        for action in range(len(ACTIONS.actions)):
+            state = node[None]
+            for interval in range(1, counts[-1] + 1):
+                wrench = ACTIONS.wrenches(scene, np.array([action]), state[..., 2])
+                state = naive(state, wrench[:, None], CART, shape, scene.walls)[:, 0]
+                generated += 1
+                if GOAL.shortfall(scene, state[0]) <= 1.0:
+                    return generated / (time.perf_counter() - begin)
+                if interval not in counts:
+                    continue
+                far = np.clip(GOAL.distance(scene, state[0]), 0.25, 2.0)
+                key = tuple(np.floor(state[0, 0] / (cells * 2.0 ** np.floor(np.log2(far)))))
+                after = cost + interval * scene.time_step
+                if after < closed.get(key, np.inf):
+                    closed[key] = after
+                    ahead = float(to_go(state[None])[0, 0])
+                    heapq.heappush(queue, (after + 3.0 * ahead, generated, after, state[0]))
+    return generated / (time.perf_counter() - begin)
+
+
+def measure_python() -> Iterator[Row]:
+    """States a second, ours over the Python loop's, in turn in one run."""
+    dynamics = pp.Dynamics.known(walled(), CART)
+    ratios = []
+    for start, _ in zip(starts(), range(5), strict=False):
+        state = np.array([[*start["cart"], 0.0, 0.0, 0.0]])
+        found = astar(dynamics, state, GOAL, ACTIONS, nodes=100_000)
+        ratios.append(found.nodes / found.seconds / python_astar(state, 3000))
+    yield (
+        "over_python_loop",
+        "states a second / those of A* on a Python loop over pymunk",
+        ">= 8",
+        float(np.median(ratios)),
+    )
+
+
+PARTS = {"cart": measure_cart, "python": measure_python}
+
+
+def main() -> None:
+    """Measure, and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    arguments = parser.parse_args()
+    warnings.simplefilter("ignore")
+    rows = (row for name in arguments.only for row in PARTS[name]())
+    if arguments.json:
+        print(json.dumps({key: float(value) for key, _, _, value in rows}))
+        return
+    print(f"{machine()}\n\n| what | bound | measured |\n|---|---|---|")
+    for key, what, bound, value in rows:
+        print(f"| {what} [`{key}`] | {bound} | {value:.3g} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
