@@ -109,11 +109,11 @@ def test_looking_ahead_changes_nothing_but_the_speed(model, monkeypatch) -> None
     Means and squares of 12 parameters agree within 4 Monte Carlo errors: a false alarm 0.2 % of the
     time.
     """
-    options = {"seed": 2, "chains": 2, "cores": 1, "progress": False, "tune": 500}
-    ahead = fit(model, draws=1500, **options)
+    options = {"seed": 2, "chains": 2, "cores": 1, "progress": False, "tune": 300}
+    ahead = fit(model, draws=800, **options)
     assert float(group(ahead, "sample_stats")["look_ahead_accept"].mean()) > 0.5
     monkeypatch.setattr(fitting, "_LITTLE", np.inf)
-    plain = fit(model, draws=600, **options)
+    plain = fit(model, draws=300, **options)
     assert np.isnan(group(plain, "sample_stats")["look_ahead_accept"]).all()
     first, second = group(ahead, "posterior"), group(plain, "posterior")
     for name in first.data_vars:

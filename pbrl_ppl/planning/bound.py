@@ -28,9 +28,9 @@ class TimeToGo:
 
     A body that is pushed covers a distance no faster than its own speed and the strongest push,
     without friction, allow. Distances go around walls and static bodies on a grid. That is
-    admissible for pushed bodies as far as the grid is fine enough, but not for a body that is
-    moved by others, which may hit harder than they are pushed, and not where an effect drives
-    bodies.
+    admissible for pushed bodies that move towards the goal, as far as the grid is fine enough. It
+    is not for a body that moves away, which friction or a wall may turn back sooner; for one that
+    is moved by others, which may hit harder than they are pushed; or where an effect drives bodies.
 
     Parameters
     ----------
