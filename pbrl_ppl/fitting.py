@@ -15,7 +15,7 @@ import xarray as xr
 from pbrl_ppl.emulator import emulate
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.joint_search import weigh
-from pbrl_ppl.metropolis import AdaptiveMetropolis
+from pbrl_ppl.metropolis import AdaptiveMetropolis, Jumps
 from pbrl_ppl.mixture import check_joint_fit, labelled, mix, posterior_dataset
 from pbrl_ppl.mode_choice import choose_modes
 from pbrl_ppl.model import Problem
@@ -90,13 +90,20 @@ def _metropolis(job: Job) -> Any:
     problem, model = job.mode.problem, job.model
     blocks = gaussian_blocks(model, job.mode)
     options: dict[str, Any] = {"inner": 10}
+    if job.mode.others and len(blocks) == 1:
+        hills = [gaussian_blocks(model, other)[0] for other in job.mode.others]
+        jumps = Jumps((gaussian_blocks(model, job.mode)[0], *hills))
+    else:
+        jumps = None
     # an exact step of one block, in engine steps; where that is little, looking ahead is no use
     cost = problem.simulator.steps * problem.segments.n * problem.horizon / len(problem.parts)
     if cost > _LITTLE:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
             options = {"rough": Surrogate(problem, unpack, emulator), "inner": 30, "plain": 0.25}
-    return job.sample(AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, **options))
+    return job.sample(
+        AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, jumps=jumps, **options)
+    )
 
 
 def _paper(job: Job) -> Any:

@@ -128,6 +128,36 @@ class Gaussian:
             self.factor = np.asarray(factor, dtype=float)
 
 
+@dataclass(frozen=True, eq=False)
+class Jumps:
+    """Moves between hills of the posterior that a walk would not cross (mode jumping).
+
+    Where a point is on one hill, in units of that hill's Gaussian, the proposal is on another;
+    from there the same jump leads back (Tjelmeland and Hegstad, 2001, without their local search).
+
+    Parameters
+    ----------
+    hills : tuple of Gaussian
+        At least two, of the same places.
+    """
+
+    hills: tuple[Gaussian, ...]
+
+    def move(
+        self, q: Array, here: float, density: Callable[[Array], Any], rng: np.random.Generator
+    ) -> tuple[Array, float]:
+        """One jump from the vector q, whose log-density is ``here``; both, where it ends."""
+        first, second = (self.hills[i] for i in rng.choice(len(self.hills), 2, replace=False))
+        moved = q.copy()
+        z = solve_triangular(first.factor, q[first.places] - first.mean, lower=True)
+        moved[first.places] = second.mean + second.factor @ z
+        there = float(density(moved))
+        stretch = np.log(np.diag(second.factor) / np.diag(first.factor)).sum()
+        if rng.uniform() < _rate(there - here + float(stretch)):
+            return moved, there
+        return q, here
+
+
 @dataclass_state
 class AdaptiveState(StepMethodState):
     """What a chain must not inherit from the one before it."""
@@ -162,6 +192,8 @@ class AdaptiveMetropolis(ArrayStepShared):
         ``rough`` is far too low.
     thin : int
         Rounds over the blocks a draw.
+    jumps : Jumps, optional
+        Between hills, one a round.
     model : pymc.Model, optional
         The context's by default.
     initial_point : dict, optional
@@ -190,6 +222,7 @@ class AdaptiveMetropolis(ArrayStepShared):
         inner: int = 10,
         plain: float = 0.0,
         thin: int = 1,
+        jumps: Jumps | None = None,
         model: pm.Model | None = None,
         initial_point: dict[str, Array] | None = None,
         rng: Any = None,
@@ -200,7 +233,7 @@ class AdaptiveMetropolis(ArrayStepShared):
         values = get_value_vars_from_user_vars(vars, model)
         self.tune = True
         self.blocks, self.rough, self.inner, self.plain = blocks, rough, inner, plain
-        self.thin = thin
+        self.thin, self.jumps = thin, jumps
         (logp,), joined = join_nonshared_inputs(
             point=point, outputs=[model.logp()], inputs=values, shared_inputs={}
         )
@@ -216,6 +249,8 @@ class AdaptiveMetropolis(ArrayStepShared):
         here = float(near(q))
         rates, exact = [], []
         for _ in range(self.thin):
+            if self.jumps is not None and near is self.logp:
+                q, here = self.jumps.move(q, here, near, self.rng)
             for block in self.blocks:
                 if self.rough is None or block.cheap or self.tune:
                     for _ in range(_CHEAP if block.cheap else self.inner):

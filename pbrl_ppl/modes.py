@@ -37,6 +37,8 @@ _POPULATION, _GENERATIONS, _EVOLVED, _MOST_EVOLVED, _AFFORDED = 200, 120, 8, 15,
 _STALLED, _WORTHWHILE = 0.02, 5.0
 #: Predictions this close (sum of squares, in noise units) are of the same mode.
 _SAME = 10.0
+#: Log-posterior by which a mode is too low to hold a share of the posterior, however wide it is.
+_LOWER = 20.0
 #: How small the noise may seem beside its typical size while basins are compared.
 _EXACT = 1e-3
 
@@ -59,6 +61,8 @@ class Mode:
         Laplace covariance of phi, shape (p, p).
     log_posterior : float
         Log-likelihood plus log-prior of phi, up to a constant of the priors.
+    others : tuple of Mode
+        Lower ones, that may yet hold a share of the posterior.
     """
 
     problem: Problem
@@ -67,6 +71,7 @@ class Mode:
     jacobian: Array
     covariance: Array
     log_posterior: float
+    others: tuple[Mode, ...] = ()
 
     @property
     def values(self) -> dict[str, Array]:
@@ -271,8 +276,10 @@ def find_mode(
     initial: Array | None = None,
     rounds: int | None = None,
 ) -> Mode:
-    """Best mode; see :func:`find_modes`."""
-    return find_modes(problem, seed=seed, initial=initial, rounds=rounds)[0]
+    """Best mode, and those others that are not far below it; see :func:`find_modes`."""
+    best, *others = find_modes(problem, seed=seed, initial=initial, rounds=rounds)
+    near = (mode for mode in others if mode.log_posterior > best.log_posterior - _LOWER)
+    return replace(best, others=tuple(near))
 
 
 def _polish(problem: Problem, found: Peak) -> Peak:

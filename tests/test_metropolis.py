@@ -5,7 +5,7 @@ import pymc as pm
 import pytensor.tensor as pt
 import pytest
 
-from pbrl_ppl.metropolis import AdaptiveMetropolis, Gaussian
+from pbrl_ppl.metropolis import AdaptiveMetropolis, Gaussian, Jumps
 from pbrl_ppl.posterior import az, group
 
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
@@ -25,12 +25,24 @@ def block(mean, covariance, first: int = 0) -> Gaussian:
 
 
 def sample(
-    model: pm.Model, *, mean=None, covariance=None, blocks=None, rough=None, chains=4, **options
+    model: pm.Model,
+    *,
+    mean=None,
+    covariance=None,
+    blocks=None,
+    rough=None,
+    jumps=None,
+    chains=4,
+    **options,
 ) -> dict[str, np.ndarray]:
     """Draws by name, shape (chain, draw, ...)."""
     with model:
         step = AdaptiveMetropolis(
-            model.free_RVs, blocks=blocks or [block(mean, covariance)], rough=rough, thin=2
+            model.free_RVs,
+            blocks=blocks or [block(mean, covariance)],
+            rough=rough,
+            jumps=jumps,
+            thin=2,
         )
         trace = pm.sample(
             **({"draws": 1000, "tune": 1000, "cores": 1, "random_seed": 4} | options),
@@ -140,6 +152,30 @@ def test_banana() -> None:
     check(draws["y"], 0.5)
     check((draws["y"] - 0.5) ** 2, 0.7**2 + 0.5)
     check((draws["y"] - draws["x"] ** 2 / 2) ** 2, 0.7**2)
+
+
+def test_jumps_weigh_hills_that_no_walk_connects() -> None:
+    """A narrow hill with 0.3 of the mass and a wide one 20 of its widths away; all start on one.
+
+    The jumps' Gaussians are a third off in width, as a guess may be.
+    """
+    narrow, wide = (0.0, 0.3, 0.3), (8.0, 1.2, 0.7)  # mean, sd, share
+    with pm.Model() as model:
+        x = pm.Flat("x", shape=3)
+        parts = [
+            np.log(share) + pm.logp(pm.Normal.dist(mean, sd), x).sum()
+            for mean, sd, share in (narrow, wide)
+        ]
+        pm.Potential("mixture", pm.math.logaddexp(*parts))
+    hills = tuple(
+        block(np.full(3, mean), 1.3**2 * sd**2 * np.eye(3)) for mean, sd, _ in (narrow, wide)
+    )
+    options = {"mean": np.zeros(3), "covariance": 0.09 * np.eye(3)}
+    start = {"x": np.zeros(3)}
+    draws = sample(model, **options, jumps=Jumps(hills), draws=2000, initvals=start)["x"]
+    check((draws.mean(axis=-1) > 4.0).astype(float), 0.7)
+    stuck = sample(model, **options, chains=1, initvals=start)["x"]
+    assert stuck.max() < 4.0
 
 
 def test_impossible_points_are_rejected() -> None:
