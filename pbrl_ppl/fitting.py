@@ -22,7 +22,7 @@ from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.posterior import from_groups, group, groups
 from pbrl_ppl.record import complete
-from pbrl_ppl.starts import dispersed, from_posterior, gaussian_blocks
+from pbrl_ppl.starts import blank_point, dispersed, from_posterior, gaussian_blocks
 from pbrl_ppl.surrogate import Surrogate, Unpack
 
 #: Engine steps that cost no more than what samplers do beside them.
@@ -89,7 +89,7 @@ def _metropolis(job: Job) -> Any:
     """Adaptive blocks that look ahead with a cheap posterior; see AdaptiveMetropolis."""
     problem, model = job.mode.problem, job.model
     blocks = gaussian_blocks(model, job.mode)
-    options: dict[str, Any] = {"inner": 10}
+    options: dict[str, Any] = {"inner": 10, "initial_point": blank_point(model, problem)}
     if job.mode.others and len(blocks) == 1:
         hills = [gaussian_blocks(model, other)[0] for other in job.mode.others]
         jumps = Jumps((gaussian_blocks(model, job.mode)[0], *hills))
@@ -100,7 +100,7 @@ def _metropolis(job: Job) -> Any:
     if cost > _LITTLE:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
-            options = {"rough": Surrogate(problem, unpack, emulator), "inner": 30, "plain": 0.25}
+            options |= {"rough": Surrogate(problem, unpack, emulator), "inner": 30, "plain": 0.25}
     return job.sample(
         AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, jumps=jumps, **options)
     )

@@ -25,7 +25,7 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
     """One block a part of the scene, and one for the noise; guessed at by the Laplace method."""
     problem = mode.problem
     places, offset = {}, 0
-    point = model.initial_point()
+    point = blank_point(model, problem)
     for variable in model.continuous_value_vars:
         size = point[variable.name].size
         places[model.values_to_rvs[variable].name] = np.arange(offset, offset + size)
@@ -48,6 +48,19 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
             )
         ]
     return [*blocks, Gaussian(*noise, cheap=True)]
+
+
+def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
+    """Zeros of the shapes of the model's continuous variables, by their names in the sampler.
+
+    ``model.initial_point()`` has them too, and compiles a function for that.
+    """
+    shapes: dict[str, tuple[int, ...]] = {b.name: (len(b.owners),) for b in problem.layout.blocks}
+    shapes["sigma"] = () if problem.scalar_sigma else (len(problem.observations.columns),)
+    return {
+        value.name: np.zeros(shapes[model.values_to_rvs[value].name])
+        for value in model.continuous_value_vars
+    }
 
 
 def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:

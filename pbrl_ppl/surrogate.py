@@ -11,6 +11,7 @@ from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
 
 from pbrl_ppl.model import Problem
+from pbrl_ppl.starts import blank_point
 
 Array = NDArray[np.float64]
 Residual = Callable[[Array], Array]
@@ -34,7 +35,7 @@ class Unpack:
         variables = [model[block.name] for block in problem.layout.blocks]
         outputs = model.replace_rvs_by_values([*variables, model["sigma"]])
         values = model.continuous_value_vars
-        point = model.initial_point()
+        point = blank_point(model, problem)
         joined_outputs, joined = join_nonshared_inputs(
             point=point, outputs=[model.varlogp, *outputs], inputs=values, shared_inputs={}
         )
