@@ -27,6 +27,9 @@ _BATCH = 32
 #: nearer they grow and shrink in proportion, between these limits (m).
 _CELLS = np.array([0.4, 0.4, 0.5, 0.8, 0.8, 1.0])
 _NEAR, _FAR = 0.25, 2.0
+#: How often cells are halved where nothing is left to try: one that is wider than a push reaches
+#: hides what the push leads to.
+_HALVINGS = 3
 #: Seconds between reports of progress.
 _REPORT = 0.5
 
@@ -50,7 +53,8 @@ def astar(
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
     draws, to machine precision; of nodes in one cell of the closed set (the mean state, finer near
-    the goal) the cheapest is kept.
+    the goal) the cheapest is kept. Where nothing is left to try, the search begins again with finer
+    cells.
 
     Parameters
     ----------
@@ -95,7 +99,7 @@ def astar(
     begin = told = time.monotonic()
     stopped = "exhausted"
     try:
-        while search.queue:
+        while search.queue or (search.best is None and search.finer()):
             now = time.monotonic()
             if search.best and not improve:
                 break
@@ -146,6 +150,7 @@ class _Search:
         self.size = self.generated = 1
         self.queue: list[tuple[float, int]] = [(0.0, 0)]
         self.closed: dict[bytes, float] = {}
+        self.halved = 0
         # what was found
         self.best: Edge | None = None
         self.least_cost = np.inf
@@ -153,6 +158,16 @@ class _Search:
         self.least_distance = np.inf
         root = np.moveaxis(self.states, 0, 1)
         self._look(root, np.zeros(1), np.zeros(1, int), np.zeros(1, int), 0)
+
+    def finer(self) -> bool:
+        """Begin again with cells half as wide; false if they are as fine as they get."""
+        if self.halved == _HALVINGS:
+            return False
+        self.halved += 1
+        self.size, self.queue, self.closed = 1, [(0.0, 0)], {}
+        # edges of the tree that is given up
+        self.nearest, self.least_distance = (0, -1, 0), np.inf
+        return True
 
     def expand(self) -> None:
         """Take the most promising nodes, and try all actions at each, in one engine call each."""
@@ -226,7 +241,8 @@ class _Search:
         mean = np.nan_to_num(states.mean(axis=0))
         mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))
         level = np.floor(np.log2(np.clip(far, _NEAR, _FAR)))
-        cell = np.floor(mean / (_CELLS * 2.0 ** level[:, None, None])).reshape(len(mean), -1)
+        width = _CELLS * 2.0 ** (level[:, None, None] - self.halved)
+        cell = np.floor(mean / width).reshape(len(mean), -1)
         return np.concatenate([level[:, None], cell], axis=1).astype(np.int32)
 
     def path(self, last: Edge) -> list[tuple[int, int]]:
