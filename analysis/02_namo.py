@@ -25,7 +25,7 @@ from pbrl_ppl.errors import UninformedWarning
 from pbrl_ppl.scene_plots import draw_goal, draw_motion, draw_scene
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models" / "namo"))
-from world import GOAL, SCENE, World, follow, go_round, movable, pushes
+from world import GOAL, SCENE, World, at_rest, follow, go_round, movable, pushes
 
 SEED = 1
 OUT = Path("out")
@@ -76,27 +76,26 @@ def main() -> None:
     )  # fmt: skip
     pp.save_posterior(before, OUT / "namo_before.nc")
     before = pp.load_posterior(OUT / "namo_before.nc")
-    say(
-        f"fitted to {len(seen.wrenches)} transitions of the robot alone; movable: {beliefs(before)}"
-    )
+    say(f"fitted to {len(seen.wrenches)} transitions of the robot alone")
+    say(f"can be moved: {beliefs(before)}")
 
-    first = pp.plan(before, seen.states[-1], GOAL, pushes(), seed=SEED)
+    first = pp.plan(before, at_rest(seen.states[-1]), GOAL, pushes(), seed=SEED)
     expected = first.predicted["predicted"].mean("draw").to_numpy()
     say(f"first plan: {first.in_words()}")
     say(f"            {told(expected)}")
 
     failed = follow(world, seen.states[-1], first.wrenches, expected)
-    say(
-        f"in the real rooms: given up after {len(failed.wrenches)} intervals; {told(failed.states)}"
-    )
+    say(f"played in the real rooms, given up after {len(failed.wrenches)} intervals")
+    say(f"            {told(failed.states)}")
 
     after = pp.update(before, failed.history(), seed=SEED, progress=False)
     pp.save_posterior(after, OUT / "namo_after.nc")
     after = pp.load_posterior(OUT / "namo_after.nc")
     did = json.loads(after.attrs["updates"])[-1]["did"]
-    say(f"the posterior is {did}; can be moved: {beliefs(after)}")
+    say(f"the posterior is {did}")
+    say(f"can be moved: {beliefs(after)}")
 
-    done = pp.act(world, after, failed.states[-1], GOAL, pushes(), every=10, seed=SEED)
+    done = pp.act(world, after, at_rest(failed.states[-1]), GOAL, pushes(), every=10, seed=SEED)
     say(f"second plan, made anew every second ({done.plans} times): {told(done.states)}")
     say(f"the goal is {'' if done.reached else 'not '}reached, {done.distance:.2f} m from it")
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Patch, Polygon
@@ -43,7 +45,12 @@ def draw_scene(
         if body.static and body.pose is not None:
             axes.add_patch(_outline(body, np.array(body.pose), color=_STATIC))
     for i, (body, state) in enumerate(zip(scene.dynamic, states, strict=True)):
-        how = {"facecolor": _colour(i), "edgecolor": "black", "linewidth": 0.8, "zorder": 2}
+        how: dict[str, Any] = {
+            "facecolor": _colour(i),
+            "edgecolor": "black",
+            "linewidth": 0.8,
+            "zorder": 2,
+        }
         if faded:
             how |= {"facecolor": "none", "edgecolor": _colour(i), "linestyle": "--", "zorder": 1}
         axes.add_patch(_outline(body, state[:3], **how))
@@ -101,7 +108,7 @@ def _colour(index: int) -> str:
     return _COLOURS[index % len(_COLOURS)]
 
 
-def _outline(body: Body, pose: Array, **how: object) -> Patch:
+def _outline(body: Body, pose: Array, **how: Any) -> Patch:
     """A body's outline at a pose (x, y, theta)."""
     corners = body.shape.outline
     if corners is None:

@@ -53,6 +53,17 @@ class World:
         return self.look()
 
 
+def at_rest(states: np.ndarray) -> np.ndarray:
+    """Measured states (body, 6) to plan from: speeds within three sigma of the noise become 0.
+
+    Nothing resists a couch's turning about its one wheel, so a plan would have it turn for ever.
+    """
+    states = states.copy()
+    slow = abs(states[:, 3:]) < 3 * NOISE[3:]
+    states[:, 3:][slow] = 0.0
+    return states
+
+
 def pushes() -> pp.ActionSet:
     """What the robot can do: go in one of eight directions of the world."""
     angles = np.arange(8) * np.pi / 4
