@@ -295,8 +295,8 @@ def smoothed(log_weights: Array) -> tuple[Array, float]:
         are too few different ones to say.
     """
     result, k = log_weights, np.inf
-    # in the tail are values that differ, or ArviZ refuses
-    with contextlib.suppress(ValueError):
+    # in the tail are values that differ, or ArviZ refuses; a tail that is endless overflows
+    with contextlib.suppress(ValueError), np.errstate(over="ignore"):
         if DATATREE:
             from arviz_stats.base import array_stats
 

@@ -40,6 +40,8 @@ class Dynamics:
         :meth:`noisy` works.
     substeps, threads : int
         Of the engine.
+    declared : iterable of Effect
+        Where the names of the effects that the scene declares are looked up.
     """
 
     def __init__(
@@ -51,8 +53,9 @@ class Dynamics:
         noise: tuple[Array, tuple[int, ...], float | None] | None = None,
         substeps: int | None = None,
         threads: int = 2,
+        declared: Iterable[Effect] = catalogue,
     ) -> None:
-        attached = attach(scene, effects)
+        attached = attach(scene, effects, declared)
         self.scene, self.layout, self._noise = scene, build_layout(scene, attached), noise
         self.phi = np.atleast_2d(np.asarray(phi, dtype=float))
         self._engine = Simulator(scene, self.layout, attached, substeps=substeps, threads=threads)
@@ -96,6 +99,7 @@ class Dynamics:
         PosteriorError
             If it holds fewer draws.
         """
+        effects = tuple(effects)
         problem = problem_of(idata, effects)
         phi, sigma = parameter_draws(problem, idata)
         if draws is None:
@@ -111,10 +115,10 @@ class Dynamics:
         return cls(
             problem.scene,
             phi[chosen],
-            problem.effects,
             noise=(sigma[chosen], problem.observations.columns, problem.nu),
             substeps=problem.substeps,
             threads=threads,
+            declared=effects,  # a posterior's scene declares all of them
         )
 
     @property
