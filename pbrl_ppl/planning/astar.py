@@ -21,8 +21,10 @@ from pbrl_ppl.planning.search import Found
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-#: Nodes expanded in one engine call.
+#: Nodes expanded in one engine call; fewer under many draws, whose calls are large anyway.
 _BATCH = 32
+#: Share of the time for a search under one draw that guides that under all.
+_GUIDE = 0.5
 #: Cells of the closed set one metre from the goal (m, m, rad, m/s, m/s, rad/s); further away and
 #: nearer they grow and shrink in proportion, between these limits (m).
 _CELLS = np.array([0.4, 0.4, 0.5, 0.8, 0.8, 1.0])
@@ -50,7 +52,8 @@ def astar(
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
     draws, to machine precision; of nodes in one cell of the closed set (the mean state, finer near
-    the goal) the cheapest is kept.
+    the goal) the cheapest is kept. Under many draws, a plan for one of them is found first, and
+    the search begins with the nodes along it: that costs little, and leads around obstacles.
 
     Parameters
     ----------
@@ -68,7 +71,7 @@ def astar(
         cells hold one state, the plan costs at most so many times the least. See
         :class:`pbrl_ppl.planning.bound.TimeToGo` for where it is.
     nodes, seconds : int, float
-        Where to stop.
+        Where to stop; the search under one draw does not count as nodes.
     improve : bool
         Whether to go on for a cheaper plan until a limit, or until there is none.
     noise : bool
@@ -95,6 +98,15 @@ def astar(
     begin = told = time.monotonic()
     stopped = "exhausted"
     try:
+        if dynamics.draws > 1:
+            guide = _Search(dynamics.single(), start, goal, actions, tail, weight)
+            # as much of the engine's work as the limit of nodes allows the other
+            most = nodes * dynamics.draws
+            while guide.queue and not guide.best and guide.generated < most:
+                if time.monotonic() - begin > _GUIDE * seconds:
+                    break
+                guide.expand()
+            search.follow(guide.path(guide.best or guide.nearest))
         while search.queue:
             now = time.monotonic()
             if search.best and not improve:
@@ -156,13 +168,24 @@ class _Search:
 
     def expand(self) -> None:
         """Take the most promising nodes, and try all actions at each, in one engine call each."""
-        batch = [heapq.heappop(self.queue)[1] for _ in range(min(_BATCH, len(self.queue)))]
+        size = min(max(1, _BATCH // self.dynamics.draws), len(self.queue))
+        batch = [heapq.heappop(self.queue)[1] for _ in range(size)]
         count = len(self.actions.actions)
-        parents = np.repeat(batch, count)
-        which = np.tile(np.arange(count), len(batch))
+        self._try(np.repeat(batch, count), np.tile(np.arange(count), size))
+
+    def follow(self, steps: list[tuple[int, int]]) -> None:
+        """Put on the tree the nodes along a path from the root, as far as they are in new cells."""
+        for action, intervals in steps:
+            last = self.size - 1
+            self._try(np.array([last]), np.array([action]), intervals)
+            if self.size == last + 1:
+                break
+
+    def _try(self, parents: Ints, which: Ints, only: int | None = None) -> None:
+        """Play an action from each of some nodes, for every duration or one alone (intervals)."""
         states = np.moveaxis(self.states[parents], 0, 1)
         cost = self.cost[parents]
-        for interval in range(1, self.counts[-1] + 1):
+        for interval in range(1, (only or self.counts[-1]) + 1):
             wrenches = self.actions.wrenches(self.scene, which, mean_angle(states[..., 2]))
             states = self.dynamics.step(states, wrenches)
             if self.rng is not None:
@@ -170,7 +193,7 @@ class _Search:
             self.generated += len(parents)
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
             far = self._look(states, cost, parents, which, interval)
-            if interval in self.counts:
+            if interval == only or (only is None and interval in self.counts):
                 self._add(states, cost, far, parents, which, interval)
 
     def _look(self, states: Array, cost: Array, parents: Ints, which: Ints, interval: int) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -121,6 +122,16 @@ class Dynamics:
     def draws(self) -> int:
         """How many."""
         return len(self.phi)
+
+    def single(self) -> Dynamics:
+        """Of one draw: the nearest to the mean of all, in units of their spread."""
+        offset = (self.phi - self.phi.mean(axis=0)) / np.maximum(self.phi.std(axis=0), 1e-12)
+        i = int(np.argmin((offset**2).sum(axis=1)))
+        one = copy(self)
+        one.phi = self.phi[i : i + 1]
+        if self._noise is not None:
+            one._noise = (self._noise[0][i : i + 1], *self._noise[1:])
+        return one
 
     def mass(self, body: str) -> Array:
         """A body's mass under each draw, shape (draw,), kg."""
