@@ -41,6 +41,8 @@ class Dynamics:
         :meth:`noisy` works.
     substeps, threads : int
         Of the engine.
+    declared : iterable of Effect
+        Where the names of the scene's effects are looked up.
     """
 
     def __init__(
@@ -52,8 +54,9 @@ class Dynamics:
         noise: tuple[Array, tuple[int, ...], float | None] | None = None,
         substeps: int | None = None,
         threads: int = 2,
+        declared: Iterable[Effect] = catalogue,
     ) -> None:
-        attached = attach(scene, effects)
+        attached = attach(scene, effects, declared)
         self.scene, self.layout, self._noise = scene, build_layout(scene, attached), noise
         self.phi = np.atleast_2d(np.asarray(phi, dtype=float))
         self._engine = Simulator(scene, self.layout, attached, substeps=substeps, threads=threads)
@@ -97,7 +100,8 @@ class Dynamics:
         PosteriorError
             If it holds fewer draws.
         """
-        problem = problem_of(idata, effects)
+        effects = tuple(effects)
+        problem = problem_of(idata, effects)  # all of its effects are declared in its scene
         phi, sigma = parameter_draws(problem, idata)
         if draws is None:
             density = group(idata, "log_likelihood")["next_state"].sum("transition").values.ravel()
@@ -112,10 +116,10 @@ class Dynamics:
         return cls(
             problem.scene,
             phi[chosen],
-            problem.effects,
             noise=(sigma[chosen], problem.observations.columns, problem.nu),
             substeps=problem.substeps,
             threads=threads,
+            declared=effects,
         )
 
     @property
