@@ -32,6 +32,8 @@ from inference import CART, MODELS, NOISE, Row, simulate
 DRAWS, STARTS, SEED = 16, 20, 0
 #: Where the wheel is, forwards (m), and the share of draws that counts where there are two modes.
 WHEEL, TAIL = -0.25, 0.25
+#: How far off its heading the goal may then be (rad).
+AHEAD = np.radians(20.0)
 #: Nodes of a plan under all draws, whose guide under one may have as many for each draw; a plan
 #: with the mode may have both numbers together, which is as much of the engine's work.
 NODES = 5_000
@@ -120,7 +122,7 @@ def measure_cart(count: int = STARTS) -> Iterator[Row]:
 
 def free_cart() -> pp.Scene:
     """The shopping cart without walls; all is known but where the wheel is along the cart."""
-    scene = pp.Scene.load(MODELS / "shopping_cart" / "scene.toml").replace(walls=(), substeps=20)
+    scene = pp.Scene.load(MODELS / "shopping_cart" / "scene.toml").replace(walls=())
     known = {name: CART[name] for name in ("mass", "r", "mu_c", "mu_x", "mu_y")}
     known |= {"w_y": 0.0, "w_theta": 0.0}
     return scene.replace(bodies=(replace(scene.bodies[0], known=known),))
@@ -151,7 +153,7 @@ def bimodal_posterior(n: int = 20, draws: int = 200) -> object:
 
 def open_loop(idata: object, starts: np.ndarray, draws: int | None, nodes: int) -> np.ndarray:
     """Whether open-loop plans from starts (n, 3) reach, with either wheel in truth: (n, 2)."""
-    goal = pp.Goal.of({"cart": (0.0, 0.0, None)}, tolerance=0.25)
+    goal = pp.Goal.of({"cart": (0.0, 0.0, None)}, tolerance=0.4)
     truths = [Dynamics.known(free_cart(), {"w_x": side * WHEEL}) for side in (1, -1)]
     reached = np.zeros((len(starts), 2), bool)
     for i, start in enumerate(starts):
@@ -170,12 +172,16 @@ def compared(
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Which plays reach with the mode and with draws, and how likely by chance so many more.
 
+    Starts are 1.5 to 3 m from the goal, which the cart faces within 20 degrees. A turn moves the
+    middle about the wheel, whichever that is: 20 degrees move it 0.09 m one way or the other, 90
+    degrees 0.35 m. So goals at the side could hardly be reached with both, within the tolerance.
+
     The chance is that of a sign test over the starts: at each that differs, were the two equally
     good, either would be ahead by the toss of a coin.
     """
-    rng = np.random.default_rng(SEED)
-    way, angle, heading = rng.uniform([1.5, -np.pi, -np.pi], [3.0, np.pi, np.pi], (count, 3)).T
-    starts = np.stack([way * np.cos(angle), way * np.sin(angle), heading], axis=1)
+    rng = np.random.default_rng(SEED + 2)
+    way, angle, off = rng.uniform([1.5, -np.pi, -AHEAD], [3.0, np.pi, AHEAD], (count, 3)).T
+    starts = np.stack([way * np.cos(angle), way * np.sin(angle), angle + np.pi + off], axis=1)
     mode, draws = (open_loop(idata, starts, each, nodes) for each in (None, DRAWS))
     ahead = draws.sum(axis=1) - mode.sum(axis=1)
     better, differ = int((ahead > 0).sum()), int((ahead != 0).sum())
