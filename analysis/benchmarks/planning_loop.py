@@ -56,7 +56,7 @@ def box2d() -> ModuleType:
 
 
 def closed(trajectories: int = 4, **options: int) -> pp.Loop:
-    """The loop closed on trajectories of 30 transitions, and one in two as many held out."""
+    """The loop closed on trajectories of 30 transitions; half as many are held out."""
     world = box2d()
     setup = replace(world.CART, n_train=trajectories, n_test=max(1, trajectories // 2))
     scene = pp.Scene.load(MODELS / "shopping_cart" / "scene.toml")
