@@ -28,6 +28,9 @@ from pbrl_ppl.scene import Wall
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import machine, naive
 from inference import CART, MODELS, Row
+from planning_draws import measure_bimodal
+from planning_draws import measure_cart as measure_draws
+from planning_loop import measure_loop
 
 STARTS = 20
 FORCE, TORQUE = 15.0, 3.0
@@ -123,7 +126,13 @@ def measure_python() -> Iterator[Row]:
     )
 
 
-PARTS = {"cart": measure_cart, "python": measure_python}
+PARTS = {
+    "cart": measure_cart,
+    "python": measure_python,
+    "draws": measure_draws,
+    "bimodal": measure_bimodal,
+    "loop": measure_loop,
+}
 
 
 def main() -> None:

@@ -21,8 +21,10 @@ from pbrl_ppl.planning.search import Found
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-#: Nodes expanded in one engine call.
+#: Nodes expanded in one engine call; fewer under many draws, whose calls are large anyway.
 _BATCH = 32
+#: Share of the time for a search under one draw that guides that under all.
+_GUIDE = 0.5
 #: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
 #: second; further away and nearer they grow and shrink in proportion, between these limits.
 _CELLS = np.array([4.0, 4.0, 5.0, 8.0, 8.0, 10.0])
@@ -53,7 +55,9 @@ def astar(
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
     draws, to machine precision; of nodes in one cell of the closed set (the mean state, finer near
     the goal, in proportion to its tolerance) the cheapest is kept. Where nothing is left to try,
-    the cells are halved and the search begins anew.
+    the cells are halved and the search begins anew. Under many draws, a plan for one of them is
+    found first, and the search begins with the nodes along it: that costs little, and leads around
+    obstacles.
 
     Parameters
     ----------
@@ -71,7 +75,7 @@ def astar(
         cells hold one state, the plan costs at most so many times the least. See
         :class:`pbrl_ppl.planning.bound.TimeToGo` for where it is.
     nodes, seconds : int, float
-        Where to stop.
+        Where to stop; the search under one draw does not count as nodes.
     improve : bool
         Whether to go on for a cheaper plan until a limit, or until there is none.
     noise : bool
@@ -96,17 +100,21 @@ def astar(
     search = _Search(dynamics, start, goal, actions, tail, weight)
     search.rng = (rng or np.random.default_rng(0)) if noise else None
     begin = told = time.monotonic()
-    stopped, refined = "exhausted", 0
+    stopped = "exhausted"
     try:
-        while True:
-            if search.best and not (improve and search.queue):
-                break
-            if not search.queue:
-                if refined == _REFINED:
+        if dynamics.draws > 1:
+            guide = _Search(dynamics.single(), start, goal, actions, tail, weight)
+            # as much of the engine's work as the limit of nodes allows the other
+            most = nodes * dynamics.draws
+            while not guide.best and guide.generated < most and guide.open():
+                if time.monotonic() - begin > _GUIDE * seconds:
                     break
-                refined += 1
-                search.begin(0.5**refined)
+                guide.expand()
+            search.follow(guide.path(guide.best or guide.nearest))
+        while search.open():
             now = time.monotonic()
+            if search.best and not improve:
+                break
             if search.generated >= nodes or now - begin > seconds:
                 stopped = "nodes" if search.generated >= nodes else "time"
                 break
@@ -152,17 +160,24 @@ class _Search:
         self.near = min(target.tolerance for target in goal.targets)
         turn = min(target.angle_tolerance for target in goal.targets)
         self.cells = _CELLS * np.array([self.near, self.near, turn] * 2)
-        self.begin(1.0)
+        self.refined = 0
+        self.begin()
 
-    def begin(self, fineness: float) -> None:
-        """Begin at the root, with cells of so much of their size."""
+    def open(self) -> bool:
+        """Whether anything is left to try; where nothing is, begin anew with finer cells."""
+        if not self.queue and self.best is None and self.refined < _REFINED:
+            self.refined += 1
+            self.begin()
+        return bool(self.queue)
+
+    def begin(self) -> None:
+        """Begin at the root."""
         # the tree; it has room for more nodes than there are
         self.states, self.cost = self.root.copy(), np.zeros(1)
         self.edges = np.array([[-1, -1, 0]])
         self.size = 1
         self.queue: list[tuple[float, int]] = [(0.0, 0)]
         self.closed: dict[bytes, float] = {}
-        self.fineness = fineness
         # what was found
         self.best: Edge | None = None
         self.least_cost = np.inf
@@ -173,13 +188,24 @@ class _Search:
 
     def expand(self) -> None:
         """Take the most promising nodes, and try all actions at each, in one engine call each."""
-        batch = [heapq.heappop(self.queue)[1] for _ in range(min(_BATCH, len(self.queue)))]
+        size = min(max(1, _BATCH // self.dynamics.draws), len(self.queue))
+        batch = [heapq.heappop(self.queue)[1] for _ in range(size)]
         count = len(self.actions.actions)
-        parents = np.repeat(batch, count)
-        which = np.tile(np.arange(count), len(batch))
+        self._try(np.repeat(batch, count), np.tile(np.arange(count), size))
+
+    def follow(self, steps: list[tuple[int, int]]) -> None:
+        """Put on the tree the nodes along a path from the root, as far as they are in new cells."""
+        for action, intervals in steps:
+            last = self.size - 1
+            self._try(np.array([last]), np.array([action]), intervals)
+            if self.size == last + 1:
+                break
+
+    def _try(self, parents: Ints, which: Ints, only: int | None = None) -> None:
+        """Play an action from each of some nodes, for every duration or one alone (intervals)."""
         states = np.moveaxis(self.states[parents], 0, 1)
         cost = self.cost[parents]
-        for interval in range(1, self.counts[-1] + 1):
+        for interval in range(1, (only or self.counts[-1]) + 1):
             wrenches = self.actions.wrenches(self.scene, which, mean_angle(states[..., 2]))
             states = self.dynamics.step(states, wrenches)
             if self.rng is not None:
@@ -187,7 +213,7 @@ class _Search:
             self.generated += len(parents)
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
             far = self._look(states, cost, parents, which, interval)
-            if interval in self.counts:
+            if interval == only or (only is None and interval in self.counts):
                 self._add(states, cost, far, parents, which, interval)
 
     def _look(self, states: Array, cost: Array, parents: Ints, which: Ints, interval: int) -> Array:
@@ -243,7 +269,7 @@ class _Search:
         mean = np.nan_to_num(states.mean(axis=0))
         mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))
         level = np.floor(np.log2(np.clip(far / (_TEN * self.near), _NEAR, _FAR)))
-        size = self.fineness * self.cells * 2.0 ** level[:, None, None]
+        size = self.cells * 2.0 ** (level[:, None, None] - self.refined)
         cell = np.floor(mean / size).reshape(len(mean), -1)
         return np.concatenate([level[:, None], cell], axis=1).astype(np.int32)
 

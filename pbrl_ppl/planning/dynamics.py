@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -100,7 +101,7 @@ class Dynamics:
             If it holds fewer draws.
         """
         effects = tuple(effects)
-        problem = problem_of(idata, effects)
+        problem = problem_of(idata, effects)  # all of its effects are declared in its scene
         phi, sigma = parameter_draws(problem, idata)
         if draws is None:
             density = group(idata, "log_likelihood")["next_state"].sum("transition").values.ravel()
@@ -118,13 +119,23 @@ class Dynamics:
             noise=(sigma[chosen], problem.observations.columns, problem.nu),
             substeps=problem.substeps,
             threads=threads,
-            declared=effects,  # a posterior's scene declares all of them
+            declared=effects,
         )
 
     @property
     def draws(self) -> int:
         """How many."""
         return len(self.phi)
+
+    def single(self) -> Dynamics:
+        """Of one draw: the nearest to the mean of all, in units of their spread."""
+        offset = (self.phi - self.phi.mean(axis=0)) / np.maximum(self.phi.std(axis=0), 1e-12)
+        i = int(np.argmin((offset**2).sum(axis=1)))
+        one = copy(self)
+        one.phi = self.phi[i : i + 1]
+        if self._noise is not None:
+            one._noise = (self._noise[0][i : i + 1], *self._noise[1:])
+        return one
 
     def mass(self, body: str) -> Array:
         """A body's mass under each draw, shape (draw,), kg."""
