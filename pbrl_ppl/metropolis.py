@@ -84,8 +84,13 @@ class Gaussian:
         density: Callable[[Array], Any],
         rng: np.random.Generator,
         tune: bool,
+        shift: Any = None,
     ) -> tuple[Array, float, float]:
         """One Metropolis step of the block in the vector q, whose log-density is ``here``.
+
+        Where there are several hills, ``shift`` is from this block's own to that of the point,
+        shape (d,): what is learned is a hill's shape, and all proposals are walks, the same on
+        each.
 
         Returns
         -------
@@ -96,7 +101,7 @@ class Gaussian:
         rate : float
             With what probability the proposal was accepted.
         """
-        walk = bool(rng.uniform() < 0.5)
+        walk = shift is not None or bool(rng.uniform() < 0.5)
         moved = q.copy()
         moved[self.places], correction = self.propose(q[self.places], walk, rng)
         there = float(density(moved))
@@ -104,7 +109,7 @@ class Gaussian:
         if rng.uniform() < rate:
             q, here = moved, there
         if tune:
-            self.learn(q[self.places], rate, walk)
+            self.learn(q[self.places] - (0.0 if shift is None else shift), rate, walk)
         return q, here, rate
 
     def lengthen(self, change: float, walk: bool) -> None:
@@ -142,6 +147,11 @@ class Jumps:
     """
 
     hills: tuple[Gaussian, ...]
+
+    def shift(self, q: Array) -> Array:
+        """From the first hill's middle to that of the hill which the vector q is on, shape (d,)."""
+        depths = [float(h.depth(q[h.places]) + np.log(np.diag(h.factor)).sum()) for h in self.hills]
+        return np.asarray(self.hills[int(np.argmin(depths))].mean - self.hills[0].mean)
 
     def move(
         self, q: Array, here: float, density: Callable[[Array], Any], rng: np.random.Generator
@@ -193,7 +203,7 @@ class AdaptiveMetropolis(ArrayStepShared):
     thin : int
         Rounds over the blocks a draw.
     jumps : Jumps, optional
-        Between hills, one a round.
+        Between hills, one a round; of one block that is not cheap, whose own hill is the first.
     model : pymc.Model, optional
         The context's by default.
     initial_point : dict, optional
@@ -249,12 +259,14 @@ class AdaptiveMetropolis(ArrayStepShared):
         here = float(near(q))
         rates, exact = [], []
         for _ in range(self.thin):
+            shift: Any = None
             if self.jumps is not None and near is self.logp:
                 q, here = self.jumps.move(q, here, near, self.rng)
+                shift = self.jumps.shift(q) if self.tune else 0.0
             for block in self.blocks:
                 if self.rough is None or block.cheap or self.tune:
                     for _ in range(_CHEAP if block.cheap else self.inner):
-                        q, here, rate = block.move(q, here, near, self.rng, self.tune)
+                        q, here, rate = block.move(q, here, near, self.rng, self.tune, shift)
                         rates.append(rate)
                     continue
                 begin = rough = self.rough(q)

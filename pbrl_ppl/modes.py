@@ -37,6 +37,9 @@ _POPULATION, _GENERATIONS, _EVOLVED, _MOST_EVOLVED, _AFFORDED = 200, 120, 8, 15,
 _STALLED, _WORTHWHILE = 0.02, 5.0
 #: Predictions this close (sum of squares, in noise units) are of the same mode.
 _SAME = 10.0
+#: Parameters whose predictions agree are of different hills if by the derivative they should differ
+#: by this (sum of squares, in noise units): ten standard deviations.
+_FAR = 100.0
 #: Log-posterior by which a mode is too low to hold a share of the posterior, however wide it is.
 _LOWER = 20.0
 #: How small the noise may seem beside its typical size while basins are compared.
@@ -243,16 +246,19 @@ def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
 
 
 def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
-    """Leave out what predicts the same as one before it.
+    """Leave out what predicts the same as one before it, and is on the same hill.
 
-    That is the same hill, or a wheel's other description, or differs where the data are silent.
+    A wheel's other description is, and so is what differs where the data are silent. A mirror image
+    is not: it predicts the same, but what is linear in between would not.
     """
-    z = problem.whitened(np.array([phi for phi, _, _ in found]), found[0][1])
+    folded = fold_wheels(problem, np.array([phi for phi, _, _ in found]))
+    z = problem.whitened(folded, found[0][1])
     z = np.nan_to_num(z, nan=_SCREEN_CLIP)
-    kept: list[int] = []
+    kept: dict[int, Array] = {}
     for i in range(len(found)):
-        if not any(((z[i] - z[j]) ** 2).sum() < _SAME for j in kept):
-            kept.append(i)
+        same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < _SAME]
+        if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < _FAR for j in same):
+            kept[i] = _finish(problem, *found[i]).jacobian
     return [found[i] for i in kept]
 
 

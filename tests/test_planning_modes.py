@@ -7,6 +7,7 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.planning.dynamics import Dynamics
+from pbrl_ppl.posterior import group
 from pbrl_ppl.scene import Wall
 
 BENCHMARKS = Path(__file__).parents[1] / "analysis" / "benchmarks"
@@ -29,6 +30,10 @@ def test_draws_hedge_between_two_places_of_the_wheel(benchmark) -> None:
     in less than 5 % of all seeds; with one seed it gives the same every time.
     """
     idata = benchmark.bimodal_posterior()
+    # the fit finds both places, and in each chain either has about its half
+    front = (group(idata, "posterior")["w_x"] > 0).mean(("draw", "body"))
+    assert (abs(front - 0.5) < 0.2).all()
+    assert idata.attrs["max_rhat"] < 1.05
     mode, draws, chance = benchmark.compared(idata, 12)
     assert chance < 0.05
     assert draws.mean() >= mode.mean() + 0.2

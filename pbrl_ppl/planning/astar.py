@@ -29,6 +29,8 @@ _GUIDE = 0.5
 #: second; further away and nearer they grow and shrink in proportion, between these limits.
 _CELLS = np.array([4.0, 4.0, 5.0, 8.0, 8.0, 10.0])
 _TEN, _NEAR, _FAR = 10.0, 0.25, 2.0
+#: The largest tolerance that cells are in proportion to (m, rad): a lax goal needs care on the way.
+_WIDEST = 0.1
 #: Times that the cells are halved where the search runs out of nodes.
 _REFINED = 8
 #: Seconds between reports of progress.
@@ -157,8 +159,8 @@ class _Search:
         self.to_go = TimeToGo(dynamics, goal, actions, start)
         self.root = np.repeat(start[None], dynamics.draws, axis=0)[None]
         self.generated = 1
-        self.near = min(target.tolerance for target in goal.targets)
-        turn = min(target.angle_tolerance for target in goal.targets)
+        self.near = min(_WIDEST, *(target.tolerance for target in goal.targets))
+        turn = min(_WIDEST, *(target.angle_tolerance for target in goal.targets))
         self.cells = _CELLS * np.array([self.near, self.near, turn] * 2)
         self.refined = 0
         self.begin()
