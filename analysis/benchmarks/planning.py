@@ -23,31 +23,16 @@ import numpy as np
 import pbrl_ppl as pp
 from pbrl_ppl.planning.astar import astar
 from pbrl_ppl.planning.bound import TimeToGo
-from pbrl_ppl.scene import Wall
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import machine, naive
-from inference import CART, MODELS, Row
-from planning_draws import measure_bimodal
+from inference import CART, Row
+from planning_draws import PUSHES, measure_bimodal, walled
 from planning_draws import measure_cart as measure_draws
 from planning_loop import measure_loop
 
 STARTS = 20
-FORCE, TORQUE = 15.0, 3.0
 GOAL = pp.Goal.of({"cart": (3.0, 0.0, 0.0)})
-ACTIONS = pp.ActionSet.box(
-    "cart",
-    forces=(-FORCE, 0.0, FORCE),
-    lateral=(-FORCE, 0.0, FORCE),
-    torques=(-TORQUE, 0.0, TORQUE),
-    durations=(0.2, 0.5),
-)
-
-
-def walled() -> pp.Scene:
-    """The shopping cart's room with a wall of 4 m between the starts and the goal."""
-    scene = pp.Scene.load(MODELS / "shopping_cart" / "scene.toml")
-    return scene.replace(walls=(*scene.walls, Wall((0.0, -2.0), (0.0, 2.0))))
 
 
 def starts(seed: int = 0) -> Iterator[dict[str, tuple[float, float, float]]]:
@@ -61,7 +46,7 @@ def starts(seed: int = 0) -> Iterator[dict[str, tuple[float, float, float]]]:
 def measure_cart() -> Iterator[Row]:
     """A* with the true parameters, around the wall."""
     dynamics = pp.Dynamics.known(walled(), CART)
-    plans = [pp.plan(dynamics, start, GOAL, ACTIONS) for start in starts()]
+    plans = [pp.plan(dynamics, start, GOAL, PUSHES) for start in starts()]
     took = np.array([each.seconds for each in plans])
     what = f"cart around a wall, {STARTS} starts, A*: "
     yield (
@@ -83,17 +68,17 @@ def python_astar(start: np.ndarray, nodes: int) -> float:
     """
     scene = walled()
     dynamics = pp.Dynamics.known(scene, CART)
-    to_go = TimeToGo(dynamics, GOAL, ACTIONS, start)
-    shape, counts = scene.body("cart").shape, ACTIONS.intervals(scene)
+    to_go = TimeToGo(dynamics, GOAL, PUSHES, start)
+    shape, counts = scene.body("cart").shape, PUSHES.intervals(scene)
     cells = np.array([0.4, 0.4, 0.5, 0.8, 0.8, 1.0])
     closed, generated, begin = {}, 1, time.perf_counter()
     queue = [(0.0, 0, 0.0, start)]
     while queue and generated < nodes:
         _, _, cost, node = heapq.heappop(queue)
-        for action in range(len(ACTIONS.actions)):
+        for action in range(len(PUSHES.actions)):
             state = node[None]
             for interval in range(1, counts[-1] + 1):
-                wrench = ACTIONS.wrenches(scene, np.array([action]), state[..., 2])
+                wrench = PUSHES.wrenches(scene, np.array([action]), state[..., 2])
                 state = naive(state, wrench[:, None], CART, shape, scene.walls)[:, 0]
                 generated += 1
                 if GOAL.shortfall(scene, state[0]) <= 1.0:
@@ -116,7 +101,7 @@ def measure_python() -> Iterator[Row]:
     ratios = []
     for start, _ in zip(starts(), range(5), strict=False):
         state = np.array([[*start["cart"], 0.0, 0.0, 0.0]])
-        found = astar(dynamics, state, GOAL, ACTIONS, nodes=100_000)
+        found = astar(dynamics, state, GOAL, PUSHES, nodes=100_000)
         ratios.append(found.nodes / found.seconds / python_astar(state, 3000))
     yield (
         "over_python_loop",

@@ -24,17 +24,11 @@ import pbrl_ppl as pp
 
 sys.path.insert(0, str(Path(__file__).parent))
 from inference import MODELS, Row
+from planning_draws import PUSHES
 
 DRAG, STARTS, SEED = 3.0, 20, 0  # kg/s
 NODES = 500_000
 GOAL = pp.Goal.of({"cart": (3.0, 0.0, 0.0)})
-PUSHES = pp.ActionSet.box(
-    "cart",
-    forces=(-15.0, 0.0, 15.0),
-    lateral=(-15.0, 0.0, 15.0),
-    torques=(-3.0, 0.0, 3.0),
-    durations=(0.2, 0.5),
-)
 
 
 def box2d() -> ModuleType:
