@@ -281,7 +281,7 @@ def test_two_parts_are_as_good_as_one(parts) -> None:
     and the widths of its two fits were 0.0031 and 0.0045 m.
     """
     scene, a, b, both = parts
-    some = {"draws": 800, "thin": 4}
+    some = {"draws": 800}
     first = quick_fit(scene, a, **some)
     two, one = quick_fit(updated_scene(first), b, **some), quick_fit(scene, both, **some)
     for name in ("mass", "w_x", "w_theta", "mu_x", "mu_y", "linear_drag_coefficient"):
