@@ -236,8 +236,7 @@ def update(
 ) -> None:
     """Bring a posterior up to date with new transitions, without a fit from scratch."""
     with _interruptible(), _stages(quiet) as progress:
-        if output.exists() and not overwrite:
-            raise OutputError(f"{output}: it exists; choose another file, or pass --overwrite")
+        _check_free(output, overwrite)
         progress("reading the posterior and the history")
         from pbrl_ppl.history import History
         from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
@@ -380,12 +379,16 @@ def _pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[floa
     return name.strip(), values  # type: ignore[return-value]
 
 
+def _check_free(path: Path, overwrite: bool) -> None:
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: it exists; choose another file, or pass --overwrite")
+
+
 def _check_output(path: Path, ending: str, overwrite: bool) -> None:
     """Refuse an output before the long work whose result would be lost."""
     if path.suffix != ending:
         raise OutputError(f"{path}: expected a name that ends in {ending}")
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: it exists; choose another file, or pass --overwrite")
+    _check_free(path, overwrite)
     if not path.parent.is_dir():
         raise OutputError(f"{path}: there is no folder {path.parent}; make it, or choose another")
 

@@ -13,7 +13,12 @@ Array = NDArray[np.float64]
 
 
 def from_segments(scene: Scene, start: Array, actions: Array, observed: Array) -> History:
-    """A history of one trajectory a segment, each from its own start state.
+    """A history of segments; arguments as of :func:`segment_rows`."""
+    return History.from_dataframe(segment_rows(scene, start, actions, observed), scene)
+
+
+def segment_rows(scene: Scene, start: Array, actions: Array, observed: Array) -> pd.DataFrame:
+    """A history's rows, of one trajectory a segment, each from its own start state.
 
     Parameters
     ----------
@@ -30,7 +35,7 @@ def from_segments(scene: Scene, start: Array, actions: Array, observed: Array) -
     states = np.concatenate([start[:, None], observed], axis=1)
     wrenches = np.concatenate([actions, np.full((n, 1, k, len(WRENCH)), np.nan)], axis=1)
     trajectory, step, body = np.indices((n, h + 1, k)).reshape(3, -1)
-    frame = pd.DataFrame(
+    return pd.DataFrame(
         {
             "trajectory": trajectory,
             "step": step,
@@ -40,4 +45,3 @@ def from_segments(scene: Scene, start: Array, actions: Array, observed: Array) -
             **dict(zip(WRENCH, wrenches.reshape(-1, len(WRENCH)).T, strict=True)),
         }
     )
-    return History.from_dataframe(frame, scene)

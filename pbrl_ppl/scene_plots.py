@@ -100,11 +100,10 @@ def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
     goal : Goal
         Targets.
     """
-    moving = [body.name for body in scene.dynamic]
-    for target in goal.targets:
+    for place, target in zip(goal.places(scene), goal.targets, strict=True):
         if target.x is None or target.y is None:
             continue
-        colour = _colour(moving.index(target.body))
+        colour = _colour(place)
         circle = Circle(
             (target.x, target.y), target.tolerance, fill=False, color=colour, hatch="////"
         )

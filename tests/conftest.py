@@ -33,3 +33,9 @@ def make_history() -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture
+def benchmarks(monkeypatch):
+    """Modules of analysis/benchmarks can be imported, as they import each other."""
+    monkeypatch.syspath_prepend(str(ROOT / "analysis" / "benchmarks"))

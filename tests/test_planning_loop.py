@@ -1,18 +1,13 @@
 """The gain of closing the loop, for a planner, in a world that another engine makes."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 pytest.importorskip("Box2D", reason="Box2D is the world; install the extra `test`")
 
-BENCHMARKS = Path(__file__).parents[1] / "analysis" / "benchmarks"
-
 
 @pytest.fixture
-def benchmark(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+def benchmark(benchmarks):
     import planning_loop
 
     return planning_loop

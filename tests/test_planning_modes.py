@@ -1,7 +1,5 @@
 """Planning on draws of a posterior with two modes, against planning with the mode of one."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -10,12 +8,9 @@ from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.scene import Wall
 
-BENCHMARKS = Path(__file__).parents[1] / "analysis" / "benchmarks"
-
 
 @pytest.fixture
-def benchmark(monkeypatch):
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
+def benchmark(benchmarks):
     import planning_draws
 
     return planning_draws

@@ -15,7 +15,7 @@ import json
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
 from pathlib import Path
 
@@ -366,16 +366,16 @@ PARTS: dict[str, Callable[[], Iterator[Row]]] = {
 }
 
 
-def main() -> None:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def measure(parts: Mapping[str, Callable[[], Iterator[Row]]], description: str | None) -> None:
+    """Measure the parts that the command line asks for, and print."""
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
-    rows = (row for name in arguments.only for row in PARTS[name]())
+    rows = (row for name in arguments.only for row in parts[name]())
     if arguments.json:
-        print(json.dumps({key: value for key, _, _, value in rows}))
+        print(json.dumps({key: float(value) for key, _, _, value in rows}))
         return
     print(f"{machine()}\n\n| what | bound | measured |\n|---|---|---|")
     for key, what, bound, value in rows:
@@ -383,4 +383,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    measure(PARTS, __doc__)

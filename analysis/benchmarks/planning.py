@@ -9,12 +9,9 @@ Seconds are this machine's; the ratio compares both sides in one run.
 
 from __future__ import annotations
 
-import argparse
 import heapq
-import json
 import sys
 import time
-import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,8 +22,8 @@ from pbrl_ppl.planning.astar import astar
 from pbrl_ppl.planning.bound import TimeToGo
 
 sys.path.insert(0, str(Path(__file__).parent))
-from engine import machine, naive
-from inference import CART, Row
+from engine import naive
+from inference import CART, Row, measure
 from planning_draws import PUSHES, measure_bimodal, walled
 from planning_draws import measure_cart as measure_draws
 from planning_loop import measure_loop
@@ -120,21 +117,5 @@ PARTS = {
 }
 
 
-def main() -> None:
-    """Measure, and print."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--only", nargs="+", choices=PARTS, default=list(PARTS))
-    arguments = parser.parse_args()
-    warnings.simplefilter("ignore")
-    rows = (row for name in arguments.only for row in PARTS[name]())
-    if arguments.json:
-        print(json.dumps({key: float(value) for key, _, _, value in rows}))
-        return
-    print(f"{machine()}\n\n| what | bound | measured |\n|---|---|---|")
-    for key, what, bound, value in rows:
-        print(f"| {what} [`{key}`] | {bound} | {value:.3g} |", flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    measure(PARTS, __doc__)

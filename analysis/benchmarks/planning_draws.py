@@ -1,7 +1,6 @@
 """What planning on posterior draws gains over planning with the mode, in the true world.
 
-    python analysis/benchmarks/planning_draws.py          # a table
-    python analysis/benchmarks/planning_draws.py cart     # some of it
+    python analysis/benchmarks/planning.py --only draws bimodal
 
 The true world is the engine with the true parameters; plans see a posterior file alone. Limits are
 numbers of nodes, not seconds, so that the figures do not depend on the machine.
@@ -12,8 +11,7 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -190,19 +188,3 @@ def measure_bimodal(count: int = STARTS) -> Iterator[Row]:
     yield "bimodal_map_success", f"{what} reaches with the mode", "", float(mode.mean())
     what = f"the same with {DRAWS} draws, the worst quarter counts (by chance: p = {chance:.1g})"
     yield "bimodal_draws_success", what, "> bimodal_map_success", float(draws.mean())
-
-
-PARTS: dict[str, Callable[[], Iterator[Row]]] = {"cart": measure_cart, "bimodal": measure_bimodal}
-
-
-def main() -> None:
-    """Measure and print."""
-    warnings.simplefilter("ignore")
-    print("| what | bound | measured |\n|---|---|---|")
-    for name in sys.argv[1:] or PARTS:
-        for key, what, bound, value in PARTS[name]():
-            print(f"| {what} [`{key}`] | {bound} | {value:.3g} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,6 +1,6 @@
 """What closing the loop gains a planner: plans with the model before and after, played in Box2D.
 
-    python analysis/benchmarks/planning_loop.py
+    python analysis/benchmarks/planning.py --only loop
 
 The world is models/shopping_cart/make_history.py's, at steps of 1 ms, and has a drag that the
 scene does not declare. The history is recorded in it, with noise; plans see the posterior files
@@ -12,7 +12,6 @@ from __future__ import annotations
 import importlib.util
 import sys
 import tempfile
-import warnings
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -100,15 +99,3 @@ def measure_loop(count: int = STARTS) -> Iterator[Row]:
     yield "final_distance_before", f"{what}, declared model", "", before
     yield "final_distance_after", f"the same, revised model (added: {named})", "", after
     yield "final_distance_ratio", "revised / declared", "<= 0.5", after / before
-
-
-def main() -> None:
-    """Measure and print."""
-    warnings.simplefilter("ignore")
-    print("| what | bound | measured |\n|---|---|---|")
-    for key, what, bound, value in measure_loop():
-        print(f"| {what} [`{key}`] | {bound} | {value:.3g} |", flush=True)
-
-
-if __name__ == "__main__":
-    main()

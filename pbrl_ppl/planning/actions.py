@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.planning.goals import check_keys, read_toml
+from pbrl_ppl.planning.goals import read_tables, read_toml
 from pbrl_ppl.posterior import group, scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.scene_checks import nearest
@@ -137,12 +137,7 @@ class ActionSet:
             If it is missing, is not TOML, has an unknown key, or no action.
         """
         table = read_toml(path, "actions", ("durations", "action"))
-        actions = []
-        for given in table.get("action", []):
-            check_keys(given, [each.name for each in fields(Action)], f"{path}: [[action]]")
-            if "body" not in given:
-                raise GoalError(f"{path}: an [[action]] has no body; name one")
-            actions.append(Action(**given))
+        actions = read_tables(path, table.get("action", []), Action)
         return cls(tuple(actions), table.get("durations"))
 
     @classmethod

@@ -48,8 +48,7 @@ class TimeToGo:
         scene = dynamics.scene
         self.goal, self.scene = goal, scene
         anyone = max(actions.strongest(body.name)[0] for body in scene.dynamic)
-        names = [body.name for body in scene.dynamic]
-        self._own = [names.index(t.body) for t in goal.targets]
+        self._own = goal.places(scene)
         self._fields, self._push, self._turn = [], [], []
         for target, i in zip(goal.targets, self._own, strict=True):
             force, torque = actions.strongest(target.body)

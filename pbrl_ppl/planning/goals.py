@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -144,14 +144,7 @@ class Goal:
             If it is missing, is not TOML, or has an unknown key.
         """
         table = read_toml(path, "goal", ("contact_penalty", "target"))
-        targets = []
-        for given in table.pop("target", []):
-            known = [each.name for each in fields(Target)]
-            check_keys(given, known, f"{path}: [[target]]")
-            if "body" not in given:
-                raise GoalError(f"{path}: a [[target]] has no body; name one")
-            targets.append(Target(**given))
-        return cls(tuple(targets), **table)
+        return cls(tuple(read_tables(path, table.pop("target", []), Target)), **table)
 
     def check(self, scene: Scene) -> None:
         """Refuse a goal for a body that the scene lacks, or that cannot move.
@@ -169,6 +162,11 @@ class Goal:
                     f"{nearest(target.body, moving)}"
                 )
 
+    def places(self, scene: Scene) -> list[int]:
+        """Where the targets' bodies are among the scene's moving ones."""
+        moving = [body.name for body in scene.dynamic]
+        return [moving.index(target.body) for target in self.targets]
+
     def errors(self, scene: Scene, states: Array) -> Array:
         """Offsets from the targets, 0 where free, shape (..., target, 3): m, m, rad.
 
@@ -179,7 +177,7 @@ class Goal:
         states : ndarray
             Shape (..., body, 6).
         """
-        poses = states[..., [_place(scene, t.body) for t in self.targets], :3]
+        poses = states[..., self.places(scene), :3]
         wanted = np.array(
             [[np.nan if v is None else v for v in (t.x, t.y, t.theta)] for t in self.targets]
         )
@@ -199,18 +197,14 @@ class Goal:
         """How far off in units of the tolerances, of the worst target; at most 1 is there."""
         offset = self.errors(scene, states)
         worst = np.zeros(offset.shape[:-2])
-        for i, t in enumerate(self.targets):
+        for i, (t, place) in enumerate(zip(self.targets, self.places(scene), strict=True)):
             far = np.hypot(offset[..., i, 0], offset[..., i, 1]) / t.tolerance
             worst = np.maximum(worst, np.maximum(far, abs(offset[..., i, 2]) / t.angle_tolerance))
             if t.speed is not None:
-                body = states[..., _place(scene, t.body), :]
+                body = states[..., place, :]
                 rim = scene.body(t.body).shape.bounding_radius * abs(body[..., 5])
                 worst = np.maximum(worst, (np.hypot(body[..., 3], body[..., 4]) + rim) / t.speed)
         return worst
-
-
-def _place(scene: Scene, name: str) -> int:
-    return [body.name for body in scene.dynamic].index(name)
 
 
 def read_toml(path: str | Path, what: str, known: Iterable[str]) -> dict[str, Any]:
@@ -237,3 +231,19 @@ def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> No
     for key in table:
         if key not in known:
             raise GoalError(f'{where}: unknown key "{key}"{nearest(key, known)}')
+
+
+def read_tables(path: str | Path, tables: Iterable[Mapping[str, Any]], kind: Any) -> Iterator[Any]:
+    """One Target or Action from each table of a file.
+
+    Raises
+    ------
+    GoalError
+        If a key is unknown, or no body is named.
+    """
+    name = f"[[{kind.__name__.lower()}]]"
+    for given in tables:
+        check_keys(given, [each.name for each in fields(kind)], f"{path}: {name}")
+        if "body" not in given:
+            raise GoalError(f"{path}: one {name} has no body; name it")
+        yield kind(**given)

@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.history import STATE, WRENCH
+from pbrl_ppl.history import STATE
+from pbrl_ppl.history_again import segment_rows
 from pbrl_ppl.history_files import write_atomically
 from pbrl_ppl.physics import check_placement, overlap
 from pbrl_ppl.planning.actions import ActionSet
@@ -86,14 +87,8 @@ class Plan:
         DataFrame
             Columns as DESIGN's ``history.csv``; state cells after the start are missing.
         """
-        rows = []
-        for step in range(len(self.wrenches) + 1):
-            for i, body in enumerate(self.scene.dynamic):
-                state = self.start[i] if step == 0 else np.full(6, np.nan)
-                last = step == len(self.wrenches)
-                wrench = np.full(3, np.nan) if last else self.wrenches[step, i]
-                rows.append([0, step, step * self.scene.time_step, body.name, *state, *wrench])
-        return pd.DataFrame(rows, columns=["trajectory", "step", "time", "body", *STATE, *WRENCH])
+        nothing = np.full((1, len(self.wrenches), *self.start.shape), np.nan)
+        return segment_rows(self.scene, self.start[None], self.wrenches[None], nothing)
 
     def save(self, path: str | Path) -> None:
         """Write the plan as a CSV file, whole or not at all.
@@ -211,7 +206,7 @@ def plan(
     goal.check(scene)
     actions.check(scene)
     first = start_state(scene, start)
-    _check_room(scene, goal, first)
+    _check_room(scene, goal)
     search: Callable[..., Found] = astar if method == "astar" else mppi
     rng = np.random.default_rng(seed)
     found = search(
@@ -300,13 +295,12 @@ def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) 
     return states
 
 
-def _check_room(scene: Scene, goal: Goal, start: Array) -> None:
+def _check_room(scene: Scene, goal: Goal) -> None:
     """Refuse targets inside walls or static bodies, by more than their tolerance."""
     for target in goal.targets:
         if target.x is None or target.y is None or target.theta is None:
             continue
-        alone = scene.subset([target.body])
-        alone = alone.replace(joints=())
+        alone = scene.subset([target.body]).replace(joints=())
         pose = np.array([[[target.x, target.y, target.theta]]])
         depth = float(overlap(alone, pose)[0])
         if depth > target.tolerance:

@@ -76,8 +76,7 @@ class Horizon:
         self.tail, self.noise = tail, noise
         self.most = _strongest(dynamics.scene, actions)
         self.mean = np.zeros((horizon, *self.most.shape))
-        names = [body.name for body in dynamics.scene.dynamic]
-        self._own = [names.index(target.body) for target in goal.targets]
+        self._own = goal.places(dynamics.scene)
         self.generated = 0
 
     def improve(self, start: Array) -> None:
