@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pbrl_ppl.calibration import calibrate
     from pbrl_ppl.configurations import joint_probabilities
+    from pbrl_ppl.distributions import Prior
     from pbrl_ppl.effects import Attached, Effect, EffectParameter, catalogue
     from pbrl_ppl.errors import PbrlError
     from pbrl_ppl.findings import Findings
@@ -22,7 +23,6 @@ if TYPE_CHECKING:
     from pbrl_ppl.mode_prior import Modes
     from pbrl_ppl.model import physics_model
     from pbrl_ppl.op import SimulatorOp
-    from pbrl_ppl.parameters import Prior
     from pbrl_ppl.physics import Simulator
     from pbrl_ppl.planning.acting import Acted, act
     from pbrl_ppl.planning.actions import Action, ActionSet
@@ -91,6 +91,7 @@ __all__ = [
 _MODULES = {
     "calibration": ("calibrate",),
     "configurations": ("joint_probabilities",),
+    "distributions": ("Prior",),
     "effects": ("Attached", "Effect", "EffectParameter", "catalogue"),
     "errors": ("PbrlError",),
     "findings": ("Findings",),
@@ -102,7 +103,6 @@ _MODULES = {
     "mode_prior": ("Modes",),
     "model": ("physics_model",),
     "op": ("SimulatorOp",),
-    "parameters": ("Prior",),
     "physics": ("Simulator",),
     "planning.acting": ("Acted", "act"),
     "planning.actions": ("Action", "ActionSet"),

@@ -12,8 +12,8 @@ from typing import Any
 
 from pbrl_ppl.errors import FitError, PosteriorError
 from pbrl_ppl.evidence import Evidence
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode
 from pbrl_ppl.scene import Scene
 
 #: Two names in the order of ``scene.joinable``, or None where there is no joint.

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from pbrl_ppl.distributions import prior_residual
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.findings import Candidate
+from pbrl_ppl.laplace import Mode, posterior_steps
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode, posterior_steps, prior_residual
 
 Array = NDArray[np.float64]
 

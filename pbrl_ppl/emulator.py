@@ -7,9 +7,9 @@ from itertools import combinations_with_replacement
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.metropolis import Gaussian, explore
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode
 from pbrl_ppl.surrogate import Surrogate, Unpack
 
 Array = NDArray[np.float64]

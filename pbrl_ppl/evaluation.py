@@ -12,9 +12,9 @@ from scipy.special import logsumexp
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.findings import Errors, Rollout
 from pbrl_ppl.history import History
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.likelihood import STATE_UNITS, StartNoise
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode
 from pbrl_ppl.record import parameter_draws
 
 Array = NDArray[np.float64]

@@ -10,9 +10,9 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln, ndtr, ndtri
 from scipy.stats import truncnorm
 
+from pbrl_ppl.distributions import Prior
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.likelihood import robust
-from pbrl_ppl.modes import Mode
-from pbrl_ppl.parameters import Prior
 
 Array = NDArray[np.float64]
 

@@ -15,11 +15,12 @@ import xarray as xr
 from pbrl_ppl.emulator import emulate
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.joint_search import weigh
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.metropolis import AdaptiveMetropolis, Jumps
 from pbrl_ppl.mixture import check_joint_fit, labelled, mix, posterior_dataset
 from pbrl_ppl.mode_choice import choose_modes
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode, find_mode
+from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import from_groups, group, groups
 from pbrl_ppl.record import complete
 from pbrl_ppl.starts import blank_point, dispersed, from_posterior, gaussian_blocks

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.distributions import Prior, inside
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.identifiability import (
     INFORMED,
@@ -17,9 +18,9 @@ from pbrl_ppl.identifiability import (
     Identifiability,
     Width,
 )
+from pbrl_ppl.laplace import Mode, posterior_steps
 from pbrl_ppl.likelihood import STATE, Observations, whiten
-from pbrl_ppl.modes import Mode, inside, posterior_steps
-from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior
+from pbrl_ppl.parameters import JOINT_INDICES, Layout
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.posterior import group, scalars, scene_of
 from pbrl_ppl.prior import build_layout

@@ -13,10 +13,12 @@ from scipy.optimize import least_squares
 from scipy.special import logsumexp
 
 from pbrl_ppl.configurations import Configuration, Weighed, configurations
+from pbrl_ppl.distributions import inside, prior_draws
 from pbrl_ppl.evidence import Evidence, importance, laplace
 from pbrl_ppl.history_start import lever
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.model import COARSE, Problem
-from pbrl_ppl.modes import Mode, find_mode, find_modes, inside
+from pbrl_ppl.modes import find_mode, find_modes
 from pbrl_ppl.parameters import JOINT_ANCHORS
 from pbrl_ppl.scene import WORLD, Joint
 
@@ -154,7 +156,7 @@ def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed
     problem = mode.problem
     priors = problem.layout.priors
     rng = np.random.default_rng(seed)
-    draws = np.stack([prior.sample(rng, _SCREENED) for prior in priors], axis=1)
+    draws = prior_draws(priors, rng, _SCREENED)
     places = _anchor_places(problem, configuration)
     draws[:, places] = mode.phi[places]
     draws = inside(priors, draws)
@@ -217,11 +219,11 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
         return np.asarray(np.linalg.norm(apart, axis=1) - np.linalg.norm(length, axis=1))
 
     rng = np.random.default_rng(0)
-    starts = np.stack([prior.sample(rng, _GEOMETRIC) for prior in priors], axis=1)
+    starts = prior_draws(priors, rng, _GEOMETRIC)
     starts[0] = [prior.centre for prior in priors]
     if joint.kind == "hinge":
         starts = starts[:1]
-    starts = inside(tuple(priors), starts)
+    starts = inside(priors, starts)
     bounds = np.array([prior.support for prior in priors]).T
     found = [least_squares(miss, start, bounds=bounds) for start in starts]
     found.sort(key=lambda result: float(result.cost))

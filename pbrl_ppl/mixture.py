@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.configurations import ATTRIBUTE, Weighed, stored
 from pbrl_ppl.errors import FitError
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.model import Problem, build_model
-from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import JOINT_INDICES
 from pbrl_ppl.posterior import from_groups, group, groups
 

@@ -10,6 +10,7 @@ import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import i0e
 
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import (
@@ -19,7 +20,6 @@ from pbrl_ppl.parameters import (
     WHEEL_PARAMETERS,
     Block,
     Layout,
-    Prior,
 )
 from pbrl_ppl.scene import WORLD, Body, Scene
 from pbrl_ppl.scene_checks import nearest

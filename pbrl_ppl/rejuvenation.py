@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.distributions import inside, prior_residual
 from pbrl_ppl.likelihood import log_density
 from pbrl_ppl.metropolis import TARGET_ACCEPTANCE, Gaussian
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import inside, prior_residual
 from pbrl_ppl.starts import constrain, unconstrain
 
 Array = NDArray[np.float64]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.findings import Unexplained
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.likelihood import STATE
-from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
 

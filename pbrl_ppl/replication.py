@@ -17,10 +17,10 @@ from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import STATE
 from pbrl_ppl.history_again import from_segments
 from pbrl_ppl.model import Problem, build_model
-from pbrl_ppl.modes import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group
 from pbrl_ppl.ranks import MOST_DRAWS, rank
 from pbrl_ppl.record import parameter_draws
+from pbrl_ppl.wheel_symmetry import fold_wheels
 
 Array = NDArray[np.float64]
 #: One replication's numbers, by name, each a list over the parameters.
@@ -183,7 +183,7 @@ def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -
     """What is ranked, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
     if problem.scalar_sigma:
         sigma = sigma[:, :1]
-    return np.hstack([fold_wheels(problem, phi), sigma, likelihood[:, None]])
+    return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])
 
 
 def labels(problem: Problem) -> tuple[str, ...]:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl import findings
 from pbrl_ppl.criticism import Signature, inseparable, rank_candidates, twins
+from pbrl_ppl.distributions import inside
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.evaluation import HeldOut, standard_error
@@ -18,8 +19,9 @@ from pbrl_ppl.findings import Added, Estimate, Findings, Numerical
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import History
 from pbrl_ppl.identification import identify
+from pbrl_ppl.laplace import Mode, with_start_noise
 from pbrl_ppl.model import Problem, build_model
-from pbrl_ppl.modes import Mode, find_mode, inside, with_start_noise
+from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.posterior import interval
 from pbrl_ppl.record import versions

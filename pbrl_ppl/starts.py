@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import expit
 
+from pbrl_ppl.distributions import Prior, inside
 from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.metropolis import Gaussian
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode, inside
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import group
 from pbrl_ppl.record import parameter_draws
 

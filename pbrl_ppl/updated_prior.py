@@ -12,9 +12,9 @@ from scipy.optimize import brentq, least_squares
 from scipy.special import i0e, i1e
 from scipy.stats import truncnorm
 
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import scalars, scene_of
 from pbrl_ppl.prior import build_layout
 from pbrl_ppl.scene import Scene

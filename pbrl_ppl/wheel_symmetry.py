@@ -43,13 +43,46 @@ def fold_draws(layout: Layout, draws: Mapping[str, Array]) -> dict[str, Array]:
     array([0.1, 0.1])
     """
     folded = dict(draws)
-    owners = {owner for block in layout.blocks if block.of == "body" for owner in block.owners}
-    for owner in owners:
+    for owner in _owners(layout):
         labels = [f"{name}[{owner}]" for name in MIXED]
         # with one of them known there is no symmetry left
         if all(label in draws and label in layout.labels for label in labels):
             folded |= dict(zip(labels, _fold(*(draws[label] for label in labels)), strict=True))
     return folded
+
+
+def fold_wheels(layout: Layout, phi: Array) -> Array:
+    """Choose one of each wheel's four equal descriptions, whatever other draws there are.
+
+    Namely mu_x <= mu_y and w_theta in (-pi/2, pi/2].
+
+    Parameters
+    ----------
+    layout : Layout
+        Says which bodies' wheels are unknown.
+    phi : ndarray
+        Parameters in the layout's order, shape (..., p), SI units.
+
+    Returns
+    -------
+    ndarray
+        The same shape.
+    """
+    phi = phi.copy()
+    for owner in _owners(layout):
+        labels = [f"{name}[{owner}]" for name in MIXED]
+        if not all(label in layout.labels for label in labels):
+            continue
+        angle, x, y = (layout.labels.index(label) for label in labels)
+        phi[..., angle] += np.where(phi[..., x] > phi[..., y], np.pi / 2, 0.0)
+        phi[..., [x, y]] = np.sort(phi[..., [x, y]], axis=-1)
+        phi[..., angle] = np.pi / 2 - np.mod(np.pi / 2 - phi[..., angle], np.pi)
+    return phi
+
+
+def _owners(layout: Layout) -> set[str]:
+    """Bodies that have unknown parameters."""
+    return {owner for block in layout.blocks if block.of == "body" for owner in block.owners}
 
 
 def _fold(angle: Array, mu_x: Array, mu_y: Array) -> tuple[Array, Array, Array]:

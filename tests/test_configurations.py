@@ -24,16 +24,17 @@ from pbrl_ppl.configurations import (
     joint_probabilities,
     stored,
 )
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.errors import FitError, PosteriorError, UninformedWarning
 from pbrl_ppl.evidence import Evidence, _Law, importance, laplace
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import History
 from pbrl_ppl.identification import identify
 from pbrl_ppl.joint_search import weigh
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.likelihood import STATE
 from pbrl_ppl.model import Problem, physics_model
-from pbrl_ppl.modes import Mode, find_mode
-from pbrl_ppl.parameters import Prior
+from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.posterior import (
     convergence,

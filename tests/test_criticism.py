@@ -10,8 +10,9 @@ from scipy.stats import kstest
 from pbrl_ppl.criticism import inseparable, rank_candidates, twins
 from pbrl_ppl.effects import attach, candidates, catalogue
 from pbrl_ppl.history import History
+from pbrl_ppl.laplace import with_start_noise
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import find_mode, with_start_noise
+from pbrl_ppl.modes import find_mode
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.conftest import COLUMNS, ROOT
 

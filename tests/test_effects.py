@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects import Effect, EffectParameter, attach, catalogue
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.worlds import BY_NAME, G, body, predict, simulator, state
 

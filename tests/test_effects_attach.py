@@ -4,9 +4,9 @@ import dataclasses
 
 import pytest
 
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects import EffectParameter, attach, candidates
 from pbrl_ppl.errors import EffectError
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Joint, Scene, Shape
 from tests.worlds import BY_NAME, body
 

@@ -10,6 +10,7 @@ import pymc as pm
 import pytest
 
 from pbrl_ppl import record
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import (
     BoundWarning,
@@ -21,7 +22,6 @@ from pbrl_ppl.errors import (
 from pbrl_ppl.fitting import METHODS, fit
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import (
     az,
     convergence,

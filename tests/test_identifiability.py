@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects.base import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.identification import identify, uninformed
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import draws
 from tests.test_model import CART, cart_scene, simulated_history
 

@@ -5,10 +5,11 @@ import pandas as pd
 import pytest
 
 from pbrl_ppl.coupling import independent_parts
+from pbrl_ppl.distributions import inside
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.model import physics_model
-from pbrl_ppl.modes import Mode, inside
 from pbrl_ppl.physics import PartedSimulator, Simulator
 from pbrl_ppl.prior import build_layout
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall

@@ -6,9 +6,10 @@ import pytensor
 import pytest
 from scipy import stats
 
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS, Prior
+from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS
 from pbrl_ppl.prior import build_layout, random_variable, table1
 from pbrl_ppl.scene import Body, Scene, Shape
 

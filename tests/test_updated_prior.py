@@ -9,11 +9,11 @@ import pytest
 from scipy import stats
 
 import pbrl_ppl as pp
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import ConvergenceWarning, ParameterError, PosteriorError, SceneError
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.model import physics_model
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import draws, from_groups, group, groups
 from pbrl_ppl.prior import build_layout, random_variable
 from pbrl_ppl.scene import Body, Scene, Shape

@@ -9,6 +9,7 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli import main
+from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.errors import (
     BoundWarning,
@@ -20,10 +21,10 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import History
+from pbrl_ppl.laplace import with_start_noise
 from pbrl_ppl.likelihood import StartNoise
 from pbrl_ppl.model import build_model, physics_model
-from pbrl_ppl.modes import find_mode, with_start_noise
-from pbrl_ppl.parameters import Prior
+from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import (
     az,
     convergence,

@@ -1,0 +1,173 @@
+"""A univariate prior as data, and several of them as a space to search in."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import truncnorm
+
+from pbrl_ppl.errors import ParameterError
+
+Array = NDArray[np.float64]
+
+#: How far (in sigmas) mu may lie outside the support: farther out, densities lose their digits.
+_FARTHEST = 30.0
+#: How far inside a bound the search stays, as a share of the interval or of one unit.
+_MARGIN = 1e-6
+
+
+@dataclass(frozen=True)
+class Prior:
+    """A univariate prior as data: a family of Table 1 (or a normal) and its hyper-parameters.
+
+    Parameters
+    ----------
+    family : str
+        ``log_normal``, ``truncated_normal``, ``normal``, ``half_normal``, ``von_mises`` or
+        ``categorical``, which is uniform over the whole numbers from ``lower`` to ``upper``.
+    mu, sigma : float
+        Location and scale; of the logarithm for ``log_normal``. A ``half_normal`` is a normal cut
+        off at zero, about zero unless ``mu`` says otherwise. For ``von_mises``, ``mu`` is the mean
+        direction and ``kappa`` the concentration.
+    lower, upper : float
+        Support of a truncated normal or a categorical distribution.
+    kappa : float
+        Concentration of a von Mises distribution.
+
+    Raises
+    ------
+    ParameterError
+        If the hyper-parameters make no distribution: a scale that is not above 0, a number that is
+        not finite, an empty support, or one so far from ``mu`` that the density underflows.
+
+    Examples
+    --------
+    >>> Prior("truncated_normal", mu=0.5, sigma=1.0, lower=0.0, upper=1.0).support
+    (0.0, 1.0)
+    """
+
+    family: str
+    mu: float = 0.0
+    sigma: float = 1.0
+    lower: float = -np.inf
+    upper: float = np.inf
+    kappa: float = 1.0
+
+    def __post_init__(self) -> None:
+        for key in ("mu", "sigma", "kappa"):
+            value = getattr(self, key)
+            if not np.isfinite(value):
+                raise ParameterError(f"{self.family}: {key} is {value}, expected a finite number")
+            if key != "mu" and value <= 0:
+                raise ParameterError(f"{self.family}: {key} is {value}, expected more than 0")
+        if self.family not in ("truncated_normal", "half_normal"):
+            return
+        lower, upper = self.support
+        if not lower < upper:
+            raise ParameterError(
+                f"{self.family}: lower is {lower} and upper {upper}, expected lower below upper"
+            )
+        away = max(lower - self.mu, self.mu - upper) / self.sigma
+        if away > _FARTHEST:
+            raise ParameterError(
+                f"{self.family}: mu is {self.mu:g}, {away:.3g} sigma outside the support"
+                f" [{lower:g}, {upper:g}], where the density underflows; expected at most"
+                f" {_FARTHEST:g}; move mu towards the support or widen sigma"
+            )
+
+    @property
+    def support(self) -> tuple[float, float]:
+        """Smallest and largest value that the prior allows."""
+        if self.family in ("log_normal", "half_normal"):
+            return 0.0, np.inf
+        if self.family in ("truncated_normal", "categorical"):
+            return self.lower, self.upper
+        return -np.inf, np.inf
+
+    @property
+    def hyper_names(self) -> tuple[str, str]:
+        """Names of the two hyper-parameters that a scene may declare."""
+        return ("mu", "kappa") if self.family == "von_mises" else ("mu", "sigma")
+
+    @property
+    def discrete(self) -> bool:
+        """Whether the values are whole numbers that stand for names."""
+        return self.family == "categorical"
+
+    @property
+    def centre(self) -> float:
+        """A central value inside the support."""
+        if self.family == "log_normal":
+            return float(np.exp(self.mu))
+        if self.family == "half_normal":
+            return max(self.mu, 0.6745 * self.sigma)
+        if self.discrete:
+            return self.lower
+        return float(np.clip(self.mu, *self.support))
+
+    def residual(self, x: Array) -> Array:
+        """Half its square is the negative log-density up to a constant, so MAP is least squares.
+
+        Parameters
+        ----------
+        x : ndarray
+            Values inside the support, any shape.
+
+        Returns
+        -------
+        ndarray
+            Residuals, dimensionless, same shape.
+        """
+        if self.family == "log_normal":
+            # -log p = log x + (log x - mu)^2 / 2 sigma^2: a square about mu - sigma^2
+            safe = np.log(np.maximum(x, 1e-300))
+            return np.asarray((safe - self.mu + self.sigma**2) / self.sigma)
+        if self.discrete:
+            return np.zeros_like(x)
+        if self.family == "von_mises":
+            return np.asarray(2.0 * np.sqrt(self.kappa) * np.sin((x - self.mu) / 2.0))
+        return np.asarray((x - self.mu) / self.sigma)
+
+    def sample(self, rng: np.random.Generator, size: int) -> Array:
+        """Draw values; ``size`` of them."""
+        if self.family == "log_normal":
+            return rng.lognormal(self.mu, self.sigma, size)
+        if self.family == "von_mises":
+            return rng.vonmises(self.mu, self.kappa, size)
+        if self.discrete:
+            return rng.integers(int(self.lower), int(self.upper) + 1, size).astype(float)
+        if self.family == "half_normal" and not self.mu:
+            return np.abs(rng.normal(0.0, self.sigma, size))
+        if self.family in ("truncated_normal", "half_normal"):
+            ends = (np.array(self.support) - self.mu) / self.sigma
+            draws = truncnorm.rvs(*ends, self.mu, self.sigma, size=size, random_state=rng)
+            return np.asarray(np.clip(draws, *self.support))
+        return rng.normal(self.mu, self.sigma, size)
+
+
+def prior_draws(priors: Sequence[Prior], rng: np.random.Generator, n: int) -> Array:
+    """Independent draws from each prior, shape (n, p)."""
+    return np.stack([prior.sample(rng, n) for prior in priors], axis=1)
+
+
+def prior_residual(priors: Sequence[Prior], phi: Array) -> Array:
+    """Each prior's least-squares residual, shape (..., p)."""
+    columns = [prior.residual(phi[..., i]) for i, prior in enumerate(priors)]
+    return np.stack(columns, axis=-1) if columns else np.zeros_like(phi)
+
+
+def inside(priors: Sequence[Prior], phi: Array) -> Array:
+    """Move values just inside their supports, shape (..., p)."""
+    lower, upper = box(priors)
+    return np.clip(phi, lower, upper)
+
+
+def box(priors: Sequence[Prior]) -> tuple[Array, Array]:
+    """Bounds of the search: the supports, less a margin; whole numbers may be at either end."""
+    support = np.array([prior.support for prior in priors]).reshape(-1, 2)
+    width = np.where(np.isfinite(np.ptp(support, axis=1)), np.ptp(support, axis=1), 1.0)
+    width[[prior.discrete for prior in priors]] = 0.0
+    return support[:, 0] + _MARGIN * width, support[:, 1] - _MARGIN * width
