@@ -101,7 +101,7 @@ def _metropolis(job: Job) -> Any:
     if cost > _LITTLE:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
-            options |= {"rough": Surrogate(problem, unpack, emulator), "inner": 30, "plain": 0.25}
+            options |= {"rough": Surrogate(problem, unpack, emulator), "inner": 45, "plain": 0.1}
     return job.sample(
         AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, jumps=jumps, **options)
     )
@@ -191,7 +191,7 @@ def _thinned(trace: Any, thin: int) -> Any:
 _DEFAULT = "metropolis"
 #: The samplers by name. Of the paper's schedule only the kind is known to us; its lengths are ours.
 METHODS: Mapping[str, Method] = {
-    "metropolis": Method(_metropolis, draws=1000, tune=500, thin=1),
+    "metropolis": Method(_metropolis, draws=800, tune=500, thin=1),
     "paper": Method(_paper, draws=1000, tune=5000, thin=10),
     "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),
     "smc": Method(_smc, draws=1000, tune=0, thin=1),

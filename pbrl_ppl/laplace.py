@@ -104,7 +104,7 @@ def climb(
     """
     priors = problem.layout.priors
     lower, upper = box(priors)
-    sigma, value = value_at(problem, phi)
+    sigma, value = _at(problem, phi)
     if not priors:
         return phi, sigma, value
     steps = 1e-3 * problem.layout.scale(phi)
@@ -130,7 +130,7 @@ def climb(
             residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=tries,
             ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
-        better, improved = value_at(problem, result.x)
+        better, improved = _at(problem, result.x)
         if improved < value:
             break
         phi, sigma, gain, value = result.x, better, improved - value, improved
@@ -141,7 +141,7 @@ def climb(
     return phi, sigma, value
 
 
-def value_at(problem: Problem, phi: Array) -> tuple[Array, float]:
+def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
     """The most likely sigma at phi, and the log-posterior there."""
     residual = problem.residual(phi)
     sigma = profile_sigma(problem, residual)

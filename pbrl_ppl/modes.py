@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 #: Transitions used to tell basins apart, and how many of the best are searched with all data; with
 #: no more than so many transitions, all are.
-_PART, _POLISHED, _FEW = 60, 2, 20
+_PART, _POLISHED, _FEW = 40, 2, 20
 #: Population and generations that look for the hill of few data, how many of them are climbed
 #: from, the most parameters that is for, and the most engine steps it may take.
 _POPULATION, _GENERATIONS, _EVOLVED, _MOST_EVOLVED, _AFFORDED = 200, 120, 8, 15, 2e7

@@ -547,7 +547,7 @@ def test_cart_is_calibrated() -> None:
     history = simulated_history(scene, CART, seed=7, trajectories=3, intervals=4)
     with ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool:
         result = calibrate(
-            scene, history, replications=20, seed=1, draws=500, tune=300, chains=2,
+            scene, history, replications=20, seed=1, draws=800, tune=400, chains=2,
             executor=pool, progress=False,
         )  # fmt: skip
     table = result.table()
