@@ -19,13 +19,14 @@ from pbrl_ppl.findings import Added, Estimate, Findings, Numerical
 from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import History
 from pbrl_ppl.identification import identify
-from pbrl_ppl.laplace import Mode, with_start_noise
+from pbrl_ppl.laplace import Mode
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.posterior import interval
 from pbrl_ppl.record import versions
 from pbrl_ppl.remainder import find_remainder
+from pbrl_ppl.resolution import choose_horizon, noisy, shift, with_enough_substeps
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
@@ -42,12 +43,6 @@ TRIED, MOST_ADDED = 4, 5
 WORTH_A_REFIT = 0.5
 #: Likelihoods that differ by less do not choose between effects: the catalogue's order does.
 TIE = 1.0
-#: A doubling of the substeps may move predictions by this share of the noise.
-SMALL_SHIFT = 0.1
-MOST_SUBSTEPS = 640
-#: A start state's noise may spread to this many times the noise of the measured end.
-LARGEST_SPREAD = 3.0
-HORIZONS = (1, 2, 5, 10, 20, 50, 100)
 #: Names are not to be trusted if what is left is more than this share of what they explained (of
 #: the squared error); with less, the verdict is what was added, and the rest is reported beside it.
 LARGE_REMAINDER = 0.1
@@ -168,37 +163,8 @@ class _Loop:
             threads=2,
         )
         mode = find_mode(problem, seed=self.seed)
-        mode = self._choose_horizon(mode) if horizon is None else _noisy(mode)
-        return self.with_enough_substeps(mode)
-
-    def _choose_horizon(self, mode: Mode) -> Mode:
-        """Shortest horizon at which the start state's noise does not drown the prediction."""
-        longest = int(self.train.dataset["n_rows"].min()) - 1
-        tried: list[tuple[float, Mode]] = []
-        for horizon in HORIZONS:
-            if horizon > max(1, longest // 2):
-                break
-            problem = replace(mode.problem, horizon=horizon, noise=None)
-            mode = _noisy(mode if horizon == 1 else find_mode(problem, initial=mode.phi))
-            gain = mode.problem.noise.gain if mode.problem.noise else np.ones((1, 1))
-            cells = len(mode.problem.scene.dynamic) * len(mode.sigma)  # of the last interval
-            spread = np.sqrt(np.maximum(gain[:, -cells:] ** 2 - 1.0, 0.0))
-            worst = float(np.median(spread, axis=0).max())
-            tried.append((worst, mode))
-            if worst <= LARGEST_SPREAD:
-                break
-        return min(tried, key=lambda each: each[0])[1]
-
-    def with_enough_substeps(self, mode: Mode) -> Mode:
-        """Double the substeps until that no longer moves predictions, and refit."""
-        begin = mode.problem.substeps
-        while shift(mode) > SMALL_SHIFT and mode.problem.substeps < MOST_SUBSTEPS:
-            finer = replace(mode.problem, substeps=2 * mode.problem.substeps)
-            mode = replace(mode, problem=finer)
-        if mode.problem.substeps == begin:
-            return mode
-        self.say(f"using {mode.problem.substeps} engine steps an interval")
-        return _noisy(mode, rounds=1)
+        mode = choose_horizon(mode) if horizon is None else noisy(mode)
+        return with_enough_substeps(mode, self.say)
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
         """Candidate effects for a model."""
@@ -248,7 +214,7 @@ class _Loop:
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> _Step | None:
         """Accept an improvement on held-out data that is clear and that matters."""
-        fitted = self.with_enough_substeps(_noisy(fitted, rounds=1))
+        fitted = with_enough_substeps(noisy(fitted, rounds=1), self.say)
         gains = self.held_out.gains(mode, fitted)
         total, error = float(gains.sum()), standard_error(gains)
         fall = self.held_out.fall(mode, fitted)
@@ -271,7 +237,7 @@ class _Loop:
         problem = replace(mode.problem, effects=kept)
         labels = mode.problem.layout.labels
         phi = [mode.phi[labels.index(label)] for label in problem.layout.labels]
-        return _noisy(find_mode(problem, initial=np.array(phi)), rounds=1)
+        return noisy(find_mode(problem, initial=np.array(phi)), rounds=1)
 
     def posterior(self, mode: Mode, draws: int | None) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
@@ -374,23 +340,6 @@ def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
         if significant and not any(twins(each, other) for other in kept):
             kept.append(each)
     return sorted(kept, key=lambda each: each.log_p)
-
-
-def _noisy(mode: Mode, rounds: int = 2) -> Mode:
-    """Account for start-state noise and refit; from scratch twice, for it depends on the fit."""
-    for _ in range(rounds):
-        mode = find_mode(with_start_noise(mode.problem, mode), initial=mode.phi)
-    return mode
-
-
-def shift(mode: Mode) -> float:
-    """Root mean square change of predictions in noise units if the substeps are doubled."""
-    problem = mode.problem
-    finer = replace(problem, substeps=2 * problem.substeps)
-    change = (problem.residual(mode.phi) - finer.residual(mode.phi)) / mode.sigma
-    if problem.noise is not None:
-        change = change / problem.noise.gain.reshape(change.shape)
-    return float(np.sqrt(np.nanmean(change**2, axis=(0, 1, 2)).max()))
 
 
 def _log_likelihood(mode: Mode) -> float:

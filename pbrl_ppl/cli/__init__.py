@@ -1,0 +1,9 @@
+"""Command line: one file a command.
+
+Imports of the package stand inside the functions: PyMC takes seconds to load, and ``--help`` or a
+mistyped path should not wait for it.
+"""
+
+from pbrl_ppl.cli.app import main
+
+__all__ = ["main"]

@@ -1,0 +1,83 @@
+"""``pbrl-ppl calibrate``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pbrl_ppl.cli.terminal import FAILED, SceneFile, Velocities, interruptible, load_files
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor
+
+    from pbrl_ppl.ranks import Calibration
+
+
+def calibrate(
+    scene: SceneFile,
+    history: Annotated[
+        Path, typer.Argument(metavar="HISTORY", help="History whose design is kept (.csv, ...).")
+    ],
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="DIR", help="Folder for results; goes on there."),
+    ],
+    replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
+    draws: Annotated[int, typer.Option(min=100, help="Posterior draws of each chain.")] = 1500,
+    estimate_velocities: Velocities = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+) -> None:
+    """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
+    with interruptible(f"finished replications are in {output}; the same command goes on"):
+        declared, design = load_files(scene, history, estimate_velocities)
+        os.environ.setdefault("MPLBACKEND", "Agg")
+        from pbrl_ppl import calibration, plots
+        from pbrl_ppl.history_files import write_atomically
+
+        with _pool(jobs) as executor:
+            result = calibration.calibrate(
+                declared, design, replications=replications, seed=seed, draws=draws, folder=output,
+                executor=executor, progress=not quiet,
+            )  # fmt: skip
+        result.save(output / "ranks.nc")
+        write_atomically(output / "table.csv", result.table().to_csv)
+        picture = plots.png(plots.plot_calibration(result))
+        write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
+    typer.echo(_calibrated(result))
+    typer.echo(f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}")
+    if not result.passed:
+        raise typer.Exit(FAILED)
+
+
+@contextmanager
+def _pool(jobs: int) -> Iterator[Executor | None]:
+    """Fresh processes: PyMC's threads do not survive a fork."""
+    if jobs == 1:
+        yield None
+        return
+    from concurrent.futures import ProcessPoolExecutor
+    from multiprocessing import get_context
+
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        yield pool
+
+
+def _calibrated(calibration: Calibration) -> str:
+    """The table's columns that matter, and what they should be."""
+    rows, data = calibration.table(), calibration.dataset
+    head = rows.iloc[0]
+    columns = ["p_holm", "coverage_50", "coverage_90", "ess", "r_hat", "passed"]
+    short = int((data["size"] < data["size"].max()).any("parameter").sum())
+    ranges = (f"{head[f'low_{level}']:.3g} to {head[f'high_{level}']:.3g}" for level in (50, 90))
+    return (
+        rows[columns].to_string(float_format="{:.4g}".format, index_names=False)
+        + f"\n{data.sizes['replication']} replications, {short} with too few effective draws;"
+        " expected of a right sampler: p_holm at least 0.01, coverages in " + ", ".join(ranges)
+    )

@@ -1,0 +1,67 @@
+"""``pbrl-ppl close-loop``."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pbrl_ppl.cli.terminal import SceneFile, Velocities, interruptible, load_files, stages
+
+
+def close_loop(
+    scene: SceneFile,
+    train: Annotated[
+        Path, typer.Argument(metavar="TRAIN", help="Measured history (.csv, .parquet, .nc).")
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
+    ],
+    test: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="TEST",
+            help="Held-out history; without it, a quarter of TRAIN's trajectories.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Write to a folder that has content.")
+    ] = False,
+    substeps: Annotated[
+        int | None, typer.Option(min=1, help="Engine steps per interval, for the scene's.")
+    ] = None,
+    horizon: Annotated[
+        int | None, typer.Option(min=1, help="Intervals predicted at once; chosen if not given.")
+    ] = None,
+    draws: Annotated[
+        int | None, typer.Option(min=100, help="Posterior draws of each chain.")
+    ] = None,
+    estimate_velocities: Velocities = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+) -> None:
+    """Find what the declared model lacks, add it, refit, and report before and after."""
+    with interruptible(), stages(quiet) as progress:
+        progress("reading the scene and the histories")
+        declared, history = load_files(scene, train, estimate_velocities)
+        held_out = None
+        if test is not None:
+            _, held_out = load_files(scene, test, estimate_velocities)
+        if substeps is not None:
+            declared = declared.replace(substeps=substeps)
+        progress("loading the sampler")
+        # nobody is there to see a window
+        os.environ.setdefault("MPLBACKEND", "Agg")
+        from pbrl_ppl import report
+
+        # before the long work, which would be lost
+        report.check_folder(output, overwrite)
+        options = {"draws": draws, "horizon": horizon}
+        given = {name: value for name, value in options.items() if value is not None}
+        loop = report.close_loop(declared, history, held_out, seed=seed, progress=progress, **given)
+        progress("writing the report")
+        loop.save(output, overwrite=overwrite)
+    typer.echo(report.verdict_in_words(loop.findings))
+    typer.echo(f"report: {output / 'report.html'}")

@@ -1,0 +1,144 @@
+"""``pbrl-ppl plan``."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pbrl_ppl.cli.terminal import FAILED, check_free, interruptible, stages
+from pbrl_ppl.errors import GoalError, OutputError
+
+
+def plan(
+    posterior: Annotated[
+        Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); all that is needed.")
+    ],
+    start: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="BODY=X,Y,THETA",
+            help="Where a body starts (m, rad), at rest or with ,VX,VY,OMEGA; once a body.",
+        ),
+    ] = None,
+    goal: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="BODY=X,Y,THETA",
+            help="Where a body should be, - where free; once a body. Or a goal file (.toml).",
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", metavar="FILE", help="The plan (.csv).")
+    ] = None,
+    actions: Annotated[
+        Path | None,
+        typer.Option(help="Actions (.toml); such as the posterior's data were recorded with."),
+    ] = None,
+    method: Annotated[str, typer.Option(help="astar or mppi.")] = "astar",
+    draws: Annotated[
+        int | None, typer.Option(min=1, help="Posterior draws to plan with; the MAP if not given.")
+    ] = None,
+    tail: Annotated[
+        float, typer.Option(help="Share of the worst draws that count; 1 is the expectation.")
+    ] = 1.0,
+    noise: Annotated[bool, typer.Option("--noise", help="Plan with Eq. 13's noise.")] = False,
+    tolerance: Annotated[float | None, typer.Option(help="How near is there (m).")] = None,
+    angle_tolerance: Annotated[float | None, typer.Option(help="How near is there (rad).")] = None,
+    contact_penalty: Annotated[
+        float | None, typer.Option(help="Cost of a second in contact (s); inf forbids it.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(help="Limit of the search (s).")] = 60.0,
+    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
+    animate: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Show the plan as a picture that moves (.gif)."),
+    ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace files that exist.")
+    ] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+) -> None:
+    """Plan from a start to a goal with a posterior file, and nothing else."""
+    with interruptible(), stages(quiet) as progress:
+        if output is None and animate is None:
+            raise GoalError("plan: say where it should be written: -o plan.csv")
+        for path, ending in ((output, ".csv"), (animate, ".gif")):
+            if path is not None:
+                _check_output(path, ending, overwrite)
+        progress("reading the posterior")
+        from pbrl_ppl.planning.actions import ActionSet
+        from pbrl_ppl.planning.goals import Goal
+        from pbrl_ppl.planning.plan import plan as make_plan
+        from pbrl_ppl.posterior import load_posterior, scene_of
+
+        idata = load_posterior(posterior)
+        only = [body.name for body in scene_of(idata).dynamic]
+        options = {
+            "tolerance": tolerance,
+            "angle_tolerance": angle_tolerance,
+            "contact_penalty": contact_penalty,
+        }
+        given = {name: value for name, value in options.items() if value is not None}
+        if goal and goal[0].endswith(".toml"):
+            if len(goal) > 1 or given:
+                raise GoalError("--goal: a file has the whole goal; drop the other options of it")
+            wanted = Goal.load(goal[0])
+        else:
+            wanted = Goal.of(dict(_pose(text, only, "--goal") for text in goal or ()), **given)
+        places = dict(_pose(text, only, "--start") for text in start or ())
+        allowed = None if actions is None else ActionSet.load(actions)
+        progress("planning")
+        result = make_plan(
+            idata, places, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,
+            seconds=seconds, seed=seed, progress=progress,
+        )  # fmt: skip
+        if output is not None:
+            result.save(output)
+        if animate is not None:
+            progress("drawing")
+            os.environ.setdefault("MPLBACKEND", "Agg")
+            from pbrl_ppl.scene_plots import animate_plan
+
+            animate_plan(result, animate)
+    typer.echo(result.in_words())
+    for path in (output, animate):
+        if path is not None:
+            typer.echo(f"plan: {path}")
+    if not result.reached:
+        raise typer.Exit(FAILED)
+
+
+def _pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float]]:
+    """A body and its numbers from ``BODY=X,Y,THETA``; the body may be left out if there is one.
+
+    A coordinate that is free, ``-``, is None.
+    """
+    name, separator, numbers = text.rpartition("=")
+    if not separator:
+        if len(bodies) > 1:
+            raise GoalError(f"{option} {text}: say which body: {bodies[0]}={text}")
+        name = bodies[0]
+    values = []
+    for number in numbers.split(","):
+        try:
+            values.append(None if number.strip() == "-" else float(number))
+        except ValueError:
+            raise GoalError(
+                f"{option} {text}: {number.strip()!r} is not a number; expected BODY=X,Y,THETA"
+            ) from None
+    if option == "--start" and None in values:
+        raise GoalError(f"{option} {text}: a start has no free coordinates; give a number for -")
+    return name.strip(), values  # type: ignore[return-value]
+
+
+def _check_output(path: Path, ending: str, overwrite: bool) -> None:
+    """Refuse an output before the long work whose result would be lost."""
+    if path.suffix != ending:
+        raise OutputError(f"{path}: expected a name that ends in {ending}")
+    check_free(path, overwrite)
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: there is no folder {path.parent}; make it, or choose another")
