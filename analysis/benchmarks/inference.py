@@ -199,7 +199,7 @@ def measure_update() -> Iterator[Row]:
         seconds(lambda i=i: pp.update(idata, more, seed=i, progress=False))[0]
         for i in range(ROUNDS)
     ]
-    what = "cart posterior of 4 x 1000 draws and 360 transitions, one more: seconds"
+    what = "cart posterior of 4 x 800 draws and 360 transitions, one more: seconds"
     yield "update_seconds", what, "<= 1", float(np.median(times))
 
 
