@@ -4,8 +4,8 @@
     python analysis/01_parameter_error.py --histories 20
 
 Random pushes from random states; the mode of the posterior against the truth, median over
-histories. Without noise two transitions are mostly enough, as the paper's section 5 has it; noise of
-0.25 (m, rad, m/s, rad/s) is the paper's, more than ten times what motion capture has.
+histories. Without noise two transitions are mostly enough, as the paper's section 5 has it; noise
+of 0.25 (m, rad, m/s, rad/s) is the paper's, more than ten times what motion capture has.
 """
 
 from __future__ import annotations

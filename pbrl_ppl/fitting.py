@@ -101,7 +101,7 @@ def _metropolis(job: Job) -> Any:
     if cost > _LITTLE:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
-            options |= {"rough": Surrogate(problem, unpack, emulator), "inner": 45, "plain": 0.1}
+            options |= {"rough": Surrogate(problem, unpack, emulator), "inner": 45, "plain": 0.3}
     return job.sample(
         AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, jumps=jumps, **options)
     )
