@@ -9,34 +9,30 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pbrl_ppl.calibration import calibrate
-    from pbrl_ppl.configurations import joint_probabilities
-    from pbrl_ppl.distributions import Prior
+    from pbrl_ppl.agents import Acted, act
+    from pbrl_ppl.calibration import Calibration, calibrate
+    from pbrl_ppl.criticism import Findings, PriorCheck, prior_predictive_check
     from pbrl_ppl.effects import Attached, Effect, EffectParameter, catalogue
     from pbrl_ppl.errors import PbrlError
-    from pbrl_ppl.findings import Findings
-    from pbrl_ppl.fitting import fit
     from pbrl_ppl.history import History, Segments
-    from pbrl_ppl.identifiability import Identifiability
-    from pbrl_ppl.identification import identify, uninformed
-    from pbrl_ppl.learned_modes import learned_modes, mode_probabilities
-    from pbrl_ppl.mode_prior import Modes
-    from pbrl_ppl.model import physics_model
-    from pbrl_ppl.op import SimulatorOp
+    from pbrl_ppl.model import Modes, SimulatorOp, Transition, physics_model
+    from pbrl_ppl.modes import joint_probabilities
+    from pbrl_ppl.parameters import Prior
     from pbrl_ppl.physics import Simulator
-    from pbrl_ppl.planning.acting import Acted, act
-    from pbrl_ppl.planning.actions import Action, ActionSet
-    from pbrl_ppl.planning.dynamics import Dynamics
-    from pbrl_ppl.planning.goals import Goal, Target
-    from pbrl_ppl.planning.plan import Plan, plan
-    from pbrl_ppl.posterior import load_posterior, save_posterior
-    from pbrl_ppl.prior_check import PriorCheck, prior_predictive_check
-    from pbrl_ppl.ranks import Calibration
+    from pbrl_ppl.planning import Action, ActionSet, Dynamics, Goal, Plan, Target, plan
+    from pbrl_ppl.posterior import (
+        Identifiability,
+        identify,
+        learned_modes,
+        load_posterior,
+        mode_probabilities,
+        save_posterior,
+        uninformed,
+        updated_scene,
+    )
     from pbrl_ppl.report import Loop, close_loop
+    from pbrl_ppl.sampling import fit, update
     from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-    from pbrl_ppl.transition import Transition
-    from pbrl_ppl.updated_prior import updated_scene
-    from pbrl_ppl.updating import update
 
 __version__ = "0.1.0"
 
@@ -89,34 +85,73 @@ __all__ = [
 ]
 
 _MODULES = {
-    "calibration": ("calibrate",),
-    "configurations": ("joint_probabilities",),
-    "distributions": ("Prior",),
-    "effects": ("Attached", "Effect", "EffectParameter", "catalogue"),
+    "agents": (
+        "Acted",
+        "act",
+    ),
+    "calibration": (
+        "Calibration",
+        "calibrate",
+    ),
+    "criticism": (
+        "Findings",
+        "PriorCheck",
+        "prior_predictive_check",
+    ),
+    "effects": (
+        "Attached",
+        "Effect",
+        "EffectParameter",
+        "catalogue",
+    ),
     "errors": ("PbrlError",),
-    "findings": ("Findings",),
-    "fitting": ("fit",),
-    "history": ("History", "Segments"),
-    "identifiability": ("Identifiability",),
-    "identification": ("identify", "uninformed"),
-    "learned_modes": ("learned_modes", "mode_probabilities"),
-    "mode_prior": ("Modes",),
-    "model": ("physics_model",),
-    "op": ("SimulatorOp",),
+    "history": (
+        "History",
+        "Segments",
+    ),
+    "model": (
+        "Modes",
+        "SimulatorOp",
+        "Transition",
+        "physics_model",
+    ),
+    "modes": ("joint_probabilities",),
+    "parameters": ("Prior",),
     "physics": ("Simulator",),
-    "planning.acting": ("Acted", "act"),
-    "planning.actions": ("Action", "ActionSet"),
-    "planning.dynamics": ("Dynamics",),
-    "planning.goals": ("Goal", "Target"),
-    "planning.plan": ("Plan", "plan"),
-    "posterior": ("load_posterior", "save_posterior"),
-    "prior_check": ("PriorCheck", "prior_predictive_check"),
-    "ranks": ("Calibration",),
-    "report": ("Loop", "close_loop"),
-    "scene": ("Body", "Joint", "Scene", "Shape", "Wall"),
-    "transition": ("Transition",),
-    "updated_prior": ("updated_scene",),
-    "updating": ("update",),
+    "planning": (
+        "Action",
+        "ActionSet",
+        "Dynamics",
+        "Goal",
+        "Plan",
+        "Target",
+        "plan",
+    ),
+    "posterior": (
+        "Identifiability",
+        "identify",
+        "learned_modes",
+        "load_posterior",
+        "mode_probabilities",
+        "save_posterior",
+        "uninformed",
+        "updated_scene",
+    ),
+    "report": (
+        "Loop",
+        "close_loop",
+    ),
+    "sampling": (
+        "fit",
+        "update",
+    ),
+    "scene": (
+        "Body",
+        "Joint",
+        "Scene",
+        "Shape",
+        "Wall",
+    ),
 }
 
 

@@ -10,13 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pbrl_ppl.fitting import fit
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
-from pbrl_ppl.posterior import az, draws, group, load_posterior, save_posterior, scene_of
+from pbrl_ppl.posterior.store import az, draws, group, load_posterior, save_posterior, scene_of
+from pbrl_ppl.sampling import fit, update
 from pbrl_ppl.scene import Body, Scene, Shape
-from pbrl_ppl.updating import update
-from tests.test_model import simulated_history
+from tests.model.test_model import simulated_history
 
 GENERATIONS = ("5", "6")
 DATA = Path(__file__).parent / "data"

@@ -7,9 +7,9 @@ import numpy as np
 
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.effects.base import Attached, Effect
+from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import Simulator
-from pbrl_ppl.prior import build_layout
 from pbrl_ppl.scene import Body, Scene, Shape
 
 G = 9.81  # m/s^2

@@ -27,10 +27,10 @@ import pytensor
 import pytensor.tensor as pt
 
 from pbrl_ppl import Body, Scene, Shape, Simulator, SimulatorOp
+from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import compiled
 from pbrl_ppl.physics.world import World
-from pbrl_ppl.prior import build_layout
 from pbrl_ppl.scene import Wall
 
 APARTMENT = Path(__file__).parents[2] / "models" / "apartment" / "scene.toml"

@@ -27,14 +27,14 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 
 import pbrl_ppl as pp
-from pbrl_ppl.history_start import lever
-from pbrl_ppl.likelihood import next_state_logp
+from pbrl_ppl.history import lever
 from pbrl_ppl.model import Problem, sigma_prior
+from pbrl_ppl.model.likelihood import next_state_logp
+from pbrl_ppl.model.table1 import build_layout, random_variable
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
 from pbrl_ppl.physics import PartedSimulator
-from pbrl_ppl.posterior import az, convergence, group
-from pbrl_ppl.prior import build_layout, random_variable
+from pbrl_ppl.posterior.store import az, convergence, group
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import ROUNDS, machine, naive

@@ -15,7 +15,7 @@ from pbrl_ppl.cli.terminal import FAILED, SceneFile, Velocities, interruptible, 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from pbrl_ppl.ranks import Calibration
+    from pbrl_ppl.calibration import Calibration
 
 
 def calibrate(
@@ -38,8 +38,9 @@ def calibrate(
     with interruptible(f"finished replications are in {output}; the same command goes on"):
         declared, design = load_files(scene, history, estimate_velocities)
         os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl import calibration, plots
-        from pbrl_ppl.history_files import write_atomically
+        from pbrl_ppl.calibration import calibration
+        from pbrl_ppl.history import write_atomically
+        from pbrl_ppl.report import plots
 
         with _pool(jobs) as executor:
             result = calibration.calibrate(

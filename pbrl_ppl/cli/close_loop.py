@@ -54,7 +54,7 @@ def close_loop(
         progress("loading the sampler")
         # nobody is there to see a window
         os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl import report
+        from pbrl_ppl.report import report
 
         # before the long work, which would be lost
         report.check_folder(output, overwrite)

@@ -70,9 +70,8 @@ def plan(
             if path is not None:
                 _check_output(path, ending, overwrite)
         progress("reading the posterior")
-        from pbrl_ppl.planning.actions import ActionSet
-        from pbrl_ppl.planning.goals import Goal
-        from pbrl_ppl.planning.plan import plan as make_plan
+        from pbrl_ppl.planning import ActionSet, Goal
+        from pbrl_ppl.planning import plan as make_plan
         from pbrl_ppl.posterior import load_posterior, scene_of
 
         idata = load_posterior(posterior)
@@ -101,7 +100,7 @@ def plan(
         if animate is not None:
             progress("drawing")
             os.environ.setdefault("MPLBACKEND", "Agg")
-            from pbrl_ppl.scene_plots import animate_plan
+            from pbrl_ppl.report import animate_plan
 
             animate_plan(result, animate)
     typer.echo(result.in_words())

@@ -38,7 +38,7 @@ def update(
         idata = load_posterior(posterior)
         new = History.load(history, scene_of(idata), estimate_velocities=estimate_velocities)
         progress("updating")
-        from pbrl_ppl import updating
+        from pbrl_ppl.sampling import updating
 
         idata = updating.update(idata, new, seed=seed, progress=False)
         save_posterior(idata, output)

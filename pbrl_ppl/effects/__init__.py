@@ -62,7 +62,7 @@ def attach(
 
     Examples
     --------
-    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> from pbrl_ppl.scene.scene import Body, Scene, Shape
     >>> cart = Body("cart", Shape.box(1.0, 0.6), effects=("linear_drag",))
     >>> [a.effect.name for a in attach(Scene(time_step=0.1, bodies=(cart,)))]
     ['linear_drag']

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.distributions import Prior
 from pbrl_ppl.errors import EffectError
+from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 
 #: ``force(state, command, parameters, wrench)``: adds to ``wrench`` (force_x, force_y, torque) in
@@ -73,7 +73,7 @@ class Effect:
 
     Examples
     --------
-    >>> from pbrl_ppl.distributions import Prior
+    >>> from pbrl_ppl.parameters.priors import Prior
     >>> def force(state, command, parameters, wrench):
     ...     wrench[0] -= parameters[0] * state[3] ** 3
     >>> cubic_drag = Effect(

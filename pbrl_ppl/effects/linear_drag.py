@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects.base import Effect, EffectParameter
+from pbrl_ppl.parameters import Prior
 
 
 def _force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:

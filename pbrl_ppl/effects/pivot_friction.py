@@ -2,8 +2,8 @@
 
 from typing import Any
 
-from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects.base import Effect, EffectParameter, is_pivoted
+from pbrl_ppl.parameters import Prior
 
 
 def _modify(properties: dict[str, Any], parameters: dict[str, Any]) -> None:

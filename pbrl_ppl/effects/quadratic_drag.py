@@ -3,8 +3,8 @@
 import math
 from typing import Any
 
-from pbrl_ppl.distributions import Prior
 from pbrl_ppl.effects.base import Effect, EffectParameter
+from pbrl_ppl.parameters import Prior
 
 
 def _force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:

@@ -1,7 +1,17 @@
 """The engine: world building, wheel, joints and the batched rollout; alone in importing pymunk."""
 
-from pbrl_ppl.physics.parts import PartedSimulator
+from pbrl_ppl.physics.coupling import Parts, independent_parts
+from pbrl_ppl.physics.parts import Part, PartedSimulator
 from pbrl_ppl.physics.placement import check_history, check_placement, overlap
 from pbrl_ppl.physics.simulator import Simulator
 
-__all__ = ["PartedSimulator", "Simulator", "check_history", "check_placement", "overlap"]
+__all__ = [
+    "Part",
+    "PartedSimulator",
+    "Parts",
+    "Simulator",
+    "check_history",
+    "check_placement",
+    "independent_parts",
+    "overlap",
+]

@@ -23,14 +23,7 @@ from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.effects.base import Force
 from pbrl_ppl.physics.properties import COLUMNS, JOINT_COLUMNS
-from pbrl_ppl.physics.world import (
-    DIVERGED,
-    FAR,
-    ITERATIONS_A_RATIO,
-    MOST_ITERATIONS,
-    TINY,
-    World,
-)
+from pbrl_ppl.physics.world import DIVERGED, FAR, ITERATIONS_A_RATIO, MOST_ITERATIONS, TINY, World
 
 #: The engine's functions in use, each by the name of its address.
 Functions = namedtuple(

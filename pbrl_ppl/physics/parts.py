@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.coupling import Parts
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.parameters import Layout
+from pbrl_ppl.physics.coupling import Parts
 from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.simulator import Simulator
 from pbrl_ppl.scene import Scene
@@ -49,8 +49,8 @@ class PartedSimulator:
     effects : tuple of Attached
         All effects of the model.
     parts : tuple of tuple of str
-        Every moving body's name once; see :func:`pbrl_ppl.coupling.independent_parts`. None for a
-        scene in one part.
+        Every moving body's name once; see :func:`independent_parts`. None for a scene in one
+        part.
     substeps, threads, extrapolate
         As for :class:`Simulator`.
 

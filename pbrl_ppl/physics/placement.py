@@ -52,7 +52,7 @@ def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | No
 
     Examples
     --------
-    >>> from pbrl_ppl.scene import Shape
+    >>> from pbrl_ppl.scene.scene import Shape
     >>> pucks = (Body("a", Shape.circle(0.1)), Body("b", Shape.circle(0.2)))
     >>> scene = Scene(time_step=0.1, bodies=pucks)
     >>> start = np.zeros((1, 2, 6))

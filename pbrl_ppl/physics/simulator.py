@@ -11,9 +11,9 @@ from queue import SimpleQueue
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.differences import differentiate
 from pbrl_ppl.effects.base import Attached
 from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.numerics import differentiate
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import compiled, plain
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties

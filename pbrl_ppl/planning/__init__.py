@@ -1,1 +1,8 @@
-"""Planning on posteriors: goals, actions, A* and a receding horizon; it needs the file alone."""
+"""Goals, actions and the searches for a plan under posterior draws."""
+
+from pbrl_ppl.planning.actions import Action, ActionSet
+from pbrl_ppl.planning.dynamics import Dynamics
+from pbrl_ppl.planning.goals import Goal, Target
+from pbrl_ppl.planning.planner import Plan, plan, start_state
+
+__all__ = ["Action", "ActionSet", "Dynamics", "Goal", "Plan", "Target", "plan", "start_state"]

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.goals import read_tables, read_toml
 from pbrl_ppl.posterior import group, scene_of
-from pbrl_ppl.scene import Scene
-from pbrl_ppl.scene_checks import nearest
+from pbrl_ppl.scene import Scene, nearest
 
 Array = NDArray[np.float64]
 

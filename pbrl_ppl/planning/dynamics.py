@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.distributions import prior_residual
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.likelihood import next_state_random
+from pbrl_ppl.model import build_layout, next_state_random
+from pbrl_ppl.parameters import prior_residual
 from pbrl_ppl.physics import Simulator
-from pbrl_ppl.posterior import group
-from pbrl_ppl.prior import build_layout
-from pbrl_ppl.record import parameter_draws, problem_of
+from pbrl_ppl.posterior import group, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.scene import Scene
-from pbrl_ppl.scene_checks import nearest
+from pbrl_ppl.scene import Scene, nearest
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,132 @@
+"""Acting on plans: play some of one, look where that led, plan again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pbrl_ppl.errors import GoalError
+from pbrl_ppl.history import History, from_segments
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal, plan, start_state
+from pbrl_ppl.posterior import scene_of
+from pbrl_ppl.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Acted:
+    """What happened.
+
+    Attributes
+    ----------
+    scene : Scene
+        Orders the bodies.
+    states : ndarray
+        As the world returned them, the start first, shape (time + 1, body, 6), SI units.
+    wrenches : ndarray
+        As they were played, shape (time, body, 3), N and N m.
+    reached : bool
+        Whether the last state is within the goal's tolerances.
+    distance : float
+        L2 distance of the last state from the goal (m).
+    plans : int
+        How many were made.
+    """
+
+    scene: Scene
+    states: Array
+    wrenches: Array
+    reached: bool
+    distance: float
+    plans: int
+
+    def history(self) -> History:
+        """As a history of one trajectory: for :func:`pbrl_ppl.update`, say."""
+        return from_segments(
+            self.scene, self.states[:1], self.wrenches[None], self.states[None, 1:]
+        )
+
+
+def act(
+    world: Callable[[Array], Array],
+    idata: Any,
+    start: Mapping[str, Sequence[float]] | ArrayLike,
+    goal: Goal | Mapping[str, Sequence[float | None]],
+    actions: ActionSet | None = None,
+    *,
+    every: int | None = None,
+    intervals: int = 200,
+    **options: Any,
+) -> Acted:
+    """Plan, play the beginning of the plan, look, and plan again, until the goal is reached.
+
+    Parameters
+    ----------
+    world : callable
+        Plays one sampling interval: takes wrenches, shape (body, 3), world frame, N and N m, and
+        returns the measured states after it, shape (body, 6), SI units.
+    idata, start, goal, actions
+        As of :func:`pbrl_ppl.plan`.
+    every : int, optional
+        Intervals of a plan that are played before the next one is made; without it, the whole plan
+        is played, and that is all.
+    intervals : int
+        The most that are played.
+    **options
+        Of :func:`pbrl_ppl.plan`.
+
+    Returns
+    -------
+    Acted
+        States, wrenches, and whether the goal is reached.
+
+    Raises
+    ------
+    GoalError
+        As :func:`pbrl_ppl.plan`; if ``every`` or ``intervals`` is below 1, or the world returns
+        states of another shape.
+
+    Examples
+    --------
+    ::
+
+        done = act(robot.push_and_look, idata, start, goal, every=10, draws=16)
+        idata = pp.update(idata, done.history())
+    """
+    if intervals < 1 or (every is not None and every < 1):
+        raise GoalError(f"act: every is {every} and intervals {intervals}, expected 1 or more")
+    scene = idata.scene if isinstance(idata, Dynamics) else scene_of(idata)
+    goal = goal if isinstance(goal, Goal) else Goal.of(goal)
+    goal.check(scene)
+    states, plans = [start_state(scene, start)], 0
+    played: list[Array] = []
+    while len(played) < intervals and not _there(scene, goal, states[-1]):
+        ahead = plan(idata, states[-1], goal, actions, **options)
+        plans += 1
+        for wrench in ahead.wrenches[: intervals - len(played)][:every]:
+            state = np.asarray(world(wrench), dtype=float)
+            if state.shape != states[0].shape or not np.isfinite(state).all():
+                raise GoalError(
+                    f"act: the world returned states of shape {state.shape}, expected finite ones"
+                    f" of shape {states[0].shape}"
+                )
+            states.append(state)
+            played.append(wrench)
+            if every is not None and _there(scene, goal, state):
+                break
+        if every is None or not len(ahead.wrenches):
+            break
+    wrenches = np.array(played).reshape(-1, len(states[0]), 3)
+    distance = float(goal.distance(scene, states[-1]))
+    return Acted(
+        scene, np.array(states), wrenches, _there(scene, goal, states[-1]), distance, plans
+    )
+
+
+def _there(scene: Scene, goal: Goal, state: Array) -> bool:
+    return bool(goal.shortfall(scene, state) <= 1.0)

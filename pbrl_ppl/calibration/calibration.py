@@ -1,0 +1,258 @@
+"""Simulation-based calibration of the whole pipeline (Talts et al., 2018; Modrák et al., 2023).
+
+Parameters are drawn from the model's own prior, next states are simulated with them from the
+history's start states (Eq. 13), and the whole fit is run on these. If prior, engine, likelihood and
+sampler belong together, the true values' ranks among the posterior draws are uniform.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Generator, Iterable, Mapping
+from concurrent.futures import Executor, as_completed
+from contextlib import closing
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from pbrl_ppl.calibration.ranks import Calibration
+from pbrl_ppl.calibration.replication import Record, draw_truths, labels, replicate
+from pbrl_ppl.effects import Attached, Effect
+from pbrl_ppl.errors import FitError, OutputError
+from pbrl_ppl.history import History, write_atomically
+from pbrl_ppl.model import Problem, physics_model, sigma_prior
+from pbrl_ppl.posterior import versions
+from pbrl_ppl.scene import Scene
+
+#: What the replications in a folder depend on.
+_DESIGN = "design.json"
+
+
+def calibrate(
+    scene: Scene,
+    history: History,
+    *,
+    effects: Iterable[Effect | Attached] = (),
+    replications: int = 200,
+    seed: int = 1,
+    folder: str | Path | None = None,
+    executor: Executor | None = None,
+    horizon: int = 1,
+    sigma: str = "per_dimension",
+    nu: float | None = None,
+    substeps: int | None = None,
+    draws: int = 1500,
+    tune: int = 500,
+    chains: int = 4,
+    progress: bool = True,
+    **options: Any,
+) -> Calibration:
+    """Check prior, engine, likelihood and sampler against each other on simulated data.
+
+    Start states, actions and which cells are measured are the history's; what was measured counts
+    for nothing but the prior of sigma, which stays that of the history. A start state is exact, as
+    in Eq. 11. A wheel's equal descriptions are folded into one, of truth and draws alike. The
+    log-likelihood is ranked too: the parameters' ranks alone cannot see a fit that ignores its
+    data.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry, and the prior.
+    history : History
+        The design.
+    effects : iterable of Effect or Attached
+        Effects beside those that the scene declares.
+    replications : int
+        Simulated histories; fewer than 100 find gross faults alone.
+    seed : int
+        The same seed gives the same answer, whatever the executor.
+    folder : str or Path, optional
+        Where each finished replication is kept; a later call with the same arguments goes on from
+        there, with more replications if more are asked for. Made if missing.
+    executor : concurrent.futures.Executor, optional
+        Where replications are run; by default here, one after another.
+    horizon, sigma, nu, substeps : optional
+        As of :func:`pbrl_ppl.physics_model`.
+    draws, tune, chains : int
+        As of :func:`pbrl_ppl.fit`. A fit with fewer than 99 effective draws is done again with four
+        times the draws, at most twice.
+    progress : bool
+        Whether to show progress on stderr.
+    **options
+        Passed to :func:`pbrl_ppl.fit`.
+
+    Returns
+    -------
+    Calibration
+        Its ``dataset.attrs["redrawn"]`` counts the draws from the prior that the engine could not
+        simulate; they were drawn again, for the posterior excludes them too.
+
+    Raises
+    ------
+    FitError
+        If a joint's bodies are unknown, (almost) no draw from the prior can be simulated, or all
+        replications failed.
+    OutputError
+        If the folder holds another calibration, or cannot be written.
+    ValueError
+        If ``replications`` is below 2.
+
+    Warns
+    -----
+    UserWarning
+        If a replication failed.
+
+    Examples
+    --------
+    ::
+
+        result = calibrate(scene, history, folder="calibration", draws=250)
+        result.table()[["p_holm", "coverage_50", "coverage_90"]]
+        result.passed
+    """
+    if replications < 2:
+        raise ValueError(f"replications is {replications}, expected at least 2, better 200")
+    model = physics_model(
+        scene, history, effects, horizon=horizon, sigma=sigma, nu=nu, substeps=substeps
+    )
+    design: Problem = model.problem
+    if design.layout.discrete.any():
+        raise FitError(
+            "calibrate: which bodies a joint joins is unknown, and ranks are for parameters that"
+            " are not whole numbers; name the bodies in the scene"
+        )
+    median, spread = sigma_prior(design.observations, design.segments)
+    # a prior that looked at the simulated data would not be the one they were simulated from
+    design = replace(design, sigma_prior=(tuple(median.tolist()), spread))
+    settings = {"draws": draws, "tune": tune, "chains": chains, **options}
+    about = _about(design, seed, settings)
+    store = None if folder is None else _opened(Path(folder), about)
+    truths, redrawn = draw_truths(design, replications, seed)
+    # without what was computed, it is small enough to send
+    design = replace(design)
+    done: dict[int, Record] = {}
+    failures: dict[int, str] = {}
+    tasks = {}
+    for i, truth in enumerate(truths):
+        if store is not None and _file(store, i).is_file():
+            done[i] = _read(_file(store, i))
+        else:
+            tasks[i] = partial(replicate, design, truth, _seed(seed, i), settings)
+    with closing(_results(tasks, executor)) as results:
+        shown = track(
+            results,
+            f"calibrating, {len(done)} of {replications} done before",
+            total=len(tasks),
+            console=Console(stderr=True),
+            disable=not progress,
+        )
+        for i, result in shown:
+            try:
+                record = result()
+            except Exception as error:  # whatever it was, the other replications go on
+                failures[i] = f"replication {i}: {type(error).__name__}: {error}"
+                continue
+            if store is not None:
+                write_atomically(_file(store, i), partial(_write, text=json.dumps(record)))
+            done[i] = record
+    failed = tuple(failures[i] for i in sorted(failures))
+    if not done:
+        raise FitError(f"calibrate: all {replications} replications failed; {failed[0]}")
+    if failed:
+        warnings.warn(
+            f"{len(failed)} of {replications} replications failed; {failed[0]}", stacklevel=2
+        )
+    numbers = sorted(done)
+    columns = {name: np.array([done[i][name] for i in numbers]) for name in done[numbers[0]]}
+    return Calibration.of(
+        columns.pop("rank"),
+        columns.pop("size"),
+        list(labels(design)),
+        replication=np.array(numbers),
+        failures=failed,
+        attrs={key: json.dumps(value) for key, value in about.items()} | {"redrawn": redrawn},
+        **columns,
+    )
+
+
+def _seed(seed: int, number: int) -> int:
+    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
+
+
+def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[tuple[int, Any]]:
+    """Each task's number, and a call that gives its result or raises its error."""
+    if executor is None:
+        yield from tasks.items()
+        return
+    futures = {executor.submit(task): i for i, task in tasks.items()}
+    try:
+        for future in as_completed(futures):
+            yield futures[future], future.result
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """All that a replication's numbers depend on, as JSON has it."""
+    about = {
+        "scene": design.scene.to_toml(),
+        "history": design.history.data_sha256,
+        "effects": [[one.effect.name, one.body, repr(one.effect.parameters)]
+                    for one in design.effects],
+        "horizon": design.horizon,
+        "substeps": design.substeps,
+        "scalar_sigma": design.scalar_sigma,
+        "nu": design.nu,
+        "sigma_prior": design.sigma_prior,
+        "seed": seed,
+        "settings": dict(settings),
+        "versions": versions(),
+    }  # fmt: skip
+    return dict(json.loads(json.dumps(about)))
+
+
+def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
+    """Make the folder of a calibration, or check that it holds this one."""
+    path = folder / _DESIGN
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        if not path.exists():
+            if any(folder.iterdir()):
+                raise OutputError(f"{folder}: holds other files; choose a new or an empty folder")
+            write_atomically(path, partial(_write, text=json.dumps(about, indent=1)))
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        if isinstance(error, OutputError):
+            raise
+        raise OutputError(f"{path}: cannot be made or read: {error}") from error
+    other = [key for key, value in about.items() if found.get(key) != value]
+    if other:
+        raise OutputError(
+            f"{folder}: holds a calibration with another {', '.join(other)}"
+            f" ({other[0]}: {found.get(other[0])!r:.80}, expected {about[other[0]]!r:.80}); choose"
+            " another folder, or the arguments it was begun with"
+        )
+    return folder
+
+
+def _file(folder: Path, number: int) -> Path:
+    return folder / f"replication-{number:05d}.json"
+
+
+def _read(path: Path) -> Record:
+    try:
+        return dict(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError) as error:
+        raise OutputError(f"{path}: cannot be read: {error}; delete it to run it again") from error
+
+
+def _write(path: Path, text: str) -> int:
+    return path.write_text(text + "\n", encoding="utf-8")

@@ -1,0 +1,191 @@
+"""One replication of a simulation-based calibration: draw from the prior, simulate, fit, rank."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.calibration.ranks import MOST_DRAWS, rank
+from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
+from pbrl_ppl.history import STATE, from_segments
+from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.parameters import fold_wheels
+from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws
+from pbrl_ppl.sampling import fit
+
+Array = NDArray[np.float64]
+#: One replication's numbers, by name, each a list over the parameters.
+Record = dict[str, list[float]]
+
+#: A fit with fewer than 99 effective draws is done again with four times the draws, so often.
+_AGAIN, _LONGER = 2, 4
+#: Draws from the prior are given up where fewer than one in so many is possible.
+_MOST_REDRAWN = 50
+
+
+class Truth(NamedTuple):
+    """What a replication was simulated with, and the simulated next states.
+
+    Attributes
+    ----------
+    phi : ndarray
+        Shape (p,), SI units.
+    sigma : ndarray
+        Shape (state,).
+    values : ndarray
+        Shape (transition, H, body, state).
+    """
+
+    phi: Array
+    sigma: Array
+    values: Array
+
+
+def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
+    """Draw parameters from the model's prior and next states by Eq. 13, with PyMC.
+
+    Parameters
+    ----------
+    design : Problem
+        Says the prior, start states and actions.
+    n : int
+        How many; the first of more are the same.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    truths : list of Truth
+        Such as the engine can simulate.
+    redrawn : int
+        How many others came up between them.
+
+    Raises
+    ------
+    FitError
+        If too few draws can be simulated.
+    """
+    model = build_model(design)
+    names = [block.name for block in design.layout.blocks] + ["sigma", "next_state"]
+    total = n
+    while total <= _MOST_REDRAWN * n:
+        # compiling would take longer than drawing
+        drawn = pm.draw(
+            [model[name] for name in names], draws=total, random_seed=seed, mode="FAST_COMPILE"
+        )
+        prior = {
+            name: (("chain", "draw", *(f"{name}_{d}" for d in range(value.ndim - 1))), value[None])
+            for name, value in zip(names[:-1], drawn[:-1], strict=True)
+        }
+        trace = from_groups({"posterior": xr.Dataset(prior)}, {})
+        phi, sigma = parameter_draws(design, trace)
+        values = drawn[-1]
+        possible = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        chosen = np.flatnonzero(possible)[:n]
+        if len(chosen) == n:
+            truths = [Truth(phi[i], sigma[i], values[i]) for i in chosen]
+            return truths, int(chosen[-1]) + 1 - n
+        total *= 2
+    raise FitError(
+        f"calibrate: {possible.sum()} of {len(possible)} draws from the prior can be simulated,"
+        f" expected at least 1 in {_MOST_REDRAWN}; make the scene's prior narrower"
+    )
+
+
+def simulated(design: Problem, values: Array) -> Problem:
+    """The problem with other next states in place of the measured ones.
+
+    Its history has one trajectory a segment, so that each starts from the design's own state.
+
+    Parameters
+    ----------
+    design : Problem
+        Start states, actions and which cells are measured.
+    values : ndarray
+        Next states, shape (transition, H, body, state), SI units.
+    """
+    segments, observations = design.segments, design.observations
+    observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)
+    observed[..., list(observations.columns)] = np.where(observations.measured, values, np.nan)
+    history = from_segments(design.scene, segments.start, segments.actions, observed)
+    return replace(design, history=history)
+
+
+def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, Any]) -> Record:
+    """Fit what was simulated and rank the truth among the posterior draws.
+
+    Parameters
+    ----------
+    design : Problem
+        As for :func:`simulated`, with a prior of sigma.
+    truth : Truth
+        From :func:`draw_truths`.
+    seed : int
+        Of the fit.
+    settings : mapping
+        Arguments of :func:`pbrl_ppl.fit`.
+
+    Returns
+    -------
+    dict of str to list
+        ``rank``, ``size``, ``truth``, ``ess`` and ``r_hat``, over the parameters.
+    """
+    problem = simulated(design, truth.values)
+    model = build_model(problem)
+    settings = {"cores": 1, **settings}
+    for again in range(_AGAIN + 1):
+        with warnings.catch_warnings():
+            # convergence is in the result; the others are of made-up data
+            for kind in (ConvergenceWarning, BoundWarning, UninformedWarning):
+                warnings.simplefilter("ignore", kind)
+            idata = fit(model, seed=seed, progress=False, **settings)
+        if "interrupted" in idata.attrs:
+            raise KeyboardInterrupt
+        sizes = group(idata, "posterior").sizes
+        likelihood = group(idata, "log_likelihood")["next_state"].sum("transition").values
+        drawn = _quantities(problem, *parameter_draws(problem, idata), likelihood.ravel())
+        shape = (sizes["chain"], sizes["draw"])
+        data = {
+            name: (("chain", "draw"), column.reshape(shape))
+            for name, column in zip(labels(problem), drawn.T, strict=True)
+        }
+        # of the folded draws: a chain that changes between equal wheels has not failed to mix
+        r_hat, ess = convergence(from_groups({"posterior": xr.Dataset(data)}, {}))
+        if min(ess.values()) >= MOST_DRAWS or again == _AGAIN:
+            break
+        settings |= {key: _LONGER * settings[key] for key in ("draws", "tune")}
+    residual = problem.residual(truth.phi)
+    of_truth = problem.log_density(residual, truth.sigma).sum(keepdims=True)
+    true = _quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
+    ranks = [
+        rank(column, value, each)
+        for column, value, each in zip(drawn.T, true, ess.values(), strict=True)
+    ]
+    return {
+        "rank": [each[0] for each in ranks],
+        "size": [each[1] for each in ranks],
+        "truth": true.tolist(),
+        "ess": list(ess.values()),
+        "r_hat": list(r_hat.values()),
+    }
+
+
+def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
+    """What is ranked, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
+    if problem.scalar_sigma:
+        sigma = sigma[:, :1]
+    return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])
+
+
+def labels(problem: Problem) -> tuple[str, ...]:
+    """Names of what is ranked, such as ``mass[cart]``."""
+    names = problem.observations.names
+    sigma = ("sigma",) if problem.scalar_sigma else tuple(f"sigma[{name}]" for name in names)
+    return (*problem.layout.labels, *sigma, "log_likelihood")

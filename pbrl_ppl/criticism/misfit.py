@@ -1,0 +1,146 @@
+"""What is left in the residual after the catalogue: a permutation test of a flexible regression."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.criticism.findings import Unexplained
+from pbrl_ppl.model import STATE
+from pbrl_ppl.modes import Mode
+
+Array = NDArray[np.float64]
+
+#: Chance of calling clean data unexplained.
+FALSE_ALARM = 0.01
+#: Less than this share of the residual's variance does not matter.
+SMALLEST_SHARE = 0.02
+_PERMUTATIONS = 499
+_FOLDS = 5
+_RIDGE = 1.0
+#: More transitions than this say the same more slowly.
+_MOST = 1500
+
+FEATURES = (
+    "position x",
+    "position y",
+    "orientation (cosine)",
+    "orientation (sine)",
+    "forward speed",
+    "sideways speed",
+    "angular speed",
+    "speed",
+    "commanded forward force",
+    "commanded sideways force",
+    "commanded torque",
+    "time",
+)
+
+
+def find_remainder(mode: Mode, *, seed: int = 0) -> Unexplained | None:
+    """Test whether the residual of a fitted model still depends on state, action or time.
+
+    A kernel ridge regression with one smooth term a quantity predicts the residual of trajectories
+    that it was not trained on; the null distribution comes from shuffling the transitions.
+
+    Parameters
+    ----------
+    mode : Mode
+        A fitted model.
+    seed : int
+        Of the shuffling and the folds.
+
+    Returns
+    -------
+    Unexplained or None
+        Where the structure is strongest; None if there is none beyond chance.
+    """
+    rng = np.random.default_rng(seed)
+    problem = mode.problem
+    n, k = problem.segments.n, len(problem.scene.dynamic)
+    chosen = np.sort(rng.permutation(n)[:_MOST])
+    columns = problem.observations.columns
+    # a segment's residual in one number a dimension: independent cells, so their scaled sum
+    target = mode.whitened.reshape(n, problem.horizon, k, len(columns)).sum(1)
+    target = target[chosen] / np.sqrt(problem.horizon)
+    groups = problem.segments.trajectory[chosen]
+    best: Unexplained | None = None
+    for i, body in enumerate(problem.scene.dynamic):
+        features = _features(mode, i)[chosen]
+        y = target[:, i] - target[:, i].mean(axis=0)
+        kernels = _kernels(features)
+        smoother = _cross_validated(kernels.sum(axis=0), groups, rng)
+        shares = _explained(smoother, y)
+        null = np.array(
+            [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
+        )
+        at = int(np.argmax(shares))
+        p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * k
+        if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE:
+            continue
+        if best is None or shares[at] > best.share:
+            best = _describe(body.name, STATE[columns[at]], kernels, y[:, at], shares[at], p_value)
+    return best
+
+
+def _features(mode: Mode, body: int) -> Array:
+    """State and action at each segment's start, in the body's frame, shape (transition, 12)."""
+    segments = mode.problem.segments
+    x, y, theta, vx, vy, omega = segments.start[:, body].T
+    fx, fy, torque = segments.actions[:, :, body].mean(axis=1).T
+    c, s = np.cos(theta), np.sin(theta)
+    time = segments.step.astype(float)
+    return np.stack(
+        [
+            x, y, c, s, c * vx + s * vy, c * vy - s * vx, omega, np.hypot(vx, vy),
+            c * fx + s * fy, c * fy - s * fx, torque, time,
+        ],
+        axis=1,
+    )  # fmt: skip
+
+
+def _kernels(features: Array) -> Array:
+    """One Gaussian kernel a quantity, on ranks scaled to unit range, shape (feature, n, n)."""
+    order = np.argsort(np.argsort(features, axis=0), axis=0) / max(len(features) - 1, 1)
+    varies = np.ptp(features, axis=0) > 1e-9
+    order = np.where(varies, order, 0.0)
+    difference = order.T[:, :, None] - order.T[:, None, :]
+    kernels = np.exp(-0.5 * (difference / 0.2) ** 2)
+    kernels[~varies] = 0.0
+    return kernels / max(int(varies.sum()), 1)
+
+
+def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Matrix that predicts each transition from those of other trajectories."""
+    smoother = np.zeros_like(kernel)
+    names = rng.permutation(np.unique(groups))
+    for held in np.array_split(names, min(_FOLDS, len(names))):
+        out = np.isin(groups, held)
+        inner = kernel[np.ix_(~out, ~out)] + _RIDGE * np.eye(int((~out).sum()))
+        smoother[np.ix_(out, ~out)] = np.linalg.solve(inner, kernel[np.ix_(~out, out)]).T
+    return smoother
+
+
+def _explained(smoother: Array, y: Array) -> Array:
+    """Share of variance predicted, per column."""
+    size = np.maximum((y**2).sum(axis=0), 1e-300)
+    return np.asarray(1.0 - ((y - smoother @ y) ** 2).sum(axis=0) / size)
+
+
+def _describe(
+    body: str, dimension: str, kernels: Array, y: Array, share: float, p_value: float
+) -> Unexplained:
+    weights = np.linalg.solve(kernels.sum(axis=0) + _RIDGE * np.eye(len(y)), y)
+    parts = np.array([np.var(kernel @ weights) for kernel in kernels])
+    name = FEATURES[int(np.argmax(parts))]
+    return Unexplained(
+        body=body,
+        dimension=dimension,
+        depends_on=name,
+        share=float(share),
+        p_value=min(1.0, p_value),
+        sentence=(
+            f"the error of {dimension} of {body} still depends on its {name}:"
+            f" {share:.0%} of it could be predicted, and nothing in the catalogue does so"
+        ),
+    )

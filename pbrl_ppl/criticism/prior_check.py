@@ -1,0 +1,213 @@
+"""Prior predictive check: whether the declared prior could have produced data like these."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import FitError
+from pbrl_ppl.model import STATE, STATE_UNITS, Problem
+from pbrl_ppl.posterior import HDI_PROB, group
+
+Array = NDArray[np.float64]
+
+#: Where the quantiles are taken: the ends and middle of the interval, and its half.
+QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
+#: More than this share of cells beyond all draws, and the prior cannot have made the data. Measured
+#: with 200 draws: at most 0.08 on sound problems, at least 0.14 with a mass 100 times too large.
+#: The share inside the interval tells less: all cells share one phi, which may be in a tail.
+MOST_BEYOND = 0.11
+_FEWEST = 50
+_CHUNK = 16
+
+
+@dataclass(frozen=True, eq=False)
+class PriorCheck:
+    """Measured changes of state over a segment against what the prior predicts.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        With the dims body, state and quantile, in the units of the states:
+
+        - ``predicted`` and ``measured`` (body, state, quantile): changes, all cells pooled;
+        - ``predicted_sd`` and ``measured_sd`` (body, state);
+        - ``predicted_extent`` (body, state): 94 % of the predicted changes are at most so large;
+        - ``measured_largest`` (body, state): the largest measured change;
+        - ``share_inside`` (body, state): share of the measured cells inside the central 94 % of
+          their own predictions;
+        - ``share_beyond`` (body, state): share that lies beyond all of them.
+    seconds : float
+        Length of a segment (s).
+    draws, diverged : int
+        Draws from the prior, and those that the engine could not follow and that were left out.
+    """
+
+    dataset: xr.Dataset
+    seconds: float
+    draws: int
+    diverged: int
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """Where the data are outside of what the prior can produce; none where they are inside."""
+        found = []
+        for body in self.dataset["body"].values:
+            for state in self.dataset["state"].values:
+                one = self.dataset.sel(body=body, state=state)
+                unit = STATE_UNITS[STATE.index(str(state))]
+                share = float(one["share_beyond"])
+                if not share > MOST_BEYOND:  # or not measured
+                    continue
+                found.append(
+                    f"{state} of {body} changes by up to {float(one['measured_largest']):.3g}"
+                    f" {unit} in {self.seconds:g} s; under the prior 94 % of changes are within"
+                    f" {float(one['predicted_extent']):.3g} {unit}, and none of {self.draws} draws"
+                    f" from it reaches {100 * share:.0f} % of the measured ones: check units, or"
+                    " the prior's hyper-parameters"
+                )
+        if self.diverged > 0.1 * self.draws:
+            found.append(
+                f"the engine diverged on {self.diverged} of {self.draws} draws from the prior:"
+                " narrow the prior, or use more substeps"
+            )
+        return tuple(found)
+
+
+def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) -> PriorCheck:
+    """Compare measured changes over a segment with what the prior predicts for them.
+
+    The noise added to the predictions is the median of sigma's prior. All of that prior would not
+    do: it is scaled by the data and so wide that noise could explain any change.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        As made by :func:`pbrl_ppl.physics_model`.
+    draws : int
+        Draws from the prior, at least 50: what none of them reaches counts against the prior.
+    seed : int
+        The same seed gives the same answer.
+
+    Returns
+    -------
+    PriorCheck
+        Its ``sentences`` are empty where the prior could have made the data.
+
+    Raises
+    ------
+    FitError
+        If the model was not made by ``physics_model``, or the engine diverged on every draw.
+    ValueError
+        If ``draws`` is below 50.
+
+    Examples
+    --------
+    ::
+
+        check = pp.prior_predictive_check(pp.physics_model(scene, history))
+        check.dataset["share_inside"]
+        check.sentences  # ('omega of cart changes by up to 12 rad/s in 0.1 s; under ...',)
+    """
+    problem = getattr(model, "problem", None)
+    if not isinstance(problem, Problem):
+        raise FitError("prior check: this pm.Model was not made by physics_model; make it so")
+    if draws < _FEWEST:
+        raise ValueError(f"draws is {draws}, expected at least {_FEWEST}")
+    rng = np.random.default_rng(seed)
+    observations, segments = problem.observations, problem.segments
+    columns = list(observations.columns)
+    noise = problem.noise_prior[0]
+    first = segments.start[..., columns]
+    measured = observations.wrapped(observations.values[:, -1] - first)
+    phi = _prior_draws(model, problem, draws, rng)
+    ends = np.concatenate(
+        [
+            problem.predict(phi[i : i + _CHUNK])[..., -1, :, :][..., columns]
+            for i in range(0, len(phi), _CHUNK)
+        ]
+    )
+    good = np.isfinite(ends).all(axis=(1, 2, 3))
+    if good.sum() < 2:
+        raise FitError(
+            f"prior check: the engine diverged on {len(good) - good.sum()} of {len(good)} draws"
+            " from the prior; narrow the prior's hyper-parameters, or use more substeps"
+        )
+    ends = ends[good] + noise * rng.standard_normal(ends[good].shape)
+    predicted = observations.wrapped(ends - first)
+    dataset = _compare(predicted, measured)
+    coords = {
+        "body": [body.name for body in problem.scene.dynamic],
+        "state": list(observations.names),
+        "quantile": list(QUANTILES),
+    }
+    return PriorCheck(
+        dataset.assign_coords(coords),
+        problem.horizon * problem.scene.time_step,
+        draws,
+        int(draws - good.sum()),
+    )
+
+
+def _prior_draws(model: pm.Model, problem: Problem, draws: int, rng: np.random.Generator) -> Array:
+    """Phi from the model's prior, shape (draw, p)."""
+    names = [block.name for block in problem.layout.blocks]
+    if not names:
+        return np.zeros((draws, 0))
+    with _quiet():
+        idata = pm.sample_prior_predictive(
+            draws, model=model, var_names=names, random_seed=int(rng.integers(2**31))
+        )
+    prior = group(idata, "prior")
+    return problem.layout.to_vectors({name: prior[name].to_numpy() for name in names}, draws)
+
+
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Without PyMC's line that it samples, and PyMC 6's that truncated normals run in Python."""
+    logger = logging.getLogger("pymc")
+    level = logger.level
+    logger.setLevel(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "Numba will use object mode", UserWarning)
+            yield
+    finally:
+        logger.setLevel(level)
+
+
+def _compare(predicted: Array, measured: Array) -> xr.Dataset:
+    """Summaries of changes: (draw, transition, body, state), and (transition, body, state)."""
+    seen = np.isfinite(measured)
+    low, high = np.quantile(predicted, [QUANTILES[0], QUANTILES[-1]], axis=0)
+    inside = (measured >= low) & (measured <= high)
+    beyond = (measured < predicted.min(axis=0)) | (measured > predicted.max(axis=0))
+    total = np.maximum(seen.sum(axis=0), 1)
+    # cells that were not measured count on neither side
+    pooled = np.where(seen, predicted, np.nan).reshape(-1, *measured.shape[1:])
+    dims = ("body", "state")
+    some = seen.any(axis=0)
+    safe = np.where(some, 1.0, np.nan)
+    pooled, own = (np.where(some, each, 0.0) for each in (pooled, measured))
+    predicted_quantiles = np.nanquantile(pooled, QUANTILES, axis=0) * safe
+    measured_quantiles = np.nanquantile(own, QUANTILES, axis=0) * safe
+    return xr.Dataset(
+        {
+            "predicted": (("quantile", *dims), predicted_quantiles),
+            "measured": (("quantile", *dims), measured_quantiles),
+            "predicted_sd": (dims, np.nanstd(pooled, axis=0) * safe),
+            "measured_sd": (dims, np.nanstd(own, axis=0) * safe),
+            "predicted_extent": (dims, np.nanquantile(np.abs(pooled), HDI_PROB, axis=0) * safe),
+            "measured_largest": (dims, np.nanmax(np.abs(own), axis=0) * safe),
+            "share_inside": (dims, inside.sum(axis=0) / total * safe),
+            "share_beyond": (dims, beyond.sum(axis=0) / total * safe),
+        }
+    ).transpose("body", "state", "quantile")

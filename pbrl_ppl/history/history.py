@@ -1,0 +1,291 @@
+"""Histories: measured states and actions, validated, as an `xarray.Dataset`."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pandas as pd
+import xarray as xr
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.files import STATE, WRENCH, read_table, to_table, write_dataset
+from pbrl_ppl.history.rows import arrays
+from pbrl_ppl.history.start import complete_start
+from pbrl_ppl.scene import Scene
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+__all__ = ["STATE", "STATE_UNITS", "WRENCH", "WRENCH_UNITS", "History", "Segments"]
+
+STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+WRENCH_UNITS = ("N", "N", "N m")
+
+
+@dataclass(frozen=True, eq=False)
+class Segments:
+    """Pieces of a history: predict H intervals from one state.
+
+    Attributes
+    ----------
+    start : (n, k, 6) array
+        State to start from, complete (m, m, rad, m/s, m/s, rad/s).
+    actions : (n, H, k, 3) array
+        Wrench in each interval (N, N, N m).
+    observed : (n, H, k, 6) array
+        State measured at the end of each interval; NaN where missing.
+    trajectory, step : (n,) arrays of int
+        Position of the trajectory and of the step where the piece starts.
+    """
+
+    start: Floats
+    actions: Floats
+    observed: Floats
+    trajectory: Ints
+    step: Ints
+
+    @property
+    def n(self) -> int:
+        """Number of segments."""
+        return len(self.start)
+
+    @property
+    def horizon(self) -> int:
+        """Intervals in each segment, H."""
+        return int(self.actions.shape[1])
+
+
+class History:
+    """A measured history of the bodies of a scene that move; treat it as read-only.
+
+    Parameters
+    ----------
+    dataset : xarray.Dataset
+        As built by `load` and `from_dataframe`, with the variables
+
+        - ``observed`` (trajectory, time, body, state): the measured state; NaN where missing
+          (m, m, rad, m/s, m/s, rad/s);
+        - ``action`` (trajectory, time, body, wrench): held over the interval that starts there;
+          NaN on a trajectory's last row and after (N, N, N m);
+        - ``start`` (trajectory, time, body, state): the state completed through hinges and
+          estimated velocities;
+        - ``clock`` (trajectory, time): time (s);
+        - ``n_rows`` (trajectory,): number of steps.
+
+    Examples
+    --------
+    ::
+
+        history = History.load("train.csv", scene)
+        history.segments(horizon=5).start.shape
+    (72, 1, 6)
+    """
+
+    def __init__(self, dataset: xr.Dataset) -> None:
+        self.dataset = dataset
+
+    @classmethod
+    def load(cls, path: str | Path, scene: Scene, *, estimate_velocities: bool = False) -> History:
+        """Read a history from a CSV, Parquet or NetCDF file, by suffix.
+
+        Parameters
+        ----------
+        path : str or pathlib.Path
+            File with one row for each (trajectory, step, body), or one that `save` wrote.
+        scene : Scene
+            The bodies, hinges and time step that are expected.
+        estimate_velocities : bool
+            Whether velocities that were never measured are estimated from positions for ``start``
+            (by a local polynomial); they stay missing in ``observed``.
+
+        Raises
+        ------
+        HistoryError
+            If the file cannot be used; the message says where and what to do.
+        """
+        path = Path(path)
+        return cls.from_dataframe(
+            read_table(path),
+            scene,
+            estimate_velocities=estimate_velocities,
+            source=f"history {path}",
+        )
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        frame: pd.DataFrame,
+        scene: Scene,
+        *,
+        estimate_velocities: bool = False,
+        source: str = "history",
+    ) -> History:
+        """Build a history from a table; arguments and errors as `load`.
+
+        Rows are numbered in messages as in a file, with the header as row 1.
+        """
+        if not isinstance(frame, pd.DataFrame):
+            raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
+        table = arrays(frame, scene, source)
+        start = complete_start(table.state, scene, estimate_velocities=estimate_velocities)
+        state_dims = ("trajectory", "time", "body", "state")
+        state_units = {"units": ", ".join(STATE_UNITS)}
+        wrench_units = {"units": ", ".join(WRENCH_UNITS)}
+        dataset = xr.Dataset(
+            {
+                "observed": (state_dims, table.state, state_units),
+                "action": (("trajectory", "time", "body", "wrench"), table.action, wrench_units),
+                "start": (state_dims, start, state_units),
+                "clock": (("trajectory", "time"), table.clock, {"units": "s"}),
+                "n_rows": ("trajectory", table.n_rows),
+            },
+            coords={
+                "trajectory": table.labels,
+                "time": np.arange(table.clock.shape[1]),
+                "body": [body.name for body in scene.dynamic],
+                "state": list(STATE),
+                "wrench": list(WRENCH),
+            },
+            attrs={"time_step": scene.time_step},
+        )
+        return cls(_hashed(dataset))
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """Return the measured rows, one for each (trajectory, step, body); steps count from 0."""
+        return to_table(self.dataset)
+
+    def save(self, path: str | Path) -> None:
+        """Write what was measured as CSV, Parquet or NetCDF, by suffix, atomically.
+
+        Raises
+        ------
+        OutputError
+            If the suffix is unknown or the file cannot be written.
+        """
+        write_dataset(self.dataset, Path(path))
+
+    def segments(self, horizon: int = 1) -> Segments:
+        """Cut every trajectory into pieces of ``horizon`` intervals that do not overlap.
+
+        What is left over at a trajectory's end, and pieces whose start is incomplete, are dropped.
+
+        Raises
+        ------
+        HistoryError
+            If the horizon is not a whole number from 1 up, or no piece is left.
+        """
+        if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
+            raise HistoryError(f"horizon is {horizon!r}, expected a whole number from 1 up")
+        intervals = self.dataset["n_rows"].to_numpy() - 1
+        if horizon > intervals.max():
+            raise HistoryError(
+                f"horizon is {horizon} intervals, and the longest trajectory has "
+                f"{intervals.max()}; use a shorter horizon"
+            )
+        counts = intervals // horizon
+        trajectory = np.repeat(np.arange(len(counts)), counts)
+        step = np.concatenate([np.arange(count) * horizon for count in counts])
+        start = self.dataset["start"].to_numpy()
+        complete = np.isfinite(start[trajectory, step]).all(axis=(1, 2))
+        trajectory, step = trajectory[complete], step[complete]
+        if not len(step):
+            raise HistoryError(
+                f"no segment of {horizon} intervals starts from a complete state; use another "
+                "horizon, or measure the states there"
+            )
+        rows = step[:, None] + np.arange(horizon)
+        return Segments(
+            start=start[trajectory, step],
+            actions=self.dataset["action"].to_numpy()[trajectory[:, None], rows],
+            observed=self.dataset["observed"].to_numpy()[trajectory[:, None], rows + 1],
+            trajectory=trajectory,
+            step=step,
+        )
+
+    def split(self, test_fraction: float = 0.25, seed: int = 0) -> tuple[History, History]:
+        """Return a part to train on and a part to test on, of whole trajectories.
+
+        Raises
+        ------
+        HistoryError
+            If there are fewer than 2 trajectories, or the fraction is not between 0 and 1.
+        """
+        n = self.n_trajectories
+        if not 0 < test_fraction < 1:
+            raise HistoryError(f"test_fraction is {test_fraction}, expected between 0 and 1")
+        if n < 2:
+            raise HistoryError(
+                f"a history of {n} trajectory cannot be split by whole trajectories; expected at "
+                "least 2; record another, or give the test data in a file of their own"
+            )
+        n_test = min(max(round(test_fraction * n), 1), n - 1)
+        shuffled = np.random.default_rng(seed).permutation(n)
+        return (
+            self.select(sorted(shuffled[n_test:].tolist())),
+            self.select(sorted(shuffled[:n_test].tolist())),
+        )
+
+    def select(self, trajectories: Sequence[int] | Ints) -> History:
+        """Return the trajectories at these positions, in this order.
+
+        Raises
+        ------
+        HistoryError
+            If there are none, or a position is out of range or given twice.
+        """
+        positions = [int(position) for position in trajectories]
+        n = self.n_trajectories
+        if not positions or not all(0 <= position < n for position in positions):
+            raise HistoryError(f"trajectories {positions} asked for, expected some of 0 to {n - 1}")
+        if len(set(positions)) < len(positions):
+            raise HistoryError(f"trajectories {positions} asked for; expected each once")
+        chosen = self.dataset.isel(trajectory=positions)
+        chosen = chosen.isel(time=slice(int(chosen["n_rows"].max())))
+        return History(_hashed(chosen))
+
+    @property
+    def n_trajectories(self) -> int:
+        """Number of trajectories."""
+        return int(self.dataset.sizes["trajectory"])
+
+    @property
+    def n_transitions(self) -> int:
+        """Number of intervals: steps that have a next one, whatever the number of bodies."""
+        return int((self.dataset["n_rows"] - 1).sum())
+
+    @property
+    def bodies(self) -> tuple[str, ...]:
+        """Names of the bodies, in the order of the arrays."""
+        return tuple(str(name) for name in self.dataset["body"].to_numpy())
+
+    @property
+    def data_sha256(self) -> str:
+        """Hash of what was measured, the same for the same data in any file format."""
+        return str(self.dataset.attrs["data_sha256"])
+
+    def __repr__(self) -> str:
+        return (
+            f"History({self.n_trajectories} trajectories, {self.n_transitions} transitions, "
+            f"bodies {', '.join(self.bodies)}, sha256 {self.data_sha256[:12]})"
+        )
+
+
+def _hashed(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the dataset with the hash of its measured arrays among its attributes."""
+    digest = hashlib.sha256()
+    for name in ("trajectory", "body"):
+        digest.update("\0".join(str(label) for label in dataset[name].to_numpy()).encode())
+        digest.update(b"\1")
+    digest.update(dataset["n_rows"].to_numpy().astype("<i8").tobytes())
+    for name in ("clock", "observed", "action"):
+        values: Any = dataset[name].to_numpy()
+        # One NaN and one zero: both have several bit patterns.
+        canonical = np.where(np.isnan(values), np.nan, values + 0.0)
+        digest.update(np.ascontiguousarray(canonical, dtype="<f8").tobytes())
+    return dataset.assign_attrs(data_sha256=digest.hexdigest())

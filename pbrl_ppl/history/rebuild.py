@@ -1,0 +1,47 @@
+"""A history again, from the segments that a problem or a posterior file holds."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pbrl_ppl.history.history import STATE, WRENCH, History
+from pbrl_ppl.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+def from_segments(scene: Scene, start: Array, actions: Array, observed: Array) -> History:
+    """A history of segments; arguments as of :func:`segment_rows`."""
+    return History.from_dataframe(segment_rows(scene, start, actions, observed), scene)
+
+
+def segment_rows(scene: Scene, start: Array, actions: Array, observed: Array) -> pd.DataFrame:
+    """A history's rows, of one trajectory a segment, each from its own start state.
+
+    Parameters
+    ----------
+    scene : Scene
+        Names the bodies and the time step.
+    start : ndarray
+        Complete start states, shape (n, body, 6), SI units.
+    actions : ndarray
+        Wrenches, shape (n, H, body, 3).
+    observed : ndarray
+        Next states, shape (n, H, body, 6), NaN where missing.
+    """
+    n, h, k = actions.shape[:3]
+    states = np.concatenate([start[:, None], observed], axis=1)
+    wrenches = np.concatenate([actions, np.full((n, 1, k, len(WRENCH)), np.nan)], axis=1)
+    trajectory, step, body = np.indices((n, h + 1, k)).reshape(3, -1)
+    return pd.DataFrame(
+        {
+            "trajectory": trajectory,
+            "step": step,
+            "time": step * scene.time_step,
+            "body": np.array([each.name for each in scene.dynamic])[body],
+            **dict(zip(STATE, states.reshape(-1, len(STATE)).T, strict=True)),
+            **dict(zip(WRENCH, wrenches.reshape(-1, len(WRENCH)).T, strict=True)),
+        }
+    )

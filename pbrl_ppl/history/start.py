@@ -1,0 +1,134 @@
+"""States that a segment may start from: what was measured, completed by hinges and derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from scipy.signal import savgol_filter
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.files import STATE
+from pbrl_ppl.scene import WORLD, Point, Scene
+
+Floats = npt.NDArray[np.float64]
+
+
+def complete_start(state: Floats, scene: Scene, *, estimate_velocities: bool) -> Floats:
+    """Return the states completed; measured cells are kept.
+
+    Parameters
+    ----------
+    state : (trajectory, time, body, 6) array
+        Measured states, NaN where missing (m, m, rad, m/s, m/s, rad/s).
+    scene : Scene
+        Its known hinges give positions and velocities from angles.
+    estimate_velocities : bool
+        Whether velocities that were never measured are estimated from positions.
+
+    Raises
+    ------
+    HistoryError
+        If no step before a trajectory's last has a complete state.
+    """
+    start = state.copy()
+    if estimate_velocities:
+        # The angular velocity first: hinges turn it into velocities.
+        _estimate(start, state, (5,), scene.time_step)
+    fill_hinges(start, scene)
+    if estimate_velocities:
+        _estimate(start, state, (3, 4), scene.time_step)
+        fill_hinges(start, scene)
+    if not np.isfinite(start[:, :-1]).all(axis=(-1, -2)).any():
+        raise HistoryError(_incomplete(start, scene))
+    return start
+
+
+def _incomplete(start: Floats, scene: Scene) -> str:
+    parts = []
+    for i, body in enumerate(scene.dynamic):
+        lacking = [name for j, name in enumerate(STATE) if np.isnan(start[:, :, i, j]).all()]
+        if lacking:
+            parts.append(f'{", ".join(lacking)} of body "{body.name}"')
+    what = "; ".join(parts) or "some cells at every step"
+    return (
+        f"history: no step has a complete state to start from: missing are {what}; measure them, "
+        "declare the hinge that holds the body in the scene (it gives x, y, vx, vy from theta and "
+        "omega), or pass estimate_velocities=True (it gives vx, vy, omega from x, y, theta)"
+    )
+
+
+def fill_hinges(start: Floats, scene: Scene) -> None:
+    """Fill missing x, y, vx, vy of hinged bodies in place, breadth first from the world."""
+    position = {body.name: i for i, body in enumerate(scene.dynamic)}
+    for parent, child, at_parent, at_child in _hinge_order(scene):
+        if child not in position:
+            continue
+        if parent in position:
+            origin = start[:, :, position[parent]]
+        else:
+            pose = (0.0, 0.0, 0.0) if parent == WORLD else scene.body(parent).pose
+            origin = np.broadcast_to(
+                np.array([*(pose or ()), 0.0, 0.0, 0.0]), (*start.shape[:2], 6)
+            )
+        body = start[:, :, position[child]]
+        arm, arm_rate = lever(origin, at_parent)
+        own, own_rate = lever(body, at_child)
+        place = origin[..., :2] + arm - own
+        speed = origin[..., 3:5] + arm_rate - own_rate
+        for columns, filled in ((slice(0, 2), place), (slice(3, 5), speed)):
+            body[..., columns] = np.where(np.isnan(body[..., columns]), filled, body[..., columns])
+
+
+def lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
+    """Return an anchor's offset from its body's origin in the world, and that offset's rate."""
+    cos, sin = np.cos(state[..., 2]), np.sin(state[..., 2])
+    x = cos * anchor[0] - sin * anchor[1]
+    y = sin * anchor[0] + cos * anchor[1]
+    return np.stack([x, y], -1), np.stack([-y, x], -1) * state[..., 5:6]
+
+
+def _hinge_order(scene: Scene) -> list[tuple[str, str, Point, Point]]:
+    """Return known hinges as (parent, child, anchors), breadth first from what is fixed."""
+    edges = []
+    for joint in scene.joints:
+        if joint.kind == "hinge" and joint.known and joint.bodies:
+            a, b = joint.bodies
+            at_a, at_b = joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0)
+            edges += [(a, b, at_a, at_b), (b, a, at_b, at_a)]
+    fixed = [WORLD, *(body.name for body in scene.bodies if body.static)]
+    reached, order = list(fixed), []
+    for parent in reached:  # the list grows while it is walked: that is the breadth-first queue
+        for edge in edges:
+            if edge[0] == parent and edge[1] not in reached:
+                order.append(edge)
+                reached.append(edge[1])
+    # Then chains that hang on a body whose position was measured.
+    return order + [edge for _ in scene.bodies for edge in edges]
+
+
+def _estimate(start: Floats, state: Floats, columns: tuple[int, ...], dt: float) -> None:
+    """Fill velocities that were never measured, by a local polynomial of the positions."""
+    for body in range(state.shape[2]):
+        for column in columns:
+            if not np.isnan(start[:, :, body, column]).all():
+                continue
+            for trajectory in range(state.shape[0]):
+                values = start[trajectory, :, body, column - 3]
+                start[trajectory, :, body, column] = _derivative(values, dt, angle=column == 5)
+
+
+def _derivative(values: Floats, dt: float, *, angle: bool) -> Floats:
+    """Return the rate of a series, run by run of its finite values; NaN elsewhere."""
+    rate = np.full(values.shape, np.nan)
+    finite = np.flatnonzero(np.isfinite(values))
+    for run in np.split(finite, np.flatnonzero(np.diff(finite) > 1) + 1):
+        if len(run) < 2:
+            continue
+        part = np.unwrap(values[run]) if angle else values[run]
+        if len(run) == 2:
+            rate[run] = (part[1] - part[0]) / dt
+        else:
+            # An even window would give the rate between samples.
+            window = 5 if len(run) >= 5 else 3
+            rate[run] = savgol_filter(part, window, 2, deriv=1, delta=dt)
+    return rate

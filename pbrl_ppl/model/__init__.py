@@ -1,0 +1,39 @@
+"""Table 1, Eqs. 11 and 12, the engine as a pytensor Op, and the `pm.Model` made of them."""
+
+from pbrl_ppl.model.library import Modes
+from pbrl_ppl.model.likelihood import (
+    STATE,
+    STATE_UNITS,
+    Observations,
+    StartNoise,
+    estimate_sigma,
+    log_density,
+    next_state_random,
+    robust,
+    whiten,
+)
+from pbrl_ppl.model.op import SimulatorOp
+from pbrl_ppl.model.problem import COARSE, Problem, build_model, physics_model, sigma_prior
+from pbrl_ppl.model.table1 import build_layout
+from pbrl_ppl.model.transition import Transition
+
+__all__ = [
+    "COARSE",
+    "STATE",
+    "STATE_UNITS",
+    "Modes",
+    "Observations",
+    "Problem",
+    "SimulatorOp",
+    "StartNoise",
+    "Transition",
+    "build_layout",
+    "build_model",
+    "estimate_sigma",
+    "log_density",
+    "next_state_random",
+    "physics_model",
+    "robust",
+    "sigma_prior",
+    "whiten",
+]

@@ -1,0 +1,171 @@
+"""SimulatorOp: the engine as a black-box pytensor Op, its derivative, and numba dispatch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numba
+import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+from pytensor.gradient import grad_undefined
+from pytensor.graph.basic import Apply
+from pytensor.graph.op import Op
+from pytensor.link.numba.dispatch.basic import numba_funcify
+
+from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.errors import ParameterError, SimulationError
+from pbrl_ppl.parameters import Layout
+from pbrl_ppl.physics import PartedSimulator, Parts
+from pbrl_ppl.scene import Scene
+
+Array = NDArray[np.float64]
+
+
+class _EngineOp(Op):
+    """What the prediction and its derivative share: inputs and how impossible ones are answered."""
+
+    __props__ = ("scene", "layout", "effects", "substeps", "threads", "parts")
+
+    def __init__(
+        self,
+        scene: Scene,
+        layout: Layout,
+        effects: tuple[Attached, ...] = (),
+        substeps: int | None = None,
+        threads: int = 1,
+        parts: Parts | None = None,
+    ) -> None:
+        self.scene, self.layout, self.effects, self.parts = scene, layout, effects, parts
+        self.substeps = scene.substeps if substeps is None else substeps
+        self.threads = threads
+        self.simulator = PartedSimulator(
+            scene, layout, effects, parts, substeps=self.substeps, threads=threads
+        )
+
+    @property
+    def _last(self) -> tuple[int, ...]:
+        """Last dimensions of the output, after (transition, H)."""
+        raise NotImplementedError
+
+    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+        raise NotImplementedError
+
+    def make_node(self, phi: Any, start: Any, actions: Any) -> Apply:
+        """Check what can be checked before values are there.
+
+        Raises
+        ------
+        SimulationError
+            If an input has the wrong number of dimensions or a static shape that does not fit.
+        """
+        k, p = len(self.scene.dynamic), self.layout.size
+        inputs = []
+        for name, value, shape in (
+            ("phi", phi, (p,)),
+            ("start", start, (None, k, 6)),
+            ("actions", actions, (None, None, k, 3)),
+        ):
+            tensor = pt.cast(pt.as_tensor_variable(value), "float64")
+            static = tensor.type.shape
+            fits = len(static) == len(shape) and all(
+                s is None or e is None or s == e for s, e in zip(static, shape, strict=True)
+            )
+            if not fits:
+                expected = ", ".join("?" if e is None else str(e) for e in shape)
+                raise SimulationError(
+                    f"{type(self).__name__}: {name} has shape {static}, expected ({expected})"
+                )
+            inputs.append(tensor)
+        return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, *self._last))])
+
+    def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
+        """(transition, H) from the shape of the actions."""
+        actions = arguments[-1][2]  # older stacks pass (fgraph, node, shapes), newer (node, shapes)
+        return [(actions[0], actions[1], *self._last)]
+
+    def perform(self, node: Apply, inputs: Any, outputs: Any) -> None:
+        """Run the engine."""
+        outputs[0][0] = self.predict(*inputs)
+
+    def predict(self, phi: Array, start: Array, actions: Array) -> Array:
+        """Run the engine."""
+        try:
+            return self._compute(phi, start, actions)
+        except ParameterError:  # a sampler may look there; nothing can be observed of it
+            return np.full((*actions.shape[:2], *self._last), np.nan)
+
+
+class SimulatorOp(_EngineOp):
+    """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
+
+    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3);
+    the output has shape (transition, H, body, 6); all float64, in SI units. A transition in which
+    the engine diverges is NaN, and so is everything where phi is impossible (a mass that is not
+    positive, say): the likelihood of that is zero. The derivative by phi is by finite differences,
+    all columns in one call of the engine.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry.
+    layout : Layout
+        Order of phi.
+    effects : tuple of Attached
+        All effects of the model.
+    substeps : int, optional
+        Engine steps an interval; the scene's by default.
+    threads : int
+        Worlds that run side by side.
+    parts : tuple of tuple of str, optional
+        Moving bodies in parts that never touch and share no joint, each with an engine of its own;
+        see :func:`pbrl_ppl.physics.coupling.independent_parts`.
+    """
+
+    @property
+    def _last(self) -> tuple[int, ...]:
+        return len(self.scene.dynamic), 6
+
+    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+        return self.simulator.recall(phi, start, actions)
+
+    def pullback(
+        self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
+    ) -> list[Any]:
+        """Vector-Jacobian product; start states and actions are data and have no derivative."""
+        jacobian = JacobianOp(*(getattr(self, name) for name in self.__props__))(*inputs)
+        return [
+            (cotangents[0][..., None] * jacobian).sum(axis=(0, 1, 2, 3)),
+            *(
+                grad_undefined(self, i, inputs[i], "the engine is differentiated by phi alone")
+                for i in (1, 2)
+            ),
+        ]
+
+    L_op = pullback  # its name in pytensor 2
+
+
+class JacobianOp(_EngineOp):
+    """Derivative of :class:`SimulatorOp` by phi, shape (transition, H, body, 6, p)."""
+
+    @property
+    def _last(self) -> tuple[int, ...]:
+        return len(self.scene.dynamic), 6, self.layout.size
+
+    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+        return self.simulator.jacobian(phi, start, actions)
+
+
+@numba_funcify.register(_EngineOp)
+def _numba_engine(op: _EngineOp, node: Any = None, **kwargs: Any) -> Any:
+    """For the numba backend: step out to the rollout, which is compiled code of its own."""
+    kind = numba.types.Array(numba.float64, 2 + len(op._last), "C")
+
+    @numba.njit
+    def simulate(phi, start, actions):  # type: ignore[no-untyped-def]
+        with numba.objmode(result=kind):
+            result = op.predict(phi, start, actions)
+        return result
+
+    return simulate

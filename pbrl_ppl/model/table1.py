@@ -1,0 +1,280 @@
+"""Table 1: the univariate prior of each physical parameter, and phi's layout for a scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+from scipy.special import i0e
+
+from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.errors import ParameterError
+from pbrl_ppl.parameters import (
+    BODY_PARAMETERS,
+    JOINT_ANCHORS,
+    JOINT_INDICES,
+    WHEEL_PARAMETERS,
+    Block,
+    Layout,
+    Prior,
+)
+from pbrl_ppl.scene import WORLD, Body, Scene, nearest
+
+Array = NDArray[np.float64]
+
+#: Half the side of the square in which a joint's anchor in the world is sought where the scene has
+#: neither walls nor poses (m).
+_UNBOUNDED = 10.0
+#: Above this concentration PyMC 5's von Mises density overflows.
+_SHARP = 500.0
+
+
+def table1(body: Body) -> dict[str, Prior]:
+    """Table 1 for one body, uninformative by default; ``body.prior`` replaces hyper-parameters.
+
+    Parameters
+    ----------
+    body : Body
+        Its bounds (m) limit where the wheel can be.
+
+    Returns
+    -------
+    dict of str to Prior
+        One prior a parameter of Eq. 8.
+
+    Raises
+    ------
+    ParameterError
+        If a hyper-parameter does not belong to the parameter's family, or makes no distribution.
+
+    Examples
+    --------
+    >>> from pbrl_ppl.scene.scene import Body, Shape
+    >>> table1(Body("cart", Shape.box(1.0, 0.6)))["w_x"].support
+    (-0.5, 0.5)
+    """
+    x_min, x_max, y_min, y_max = body.shape.bounds
+    share = Prior("truncated_normal", mu=0.5, sigma=1.0, lower=0.0, upper=1.0)
+    priors = {
+        "mass": Prior("log_normal", mu=1.0, sigma=1.5),
+        "r": Prior("log_normal", mu=-1.5, sigma=1.0),
+        "mu_c": share,
+        "w_x": Prior("truncated_normal", sigma=x_max - x_min, lower=x_min, upper=x_max),
+        "w_y": Prior("truncated_normal", sigma=y_max - y_min, lower=y_min, upper=y_max),
+        "w_theta": Prior("von_mises", mu=0.0, kappa=0.5),
+        "mu_x": share,
+        "mu_y": share,
+    }
+    return {name: declared_prior(body, name, prior) for name, prior in priors.items()}
+
+
+def declared_prior(body: Body, name: str, default: Prior) -> Prior:
+    """A parameter's prior with the hyper-parameters that the scene declares for it.
+
+    Parameters
+    ----------
+    body : Body
+        Its ``prior`` is looked at.
+    name : str
+        A parameter of Table 1, or an effect's variable such as ``linear_drag_coefficient``.
+    default : Prior
+        Gives the family, the support and what the scene leaves out.
+
+    Raises
+    ------
+    ParameterError
+        If a hyper-parameter does not belong to the family, or makes no distribution.
+    """
+    hyper: dict[str, Any] = dict(dict(body.prior).get(name, ()))
+    where = f"body {body.name!r}: prior of {name}"
+    for key in hyper:
+        if key not in default.hyper_names:
+            raise ParameterError(
+                f"{where} has {key!r}, expected {' and '.join(default.hyper_names)}"
+                f" ({default.family})"
+            )
+    try:
+        return replace(default, **hyper)
+    except ParameterError as error:
+        raise ParameterError(f"{where}: {error}") from None
+
+
+def anchor_prior(scene: Scene, holder: str, axis: int, centre: float | None = None) -> Prior:
+    """Table 1 for one coordinate of a joint's anchor, on the bounds of the body that holds it.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its extent bounds an anchor in the world.
+    holder : str
+        The body's name, or ``world``.
+    axis : int
+        0 for x, 1 for y.
+    centre : float, optional
+        Where the anchor is thought to be (m); the middle by default.
+    """
+    anywhere = (-_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, _UNBOUNDED)
+    bounds = (scene.extent or anywhere) if holder == WORLD else scene.body(holder).shape.bounds
+    lower, upper = bounds[2 * axis : 2 * axis + 2]
+    mu = (lower + upper) / 2 if centre is None else centre
+    return Prior("truncated_normal", mu=mu, sigma=upper - lower, lower=lower, upper=upper)
+
+
+def _joint_blocks(scene: Scene) -> list[Block]:
+    """Table 1's parameters of the joints that are to be inferred."""
+    joints = [
+        (name, joint)
+        for name, joint in zip(scene.joint_names, scene.joints, strict=True)
+        if not joint.known
+    ]
+    if not joints:
+        return []
+    free = tuple(name for name, joint in joints if joint.bodies is None)
+    index = Prior("categorical", lower=0.0, upper=float(len(scene.joinable) - 1))
+    blocks = [Block(i, free, "1", (index,) * len(free), of="joint") for i in JOINT_INDICES if free]
+    for column, (name, unit) in enumerate(JOINT_ANCHORS.items()):
+        side, axis = divmod(column, 2)
+        conditional = []
+        for _, joint in joints:
+            holders = scene.joinable
+            if joint.bodies is not None:
+                holders = (joint.bodies[side],) * len(holders)
+            anchor = (joint.anchor_a, joint.anchor_b)[side]
+            centre = None if anchor is None else anchor[axis]
+            conditional.append(tuple(anchor_prior(scene, each, axis, centre) for each in holders))
+        priors = tuple(_union(alternatives) for alternatives in conditional)
+        owners = tuple(owner for owner, _ in joints)
+        blocks.append(Block(name, owners, unit, priors, of="joint", conditional=tuple(conditional)))
+    return blocks
+
+
+def _union(priors: tuple[Prior, ...]) -> Prior:
+    """A prior over the support of all of these: what is known before the index is."""
+    if len(set(priors)) == 1:
+        return priors[0]
+    lower, upper = min(each.lower for each in priors), max(each.upper for each in priors)
+    return replace(priors[0], mu=(lower + upper) / 2, sigma=upper - lower, lower=lower, upper=upper)
+
+
+def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
+    """Phi of a scene: Table 1's unknowns of moving bodies and of joints, then the effects'.
+
+    Parameters
+    ----------
+    scene : Scene
+        Parameters that it names as known are left out, and a wheel's where there is none.
+    effects : tuple of Attached
+        All effects of the model.
+
+    Raises
+    ------
+    ParameterError
+        If a body's ``prior`` names a parameter that neither it nor its effects have, or makes no
+        distribution.
+    """
+    for body in scene.dynamic:
+        names = [
+            *BODY_PARAMETERS,
+            *(v for one in effects if one.body == body.name for v in one.variables),
+        ]
+        for name, _ in body.prior:
+            if name not in names:
+                raise ParameterError(
+                    f"body {body.name!r}: prior has {name!r}, which is no parameter of it or its"
+                    f" effects{nearest(name, names)}"
+                )
+    blocks = []
+    for name, unit in BODY_PARAMETERS.items():
+        bodies = [
+            body
+            for body in scene.dynamic
+            if name not in dict(body.known) and (body.wheel or name not in WHEEL_PARAMETERS)
+        ]
+        if bodies:
+            priors = tuple(table1(body)[name] for body in bodies)
+            blocks.append(Block(name, tuple(body.name for body in bodies), unit, priors))
+    blocks += _joint_blocks(scene)
+    for effect in dict.fromkeys(one.effect for one in effects):
+        on = tuple(one.body for one in effects if one.effect == effect)
+        for each in effect.parameters:
+            name = effect.variable(each)
+            priors = tuple(declared_prior(scene.body(owner), name, each.prior) for owner in on)
+            blocks.append(Block(name, on, each.unit, priors, effect=effect.name))
+    return Layout(tuple(blocks))
+
+
+def random_variable(
+    name: str,
+    priors: tuple[Prior, ...],
+    dims: str,
+    conditional: tuple[tuple[Prior, ...], ...] = (),
+    index: Any = None,
+) -> Any:
+    """Declare priors of one family in the PyMC model of the context, one an owner.
+
+    Parameters
+    ----------
+    name : str
+        The variable's name.
+    priors : tuple of Prior
+        Same family, one a body or joint.
+    dims : str
+        The model's dimension over those bodies or joints.
+    conditional : tuple of tuple of Prior
+        For each owner its prior if its index is 0, 1, ...; see `Block`.
+    index : tensor, optional
+        Index variable of each owner, whole numbers, shape (owner,).
+
+    Raises
+    ------
+    ParameterError
+        If the family is not one of Table 1 or a normal.
+    """
+    family = priors[0].family
+
+    def hyper(key: str) -> Any:
+        if index is None:
+            return [getattr(prior, key) for prior in priors]
+        table = np.array([[getattr(prior, key) for prior in row] for row in conditional])
+        chosen = pm.math.eq(index[:, None], np.arange(table.shape[1]))
+        return pm.math.where(chosen, table, 0.0).sum(axis=1)
+
+    mu, sigma = hyper("mu"), hyper("sigma")
+    if family == "log_normal":
+        return pm.LogNormal(name, mu=mu, sigma=sigma, dims=dims)
+    if family == "truncated_normal":
+        lower, upper = hyper("lower"), hyper("upper")
+        return pm.TruncatedNormal(name, mu=mu, sigma=sigma, lower=lower, upper=upper, dims=dims)
+    if family == "von_mises":
+        return _von_mises(name, np.array(mu), np.array(hyper("kappa")), dims)
+    if family == "normal":
+        return pm.Normal(name, mu=mu, sigma=sigma, dims=dims)
+    if family == "half_normal":
+        if any(mu):
+            return pm.TruncatedNormal(name, mu=mu, sigma=sigma, lower=0.0, dims=dims)
+        return pm.HalfNormal(name, sigma=sigma, dims=dims)
+    if family == "categorical":
+        n = int(priors[0].upper) + 1
+        return pm.Categorical(name, p=np.full((len(priors), n), 1.0 / n), dims=dims)
+    raise ParameterError(
+        f"prior of {name}: family {family!r} is unknown; use log_normal, truncated_normal, normal,"
+        " half_normal, von_mises or categorical"
+    )
+
+
+def _von_mises(name: str, mu: Array, kappa: Array, dims: str) -> Any:
+    """PyMC's von Mises, or the same density written so that a sharp one does not overflow."""
+    if kappa.max() <= _SHARP:
+        return pm.VonMises(name, mu=mu, kappa=kappa, dims=dims)
+    log_norm = np.log(2 * np.pi * i0e(kappa))
+    return pm.CustomDist(
+        name,
+        mu,
+        kappa,
+        logp=lambda value, mu, kappa: kappa * (pm.math.cos(value - mu) - 1.0) - log_norm,
+        dist=lambda mu, kappa, size: pm.VonMises.dist(mu, kappa, size=size),
+        dims=dims,
+    )

@@ -1,0 +1,251 @@
+"""Which configuration of the joints explains a recording: a mode and the evidence of each."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.progress import track
+from scipy.optimize import least_squares
+from scipy.special import logsumexp
+
+from pbrl_ppl.history import lever
+from pbrl_ppl.model import COARSE, Problem
+from pbrl_ppl.modes.configurations import Configuration, Weighed, configurations
+from pbrl_ppl.modes.evidence import Evidence, importance, laplace
+from pbrl_ppl.modes.laplace import Mode
+from pbrl_ppl.modes.search import find_mode, find_modes
+from pbrl_ppl.parameters import JOINT_ANCHORS, inside, prior_draws
+from pbrl_ppl.scene import WORLD, Joint
+
+Array = NDArray[np.float64]
+
+#: A log-evidence this far below the best by the Laplace method is not looked at more closely: the
+#: approximation's error is a few units, and the same for all configurations in great part.
+_MARGIN = 25.0
+#: Configurations within this much of the best, and the best few in any case, are sought from more
+#: starts, so many: a wheel's axes may have been caught in a wrong hill.
+_CONTENDERS, _BEST, _STARTS, _SCREENED = 100.0, 2, 4, 200
+#: Rounds of the climbs that tell hills apart, and of a first climb with the exact engine. One that
+#: ends this far below the best log-posterior so far is hopeless, and goes no further: wrong joints
+#: are explained by masses so unlike that the engine takes a hundred times as long.
+_ROUGH, _FIRST, _HOPELESS = 8, 2, 300.0
+#: Starts of the search for a rod's anchors by geometry, and how many are kept.
+_GEOMETRIC, _KEPT = 12, 2
+#: Rows of the recording that the geometry is taken from, at most.
+_ROWS = 500
+
+
+def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[Weighed, ...]:
+    """Probability of each configuration of the joints whose bodies are unknown.
+
+    Each gets the mode of the continuous parameters that it leaves; the search for it begins where
+    geometry puts the anchors. The evidence is Laplace's, and for those that it cannot rule out an
+    importance sampler's.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of a scene with such joints.
+    seed : int
+        The same seed gives the same answer.
+    progress : bool
+        Whether to show how far it is.
+
+    Returns
+    -------
+    tuple of Weighed
+        As :func:`pbrl_ppl.modes.configurations.configurations` orders them.
+
+    Raises
+    ------
+    FitError
+        If there are too many configurations.
+    """
+    every = configurations(problem.scene)
+    problem.segments  # noqa: B018  # checks the start states, once for all
+    console = Console(stderr=True)
+    modes: dict[Configuration, Mode] = {}
+    for each in track(every, "trying joints", console=console, disable=not progress):
+        own = each.problem(problem)
+        if each.empty:
+            modes[each] = _apart(own, seed)
+            continue
+        worth = max(mode.log_posterior for mode in modes.values()) - _HOPELESS
+        modes[each] = _joint(own, each, modes[every[0]], worth)
+    worth = max(mode.log_posterior for mode in modes.values()) - _HOPELESS
+    evidence = {each: laplace(mode) for each, mode in modes.items()}
+    leading = _leading(evidence, _CONTENDERS, at_least=_BEST)
+    for each in track(leading, "looking again", console=console, disable=not progress):
+        if each.empty:
+            better = _apart(modes[each].problem, seed + 1)
+        else:
+            better = _searched_again(modes[each], each, worth, seed)
+        if better.log_posterior > modes[each].log_posterior:
+            modes[each], evidence[each] = better, laplace(better)
+    close = _leading(evidence, _MARGIN)
+    if len(close) > 1:
+        rng = np.random.default_rng(seed)
+        for each in track(close, "weighing joints", console=console, disable=not progress):
+            evidence[each] = importance(modes[each], rng)
+    score = np.array([_score(each, evidence[each]) for each in every])
+    probability = np.exp(score - logsumexp(score))
+    return tuple(
+        Weighed(each, modes[each], evidence[each], float(p))
+        for each, p in zip(every, probability, strict=True)
+    )
+
+
+def _score(configuration: Configuration, evidence: Evidence) -> float:
+    return configuration.log_prior + evidence.log_z
+
+
+def _leading(
+    evidence: dict[Configuration, Evidence], within: float, at_least: int = 1
+) -> list[Configuration]:
+    """Those whose posterior log-weight is near the best, or among the first."""
+    order = sorted(evidence, key=lambda each: -_score(each, evidence[each]))
+    least = _score(order[0], evidence[order[0]]) - within
+    return [e for i, e in enumerate(order) if i < at_least or _score(e, evidence[e]) > least]
+
+
+def _apart(problem: Problem, seed: int) -> Mode:
+    """The mode of a problem without joints of unknown bodies."""
+    return _best(problem, find_modes(_coarse(problem), seed=seed), -np.inf)
+
+
+def _joint(problem: Problem, configuration: Configuration, apart: Mode, worth: float) -> Mode:
+    """The mode, from where geometry puts the anchors, with bodies as without joints or as before.
+
+    The hills are told apart with few engine steps; the best is climbed with the exact engine.
+    """
+    starts = []
+    for anchors in _placed(problem, configuration):
+        centre = np.array([prior.centre for prior in problem.layout.priors])
+        for start in (centre, _carried(apart, problem, centre)):
+            start[_anchor_places(problem, configuration)] = anchors
+            starts.append(start)
+    return _best(problem, _climbed(problem, starts), worth)
+
+
+def _climbed(problem: Problem, starts: list[Array]) -> list[Mode]:
+    coarse = _coarse(problem)
+    return [find_mode(coarse, initial=start, rounds=_ROUGH) for start in starts]
+
+
+def _best(problem: Problem, rough: list[Mode], worth: float) -> Mode:
+    """The best of modes that were found with few engine steps, climbed with the exact engine.
+
+    One that has not come near the log-posterior ``worth`` by then is climbed no further.
+    """
+    best = max(rough, key=lambda mode: mode.log_posterior)
+    first = find_mode(problem, initial=best.phi, rounds=_FIRST)
+    return first if first.log_posterior < worth else find_mode(problem, initial=first.phi)
+
+
+def _coarse(problem: Problem) -> Problem:
+    return replace(problem, substeps=min(COARSE, problem.substeps), extrapolate=False)
+
+
+def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed: int) -> Mode:
+    """Look for a better mode with the anchors where they are, and the bodies anywhere."""
+    problem = mode.problem
+    priors = problem.layout.priors
+    rng = np.random.default_rng(seed)
+    draws = prior_draws(priors, rng, _SCREENED)
+    places = _anchor_places(problem, configuration)
+    draws[:, places] = mode.phi[places]
+    draws = inside(priors, draws)
+    z = np.nan_to_num(_coarse(problem).whitened(draws, mode.sigma), nan=1e6)
+    order = np.argsort(np.log1p(z**2).sum(axis=(1, 2)))[:_STARTS]
+    return _best(problem, _climbed(problem, [draws[i] for i in order]), worth)
+
+
+def _carried(base: Mode, problem: Problem, default: Array) -> Array:
+    """The parameters of one problem where another has them too."""
+    values = dict(zip(base.problem.layout.labels, base.phi, strict=True))
+    labels = problem.layout.labels
+    return np.array([values.get(label, x) for label, x in zip(labels, default, strict=True)])
+
+
+def _joined(problem: Problem, configuration: Configuration) -> Iterator[tuple[str, Joint]]:
+    """Name and joint of what the configuration joins, as its scene has it."""
+    chosen = {name for name, pair in configuration.pairs if pair is not None}
+    scene = problem.scene
+    for name, joint in zip(scene.joint_names, scene.joints, strict=True):
+        if name in chosen:
+            yield name, joint
+
+
+def _anchor_places(problem: Problem, configuration: Configuration) -> list[int]:
+    """Where phi holds the anchors of the configuration's joints, four a joint."""
+    return [
+        problem.layout.index(anchor, name)
+        for name, _ in _joined(problem, configuration)
+        for anchor in JOINT_ANCHORS
+    ]
+
+
+# -- where geometry puts the anchors ---------------------------------------------------------------
+
+
+def _placed(problem: Problem, configuration: Configuration) -> list[Array]:
+    """Likely anchors of all joints of a configuration, four a joint, best first."""
+    alternatives = [
+        _anchors(problem, name, joint) for name, joint in _joined(problem, configuration)
+    ]
+    count = min(len(each) for each in alternatives)
+    return [np.concatenate([each[i] for each in alternatives]) for i in range(count)]
+
+
+def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
+    """Anchors that keep their distance over the recording: none for a hinge.
+
+    A hinge's are linear least squares; a rod's are not, and are sought from several starts.
+    """
+    priors = [problem.layout.priors[problem.layout.index(each, name)] for each in JOINT_ANCHORS]
+    a, b = (_states(problem, body) for body in joint.bodies or ())
+    reference = [_reference(problem, body) for body in joint.bodies or ()]
+
+    def miss(anchors: Array) -> Array:
+        apart = _at(a, anchors[:2]) - _at(b, anchors[2:])
+        if joint.kind == "hinge":
+            return np.asarray(apart.ravel())
+        length = _at(reference[0], anchors[:2]) - _at(reference[1], anchors[2:])
+        return np.asarray(np.linalg.norm(apart, axis=1) - np.linalg.norm(length, axis=1))
+
+    rng = np.random.default_rng(0)
+    starts = prior_draws(priors, rng, _GEOMETRIC)
+    starts[0] = [prior.centre for prior in priors]
+    if joint.kind == "hinge":
+        starts = starts[:1]
+    starts = inside(priors, starts)
+    bounds = np.array([prior.support for prior in priors]).T
+    found = [least_squares(miss, start, bounds=bounds) for start in starts]
+    found.sort(key=lambda result: float(result.cost))
+    return [result.x for result in found[:_KEPT]]
+
+
+def _states(problem: Problem, body: str) -> Array:
+    """A body's recorded start states, shape (row, 6); the world's are zero."""
+    start = problem.history.dataset["start"].to_numpy()
+    rows = start[np.isfinite(start).all(axis=(-1, -2))]
+    rows = rows[:: -(-len(rows) // _ROWS)]
+    if body == WORLD:
+        return np.zeros((len(rows), 6))
+    names = [each.name for each in problem.scene.dynamic]
+    return np.asarray(rows[:, names.index(body)])
+
+
+def _reference(problem: Problem, body: str) -> Array:
+    """A body at rest in its reference pose, shape (1, 6)."""
+    pose = None if body == WORLD else problem.scene.body(body).pose
+    return np.array([[*(pose or (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0]])
+
+
+def _at(states: Array, anchor: Array) -> Array:
+    """An anchor of a body's frame in the world, shape (row, 2)."""
+    return np.asarray(states[:, :2] + lever(states, (anchor[0], anchor[1]))[0])

@@ -1,0 +1,211 @@
+"""A mode of the posterior: where a Gauss-Newton climb ends, and a Laplace covariance there."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares, minimize
+
+from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, robust, whiten
+from pbrl_ppl.numerics import differentiate
+from pbrl_ppl.parameters import box, fold_wheels, inside, prior_residual
+from pbrl_ppl.physics import PartedSimulator
+
+Array = NDArray[np.float64]
+#: Where a climb ended: phi, sigma and the log-posterior there.
+Peak = tuple[Array, Array, float]
+
+#: A residual beyond this many noise units says no more about where the mode is.
+FAR_OFF = 1e3
+#: Gain in log-posterior that is not worth another round.
+STALLED = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class Mode:
+    """A mode of the posterior.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was fitted.
+    phi : ndarray
+        Parameters in the layout's order, shape (p,), SI units.
+    sigma : ndarray
+        Noise of each state dimension, shape (state,).
+    jacobian : ndarray
+        Derivative of the whitened residual by phi, shape (transition * cell, p).
+    covariance : ndarray
+        Laplace covariance of phi, shape (p, p).
+    log_posterior : float
+        Log-likelihood plus log-prior of phi, up to a constant of the priors.
+    others : tuple of Mode
+        Lower ones, that may yet hold a share of the posterior.
+    """
+
+    problem: Problem
+    phi: Array
+    sigma: Array
+    jacobian: Array
+    covariance: Array
+    log_posterior: float
+    others: tuple[Mode, ...] = ()
+
+    @property
+    def values(self) -> dict[str, Array]:
+        """Parameters by name, shape (body,) each."""
+        return self.problem.layout.to_dict(self.phi)
+
+    @property
+    def factor(self) -> Array:
+        """Cholesky factor of the covariance, shape (p, p)."""
+        jitter = 1e-15 * np.eye(len(self.phi))
+        return np.asarray(np.linalg.cholesky(self.covariance + jitter), dtype=float)
+
+    def draws(self, rng: np.random.Generator, n: int) -> Array:
+        """Draws of phi from the Laplace approximation, cut at the supports, shape (n, p)."""
+        moved = self.phi + rng.standard_normal((n, len(self.phi))) @ self.factor.T
+        return inside(self.problem.layout.priors, moved)
+
+    @property
+    def whitened(self) -> Array:
+        """Residuals in units of noise, shape (transition, cell)."""
+        return self.problem.whitened(self.phi, self.sigma)
+
+
+def posterior_steps(
+    function: Callable[[Array], Array], phi: Array, lower: Array, upper: Array, begin: Array
+) -> tuple[Array, Array]:
+    """Derivative with steps of about one posterior standard deviation, and those steps.
+
+    Friction makes kinks; a derivative over the posterior's own scale sees their average, one over a
+    tiny step sees whichever side it is on.
+    """
+    steps = begin
+    for _ in range(2):
+        jacobian = differentiate(function, phi, steps, lower, upper)
+        size = np.sqrt((jacobian**2).sum(axis=0))
+        steps = np.clip(1.0 / np.maximum(size, 1e-300), 1e-3 * begin, 1e2 * begin)
+    return jacobian, steps
+
+
+def climb(
+    problem: Problem, phi: Array, slope: PartedSimulator, rounds: int = 40, tries: int = 4
+) -> Peak:
+    """Alternate between phi by least squares and sigma by maximum likelihood.
+
+    Derivatives are taken through the engine ``slope``.
+    """
+    priors = problem.layout.priors
+    lower, upper = box(priors)
+    sigma, value = _at(problem, phi)
+    if not priors:
+        return phi, sigma, value
+    steps = 1e-3 * problem.layout.scale(phi)
+
+    def whole(points: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
+        z = problem.whitened(points, sigma, engine).reshape(*points.shape[:-1], -1)
+        z = robust(z, problem.nu)
+        z = np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
+        return np.concatenate([z, prior_residual(priors, points)], axis=-1)
+
+    for _ in range(rounds):
+
+        def residual(point: Array, sigma: Array = sigma) -> Array:
+            return whole(point, sigma)
+
+        def jacobian(point: Array, sigma: Array = sigma, steps: Array = steps) -> Array:
+            size = np.minimum(steps, 0.1 * np.maximum(np.abs(point), steps))
+            return differentiate(
+                lambda points: whole(points, sigma, slope), point, size, lower, upper
+            )
+
+        result = least_squares(
+            residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=tries,
+            ftol=1e-6, xtol=1e-6, gtol=1e-6,
+        )  # fmt: skip
+        better, improved = _at(problem, result.x)
+        if improved < value:
+            break
+        phi, sigma, gain, value = result.x, better, improved - value, improved
+        if gain < STALLED:
+            break
+        size = np.sqrt((result.jac**2).sum(axis=0))
+        steps = np.clip(1.0 / np.maximum(size, 1e-12), 1e-6, 0.1)
+    return phi, sigma, value
+
+
+def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
+    """The most likely sigma at phi, and the log-posterior there."""
+    residual = problem.residual(phi)
+    sigma = profile_sigma(problem, residual)
+    likelihood = problem.log_density(residual, sigma).sum()
+    return sigma, float(likelihood - 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum())
+
+
+def profile_sigma(problem: Problem, residual: Array) -> Array:
+    """Maximum-likelihood sigma at given residuals, shape (state,).
+
+    Parameters
+    ----------
+    problem : Problem
+        Says which cells were measured, and how the start state's noise spreads.
+    residual : ndarray
+        Shape (transition, H, body, state).
+    """
+    measured, noise = problem.observations.measured, problem.noise
+    residual = np.nan_to_num(residual, nan=FAR_OFF)
+    sigma = estimate_sigma(residual, measured, None)
+    gaussian = problem.nu is None
+    if problem.scalar_sigma and gaussian:
+        z = whiten(residual, np.ones_like(sigma), noise)
+        return np.full_like(sigma, max(np.sqrt((z**2).sum() / measured.sum()), 1e-9))
+    if noise is None and gaussian:
+        return sigma
+    begin = np.log(sigma if noise is None else sigma / np.median(noise.gain))
+    every = np.ones_like(sigma)
+    if problem.scalar_sigma:
+        begin = begin.mean(keepdims=True)
+
+    def cost(log_sigma: Array) -> float:
+        return -float(problem.log_density(residual, np.exp(log_sigma) * every).sum())
+
+    bounds = [(b - 6, b + 6) for b in begin]
+    found = minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x
+    return np.asarray(np.exp(found) * every)
+
+
+def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> Mode:
+    """Fold the wheel's symmetry, and take the Jacobian at the posterior's own scale."""
+    phi = fold_wheels(problem.layout, phi)
+    priors = problem.layout.priors
+    if not priors:
+        cells = problem.observations.values.size
+        return Mode(problem, phi, sigma, np.zeros((cells, 0)), np.zeros((0, 0)), log_posterior)
+    lower, upper = box(priors)
+
+    def residual(points: Array, engine: PartedSimulator | None = None) -> Array:
+        z = robust(problem.whitened(points, sigma, engine), problem.nu).reshape(len(points), -1)
+        return np.concatenate([np.nan_to_num(z), prior_residual(priors, points)], axis=-1)
+
+    begin = 1e-3 * problem.layout.scale(phi)
+    _, steps = posterior_steps(partial(residual, engine=problem.coarse), phi, lower, upper, begin)
+    jacobian = differentiate(residual, phi, steps, lower, upper)
+    precision = jacobian.T @ jacobian
+    covariance = np.linalg.pinv(precision, hermitian=True)
+    n_cells = len(jacobian) - len(phi)
+    return Mode(
+        problem, phi, sigma, jacobian[:n_cells], np.asarray(covariance, dtype=float), log_posterior
+    )
+
+
+def with_start_noise(problem: Problem, mode: Mode) -> Problem:
+    """Account for the noise of measured start states, linearised at a mode."""
+    measured = problem.observations.measured.reshape(problem.segments.n, -1)
+    sensitivity = problem.sensitivity(mode.phi, mode.sigma)
+    sigma = estimate_sigma(problem.residual(mode.phi), problem.observations.measured, sensitivity)
+    return replace(problem, noise=StartNoise.of(sensitivity, measured, sigma))

@@ -1,0 +1,173 @@
+"""The posterior of which mode each body has: summed over all of them, exactly."""
+
+from __future__ import annotations
+
+from itertools import product
+from math import prod
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.optimize import minimize
+from scipy.special import logsumexp
+
+from pbrl_ppl.errors import FitError
+from pbrl_ppl.model import Observations, Problem, estimate_sigma, log_density
+from pbrl_ppl.physics import Part
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+#: A part's combinations times its measured numbers that are still summed over.
+_MOST = 50_000_000
+#: Tails and width of the proposal of log sigma; proposals a draw, and before the first.
+_TAIL, _WIDER, _THIN, _BURN = 5, 1.2, 10, 200
+#: Numbers held at once.
+_NUMBERS = 4_000_000
+
+
+class _Combinations:
+    """Every combination of modes of one part's bodies: its prior and its residuals."""
+
+    def __init__(self, problem: Problem, part: Part, table: Array) -> None:
+        names = [body.name for body in problem.scene.dynamic]
+        bodies = [names[i] for i in part.bodies]
+        modes = problem.modes
+        if modes is None:
+            raise FitError("fit: the model has no modes to choose among")
+        priors = [modes.prior(body) for body in bodies]
+        possible = [np.flatnonzero(p) for p in priors]
+        count = prod(len(each) for each in possible)
+        measured = problem.observations.values[:, :, part.bodies]
+        if count * measured.size > _MOST:
+            raise FitError(
+                f"fit: {', '.join(bodies)} meet in this history, so that {count} combinations of"
+                f" modes are to be summed over; give some modes probability 0 for some bodies,"
+                " record the bodies apart, or sample the model with pm.sample"
+            )
+        self.observations = Observations(measured, problem.observations.columns)
+        self.indices = np.array(list(product(*possible)), dtype=np.intp).reshape(count, -1)
+        self.log_prior = np.sum(
+            [np.log(p[self.indices[:, i]]) for i, p in enumerate(priors)], axis=0
+        )
+        owners = [owner for block in problem.layout.blocks for owner in block.owners]
+        whose = [bodies.index(owners[place]) for place in part.places]
+        phi = table[part.places, self.indices[:, whose]].reshape(count, -1)
+        segments = problem.segments
+        states = part.simulator(
+            phi, segments.start[:, part.bodies], segments.actions[:, :, part.bodies]
+        )
+        self.residual = self.observations.residual(states)
+
+    def log_joint(self, sigma: Array, nu: float | None) -> Array:
+        """Of data and combination given sigma (draw, state), shape (draw, combination)."""
+        seen = self.observations.measured
+        result = np.empty((len(sigma), len(self.indices)))
+        size = max(1, _NUMBERS // max(self.residual.size, 1))
+        for begin in range(0, len(sigma), size):
+            part = sigma[begin : begin + size, None]
+            each = log_density(self.residual[None], part, None, seen, nu).sum(axis=-1)
+            result[begin : begin + size] = each
+        return np.asarray(result + self.log_prior)
+
+
+def choose_modes(
+    problem: Problem, draws: int, chains: int, seed: int
+) -> tuple[Array, Array, Ints, Array]:
+    """Draw sigma from its marginal posterior, and the modes given sigma.
+
+    Given sigma, bodies that have nothing to do with each other are independent, and the sum over
+    every combination is a product of sums. Sigma is drawn by an independence Metropolis sampler
+    about the maximum of that product.
+
+    Parameters
+    ----------
+    problem : Problem
+        With modes.
+    draws, chains : int
+        Draws of each chain, and chains.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    phi : ndarray
+        Parameters, shape (chain, draw, p).
+    sigma : ndarray
+        Shape (chain, draw, state), or (chain, draw, 1) for a scalar sigma.
+    modes : ndarray of int
+        Shape (chain, draw, body).
+    accepted : ndarray
+        Share of the proposals of sigma that were, shape (chain, draw).
+
+    Raises
+    ------
+    FitError
+        If bodies that meet have too many combinations.
+    """
+    if problem.modes is None:
+        raise FitError("fit: the model has no modes to choose among")
+    rng = np.random.default_rng(seed)
+    table = problem.modes.table(problem.layout, problem.scene)
+    parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
+    median, spread = problem.noise_prior
+    typical = np.log(median)
+    counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
+    every = np.ones(len(typical))
+    if problem.scalar_sigma:
+        typical, counts = typical.mean(keepdims=True), counts.sum(keepdims=True)
+
+    def density(log_sigma: Array) -> Array:
+        sigma = np.exp(log_sigma) * every
+        each = [logsumexp(part.log_joint(sigma, problem.nu), axis=1) for part in parts]
+        prior = -0.5 * (((log_sigma - typical) / spread) ** 2).sum(axis=1)
+        return np.asarray(np.sum(each, axis=0) + prior)
+
+    begin = np.log(_rough_sigma(problem, parts, median))
+    begin = begin.mean(keepdims=True) if problem.scalar_sigma else begin
+    found = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
+    # log sigma of n residuals has about this precision; wider, for modes that mix
+    shape = _WIDER**2 / (2.0 * counts + spread**-2.0)
+    proposal = stats.multivariate_t(found, np.diag(shape), df=_TAIL)
+    n = draws * _THIN + _BURN
+    sigmas, chosen, accepted = [], [], []
+    for _ in range(chains):
+        x = proposal.rvs(n, random_state=rng).reshape(n, -1)
+        log_weight = density(x) - np.atleast_1d(proposal.logpdf(x))
+        log_uniform = np.log(rng.uniform(size=n))
+        kept = np.zeros(n, dtype=int)
+        for i in range(1, n):
+            moves = log_uniform[i] < log_weight[i] - log_weight[kept[i - 1]]
+            kept[i] = i if moves else kept[i - 1]
+        drawn = slice(_BURN + _THIN - 1, None, _THIN)
+        moved = np.diff(kept, prepend=0)[_BURN:] != 0
+        accepted.append(moved.reshape(draws, _THIN).mean(axis=1))
+        log_sigma = x[kept[drawn]]
+        sigmas.append(np.exp(log_sigma))
+        modes = np.zeros((draws, len(problem.scene.dynamic)), dtype=np.intp)
+        for own, part in zip(parts, problem.simulator.parts, strict=True):
+            joint = own.log_joint(np.exp(log_sigma) * every, problem.nu)
+            # the largest of log-probabilities with Gumbel noise is a draw
+            which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
+            modes[:, part.bodies] = own.indices[which]
+        chosen.append(modes)
+    names = [body.name for body in problem.scene.dynamic]
+    owners = [owner for block in problem.layout.blocks for owner in block.owners]
+    every_mode = np.stack(chosen)
+    of = every_mode[..., [names.index(owner) for owner in owners]]
+    phi = table[np.arange(len(owners)), of]
+    return phi, np.stack(sigmas), every_mode, np.stack(accepted)
+
+
+def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> Array:
+    """Noise under each part's best combination, which depends on it: begun with a guess."""
+    observations = problem.observations
+    residual = np.zeros_like(observations.values)
+    for turn in range(3):
+        for own, part in zip(parts, problem.simulator.parts, strict=True):
+            z = np.nan_to_num(own.residual / sigma, nan=1e6)
+            cost = np.log1p(z**2) if turn == 0 else z**2
+            best = int(cost.reshape(len(z), -1).sum(axis=1).argmin())
+            residual[:, :, part.bodies] = np.nan_to_num(own.residual[best])
+        sigma = estimate_sigma(residual, observations.measured, None)
+    return sigma

@@ -1,0 +1,200 @@
+"""Search for the posterior's modes from many starts: the best, and those near it in height."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import differential_evolution
+
+from pbrl_ppl.errors import FitError
+from pbrl_ppl.model import COARSE, Problem, estimate_sigma
+from pbrl_ppl.modes.laplace import FAR_OFF, STALLED, Mode, Peak, climb, finish
+from pbrl_ppl.parameters import box, fold_wheels, inside, prior_draws, prior_residual
+
+Array = NDArray[np.float64]
+
+#: Transitions used to tell basins apart, and how many of the best are searched with all data; with
+#: no more than so many transitions, all are.
+_PART, _POLISHED, _FEW = 40, 2, 20
+#: Population and generations that look for the hill of few data, how many of them are climbed
+#: from, the most parameters that is for, and the most engine steps it may take.
+_POPULATION, _GENERATIONS, _EVOLVED, _MOST_EVOLVED, _AFFORDED = 200, 120, 8, 15, 2e7
+#: Gain in log-posterior which shows that the coarse derivative had not led to the top. (Friction
+#: makes the top rough: some units are within its grain.)
+_WORTHWHILE = 5.0
+#: Predictions this close (sum of squares, in noise units) are of the same mode.
+_SAME = 10.0
+#: Parameters whose predictions agree are of different hills if by the derivative they should differ
+#: by this (sum of squares, in noise units): ten standard deviations.
+_FAR = 100.0
+#: Log-posterior by which a mode is too low to hold a share of the posterior, however wide it is.
+_LOWER = 20.0
+#: How small the noise may seem beside its typical size while basins are compared.
+_EXACT = 1e-3
+
+
+def find_modes(
+    problem: Problem,
+    *,
+    seed: int | np.random.Generator = 0,
+    starts: int | None = None,
+    screened: int | None = None,
+    initial: Array | None = None,
+    rounds: int | None = None,
+) -> list[Mode]:
+    """Search for modes from several starts, best first.
+
+    Parameters
+    ----------
+    problem : Problem
+        What to fit.
+    seed : int or Generator
+        Of the draws from the prior.
+    starts, screened : int, optional
+        Local searches, and draws from the prior among which their starts are chosen. With few data
+        there are more by default: they cost little there, and friction makes more hills. So it
+        does that differential evolution looks for the highest too.
+    initial : ndarray, optional
+        Where to begin, shape (p,); then there is one local search.
+    rounds : int, optional
+        With ``initial``, at most so many rounds, and no polish: a first look at where it leads.
+
+    Returns
+    -------
+    list of Mode
+        At least one.
+
+    Raises
+    ------
+    FitError
+        If a joint's bodies are unknown: modes are sought over continuous parameters.
+    """
+    priors = problem.layout.priors
+    if problem.layout.discrete.any():
+        raise FitError(
+            "which bodies a joint of the scene joins is unknown, and a mode is one of continuous"
+            " parameters; name the bodies in the scene: pbrl_ppl.fit finds them, and"
+            " joint_probabilities says which they are"
+        )
+    if initial is not None:
+        if rounds is not None:
+            first = climb(problem, inside(priors, initial), problem.coarse, rounds)
+            return [finish(problem, *first)]
+        near = climb(problem, inside(priors, initial), problem.coarse)
+        return [finish(problem, *_polish(problem, near))]
+    if not priors:  # everything is known but the noise
+        return [finish(problem, *climb(problem, np.zeros(0), problem.coarse))]
+    few = problem.segments.n <= _FEW
+    starts = (16 if few else 4) if starts is None else starts
+    screened = (1000 if few else 48) if screened is None else screened
+    rng = np.random.default_rng(seed)
+    draws = prior_draws(priors, rng, screened)
+    draws = np.vstack([[prior.centre for prior in priors], draws])
+    draws = inside(priors, draws)
+    # the basins show in a part of the data already, and with few engine steps
+    part = problem if few else _part(problem, _PART)
+    residual = part.residual(draws)
+    sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations.measured, None)
+    z = np.nan_to_num(residual / sigma, nan=FAR_OFF).reshape(len(draws), -1)
+    # log(1 + z^2): a good start fits most transitions, not the worst one
+    order = np.argsort(np.log1p(np.minimum(z, FAR_OFF) ** 2).sum(axis=1))
+    begin = draws[order[:starts]]
+    steps = problem.simulator.steps * problem.segments.n * problem.horizon
+    if few and len(priors) <= _MOST_EVOLVED and steps * _POPULATION * _GENERATIONS < _AFFORDED:
+        begin = np.vstack([begin, _evolve(problem, rng)])
+    rough = [climb(part, phi, part.simulator) for phi in begin]
+    rough.sort(key=lambda result: -result[2])
+    found = _distinct(part, rough)
+    if not few:
+        found = [climb(problem, phi, problem.coarse) for phi, _, _ in found[:_POLISHED]]
+    found.sort(key=lambda result: -result[2])
+    best = _polish(problem, found[0])
+    return [finish(problem, *result) for result in (best, *found[1:])]
+
+
+def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
+    """The best that differential evolution finds, best first, shape (evolved, p).
+
+    Where few transitions slide, the top may be so narrow that no draw from the prior leads there.
+    It shows with the exact engine alone: one with fewer steps has its kinks elsewhere.
+    """
+    priors = problem.layout.priors
+    draws = prior_draws(priors, rng, _POPULATION)
+    measured = problem.observations.measured
+    counts = measured.sum((0, 1, 2))
+    # without a floor, an exact fit of one dimension would outweigh all others
+    floor = (_EXACT * problem.noise_prior[0]) ** 2
+
+    def cost(points: Array) -> Array:
+        phi = inside(priors, points.T)
+        residual = np.where(measured, np.nan_to_num(problem.residual(phi), nan=FAR_OFF), 0.0)
+        variance = np.maximum((residual**2).sum((1, 2, 3)) / counts, floor)
+        fit = (counts * np.log(variance)).sum(axis=-1)
+        return np.asarray(0.5 * (fit + (prior_residual(priors, phi) ** 2).sum(axis=-1)))
+
+    lower, upper = box(priors)
+    lower = np.where(np.isfinite(lower), lower, draws.min(axis=0))
+    upper = np.where(np.isfinite(upper), upper, draws.max(axis=0))
+    found = differential_evolution(
+        cost, list(zip(lower, upper, strict=True)), init=draws, rng=rng,
+        strategy="rand1bin", recombination=0.9, maxiter=_GENERATIONS, polish=False,
+        vectorized=True, updating="deferred", tol=0.0, atol=STALLED,
+    )  # fmt: skip
+    best = np.argsort(found.population_energies)[:_EVOLVED]
+    return inside(priors, found.population[best])
+
+
+def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
+    """Leave out what predicts the same as one before it, and is on the same hill.
+
+    A wheel's other description is, and so is what differs where the data are silent. A mirror image
+    is not: it predicts the same, but what is linear in between would not.
+    """
+    folded = fold_wheels(problem.layout, np.array([phi for phi, _, _ in found]))
+    z = problem.whitened(folded, found[0][1])
+    z = np.nan_to_num(z, nan=FAR_OFF)
+    kept: dict[int, Array] = {}
+    for i in range(len(found)):
+        same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < _SAME]
+        if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < _FAR for j in same):
+            kept[i] = finish(problem, *found[i]).jacobian
+    return [found[i] for i in kept]
+
+
+def _part(problem: Problem, transitions: int) -> Problem:
+    """The problem, roughly, on evenly chosen trajectories of about so many transitions."""
+    history = problem.history
+    rough = replace(problem, substeps=min(COARSE, problem.substeps), extrapolate=False)
+    share = transitions / max(problem.segments.n, 1)
+    count = max(2, math.ceil(share * history.n_trajectories))
+    if problem.noise is not None or count >= history.n_trajectories:
+        return rough
+    chosen = np.linspace(0, history.n_trajectories - 1, count).astype(int)
+    part = replace(rough, history=history.select(chosen))
+    return part if part.observations.columns == problem.observations.columns else rough
+
+
+def find_mode(
+    problem: Problem,
+    *,
+    seed: int | np.random.Generator = 0,
+    initial: Array | None = None,
+    rounds: int | None = None,
+) -> Mode:
+    """Best mode, and those others that are not far below it; see :func:`find_modes`."""
+    best, *others = find_modes(problem, seed=seed, initial=initial, rounds=rounds)
+    near = (mode for mode in others if mode.log_posterior > best.log_posterior - _LOWER)
+    return replace(best, others=tuple(near))
+
+
+def _polish(problem: Problem, found: Peak) -> Peak:
+    """Go on by the exact engine's derivative, as far as that leads."""
+    if not problem.layout.size:
+        return found
+    exact = climb(problem, found[0], problem.simulator, rounds=1, tries=2)
+    if exact[2] < found[2] + _WORTHWHILE:
+        return max(found, exact, key=lambda result: result[2])
+    return climb(problem, exact[0], problem.simulator)

@@ -1,0 +1,199 @@
+"""Phi: the names of the unknown physical parameters, and dict <-> vector."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import ParameterError
+from pbrl_ppl.parameters.priors import Prior
+
+Array = NDArray[np.float64]
+
+#: Table 1's names for one body, in the order of Eq. 8, with units.
+BODY_PARAMETERS: Mapping[str, str] = {
+    "mass": "kg",
+    "r": "1",
+    "mu_c": "1",
+    "w_x": "m",
+    "w_y": "m",
+    "w_theta": "rad",
+    "mu_x": "1",
+    "mu_y": "1",
+}
+WHEEL_PARAMETERS = ("w_x", "w_y", "w_theta", "mu_x", "mu_y")
+#: Table 1's names for one joint: which bodies it joins, and where in each one's frame, with units.
+JOINT_INDICES = ("i_a", "i_b")
+JOINT_ANCHORS: Mapping[str, str] = {"a_x": "m", "a_y": "m", "b_x": "m", "b_y": "m"}
+
+
+@dataclass(frozen=True)
+class Block:
+    """One named parameter over the bodies, or joints, that have it.
+
+    Parameters
+    ----------
+    name : str
+        Variable name, e.g. ``mass`` or ``linear_drag_coefficient``.
+    owners : tuple of str
+        The bodies in the scene's order, or the joints; the length of the variable.
+    unit : str
+        SI unit.
+    priors : tuple of Prior
+        One an owner.
+    effect : str, optional
+        The effect that the parameter belongs to; None for Table 1.
+    of : str
+        ``body`` or ``joint``.
+    conditional : tuple of tuple of Prior
+        For an anchor: an owner's prior if its index is 0, 1, ...; the support is the bounds of the
+        body that the index names. Empty for all others.
+    """
+
+    name: str
+    owners: tuple[str, ...]
+    unit: str
+    priors: tuple[Prior, ...]
+    effect: str | None = None
+    of: str = "body"
+    conditional: tuple[tuple[Prior, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class Layout:
+    """The order in which unknown parameters stand in the vector phi.
+
+    Parameters
+    ----------
+    blocks : tuple of Block
+        Named parameters; the vector is their concatenation.
+    """
+
+    blocks: tuple[Block, ...]
+
+    def subset(self, owners: Iterable[str]) -> Layout:
+        """The parameters of these bodies and joints alone."""
+        kept = set(owners)
+        blocks = []
+        for block in self.blocks:
+            of = [i for i, owner in enumerate(block.owners) if owner in kept]
+            if of:
+                blocks.append(
+                    replace(
+                        block,
+                        owners=tuple(block.owners[i] for i in of),
+                        priors=tuple(block.priors[i] for i in of),
+                        conditional=tuple(block.conditional[i] for i in of if block.conditional),
+                    )
+                )
+        return Layout(tuple(blocks))
+
+    @property
+    def size(self) -> int:
+        """Length of the vector."""
+        return sum(len(block.owners) for block in self.blocks)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """One readable label an entry, such as ``mass[cart]``."""
+        return tuple(f"{block.name}[{owner}]" for block in self.blocks for owner in block.owners)
+
+    @property
+    def priors(self) -> tuple[Prior, ...]:
+        """One prior an entry."""
+        return tuple(prior for block in self.blocks for prior in block.priors)
+
+    @property
+    def bounds(self) -> tuple[Array, Array]:
+        """Lower and upper end of each entry's support, shape (p,) each."""
+        support = np.array([prior.support for prior in self.priors]).reshape(-1, 2)
+        return support[:, 0], support[:, 1]
+
+    def supports(self, phi: Array) -> tuple[Array, Array]:
+        """Ends of each entry's support at phi, shape (n, p) each; an anchor's depend on its index.
+
+        Parameters
+        ----------
+        phi : ndarray
+            Shape (n, p).
+        """
+        lower, upper = (np.tile(end, (len(phi), 1)) for end in self.bounds)
+        for block in self.blocks:
+            side = f"i_{block.name[0]}"
+            for owner, conditional in zip(block.owners, block.conditional, strict=False):
+                if f"{side}[{owner}]" not in self.labels:
+                    continue
+                place, index = self.index(block.name, owner), self.index(side, owner)
+                support = np.array([prior.support for prior in conditional])
+                held = support[phi[:, index].astype(int)]
+                lower[:, place], upper[:, place] = held.T
+        return lower, upper
+
+    def scale(self, phi: Array) -> Array:
+        """What is a large change of each entry of phi, shape (p,); zero of a discrete one."""
+        least = np.array([0.0 if each.discrete else min(each.sigma, 1.0) for each in self.priors])
+        return np.where(self.discrete, 0.0, np.maximum(np.abs(phi), 0.1 * least))
+
+    def slices(self) -> Iterator[tuple[Block, slice]]:
+        """Each block with its place in the vector."""
+        begin = 0
+        for block in self.blocks:
+            yield block, slice(begin, begin + len(block.owners))
+            begin += len(block.owners)
+
+    @property
+    def discrete(self) -> NDArray[np.bool_]:
+        """Which entries are whole numbers that stand for names, shape (p,)."""
+        return np.array([prior.discrete for prior in self.priors], dtype=bool)
+
+    def owner_kind(self, place: int) -> str:
+        """Whether an entry belongs to a ``body`` or a ``joint``."""
+        return [block.of for block in self.blocks for _ in block.owners][place]
+
+    def index(self, name: str, owner: str) -> int:
+        """Place of one parameter of one body, or joint, in the vector.
+
+        Raises
+        ------
+        ParameterError
+            If the layout has no such parameter.
+        """
+        label = f"{name}[{owner}]"
+        if label not in self.labels:
+            raise ParameterError(
+                f"parameter {label} is not among the unknown ones: {', '.join(self.labels)}"
+            )
+        return self.labels.index(label)
+
+    def to_vector(self, values: Mapping[str, object]) -> Array:
+        """Stack named values, scalars or (owner,) arrays, into the vector phi, shape (p,).
+
+        Raises
+        ------
+        ParameterError
+            If a name is missing, or a value has the wrong length.
+        """
+        vector = np.empty(self.size)
+        for block, place in self.slices():
+            if block.name not in values:
+                raise ParameterError(f"parameter {block.name} is missing; add it to the values")
+            value = np.asarray(values[block.name], dtype=float)
+            if value.size not in (1, len(block.owners)):
+                raise ParameterError(
+                    f"parameter {block.name} has {value.size} values, expected"
+                    f" {len(block.owners)}, one for each of {', '.join(block.owners)}"
+                )
+            vector[place] = value.ravel()
+        return vector
+
+    def to_vectors(self, draws: Mapping[str, Array], n: int) -> Array:
+        """Stack ``n`` named draws, shape (n, owner) each, into vectors, shape (n, p)."""
+        columns = [draws[block.name].reshape(n, -1) for block in self.blocks]
+        return np.concatenate([np.zeros((n, 0)), *columns], axis=1)
+
+    def to_dict(self, vector: Array) -> dict[str, Array]:
+        """Split phi, shape (..., p), into named arrays, shape (..., owner)."""
+        return {block.name: vector[..., place] for block, place in self.slices()}

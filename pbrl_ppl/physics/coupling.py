@@ -1,0 +1,83 @@
+"""Which bodies of a history have to do with each other."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from pbrl_ppl.history import History
+from pbrl_ppl.scene import WORLD, Scene
+
+#: Room that bodies must leave each other: a share of their size, and of how far they move apart or
+#: towards each other in an interval, within which they do not go straight.
+_SHARE = 0.25
+
+Parts = tuple[tuple[str, ...], ...]
+
+
+def independent_parts(scene: Scene, history: History) -> Parts:
+    """Moving bodies in parts that never come near each other and share no joint.
+
+    Each part has a likelihood of its own given the noise, so that many bodies cost what each of
+    them costs alone.
+
+    Parameters
+    ----------
+    scene : Scene
+        Shapes and joints. A joint of unknown bodies may join any two.
+    history : History
+        Where the bodies were; one whose place is not known at some time may have been anywhere.
+
+    Returns
+    -------
+    tuple of tuple of str
+        Names, in the order of ``scene.dynamic``.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from pbrl_ppl.scene.scene import Body, Shape
+    >>> pucks = tuple(Body(name, Shape.circle(0.1)) for name in "abc")
+    >>> scene = Scene(time_step=0.1, bodies=pucks)
+    >>> rows = [
+    ...     {"trajectory": 0, "time": 0.1 * t, "body": name, "x": x, "vx": 0.0} for t in range(2)
+    ...     for name, x in zip("abc", (0.0, 0.21, 3.0))
+    ... ]
+    >>> rest = dict.fromkeys(["y", "theta", "vy", "omega", "force_x", "force_y", "torque"], 0.0)
+    >>> independent_parts(scene, History.from_dataframe(pd.DataFrame(rows).assign(**rest), scene))
+    (('a', 'b'), ('c',))
+    """
+    names = [body.name for body in scene.dynamic]
+    k = len(names)
+    together = np.zeros((k, k), dtype=bool)
+    for joint in scene.joints:
+        if joint.bodies is None:
+            return (tuple(names),)
+        if all(name in names for name in joint.bodies) and WORLD not in joint.bodies:
+            i, j = (names.index(name) for name in joint.bodies)
+            together[i, j] = True
+    place = history.dataset["start"].to_numpy()[..., :2]
+    intervals = history.dataset["n_rows"].to_numpy() - 1
+    inside = np.arange(place.shape[1] - 1) < intervals[:, None]
+    begin, end = place[:, :-1][inside], place[:, 1:][inside]  # (interval, body, 2)
+    reach = [body.shape.bounding_radius for body in scene.dynamic]
+    for i in range(k):
+        for j in range(i):
+            least = (1.0 + _SHARE) * (reach[i] + reach[j])
+            together[i, j] |= _meet(begin[:, i] - begin[:, j], end[:, i] - end[:, j], least)
+    count, part = connected_components(together, directed=False)
+    return tuple(
+        tuple(name for name, own in zip(names, part, strict=True) if own == which)
+        for which in range(count)
+    )
+
+
+def _meet(begin: np.ndarray, end: np.ndarray, least: float) -> bool:
+    """Whether a relative place, shape (interval, 2), comes nearer than ``least``, or is unknown."""
+    if not (np.isfinite(begin).all() and np.isfinite(end).all()):
+        return True
+    way = end - begin
+    length = (way**2).sum(axis=1)
+    share = np.clip(-(begin * way).sum(axis=1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+    nearest = np.linalg.norm(begin + share[:, None] * way, axis=1)
+    return bool((nearest < least + _SHARE * np.sqrt(length)).any())

@@ -1,0 +1,307 @@
+"""From a posterior, a start and a goal to a plan, and the plan as a file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from pbrl_ppl.effects import Effect, catalogue
+from pbrl_ppl.errors import GoalError
+from pbrl_ppl.history import STATE, segment_rows, write_atomically
+from pbrl_ppl.physics import check_placement, overlap
+from pbrl_ppl.planning.actions import ActionSet
+from pbrl_ppl.planning.astar import astar
+from pbrl_ppl.planning.dynamics import Dynamics
+from pbrl_ppl.planning.goals import Goal
+from pbrl_ppl.planning.receding import mppi
+from pbrl_ppl.planning.risk import tail_mean
+from pbrl_ppl.planning.search import Found
+from pbrl_ppl.scene import Scene, nearest
+
+Array = NDArray[np.float64]
+
+METHODS = ("astar", "mppi")
+#: Draws of Eq. 13's noise that a predicted distribution holds, at least.
+_NOISY = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """Wrenches that lead to a goal, and where the model says they lead.
+
+    Attributes
+    ----------
+    scene : Scene
+        As the posterior has it.
+    goal : Goal
+        What it is for.
+    start : ndarray
+        State it starts from, shape (body, 6), SI units.
+    wrenches : ndarray
+        World frame, one a sampling interval, shape (time, body, 3), N and N m.
+    predicted : xarray.Dataset
+        Variable ``predicted`` of dims (draw, time, body, state): what each draw predicts.
+    reached : bool
+        Whether the goal is reached by the model.
+    stopped : str
+        Why the search ended: ``goal``, ``nodes``, ``time``, ``exhausted`` or ``interrupted``.
+    distance : float
+        L2 distance from the goal at the end (m), as the mean of the worst ``tail`` of draws.
+    nodes : int
+        States that were generated.
+    seconds : float
+        How long the search took.
+    """
+
+    scene: Scene
+    goal: Goal
+    start: Array
+    wrenches: Array
+    predicted: xr.Dataset
+    reached: bool
+    stopped: str
+    distance: float
+    nodes: int
+    seconds: float
+
+    @property
+    def duration(self) -> float:
+        """How long the plan takes (s)."""
+        return len(self.wrenches) * self.scene.time_step
+
+    def to_dataframe(self) -> pd.DataFrame:
+        """The plan as rows of a history without measurements but the start.
+
+        Returns
+        -------
+        DataFrame
+            Columns as DESIGN's ``history.csv``; state cells after the start are missing.
+        """
+        nothing = np.full((1, len(self.wrenches), *self.start.shape), np.nan)
+        return segment_rows(self.scene, self.start[None], self.wrenches[None], nothing)
+
+    def save(self, path: str | Path) -> None:
+        """Write the plan as a CSV file, whole or not at all.
+
+        Raises
+        ------
+        OutputError
+            If it cannot be written there.
+        """
+        table = self.to_dataframe()
+        write_atomically(Path(path), lambda to: table.to_csv(to, index=False))
+
+    def in_words(self) -> str:
+        """One sentence: whether it reaches the goal, how, and how far off it ends."""
+        why = {
+            "nodes": "the limit of nodes was reached",
+            "time": "the limit of time was reached",
+            "exhausted": "there was nothing left to try: the actions do not lead there",
+            "interrupted": "it was interrupted",
+        }
+        size = f"{len(self.wrenches)} intervals, {self.duration:.1f} s"
+        if self.reached:
+            return f"the goal is reached: {size}, {self.distance:.3f} m from it at the end"
+        return (
+            f"the goal is not reached: {why.get(self.stopped, self.stopped)}; the best plan found"
+            f" ({size}) ends {self.distance:.3f} m from it"
+        )
+
+
+def plan(
+    idata: Any,
+    start: Mapping[str, Sequence[float]] | ArrayLike,
+    goal: Goal | Mapping[str, Sequence[float | None]],
+    actions: ActionSet | None = None,
+    *,
+    method: str = "astar",
+    draws: int | None = None,
+    tail: float = 1.0,
+    noise: bool = False,
+    seed: int = 0,
+    seconds: float = 60.0,
+    effects: Iterable[Effect] = catalogue,
+    progress: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Plan:
+    """Plan from a start to a goal with what a posterior knows, and nothing else.
+
+    Parameters
+    ----------
+    idata : InferenceData, DataTree or Dynamics
+        A posterior, as :func:`pbrl_ppl.load_posterior` gives it; or parameters that are known.
+    start : mapping or array_like
+        State of each body: ``{"cart": (x, y, theta)}`` at rest, or with ``vx, vy, omega``; a body
+        that is left out is at rest at its pose in the scene. Or an array, shape (body, 6). SI.
+    goal : Goal or mapping
+        Or poses: ``{"cart": (x, y, theta)}``, None where free.
+    actions : ActionSet, optional
+        By default, pushes as in the data; see :meth:`ActionSet.recorded`.
+    method : str
+        ``astar``: a whole plan, over the action set; ``mppi``: a receding horizon for dynamic
+        tasks, with any wrench up to the strongest of the set.
+    draws : int, optional
+        Posterior draws to plan with; without it, the one of highest posterior density (MAP).
+    tail : float
+        Share of the worst draws that count: 1 for the expectation, less for conditional value at
+        risk.
+    noise : bool
+        Whether Eq. 13's noise is added while planning and in the predicted distribution.
+    seed : int
+        Of the choice of draws and of all else that is random.
+    seconds : float
+        Limit of the search.
+    effects : iterable of Effect
+        Where the names of the posterior's effects are looked up.
+    progress : callable, optional
+        Told how far the search is.
+    **options
+        Of :func:`pbrl_ppl.planning.astar.astar` or :func:`pbrl_ppl.planning.receding.mppi`.
+
+    Returns
+    -------
+    Plan
+        With ``reached`` false if a limit was met before the goal: then the best found.
+
+    Raises
+    ------
+    GoalError
+        If the start, the goal or the actions cannot be.
+    PosteriorError
+        If it is no posterior, or holds fewer draws.
+
+    Examples
+    --------
+    ::
+
+        idata = pp.load_posterior("cart.nc")
+        plan = pp.plan(idata, {"cart": (0, 0, 0)}, {"cart": (3, 1, None)}, draws=16)
+        plan.save("plan.csv")
+    """
+    if method not in METHODS:
+        raise GoalError(f'plan: method is "{method}"{nearest(method, METHODS)}')
+    if not 0 < tail <= 1:
+        raise GoalError(f"plan: tail is {tail}, expected a share above 0 and at most 1")
+    if not seconds > 0:
+        raise GoalError(f"plan: seconds is {seconds}, expected more than 0")
+    if isinstance(idata, Dynamics):
+        dynamics = idata
+        if actions is None:
+            raise GoalError("plan: parameters alone do not say how to push; give actions")
+    else:
+        dynamics = Dynamics.of(idata, draws, seed=seed, effects=effects)
+        actions = ActionSet.recorded(idata) if actions is None else actions
+    scene = dynamics.scene
+    goal = goal if isinstance(goal, Goal) else Goal.of(goal)
+    goal.check(scene)
+    actions.check(scene)
+    first = start_state(scene, start)
+    _check_room(scene, goal)
+    search: Callable[..., Found] = astar if method == "astar" else mppi
+    rng = np.random.default_rng(seed)
+    found = search(
+        dynamics, first, goal, actions, tail=tail, seconds=seconds, noise=noise, rng=rng,
+        progress=progress, **options,
+    )  # fmt: skip
+    return _described(dynamics, first, goal, found, tail, noise, rng)
+
+
+def _described(
+    dynamics: Dynamics,
+    start: Array,
+    goal: Goal,
+    found: Found,
+    tail: float,
+    noise: bool,
+    rng: np.random.Generator,
+) -> Plan:
+    scene = dynamics.scene
+    states = dynamics.rollout(start, found.wrenches)
+    distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
+    if noise:
+        times = -(-_NOISY // dynamics.draws)
+        states = np.concatenate(
+            [dynamics.rollout(start, found.wrenches, rng) for _ in range(times)]
+        )
+    predicted = xr.Dataset(
+        {"predicted": (("draw", "time", "body", "state"), states)},
+        {
+            "draw": np.arange(len(states)),
+            "time": ("time", scene.time_step * np.arange(states.shape[1]), {"units": "s"}),
+            "body": [body.name for body in scene.dynamic],
+            "state": list(STATE),
+        },
+    )
+    return Plan(
+        scene, goal, start, found.wrenches, predicted, found.reached, found.stopped, distance,
+        found.nodes, found.seconds,
+    )  # fmt: skip
+
+
+def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) -> Array:
+    """The bodies' states, shape (body, 6), from what a user gives for some of them.
+
+    Parameters
+    ----------
+    scene : Scene
+        Orders the bodies; a body that is not given is at its pose there.
+    start : mapping or array_like
+        As of :func:`plan`.
+
+    Raises
+    ------
+    GoalError
+        If a body is unknown or its state incomplete, or bodies lie inside each other.
+    """
+    names = [body.name for body in scene.dynamic]
+    if isinstance(start, Mapping):
+        for name in start:
+            if name not in names:
+                raise GoalError(
+                    f'start: the scene has no moving body "{name}"{nearest(name, names)}'
+                )
+        states = np.zeros((len(names), len(STATE)))
+        for i, body in enumerate(scene.dynamic):
+            if body.name not in start and body.pose is None:
+                raise GoalError(
+                    f"start: nothing says where {body.name} is; give {body.name} = x, y, theta"
+                )
+            given = np.asarray(start.get(body.name, body.pose), dtype=float).ravel()
+            if len(given) not in (3, 6):
+                raise GoalError(
+                    f"start of {body.name}: got {len(given)} values, expected x, y, theta or these"
+                    " and vx, vy, omega"
+                )
+            states[i, : len(given)] = given
+    else:
+        states = np.array(start, dtype=float)
+        if states.shape != (len(names), len(STATE)):
+            raise GoalError(
+                f"start has shape {states.shape}, expected ({len(names)}, 6): {', '.join(names)}"
+            )
+    if not np.isfinite(states).all():
+        raise GoalError("start: a value is not a finite number")
+    check_placement(scene, states[None], lambda _: "start")
+    return states
+
+
+def _check_room(scene: Scene, goal: Goal) -> None:
+    """Refuse targets inside walls or static bodies, by more than their tolerance."""
+    for target in goal.targets:
+        if target.x is None or target.y is None or target.theta is None:
+            continue
+        alone = scene.subset([target.body]).replace(joints=())
+        pose = np.array([[[target.x, target.y, target.theta]]])
+        depth = float(overlap(alone, pose)[0])
+        if depth > target.tolerance:
+            raise GoalError(
+                f"goal of {target.body}: there it is {depth:.2g} m inside a wall or a static body;"
+                " choose a free place"
+            )

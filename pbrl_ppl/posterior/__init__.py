@@ -1,0 +1,61 @@
+"""Posterior files: save, load, draws, what the data inform, the next prior."""
+
+from pbrl_ppl.posterior.identifiability import Identifiability
+from pbrl_ppl.posterior.identification import identify, uninformed
+from pbrl_ppl.posterior.learned_library import learned_modes, mode_probabilities
+from pbrl_ppl.posterior.record import (
+    MIN_ESS,
+    checked,
+    complete,
+    evaluate,
+    parameter_draws,
+    predictive_rows,
+    problem_of,
+    versions,
+)
+from pbrl_ppl.posterior.store import (
+    DATATREE,
+    HDI_PROB,
+    convergence,
+    draws,
+    from_groups,
+    group,
+    groups,
+    interval,
+    load_posterior,
+    save_posterior,
+    scalars,
+    scene_of,
+    smoothed,
+)
+from pbrl_ppl.posterior.updated_prior import updated_scene
+
+__all__ = [
+    "DATATREE",
+    "HDI_PROB",
+    "MIN_ESS",
+    "Identifiability",
+    "checked",
+    "complete",
+    "convergence",
+    "draws",
+    "evaluate",
+    "from_groups",
+    "group",
+    "groups",
+    "identify",
+    "interval",
+    "learned_modes",
+    "load_posterior",
+    "mode_probabilities",
+    "parameter_draws",
+    "predictive_rows",
+    "problem_of",
+    "save_posterior",
+    "scalars",
+    "scene_of",
+    "smoothed",
+    "uninformed",
+    "updated_scene",
+    "versions",
+]

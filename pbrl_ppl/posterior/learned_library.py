@@ -1,0 +1,82 @@
+"""Modes from posteriors that were learned before, and what a posterior says of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.model import Modes
+from pbrl_ppl.posterior.store import group, scalars, scene_of
+
+Array = NDArray[np.float64]
+#: Parameters that are angles, whose mean is a direction.
+_ANGLES = ("w_theta",)
+#: What a posterior holds beside parameters.
+_OTHERS = ("mode", "sigma")
+
+
+def learned_modes(
+    posteriors: Mapping[str, Any], probabilities: Mapping[str, Any] | None = None
+) -> Modes:
+    """The means of posteriors, each learned on its own, as modes to choose among.
+
+    Parameters
+    ----------
+    posteriors : mapping of str to InferenceData or DataTree
+        By the name that the mode will have; of one that has several bodies each is a mode, called
+        ``name.body``. What its scene knew of a body goes into the mode.
+    probabilities : mapping, optional
+        As for :class:`pbrl_ppl.Modes`.
+
+    Examples
+    --------
+    ::
+
+        learned = {name: pp.load_posterior(f"{name}.nc") for name in ("cart", "table")}
+        model = pp.physics_model(scene, history, modes=pp.learned_modes(learned))
+    """
+    sets: dict[str, dict[str, float]] = {}
+    for name, idata in posteriors.items():
+        scene, flat = scene_of(idata), scalars(idata)
+        for body in scene.dynamic:
+            found = {key: float(value) for key, value in body.known}
+            for label, values in flat.data_vars.items():
+                key, _, owner = str(label).rstrip("]").partition("[")
+                if owner == body.name and key not in _OTHERS:
+                    found[key] = _mean(key, values.to_numpy())
+            sets[name if len(scene.dynamic) == 1 else f"{name}.{body.name}"] = found
+    return Modes(sets, probabilities)
+
+
+def mode_probabilities(idata: Any) -> pd.DataFrame:
+    """Posterior probability of every mode: one row a body, one column a mode.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit` from a model with ``modes``.
+
+    Raises
+    ------
+    PosteriorError
+        If it is of a model without modes.
+    """
+    if "modes" not in idata.attrs:
+        raise PosteriorError("posterior: its model has no modes; pass modes= to physics_model")
+    names = Modes.from_json(str(idata.attrs["modes"])).names
+    index = group(idata, "posterior")["mode"].transpose("chain", "draw", "body")
+    share = {name: (index == i).mean(("chain", "draw")) for i, name in enumerate(names)}
+    return pd.DataFrame(
+        {name: each.to_numpy() for name, each in share.items()}, index=index["body"].to_numpy()
+    )
+
+
+def _mean(name: str, values: Array) -> float:
+    if name in _ANGLES:
+        return float(np.angle(np.exp(1j * values).mean()))
+    return float(values.mean())

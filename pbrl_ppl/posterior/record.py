@@ -1,0 +1,335 @@
+"""The whole record of a fit: predictions, likelihoods, units, origin, convergence."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import sys
+import warnings
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.effects import Effect, attach, catalogue
+from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
+from pbrl_ppl.history import STATE, History, Segments, from_segments
+from pbrl_ppl.model import Modes, Observations, Problem, sigma_prior
+from pbrl_ppl.modes import ATTRIBUTE, doubts
+from pbrl_ppl.parameters import fold_draws
+from pbrl_ppl.posterior.identification import uninformed
+from pbrl_ppl.posterior.store import (
+    attributes,
+    convergence,
+    draws,
+    from_groups,
+    group,
+    groups,
+    scene_of,
+)
+
+Array = NDArray[np.float64]
+
+#: What a posterior needs before its summaries can be relied on (Vehtari et al., 2021).
+MAX_RHAT, MIN_ESS = 1.01, 400
+_PREDICTIVE_DRAWS = 50
+#: Draws are simulated in groups: of so many, or more if that makes fewer transitions.
+_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE = 64, 20_000
+#: With fewer, nothing can be said of convergence.
+_LEAST_DRAWS = 4
+#: A parameter is stuck if this share of its draws is within this share of its support's end.
+_STUCK, _NEAR = 0.5, 0.01
+PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
+
+
+def complete(
+    problem: Problem, trace: Any, *, seed: int, method: str, asked: int | None = None
+) -> Any:
+    """Add to a trace what the posterior file must hold: likelihood, predictions, units, origin.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was fitted.
+    trace : InferenceData or DataTree
+        As PyMC gives it.
+    seed : int
+        Of the draws and of the predictions.
+    method : str
+        The sampler's name.
+    asked : int, optional
+        Draws a chain that were asked for, where an interrupt left fewer.
+
+    Returns
+    -------
+    InferenceData or DataTree
+        The posterior.
+    """
+    posterior = _folded(problem, trace)
+    phi, sigma = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
+    chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
+    rng = np.random.default_rng(seed)
+    likelihood, predictive = evaluate(problem, phi, sigma, predictive_rows(chains * n), rng)
+    data = groups(trace)
+    dims = ("transition", "step", "body", "state")
+    coords = {dim: data["observed_data"][dim].values for dim in dims}
+    result = {
+        "posterior": _with_units(problem, posterior),
+        "sample_stats": data["sample_stats"],
+        "log_likelihood": xr.Dataset(
+            {
+                "next_state": (
+                    ("chain", "draw", "transition"),
+                    likelihood.reshape(chains, n, -1),
+                )
+            },
+            {
+                "chain": posterior["chain"],
+                "draw": posterior["draw"],
+                "transition": coords["transition"],
+            },
+        ),
+        "posterior_predictive": xr.Dataset(
+            {"next_state": (("chain", "draw", *dims), predictive[None])},
+            {"chain": [0], "draw": np.arange(len(predictive)), **coords},
+        ),
+        "observed_data": xr.Dataset({"next_state": (dims, problem.observations.values)}, coords),
+        "constant_data": data["constant_data"],
+    }
+    idata = from_groups(result, _origin(problem, seed) | {"method": method})
+    if ATTRIBUTE in trace.attrs:
+        idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
+    return checked(problem, idata, asked)
+
+
+def predictive_rows(draws: int) -> NDArray[np.intp]:
+    """Which of so many draws, chains joined, the stored predictions are made with."""
+    return np.linspace(0, draws - 1, min(_PREDICTIVE_DRAWS, draws)).astype(int)
+
+
+def evaluate(
+    problem: Problem, phi: Array, sigma: Array, rows: Any, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Log-likelihoods of the transitions at draws, and next states drawn from some of them.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says which transitions.
+    phi, sigma : ndarray
+        Shapes (draw, p) and (draw, state).
+    rows : sequence of int
+        Draws to predict with, in increasing order.
+    rng : Generator
+        Of the predictions.
+
+    Returns
+    -------
+    likelihood : ndarray
+        Shape (draw, transition).
+    predictive : ndarray
+        Shape (row, transition, H, body, state).
+    """
+    likelihood = np.empty((len(phi), problem.segments.n))
+    predictive = []
+    wide = replace(problem, threads=max(problem.threads, 2))
+    size = max(_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE // problem.segments.n)
+    for begin in range(0, len(phi), size):
+        part = slice(begin, begin + size)
+        own, which = np.unique(phi[part], axis=0, return_inverse=True)  # a chain stays put at times
+        states = wide.predict(own)[which.ravel()]
+        likelihood[part] = problem.log_density(problem.observations.residual(states), sigma[part])
+        predictive += [
+            problem.next_states(states[i - begin], sigma[i], rng)
+            for i in rows
+            if begin <= i < begin + size
+        ]
+    return likelihood, np.stack(predictive)
+
+
+def problem_of(
+    idata: Any, effects: Iterable[Effect] = catalogue, history: History | None = None
+) -> Problem:
+    """The problem that a posterior was fitted to, from what the posterior holds.
+
+    Start noise and a user's own effects are not in it.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+    effects : iterable of Effect
+        Where the names of its effects are looked up.
+    history : History, optional
+        Other data for the same problem, the noise's prior included.
+
+    Raises
+    ------
+    PosteriorError
+        If it holds no scene or lacks a group.
+    EffectError
+        If an effect is not among ``effects``.
+    """
+    attrs, scene = idata.attrs, scene_of(idata)
+    given, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
+    values = measured.transpose("transition", "step", "body", "state").to_numpy()
+    columns = tuple(STATE.index(str(name)) for name in measured["state"].values)
+    start, actions = given["start"].to_numpy(), given["actions"].to_numpy()
+    observed = np.full((*values.shape[:3], len(STATE)), np.nan)
+    observed[..., columns] = values
+    if "sigma_prior" in attrs:
+        median, spread = json.loads(str(attrs["sigma_prior"]))
+    else:  # a file of an older version
+        none = np.zeros(len(start), dtype=np.int64)
+        segments = Segments(start, actions, observed, none, none)
+        median, spread = sigma_prior(Observations(values, columns), segments)
+    return Problem(
+        scene=scene,
+        history=from_segments(scene, start, actions, observed) if history is None else history,
+        effects=attach(scene, (), effects),
+        horizon=int(attrs["horizon"]),
+        substeps=int(attrs["substeps"]),
+        scalar_sigma="state" not in group(idata, "posterior")["sigma"].dims,
+        nu=float(attrs["nu"]) if "nu" in attrs else None,
+        sigma_prior=(tuple(float(each) for each in median), float(spread)),
+        columns=columns,
+        modes=Modes.from_json(str(attrs["modes"])) if "modes" in attrs else None,
+    )
+
+
+def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
+    """Draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
+    named = draws(trace)
+    n = len(named["sigma"])
+    phi = problem.layout.to_vectors(named, n)
+    sigma = named["sigma"].reshape(n, -1)
+    return phi, np.broadcast_to(sigma, (len(phi), len(problem.observations.columns)))
+
+
+def _folded(problem: Problem, trace: Any) -> xr.Dataset:
+    """The posterior with each wheel in one of its equal descriptions, the same in all chains."""
+    posterior = group(trace, "posterior").copy(deep=True)
+    if problem.modes is not None:  # the draws are the modes' own
+        return posterior
+    layout = problem.layout
+    phi, _ = parameter_draws(problem, trace)
+    folded = fold_draws(layout, dict(zip(layout.labels, phi.T, strict=True)))
+    for block in layout.blocks:
+        for i, owner in enumerate(block.owners):
+            values = posterior[block.name].values
+            values[..., i] = folded[f"{block.name}[{owner}]"].reshape(values.shape[:2])
+    return posterior
+
+
+def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
+    posterior = posterior.copy()
+    for block in problem.layout.blocks:
+        posterior[block.name].attrs["units"] = block.unit
+    posterior["sigma"].attrs["units"] = "the unit of each state dimension"
+    return posterior
+
+
+def _origin(problem: Problem, seed: int) -> dict[str, Any]:
+    scene = problem.scene
+    median, spread = problem.noise_prior
+    for body in scene.dynamic:
+        new = [
+            one.effect.name
+            for one in problem.effects
+            if one.body == body.name and one.effect.name not in body.effects
+        ]
+        scene = scene.with_effects(body.name, *new)
+    return attributes(
+        scene,
+        effects=[[one.effect.name, one.body] for one in problem.effects],
+        seed=seed,
+        horizon=problem.horizon,
+        **({} if problem.nu is None else {"nu": problem.nu}),
+        **({} if problem.modes is None else {"modes": problem.modes.to_json()}),
+        substeps=problem.substeps,
+        sigma_prior=[[float(each) for each in median], float(spread)],
+        start_noise=int(problem.noise is not None),
+        data_sha256=problem.history.data_sha256,
+        versions=versions(),
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a posterior depends on."""
+    found = {"python": ".".join(map(str, sys.version_info[:3]))}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def checked(problem: Problem, idata: Any, asked: int | None = None) -> Any:
+    """Store what is wrong with a posterior, and warn of it."""
+    found = list(_trouble(problem, idata, asked))
+    idata.attrs["warnings"] = json.dumps([message for _, message in found])
+    for kind, message in found:
+        warnings.warn(message, kind, stacklevel=4)
+    return idata
+
+
+def _trouble(
+    problem: Problem, idata: Any, asked: int | None
+) -> Iterator[tuple[type[Warning], str]]:
+    """What is wrong, and the cure."""
+    on = "go on with start= this posterior"
+    if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
+        on = "name the bodies that were found in the scene, fit that and go on with start="
+    more = f"raise draws= or thin=, or {on}"
+    if "updates" in idata.attrs:  # resampled draws are no chain that could go on
+        more = "these draws were reweighted by update; fit all data anew"
+    sizes = group(idata, "posterior").sizes
+    if asked is not None:
+        idata.attrs["interrupted"] = 1
+        yield (
+            ConvergenceWarning,
+            f"sampling was interrupted after {sizes['draw']} of {asked} draws a chain, which are"
+            f" kept; for more, {on}",
+        )
+    rough = doubts(idata)
+    if rough is not None:
+        yield ConvergenceWarning, rough
+    if sizes["draw"] < _LEAST_DRAWS:  # a mode alone
+        return
+    r_hat, ess = convergence(idata)
+    worst_hat, worst_ess = max(r_hat, key=lambda k: r_hat[k]), min(ess, key=lambda k: ess[k])
+    idata.attrs["max_rhat"], idata.attrs["min_ess"] = r_hat[worst_hat], ess[worst_ess]
+    if not (r_hat[worst_hat] <= MAX_RHAT and ess[worst_ess] >= MIN_ESS):
+        yield (
+            ConvergenceWarning,
+            f"the chains have not converged: R-hat is {r_hat[worst_hat]:.3f} for {worst_hat}"
+            f" (want <= {MAX_RHAT}), effective sample size {ess[worst_ess]:.0f} for {worst_ess}"
+            f" (want >= {MIN_ESS}); {more}",
+        )
+    if problem.modes is not None:  # what follows compares with Table 1
+        return
+    phi, _ = parameter_draws(problem, idata)
+    ends = problem.layout.supports(phi)
+    margin = _NEAR * (ends[1] - ends[0])
+    watched = np.isfinite(margin).all(axis=0) & ~problem.layout.discrete
+    for bound in ends:
+        share = (np.abs(phi - bound) < margin).mean(axis=0)
+        for i in np.flatnonzero(watched & (share > _STUCK)):
+            yield (
+                BoundWarning,
+                f"{problem.layout.labels[i]} is pressed against the end of its support,"
+                f" {np.median(bound[:, i]):g}: {share[i]:.0%} of the draws are there; check the"
+                " shape and the frame of the body, or look for an effect that the model lacks"
+                " (pbrl-ppl close-loop)",
+            )
+    silent = uninformed(idata, effects={one.effect for one in problem.effects})
+    if silent:
+        yield (
+            UninformedWarning,
+            f"the data say nothing about {', '.join(silent)}: the posterior is the prior; record"
+            " motions that depend on it, or give it in the scene (known = ...)",
+        )

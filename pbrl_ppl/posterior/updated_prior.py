@@ -1,0 +1,152 @@
+"""Table 1 updated from a posterior: the same families, with the posterior's moments."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import brentq, least_squares
+from scipy.special import i0e, i1e
+from scipy.stats import truncnorm
+
+from pbrl_ppl.effects import Effect, attach, catalogue
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.model import build_layout
+from pbrl_ppl.parameters import Prior, fold_draws
+from pbrl_ppl.posterior.store import scalars, scene_of
+from pbrl_ppl.scene import Scene
+
+Array = NDArray[np.float64]
+
+#: Limits of a truncated normal: mu this many sigmas outside the support is an exponential's slope,
+#: and sigma this many times the width of what it covers is level.
+_OUTSIDE, _LEVEL = 5.0, 5.0
+#: Limits of a von Mises concentration: level, and 0.001 rad.
+_KAPPA = (1e-3, 1e6)
+
+
+def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene:
+    """The posterior's scene with a prior that knows what the posterior knows.
+
+    The next fit of new data starts from it. It keeps each parameter's own distribution, in Table
+    1's family, and forgets how parameters depend on each other. Joints' anchors have no prior in a
+    scene and sigma's is taken from the data: both start afresh.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+    effects : iterable of Effect
+        Where the names of the model's effects are looked up; add your own to the package's.
+
+    Returns
+    -------
+    Scene
+        Its bodies' ``prior`` holds the new hyper-parameters, the effects' among them.
+
+    Raises
+    ------
+    PosteriorError
+        If the posterior holds no scene, lacks a parameter, or its draws do not vary.
+
+    Examples
+    --------
+    ::
+
+        scene = pp.updated_scene(pp.load_posterior("monday.nc"))
+        model = pp.physics_model(scene, pp.History.load("tuesday.csv", scene))
+    """
+    scene = scene_of(idata)
+    layout = build_layout(scene, attach(scene, (), effects))
+    posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
+    draws = fold_draws(layout, posterior)
+    found: dict[str, dict[str, dict[str, float]]] = {body.name: {} for body in scene.bodies}
+    for block in layout.blocks:
+        if block.of != "body":
+            continue
+        for owner, prior in zip(block.owners, block.priors, strict=True):
+            label = f"{block.name}[{owner}]"
+            if label not in draws:
+                raise PosteriorError(f"posterior: it has no {label}, which its scene asks for")
+            if not np.ptp(draws[label]) > 0:
+                raise PosteriorError(
+                    f"posterior: the draws of {label} are all {draws[label][0]:g}, so that they"
+                    " give no width to a prior; fit again, with more draws"
+                )
+            matched = moment_matched(prior, draws[label])
+            found[owner][block.name] = {k: getattr(matched, k) for k in matched.hyper_names}
+    bodies = []
+    for body in scene.bodies:
+        new = {name: tuple(hyper.items()) for name, hyper in found[body.name].items()}
+        bodies.append(replace(body, prior=tuple((dict(body.prior) | new).items())))
+    return scene.replace(bodies=tuple(bodies))
+
+
+def moment_matched(prior: Prior, draws: Array) -> Prior:
+    """The member of a prior's family that has the draws' mean and standard deviation.
+
+    Of the logarithm for ``log_normal``; the mean direction and resultant length for ``von_mises``.
+    A truncated normal's moments are those of its truncated density; where no member has the draws'
+    (piled on both bounds, say), the nearest is taken.
+
+    Parameters
+    ----------
+    prior : Prior
+        Gives the family and the support.
+    draws : ndarray
+        Inside the support, shape (draw,), at least two different ones.
+
+    Examples
+    --------
+    >>> draws = np.exp(np.random.default_rng(0).normal(2.0, 0.1, 4000))
+    >>> new = moment_matched(Prior("log_normal", mu=1.0, sigma=1.5), draws)
+    >>> round(new.mu, 2), round(new.sigma, 2)
+    (2.0, 0.1)
+    """
+    if prior.family == "von_mises":
+        resultant = np.exp(1j * draws).mean()
+        kappa = _concentration(float(np.abs(resultant)))
+        return replace(prior, mu=float(np.angle(resultant)), kappa=kappa)
+    values = np.log(draws) if prior.family == "log_normal" else draws
+    mean, sd = float(values.mean()), float(values.std())
+    if prior.family in ("truncated_normal", "half_normal"):
+        mean, sd = _parent(mean, sd, *prior.support)
+    return replace(prior, mu=mean, sigma=sd)
+
+
+def _concentration(resultant: float) -> float:
+    """Kappa whose von Mises distribution has this mean resultant length, 0 to 1."""
+    low, high = np.log(_KAPPA)
+
+    def excess(log_kappa: float) -> float:
+        kappa = np.exp(log_kappa)
+        return float(i1e(kappa) / i0e(kappa)) - resultant
+
+    if excess(low) >= 0 or excess(high) <= 0:
+        return _KAPPA[0] if excess(low) >= 0 else _KAPPA[1]
+    return float(np.exp(brentq(excess, low, high)))
+
+
+def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, float]:
+    """Mu and sigma of the normal that has this mean and sd once it is truncated."""
+    reach = min(upper - lower, mean - lower + sd, upper - mean + sd)
+    reach = reach if np.isfinite(upper - lower) else 10 * reach
+
+    def hyper(point: Array) -> tuple[float, float]:
+        sigma = float(np.exp(point[1]))
+        mu = np.clip(mean + sd * point[0], lower - _OUTSIDE * sigma, upper + _OUTSIDE * sigma)
+        return float(mu), sigma
+
+    def miss(point: Array) -> Array:
+        mu, sigma = hyper(point)
+        law = truncnorm((lower - mu) / sigma, (upper - mu) / sigma, mu, sigma)
+        return np.array([(law.mean() - mean) / sd, np.log(law.std() / sd)])
+
+    # a posterior that no bound touches is its own parent
+    begin = np.array([0.0, np.log(min(sd, 0.9 * _LEVEL * reach))])
+    far = _LEVEL * reach / sd * (_OUTSIDE + 1)
+    limits = ([-far, np.log(0.5 * sd)], [far, np.log(_LEVEL * reach)])
+    return hyper(least_squares(miss, begin, bounds=limits, x_scale="jac").x)

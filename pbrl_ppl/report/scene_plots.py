@@ -1,0 +1,173 @@
+"""Pictures of scenes from above: where bodies are, how they moved, where they should be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle, Patch, Polygon
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import write_atomically
+from pbrl_ppl.planning import Goal, Plan, Target
+from pbrl_ppl.scene import Body, Scene
+
+Array = NDArray[np.float64]
+
+#: Okabe and Ito's colours, one a moving body, in turn; what is static is grey.
+_COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
+_STATIC = "#777777"
+#: A body that moved less than this (m) has no track.
+_STILL = 0.05
+#: Draws in a moving picture, at most.
+_SHOWN = 12
+
+
+def draw_scene(
+    axes: Axes, scene: Scene, states: Array, *, names: bool = False, faded: bool = False
+) -> None:
+    """Draw walls, and bodies at one state each.
+
+    Parameters
+    ----------
+    axes : Axes
+        Drawn on; its aspect becomes equal.
+    scene : Scene
+        Shapes and walls.
+    states : ndarray
+        Shape (body, 6), moving bodies in the scene's order, SI units.
+    names : bool
+        Whether each moving body's name is written on it.
+    faded : bool
+        Whether the moving bodies are drawn as outlines: where they were.
+    """
+    for wall in scene.walls:
+        axes.plot(*zip(wall.start, wall.end, strict=True), color="black", linewidth=2.0, zorder=3)
+    for body in scene.bodies:
+        if body.static and body.pose is not None:
+            axes.add_patch(_outline(body, np.array(body.pose), color=_STATIC))
+    for i, (body, state) in enumerate(zip(scene.dynamic, states, strict=True)):
+        how: dict[str, Any] = {
+            "facecolor": _colour(i),
+            "edgecolor": "black",
+            "linewidth": 0.8,
+            "zorder": 2,
+        }
+        if faded:
+            how |= {"facecolor": "none", "edgecolor": _colour(i), "linestyle": "--", "zorder": 1}
+        axes.add_patch(_outline(body, state[:3], **how))
+        if names:
+            axes.annotate(
+                body.name, state[:2], ha="center", va="center", fontsize=8, zorder=4,
+                bbox={"boxstyle": "round,pad=0.15", "color": "white", "alpha": 0.8},
+            )  # fmt: skip
+    axes.set_aspect("equal")
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+
+
+def draw_motion(axes: Axes, scene: Scene, states: Array) -> None:
+    """Draw bodies where they end, dashed where they began, and the tracks of those that moved.
+
+    Parameters
+    ----------
+    axes, scene
+        As of :func:`draw_scene`.
+    states : ndarray
+        Shape (time, body, 6), SI units: what a plan predicts, or what happened.
+    """
+    draw_scene(axes, scene, states[0], faded=True)
+    draw_scene(axes, scene, states[-1])
+    for i in range(states.shape[1]):
+        x, y = states[:, i, :2].T
+        if np.hypot(x - x[0], y - y[0]).max() > _STILL:
+            axes.plot(x, y, color=_colour(i), linewidth=1.5, zorder=3)
+
+
+def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
+    """Draw a circle of the tolerance where each target with a place is, in its body's colour.
+
+    Parameters
+    ----------
+    axes : Axes
+        Drawn on.
+    scene : Scene
+        Orders the bodies.
+    goal : Goal
+        Targets.
+    """
+    for place, target in zip(goal.places(scene), goal.targets, strict=True):
+        if target.x is None or target.y is None:
+            continue
+        colour = _colour(place)
+        circle = Circle(
+            (target.x, target.y), target.tolerance, fill=False, color=colour, hatch="////"
+        )
+        axes.add_patch(circle)
+
+
+def _colour(index: int) -> str:
+    return _COLOURS[index % len(_COLOURS)]
+
+
+def _outline(body: Body, pose: Array, **how: Any) -> Patch:
+    """A body's outline at a pose (x, y, theta)."""
+    corners = body.shape.outline
+    if corners is None:
+        return Circle((pose[0], pose[1]), float(body.shape.radius or 0.0), **how)
+    c, s = np.cos(pose[2]), np.sin(pose[2])
+    return Polygon(np.array(corners) @ np.array([[c, s], [-s, c]]) + pose[:2], **how)
+
+
+def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
+    """Write a plan as a moving picture: the bodies under each draw, and where they should be.
+
+    Parameters
+    ----------
+    plan : Plan
+        Its predicted states are drawn, of at most a dozen draws.
+    path : str or Path
+        Ends in ``.gif``; written whole or not at all.
+    frames : int
+        Pictures a second at most; a plan is shown at the speed that it has.
+
+    Raises
+    ------
+    OutputError
+        If it cannot be written there.
+    """
+    states = plan.predicted["predicted"].to_numpy()[:_SHOWN]
+    # at the speed of the plan, with no more pictures than the eye can tell apart
+    every = max(1, round(1.0 / (frames * plan.scene.time_step)))
+    times = [*range(0, states.shape[1] - 1, every), states.shape[1] - 1]
+    figure = Figure(figsize=(6.0, 6.0), layout="constrained")
+    axes = figure.add_subplot()
+    reach = max(body.shape.bounding_radius for body in plan.scene.dynamic)
+    places = states[..., :2].reshape(-1, 2)
+    places = np.concatenate([places, *(_place(target) for target in plan.goal.targets)])
+    low, high = places.min(axis=0) - 2 * reach, places.max(axis=0) + 2 * reach
+    middle, half = (low + high) / 2, float((high - low).max()) / 2
+
+    def draw(time: int) -> None:
+        axes.clear()
+        draw_goal(axes, plan.scene, plan.goal)
+        for others in states[1:]:
+            draw_scene(axes, plan.scene, others[time], faded=True)
+        draw_scene(axes, plan.scene, states[0, time])
+        axes.set_xlim(middle[0] - half, middle[0] + half)
+        axes.set_ylim(middle[1] - half, middle[1] + half)
+        axes.set_title(f"{time * plan.scene.time_step:.1f} s")
+
+    moving = FuncAnimation(figure, draw, frames=times, init_func=lambda: None)
+    rate: Any = 1.0 / (every * plan.scene.time_step)  # pictures a second; fractions are right
+    write_atomically(Path(path), lambda to: moving.save(to, PillowWriter(fps=rate), dpi=80))
+
+
+def _place(target: Target) -> Array:
+    """Where a target is, shape (1, 2), or (0, 2) if it has no place."""
+    if target.x is None or target.y is None:
+        return np.zeros((0, 2))
+    return np.array([[target.x, target.y]])

@@ -1,0 +1,340 @@
+"""A model's posterior, by one of several samplers."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+
+from pbrl_ppl.errors import FitError
+from pbrl_ppl.model import Problem
+from pbrl_ppl.modes import Mode, choose_modes, find_mode, weigh
+from pbrl_ppl.posterior import complete, from_groups, group, groups
+from pbrl_ppl.sampling.emulator import emulate
+from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
+from pbrl_ppl.sampling.mixture import check_joint_fit, labelled, mix, posterior_dataset
+from pbrl_ppl.sampling.starts import blank_point, dispersed, from_posterior, gaussian_blocks
+from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+
+#: Engine steps that cost no more than what samplers do beside them.
+_LITTLE = 2000
+
+
+@dataclass(frozen=True)
+class Method:
+    """A sampler, and how long it runs where nothing else is asked for.
+
+    Parameters
+    ----------
+    run : callable
+        ``run(job) -> trace``.
+    draws, tune, thin : int
+        Draws kept and tuning draws of each chain; steps a draw.
+    """
+
+    run: Callable[[Job], Any]
+    draws: int
+    tune: int
+    thin: int
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """What a sampler is asked for."""
+
+    model: pm.Model
+    mode: Mode
+    seed: int
+    draws: int
+    tune: int
+    chains: int
+    thin: int
+    cores: int
+    progress: bool
+    starts: list[dict[str, Any]]
+
+    def sample(self, step: Any, steps_a_draw: int = 1) -> Any:
+        """``pm.sample`` from the starts; how it converged is judged elsewhere."""
+        try:
+            trace = pm.sample(
+                draws=self.draws * steps_a_draw,
+                tune=self.tune,
+                chains=self.chains,
+                cores=self.cores,
+                step=step,
+                initvals=self.starts,
+                random_seed=self.seed,
+                progressbar=self.progress,
+                quiet=not self.progress,
+                compute_convergence_checks=False,
+                discard_tuned_samples=True,
+            )
+        except ValueError as error:
+            if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
+                raise KeyboardInterrupt from error
+            raise
+        return _thinned(trace, steps_a_draw)
+
+
+def _metropolis(job: Job) -> Any:
+    """Adaptive blocks that look ahead with a cheap posterior; see AdaptiveMetropolis."""
+    problem, model = job.mode.problem, job.model
+    blocks = gaussian_blocks(model, job.mode)
+    options: dict[str, Any] = {"inner": 10, "initial_point": blank_point(model, problem)}
+    if job.mode.others and len(blocks) == 1:
+        hills = [gaussian_blocks(model, other)[0] for other in job.mode.others]
+        jumps = Jumps((gaussian_blocks(model, job.mode)[0], *hills))
+    else:
+        jumps = None
+    # an exact step of one block, in engine steps; where that is little, looking ahead is no use
+    cost = problem.simulator.steps * problem.segments.n * problem.horizon / len(problem.parts)
+    if cost > _LITTLE:
+        unpack = Unpack(model, problem)
+        if emulator := emulate(job.mode, unpack, blocks, job.seed):
+            options |= {"rough": Surrogate(problem, unpack, emulator), "inner": 45, "plain": 0.3}
+    return job.sample(
+        AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, jumps=jumps, **options)
+    )
+
+
+def _paper(job: Job) -> Any:
+    """One random-walk Metropolis step a variable, as PyMC 2 did: burn in, then keep each n-th."""
+    steps = [pm.Metropolis([variable]) for variable in job.model.free_RVs]
+    return job.sample(steps, job.thin)
+
+
+def _demetropolisz(job: Job) -> Any:
+    """Differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
+    return job.sample(pm.DEMetropolisZ(job.model.free_RVs), job.thin)
+
+
+def _nuts(job: Job) -> Any:
+    """NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
+    return job.sample(pm.NUTS(job.model.free_RVs), job.thin)
+
+
+def _smc(job: Job) -> Any:
+    """Sequential Monte Carlo from the prior: for several modes and few parameters."""
+    return pm.sample_smc(
+        draws=job.draws,
+        chains=job.chains,
+        cores=job.cores,
+        random_seed=job.seed,
+        progressbar=job.progress,
+        compute_convergence_checks=False,
+    )
+
+
+def _map(job: Job) -> Any:
+    """The mode alone, as a posterior of one draw."""
+    values = job.mode.problem.named(job.mode.phi, job.mode.sigma)
+    draws = {name: np.asarray(value)[None, None] for name, value in values.items()}
+    return as_trace(job.model, draws, {"lp": np.array([[job.mode.log_posterior]])})
+
+
+def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
+    """Draws as PyMC gives them, made by other means.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        Of ``physics_model``; says what each variable runs over.
+    draws : mapping of str to ndarray
+        By the variables' names, shape (chain, draw, ...).
+    stats : mapping of str to ndarray
+        What the sampler says of each draw, shape (chain, draw).
+    """
+    problem, posterior = model.problem, posterior_dataset(model, draws)
+    segments = problem.segments
+
+    per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
+    given = {
+        "start": (("transition", "body", "full_state"), segments.start),
+        "actions": (("transition", "step", "body", "wrench"), segments.actions),
+    }
+    observed = {
+        "next_state": (("transition", "step", "body", "state"), problem.observations.values)
+    }
+    return from_groups(
+        {
+            "posterior": posterior,
+            "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
+            "observed_data": labelled(model, observed),
+            "constant_data": labelled(model, given),
+        },
+        {},
+    )
+
+
+def _thinned(trace: Any, thin: int) -> Any:
+    """Keep each ``thin``-th draw."""
+    if thin == 1:
+        return trace
+    per_draw = ("posterior", "sample_stats")
+    data = {
+        name: each.isel(draw=slice(thin - 1, None, thin)) if name in per_draw else each
+        for name, each in groups(trace).items()
+    }
+    return from_groups(data, {})
+
+
+_DEFAULT = "metropolis"
+#: The samplers by name. Of the paper's schedule only the kind is known to us; its lengths are ours.
+METHODS: Mapping[str, Method] = {
+    "metropolis": Method(_metropolis, draws=800, tune=500, thin=1),
+    "paper": Method(_paper, draws=1000, tune=5000, thin=10),
+    "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),
+    "smc": Method(_smc, draws=1000, tune=0, thin=1),
+    "nuts": Method(_nuts, draws=500, tune=500, thin=1),
+    "map": Method(_map, draws=1, tune=0, thin=1),
+}
+
+
+def fit(
+    model: pm.Model,
+    *,
+    method: str = _DEFAULT,
+    seed: int = 0,
+    draws: int | None = None,
+    tune: int | None = None,
+    chains: int = 4,
+    thin: int | None = None,
+    cores: int | None = None,
+    start: Any = None,
+    progress: bool = True,
+) -> Any:
+    """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
+
+    Multi-start least squares finds the mode, from about which the chains start. Where the scene
+    does not say which bodies a joint joins, every choice is fitted by itself, and their draws are
+    mixed by their evidences; :func:`pbrl_ppl.joint_probabilities` gives those. A model with
+    ``modes`` needs no chain: all choices are summed over.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        As made by ``physics_model``.
+    method : str
+        ``metropolis``: adaptive blocks that follow the scene's independent parts and look ahead
+        with polynomials where engine runs are dear; ``paper``: one random walk a variable, burnt
+        in and thinned; ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient;
+        ``map``: the mode alone, as one draw.
+    seed : int
+        The same seed gives the same posterior.
+    draws, tune : int, optional
+        Draws kept and tuning draws of each chain; each method has its own default.
+    chains : int
+        Chains.
+    thin : int, optional
+        Steps a draw; rounds over the blocks for ``metropolis``.
+    cores : int, optional
+        Processes; as many as there are processors by default, at most one a chain.
+    start : Mode, InferenceData or DataTree, optional
+        A mode found before; or a posterior of the same model, whose chains go on where they ended,
+        with the new draws after the old.
+    progress : bool
+        Whether to show PyMC's progress bar.
+
+    Returns
+    -------
+    InferenceData or DataTree
+        Posterior, sample_stats, log_likelihood, posterior_predictive, observed_data and
+        constant_data, with units, and in ``attrs`` the scene, effects, method, versions, seed, the
+        hash of the data and the convergence. An interrupted run keeps the draws so far.
+
+    Raises
+    ------
+    FitError
+        If the model was not made by ``physics_model``, or there is no such method; for joints of
+        unknown bodies, if there are too many choices, or with ``smc`` or ``start``.
+
+    Warns
+    -----
+    ConvergenceWarning
+        If an R-hat is over 1.01 or an effective sample size under 400, if sampling was
+        interrupted, or if an evidence is too rough for the probability of a joint.
+    BoundWarning
+        If a parameter is pressed against the end of its support.
+    UninformedWarning
+        If the data say nothing about a parameter.
+    """
+    problem = getattr(model, "problem", None)
+    if not isinstance(problem, Problem):
+        raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
+    if method not in METHODS:
+        raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
+    if problem.modes is not None:
+        if method != _DEFAULT or start is not None:
+            raise FitError(
+                "fit: a model of modes is summed over exactly; leave out method= and start="
+            )
+        trace = _summed(model, METHODS[method].draws if draws is None else draws, chains, seed)
+        return complete(problem, trace, seed=seed, method="exact sum over modes")
+    chosen = METHODS[method]
+    draws = chosen.draws if draws is None else draws
+    if method == "map":
+        draws = chains = 1
+
+    def sampled(model: pm.Model, mode: Mode, starts: list[dict[str, Any]] | None = None) -> Any:
+        if starts is None:
+            starts = dispersed(mode, np.random.default_rng(seed), chains)
+        job = Job(
+            model=model,
+            mode=mode,
+            seed=seed,
+            draws=draws,
+            tune=chosen.tune if tune is None else tune,
+            chains=len(starts),
+            thin=chosen.thin if thin is None else thin,
+            cores=min(len(starts), os.cpu_count() or 1) if cores is None else cores,
+            progress=progress,
+            starts=starts,
+        )
+        with model, warnings.catch_warnings():
+            # convergence is checked and reported in this package's own words
+            warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
+            # draws from the prior, of which SMC needs some, are not compiled on the newer stack
+            warnings.filterwarnings("ignore", message="Numba will use object mode")
+            return chosen.run(job)
+
+    earlier = None if start is None or isinstance(start, Mode) else start
+    if problem.layout.discrete.any():
+        check_joint_fit(method, start)
+        found = weigh(problem, seed=seed, progress=progress)
+        trace = mix(model, problem, found, sampled, draws=draws, chains=chains, seed=seed)
+    elif earlier is not None:
+        trace = sampled(model, *from_posterior(problem, earlier))
+    else:
+        trace = sampled(model, find_mode(problem, seed=seed) if start is None else start)
+    done = group(trace, "posterior").sizes["draw"]
+    if earlier is not None:
+        trace = _appended(earlier, trace)
+    # PyMC ends an interrupted run quietly, with the draws so far
+    asked = draws if done < draws else None
+    return complete(problem, trace, seed=seed, method=method, asked=asked)
+
+
+def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:
+    """Draws of a model of modes, by summing over them."""
+    problem = model.problem
+    phi, sigma, mode, accepted = choose_modes(problem, draws, chains, seed)
+    values: dict[str, Any] = problem.layout.to_dict(phi)
+    values |= {"mode": mode, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
+    return as_trace(model, values, {"accept": accepted})
+
+
+def _appended(earlier: Any, trace: Any) -> Any:
+    """The draws of two runs, one after the other."""
+    data = groups(trace)
+    for name in ("posterior", "sample_stats"):
+        old, new = group(earlier, name), data[name]
+        shared = [str(each) for each in new.data_vars if each in old]
+        both = xr.concat([old[shared], new[shared]], dim="draw")
+        data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
+    return from_groups(data, {})

@@ -1,0 +1,204 @@
+"""Draws of several configurations of the joints as draws of the one model that holds them all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import FitError
+from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.modes import ATTRIBUTE, Mode, Weighed, stored
+from pbrl_ppl.parameters import JOINT_INDICES
+from pbrl_ppl.posterior import from_groups, group, groups
+
+Array = NDArray[np.float64]
+Labels = NDArray[np.int64]
+
+#: Configurations less probable than this share of the best get no draws: they would be a handful.
+NEGLIGIBLE = 1e-3
+
+
+def check_joint_fit(method: str, start: Any) -> None:
+    """Refuse what there is no way to do for joints of unknown bodies.
+
+    Parameters
+    ----------
+    method, start
+        As for :func:`pbrl_ppl.fit`.
+
+    Raises
+    ------
+    FitError
+        If the method is ``smc``, or there is a start.
+    """
+    if method == "smc":
+        raise FitError(
+            "fit: method is 'smc' and which bodies a joint joins is unknown; each choice of bodies"
+            " is sampled by itself, which tempering from the prior is not made for; use"
+            " 'metropolis', or name the bodies in the scene"
+        )
+    if start is not None:
+        raise FitError(
+            "fit: start= was given and which bodies a joint joins is unknown; a fit cannot go on"
+            " from one choice of bodies to all of them; leave start out and raise draws="
+        )
+
+
+def mix(
+    model: pm.Model,
+    problem: Problem,
+    found: Sequence[Weighed],
+    sample: Callable[[pm.Model, Mode], Any],
+    *,
+    draws: int,
+    chains: int,
+    seed: int,
+) -> Any:
+    """Sample each configuration that matters, and mix the draws by their probabilities.
+
+    How many draws each has is not left to chance, where they stand in the chains is. A pair's
+    bodies are in the order of ``scene.joinable`` (``i_a < i_b``): the other order is the same
+    joint. A joint that joins nothing has ``i_a = i_b`` and anchors from their prior.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        Of ``problem``.
+    problem : Problem
+        Of a scene with joints of unknown bodies.
+    found : sequence of Weighed
+        Its configurations.
+    sample : callable
+        ``sample(model, mode) -> trace`` of a configuration's own model.
+    draws, chains : int
+        What each trace is asked for.
+    seed : int
+        Of the mixture.
+
+    Returns
+    -------
+    InferenceData or DataTree
+        With ``posterior``, ``sample_stats``, ``observed_data`` and ``constant_data``, and the
+        configurations as an attribute.
+    """
+    rng = np.random.default_rng(seed)
+    probability = np.array([each.probability for each in found])
+    wanted = np.flatnonzero(allocate(probability, chains * draws))
+    traces = {}
+    for i in wanted[np.argsort(-probability[wanted])]:
+        mode = found[i].mode
+        traces[i] = sample(build_model(mode.problem), mode)
+        done = group(traces[i], "posterior").sizes["draw"]
+        if done < draws and len(traces) < len(wanted):
+            raise KeyboardInterrupt  # PyMC ended quietly, and others have no draws at all
+    draws = min(group(trace, "posterior").sizes["draw"] for trace in traces.values())
+    fitted = np.isin(np.arange(len(found)), list(traces))
+    counts = allocate(np.where(fitted, probability, 0.0), chains * draws)
+    label = rng.permutation(np.repeat(np.arange(len(found)), counts)).reshape(chains, draws)
+    values = _values(problem, found, traces, label, rng)
+    rest = groups(next(iter(traces.values())))
+    data = {
+        "posterior": posterior_dataset(model, values),
+        "sample_stats": _stats(traces, label),
+        "observed_data": rest["observed_data"],
+        "constant_data": rest["constant_data"],
+    }
+    return from_groups(data, {ATTRIBUTE: stored(found)})
+
+
+def allocate(probability: Array, n: int) -> Labels:
+    """Share ``n`` draws out by probability, to within one draw each (largest remainders).
+
+    Examples
+    --------
+    >>> allocate(np.array([0.7, 0.2995, 0.0005]), 1000)
+    array([700, 300,   0])
+    """
+    kept = np.where(probability < NEGLIGIBLE * probability.max(), 0.0, probability)
+    ideal = n * kept / kept.sum()
+    counts = np.floor(ideal).astype(np.int64)
+    left = n - int(counts.sum())
+    counts[np.argsort(counts - ideal, kind="stable")[:left]] += 1
+    return np.asarray(counts)
+
+
+def posterior_dataset(model: pm.Model, values: Mapping[str, Array]) -> xr.Dataset:
+    """Draws by variable, shape (chain, draw, ...), with the model's dimensions and coordinates."""
+    data = {
+        name: (("chain", "draw", *(model.named_vars_to_dims.get(name) or ())), value)
+        for name, value in values.items()
+    }
+    chains, draws = next(iter(values.values())).shape[:2]
+    return labelled(model, data).assign_coords(chain=np.arange(chains), draw=np.arange(draws))
+
+
+def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
+    """Variables (dims, values) with the model's coordinates of their dimensions."""
+    used = {dim for dims, _ in variables.values() for dim in dims if dim in model.coords}
+    return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})
+
+
+def _values(
+    problem: Problem,
+    found: Sequence[Weighed],
+    traces: Mapping[int, Any],
+    label: Labels,
+    rng: np.random.Generator,
+) -> dict[str, Array]:
+    """The whole model's variables, shape (chain, draw, ...), from each configuration's trace."""
+    layout, joinable = problem.layout, problem.scene.joinable
+    phi = np.full((*label.shape, layout.size), np.nan)
+    own = {i: group(t, "posterior").isel(draw=slice(label.shape[1])) for i, t in traces.items()}
+    sigma = next(iter(own.values()))["sigma"].to_numpy().copy()
+    for i, posterior in own.items():
+        here = label == i
+        sigma[here] = posterior["sigma"].to_numpy()[here]
+        for block in found[i].configuration.problem(problem).layout.blocks:
+            values = posterior[block.name].to_numpy()
+            for j, owner in enumerate(block.owners):
+                phi[here, layout.index(block.name, owner)] = values[here, j]
+        for joint, pair in found[i].configuration.pairs:
+            any_one = rng.integers(len(joinable), size=int(here.sum()))  # i_a = i_b: no joint
+            for side, name in enumerate(JOINT_INDICES):
+                held = any_one if pair is None else joinable.index(pair[side])
+                phi[here, layout.index(name, joint)] = held
+    _fill_anchors(problem, phi, rng)
+    named = layout.to_dict(phi)
+    indices = {name: named[name].astype(int) for name in JOINT_INDICES}
+    return named | indices | {"sigma": sigma}
+
+
+def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator) -> None:
+    """Draw the anchors of joints that join nothing from their prior, given the index, in place."""
+    layout = problem.layout
+    for block in layout.blocks:
+        for owner, conditional in zip(block.owners, block.conditional, strict=False):
+            column = phi[..., layout.index(block.name, owner)]
+            missing = np.isnan(column)
+            if not missing.any():  # among them are joints whose bodies are named
+                continue
+            index = phi[..., layout.index(f"i_{block.name[0]}", owner)]
+            for i, prior in enumerate(conditional):
+                here = missing & (index == i)
+                column[here] = prior.sample(rng, int(here.sum()))
+
+
+def _stats(traces: Mapping[int, Any], label: Labels) -> xr.Dataset:
+    """The samplers' own record of the draws; what differs in shape is left out."""
+    each = {i: group(t, "sample_stats").isel(draw=slice(label.shape[1])) for i, t in traces.items()}
+    first = next(iter(each.values()))
+    mixed = {}
+    for name, variable in first.data_vars.items():
+        same = [own[name].sizes == variable.sizes for own in each.values() if name in own]
+        if len(same) < len(each) or not all(same) or variable.dims[:2] != ("chain", "draw"):
+            continue
+        values = variable.to_numpy().copy()
+        for i, own in each.items():
+            values[label == i] = own[name].to_numpy()[label == i]
+        mixed[str(name)] = (variable.dims, values)
+    return xr.Dataset(mixed, first.coords)

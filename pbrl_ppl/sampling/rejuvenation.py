@@ -1,0 +1,248 @@
+"""Particles moved by Metropolis steps, all of them proposed in one engine call."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.model import Problem, log_density
+from pbrl_ppl.parameters import inside, prior_residual
+from pbrl_ppl.sampling.metropolis import TARGET_ACCEPTANCE, Gaussian
+from pbrl_ppl.sampling.starts import constrain, unconstrain
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+#: Steps under the coarse posterior for each one that is judged exactly, and of the noise.
+_INNER, _NOISE_STEPS = 15, 10
+#: Steps a round where it does not.
+_PLAIN_STEPS = 5
+#: Standard deviation of the coarse log-likelihood's error up to which it is looked ahead with.
+_CLOSE = 1.0
+#: Rounds end when no parameter's place correlates more than this with where it began; or after so
+#: many. Then copies of one particle have little more in common than strangers have.
+_FORGOTTEN, _ROUNDS = 0.5, 20
+#: Numbers held at once: particles go in groups that keep their predictions below this.
+_NUMBERS = 4_000_000
+
+
+def rejuvenate(
+    problem: Problem,
+    phi: Array,
+    sigma: Array,
+    rng: np.random.Generator,
+    progress: Callable[[str], None] = lambda stage: None,
+) -> tuple[Array, Array, float]:
+    """Move particles of a posterior until they have forgotten where they were.
+
+    Parts of the scene that have nothing to do with each other are moved and judged each on its own,
+    for given the noise they are independent; then the noise, for which the engine is not needed.
+    Where a coarse engine follows the posterior, several steps under it make one proposal, as in
+    :class:`pbrl_ppl.sampling.metropolis.AdaptiveMetropolis`.
+
+    Parameters
+    ----------
+    problem : Problem
+        Whose posterior stays what it is.
+    phi, sigma : ndarray
+        Equally weighted draws of it, shapes (particle, p) and (particle, state).
+    rng : Generator
+        Of the moves.
+    progress : callable
+        Is told of every round.
+
+    Returns
+    -------
+    phi, sigma : ndarray
+        Shapes as given.
+    accepted : float
+        Share of the moves that the exact posterior accepted.
+    """
+    mover = _Mover(replace(problem, threads=max(problem.threads, 2)), phi, sigma)
+    begin, rates = mover.u.copy(), []
+    for turn in range(_ROUNDS):
+        rates.append(np.mean([mover.move(group, rng) for group in mover.groups()]))
+        left = _correlation(begin, mover.u)
+        progress(f"moving {len(phi)} draws: round {turn + 1}, correlation {left:.2f}")
+        if left < _FORGOTTEN:
+            break
+    every = np.ones(len(problem.observations.columns))
+    return mover.phi(mover.u), np.exp(mover.noise) * every, float(np.mean(rates))
+
+
+def _correlation(before: Array, after: Array) -> float:
+    """Largest correlation of a column with itself a while ago."""
+    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
+    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+    return float(((a * b).sum(axis=0) / np.maximum(size, 1e-300)).max(initial=0.0))
+
+
+class _Mover:
+    """Particles in the unconstrained space, and what it takes to move them."""
+
+    def __init__(self, problem: Problem, phi: Array, sigma: Array) -> None:
+        self.problem, self.priors = problem, problem.layout.priors
+        phi = inside(self.priors, phi)
+        pairs = [unconstrain(prior, x) for prior, x in zip(self.priors, phi.T, strict=True)]
+        self.u = np.array([u for u, _ in pairs]).reshape(-1, len(phi)).T.copy()
+        median, self.spread = problem.noise_prior
+        self.typical = np.log(median)
+        self.noise = np.log(sigma)
+        if problem.scalar_sigma:
+            self.typical = self.typical.mean(keepdims=True)
+            self.noise = self.noise[:, :1].copy()
+        self.parts = problem.simulator.parts
+        if problem.noise is not None:  # it mixes the bodies' residuals
+            self.parts = problem.engine(1, threads=1, extrapolate=False).parts[:1]
+        self.blocks = [
+            Gaussian(part.places, self.u[:, part.places].mean(axis=0), _spread(self.u, part.places))
+            for part in self.parts
+        ]
+        columns = np.arange(self.noise.shape[1])
+        self.of_noise = Gaussian(columns, self.noise.mean(axis=0), _spread(self.noise, columns))
+        # the coarse engine's error is taken off where most of the posterior is
+        centre = self.phi(self.u.mean(axis=0))
+        self.coarse = problem.coarse
+        self.correction = problem.predict(centre) - problem.predict(centre, self.coarse)
+        self.look_ahead: bool | None = None
+
+    def groups(self) -> list[slice]:
+        """Particles in groups whose predictions fit into memory."""
+        size = max(1, _NUMBERS // max(self.problem.observations.values.size, 1))
+        return [slice(i, i + size) for i in range(0, len(self.u), size)]
+
+    def phi(self, u: Array) -> Array:
+        """Parameters at unconstrained ones, shape (..., p)."""
+        columns = [constrain(prior, u[..., i]) for i, prior in enumerate(self.priors)]
+        return np.asarray(inside(self.priors, np.stack(columns, axis=-1)) if columns else u)
+
+    def prior(self, u: Array) -> Array:
+        """Log-density of each part's parameters with the transform's, shape (particle, part)."""
+        phi = self.phi(u)
+        each = -0.5 * prior_residual(self.priors, phi) ** 2
+        for i, prior in enumerate(self.priors):
+            each[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
+        return np.stack([each[:, part.places].sum(axis=1) for part in self.parts], axis=1)
+
+    def likelihood(self, residual: Array, noise: Array) -> Array:
+        """Of each part, shape (particle, part), for log sigma (particle, state)."""
+        problem, sigma = self.problem, np.exp(noise) * np.ones(residual.shape[-1])
+        measured = problem.observations.measured
+        if len(self.parts) == 1:
+            return np.asarray(problem.log_density(residual, sigma).sum(axis=-1)[:, None])
+        result = np.empty((len(residual), len(self.parts)))
+        for j, part in enumerate(self.parts):
+            own = residual[..., part.bodies, :]
+            seen = measured[..., part.bodies, :]
+            result[:, j] = log_density(own, sigma, None, seen, problem.nu).sum(axis=-1)
+        return result
+
+    def exact(self, u: Array, noise: Array) -> tuple[Array, Array]:
+        """Log-density of each part, and the residuals."""
+        residual = self.problem.residual(self.phi(u))
+        return self.prior(u) + self.likelihood(residual, noise), residual
+
+    def rough(self, u: Array, noise: Array) -> Array:
+        """The same with the coarse engine."""
+        states = self.problem.predict(self.phi(u), self.coarse) + self.correction
+        residual = self.problem.observations.residual(states)
+        return self.prior(u) + self.likelihood(residual, noise)
+
+    def move(self, group: slice, rng: np.random.Generator) -> float:
+        """One round of one group of particles; the share of its moves that was accepted."""
+        u, noise, rates = self.u[group], self.noise[group], []
+        here, residual = self.exact(u, noise)
+        if self.look_ahead is None:
+            self.look_ahead = bool(((self.rough(u, noise) - here).std(axis=0) < _CLOSE).all())
+        for _ in range(1 if self.look_ahead else _PLAIN_STEPS):
+            walk = bool(rng.uniform() < 0.5)
+            ahead = self.look_ahead
+            y, gain = self._ahead(u, noise, rng) if ahead else self._propose(u, walk, rng)
+            there, moved = self.exact(y, noise)
+            accepted = _accepted(there - here + gain, rng)
+            if not ahead:
+                self._learn(accepted.mean(axis=0), walk)
+            rates.append(accepted.mean())
+            u, here = self._chosen(accepted, y, u), np.where(accepted, there, here)
+            for j, part in enumerate(self.parts):
+                which = np.flatnonzero(accepted[:, j])[:, None]
+                residual[which, ..., part.bodies] = moved[which, ..., part.bodies]
+        self.u[group], self.noise[group] = u, self._noisy(residual, noise, rng)
+        return float(np.mean(rates))
+
+    def _chosen(self, accepted: Bools, y: Array, u: Array) -> Array:
+        """The proposal for the parts (particle, part) that accept it."""
+        result = u.copy()
+        for j, part in enumerate(self.parts):
+            result[:, part.places] = np.where(
+                accepted[:, j, None], y[:, part.places], u[:, part.places]
+            )
+        return result
+
+    def _propose(self, u: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, Array]:
+        """A proposal, and the logarithm of each part's Hastings ratio."""
+        y, gain = u.copy(), np.zeros((len(u), len(self.parts)))
+        for j, block in enumerate(self.blocks):
+            y[:, block.places], gain[:, j] = block.propose(u[:, block.places], walk, rng)
+        return y, gain
+
+    def _learn(self, rates: Array, walk: bool) -> None:
+        """Lengthen or shorten the parts' steps; many particles say at once how many pass."""
+        for block, rate in zip(self.blocks, rates, strict=True):
+            block.lengthen(rate - TARGET_ACCEPTANCE, walk)
+
+    def _ahead(self, u: Array, noise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+        """Where several steps under the coarse posterior lead, and what undoes its preference.
+
+        That is right for steps that are as likely in the reverse order: none may learn from
+        those before it, and all learn at the end.
+        """
+        begin = here = self.rough(u, noise)
+        rates: dict[bool, list[Array]] = {True: [], False: []}
+        for _ in range(_INNER):
+            walk = bool(rng.uniform() < 0.5)
+            y, gain = self._propose(u, walk, rng)
+            there = self.rough(y, noise)
+            accepted = _accepted(there - here + gain, rng)
+            rates[walk].append(accepted.mean(axis=0))
+            u, here = self._chosen(accepted, y, u), np.where(accepted, there, here)
+        for walk, each in rates.items():
+            if each:
+                self._learn(np.mean(each, axis=0), walk)
+        return u, begin - here
+
+    def _noisy(self, residual: Array, noise: Array, rng: np.random.Generator) -> Array:
+        """Steps of the noise, shape (particle, state), at given residuals."""
+
+        def density(at: Array) -> Array:
+            prior = -0.5 * (((at - self.typical) / self.spread) ** 2).sum(axis=1)
+            return np.asarray(prior + self.likelihood(residual, at).sum(axis=1))
+
+        here = density(noise)
+        for _ in range(_NOISE_STEPS):
+            walk = bool(rng.uniform() < 0.5)
+            y, gain = self.of_noise.propose(noise, walk, rng)
+            there = density(y)
+            accepted = _accepted(there - here + gain, rng)
+            self.of_noise.lengthen(accepted.mean() - TARGET_ACCEPTANCE, walk)
+            noise = np.where(accepted[:, None], y, noise)
+            here = np.where(accepted, there, here)
+        return noise
+
+
+def _accepted(log_ratio: Array, rng: np.random.Generator) -> Bools:
+    """Whether each proposal passes; none where a density is not a number."""
+    with np.errstate(invalid="ignore"):
+        passes = np.log(rng.uniform(size=log_ratio.shape)) < log_ratio
+    return np.asarray(passes)
+
+
+def _spread(points: Array, columns: NDArray[np.intp]) -> Array:
+    """Covariance of some columns, never singular."""
+    if not len(columns):  # of a part whose parameters are known
+        return np.zeros((0, 0))
+    covariance = np.cov(points[:, columns], rowvar=False).reshape(2 * (len(columns),))
+    return covariance + 1e-9 * np.diag(np.diag(covariance)) + 1e-12 * np.eye(len(columns))

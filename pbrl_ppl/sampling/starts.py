@@ -1,0 +1,166 @@
+"""What samplers begin with: the Laplace approximation in their space, and dispersed points."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+from scipy.special import expit
+
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.model import Problem
+from pbrl_ppl.modes import Mode
+from pbrl_ppl.parameters import Prior, inside
+from pbrl_ppl.posterior import group, parameter_draws
+from pbrl_ppl.sampling.metropolis import Gaussian
+
+Array = NDArray[np.float64]
+
+
+def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
+    """One block a part of the scene, and one for the noise; guessed at by the Laplace method."""
+    problem = mode.problem
+    places, offset = {}, 0
+    point = blank_point(model, problem)
+    for variable in model.continuous_value_vars:
+        size = point[variable.name].size
+        places[model.values_to_rvs[variable].name] = np.arange(offset, offset + size)
+        offset += size
+    where = np.concatenate([np.zeros(0, int), *(places[b.name] for b in problem.layout.blocks)])
+    mean, covariance = _laplace(problem, mode)
+    blocks = []
+    for part in problem.simulator.parts:
+        own = part.places
+        if len(own):
+            blocks.append(Gaussian(where[own], mean[own], covariance[np.ix_(own, own)]))
+    noise = places["sigma"], *_sigma_laplace(problem, mode)
+    if len(blocks) == 1:  # then the noise may as well move along
+        only = blocks[0]
+        return [
+            Gaussian(
+                np.concatenate([only.places, noise[0]]),
+                np.concatenate([only.mean, noise[1]]),
+                block_diag(only.covariance, noise[2]),
+            )
+        ]
+    return [*blocks, Gaussian(*noise, cheap=True)]
+
+
+def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
+    """Zeros of the shapes of the model's continuous variables, by their names in the sampler.
+
+    ``model.initial_point()`` has them too, and compiles a function for that.
+    """
+    shapes: dict[str, tuple[int, ...]] = {b.name: (len(b.owners),) for b in problem.layout.blocks}
+    shapes["sigma"] = () if problem.scalar_sigma else (len(problem.observations.columns),)
+    return {
+        value.name: np.zeros(shapes[model.values_to_rvs[value].name])
+        for value in model.continuous_value_vars
+    }
+
+
+def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
+    """PyMC's unconstraining transform of a prior's variable at x, and its derivative there.
+
+    Numbers or arrays of any shape.
+    """
+    if prior.family in ("log_normal", "half_normal"):
+        return np.log(x), 1.0 / x
+    if prior.family == "truncated_normal":
+        left, right = x - prior.lower, prior.upper - x
+        return np.log(left / right), 1.0 / left + 1.0 / right
+    return x, np.ones_like(x)
+
+
+def constrain(prior: Prior, u: Any) -> Any:
+    """The way back from :func:`unconstrain`."""
+    if prior.family in ("log_normal", "half_normal"):
+        return np.exp(u)
+    if prior.family == "truncated_normal":
+        return prior.lower + (prior.upper - prior.lower) * expit(u)
+    return u
+
+
+def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
+    """Mode and Laplace covariance in the sampler's space, no direction wider than a prior's."""
+    pairs = [
+        unconstrain(prior, x) for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
+    ]
+    mean, scale = np.array(pairs).reshape(-1, 2).T
+    covariance = scale[:, None] * mode.covariance * scale
+    deviation = np.sqrt(np.diag(covariance))
+    shrink = np.minimum(deviation, 2.0) / deviation
+    return mean, shrink[:, None] * covariance * shrink + 1e-12 * np.eye(len(scale))
+
+
+def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
+    """Mean and covariance of log sigma: the latter half the inverse of the measurements."""
+    counts = problem.observations.measured.sum((0, 1, 2))
+    mean = np.log(mode.sigma)
+    if problem.scalar_sigma:
+        counts, mean = counts.sum(keepdims=True), mean[:1]
+    return mean, np.diag(0.5 / np.maximum(counts, 1))
+
+
+def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Array]]:
+    """Starts about two posterior standard deviations from the mode, one a chain."""
+    problem, priors = mode.problem, mode.problem.layout.priors
+    low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
+    factor, starts = mode.factor, []
+    for _ in range(chains):
+        moved = mode.phi + 2.0 * factor @ rng.standard_normal(len(mode.phi))
+        moved = np.where((moved < low) | (moved > high), mode.phi, moved)
+        sigma = mode.sigma * np.exp(0.1 * rng.standard_normal(len(mode.sigma)))
+        starts.append(problem.named(inside(priors, moved), sigma))
+    return starts
+
+
+def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, Array]]]:
+    """A posterior as if it were a mode, and where each of its chains ended.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the same scene, effects and measured dimensions.
+    idata : InferenceData or DataTree
+        Its posterior so far.
+
+    Returns
+    -------
+    mode : Mode
+        At the mean, with the draws' covariance.
+    starts : list of dict
+        One point a chain.
+
+    Raises
+    ------
+    PosteriorError
+        If its variables are not the problem's.
+    """
+    posterior = group(idata, "posterior")
+    names = [*(block.name for block in problem.layout.blocks), "sigma"]
+    missing = [name for name in names if name not in posterior]
+    if missing:
+        raise PosteriorError(f"start: the posterior has no {', '.join(missing)}; of another model?")
+    phi, sigma = parameter_draws(problem, idata)
+    covariance = np.cov(phi, rowvar=False).reshape(2 * (problem.layout.size,))
+    cells = problem.observations.values.size
+    mode = Mode(
+        problem,
+        phi.mean(axis=0),
+        sigma.mean(axis=0),
+        np.zeros((cells, problem.layout.size)),
+        covariance,
+        np.nan,
+    )
+    last = posterior.isel(draw=-1)
+    chains = range(posterior.sizes["chain"])
+    return mode, [{name: last[name].values[chain] for name in names} for chain in chains]
+
+
+def _range(prior: Prior) -> Array:
+    """Where most of a prior is, by simulation: it only limits where chains begin."""
+    return np.quantile(prior.sample(np.random.default_rng(0), 2000), [0.02, 0.98])

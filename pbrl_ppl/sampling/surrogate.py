@@ -1,0 +1,78 @@
+"""A cheap posterior for a sampler to look ahead with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+from pymc.pytensorf import compile as compile_function
+from pymc.pytensorf import join_nonshared_inputs
+
+from pbrl_ppl.model import Problem
+from pbrl_ppl.sampling.starts import blank_point
+
+Array = NDArray[np.float64]
+Residual = Callable[[Array], Array]
+
+#: Where the exact posterior's tails are the heavier, a chain would stick: this covers them.
+_FLATTER = 0.9
+
+
+class Unpack:
+    """From the sampler's vector to phi, sigma and the log-density of their priors.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        As made by :func:`pbrl_ppl.physics_model`.
+    problem : Problem
+        What it was made from.
+    """
+
+    def __init__(self, model: pm.Model, problem: Problem) -> None:
+        variables = [model[block.name] for block in problem.layout.blocks]
+        outputs = model.replace_rvs_by_values([*variables, model["sigma"]])
+        values = model.continuous_value_vars
+        point = blank_point(model, problem)
+        joined_outputs, joined = join_nonshared_inputs(
+            point=point, outputs=[model.varlogp, *outputs], inputs=values, shared_inputs={}
+        )
+        self._function = compile_function([joined], joined_outputs)
+        self._function.trust_input = True
+        self._states = len(problem.observations.columns)
+
+    def __call__(self, q: Array) -> tuple[Array, Array, float]:
+        """Parameters (p,), noise (state,) and the prior's log-density with the transforms'."""
+        prior, *phi, sigma = self._function(q)
+        return (
+            np.concatenate([np.zeros(0), *phi]),
+            np.broadcast_to(sigma, (self._states,)),
+            float(prior),
+        )
+
+
+class Surrogate:
+    """The log-posterior with residuals that cost less than the engine's.
+
+    Parameters
+    ----------
+    problem : Problem
+        The exact problem.
+    unpack : Unpack
+        Of the problem's model.
+    residual : callable
+        From phi, shape (p,), to residuals as of :meth:`Problem.residual`.
+    """
+
+    def __init__(self, problem: Problem, unpack: Unpack, residual: Residual) -> None:
+        self.problem, self.unpack, self.residual = problem, unpack, residual
+
+    def __call__(self, q: Array) -> float:
+        """Log-density at the sampler's vector."""
+        phi, sigma, prior = self.unpack(q)
+        if not np.isfinite(prior):
+            return -np.inf
+        density = self.problem.log_density(self.residual(phi), sigma)
+        return prior + _FLATTER * float(density.sum())

@@ -1,0 +1,106 @@
+"""What an update needs of a posterior and of new data: one message for each way to lack it."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+
+from pbrl_ppl.errors import HistoryError, PosteriorError
+from pbrl_ppl.history import History
+from pbrl_ppl.model import STATE, Problem
+from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, scene_of
+
+#: With fewer draws there is nothing to choose from.
+_LEAST_DRAWS = 100
+#: How far the stored likelihood of a transition may be from what the engine gives now.
+_SAME = 0.01
+#: Of how many transitions, one draw each.
+_CHECKED = 50
+_GROUPS = ("posterior_predictive", "observed_data", "constant_data")
+
+
+def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
+    """What earlier updates did; refuses posteriors and data with which there is nothing to do."""
+    for name in ("posterior", "log_likelihood", *_GROUPS):
+        group(idata, name)
+    if "data_sha256" not in idata.attrs:
+        raise PosteriorError(
+            "update: the posterior does not say which data it is of; make it with pbrl_ppl.fit"
+        )
+    if idata.attrs.get("start_noise"):
+        raise PosteriorError(
+            "update: the posterior accounts for noise in the measured start states, linearised for"
+            " its own data; fit all data anew"
+        )
+    sizes = group(idata, "posterior").sizes
+    if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
+        raise PosteriorError(
+            f"update: the posterior has {sizes['chain'] * sizes['draw']} draws, expected at least"
+            f" {_LEAST_DRAWS} to choose from; fit with a method that samples"
+        )
+    done: list[dict[str, Any]] = json.loads(str(idata.attrs.get("updates", "[]")))
+    known = [str(idata.attrs["data_sha256"])]
+    known += [each[key] for each in done for key in ("data_sha256", "before_sha256")]
+    if history.data_sha256 in known:
+        raise PosteriorError(
+            "update: these data are in the posterior already, and would count twice; pass only"
+            " what was recorded since"
+        )
+    return done
+
+
+def check_history(idata: Any, history: History) -> None:
+    """Refuse a history of other bodies, dimensions or sampling, or of nothing to go on with."""
+    scene, horizon = scene_of(idata), int(idata.attrs["horizon"])
+    names = tuple(body.name for body in scene.dynamic)
+    if history.bodies != names:
+        raise HistoryError(
+            f"update: the history is of {', '.join(history.bodies)}, the posterior of"
+            f" {', '.join(names)}; load it with the posterior's scene"
+        )
+    step = float(history.dataset.attrs["time_step"])
+    if not np.isclose(step, scene.time_step):
+        raise HistoryError(
+            f"update: the history has a row each {step:g} s, the posterior's each"
+            f" {scene.time_step:g} s; load it with the posterior's scene"
+        )
+    longest = int(history.dataset["n_rows"].max()) - 1
+    if longest < horizon:
+        raise HistoryError(
+            f"update: the posterior predicts {horizon} interval{'s' * (horizon > 1)} from one"
+            f" state, and the longest new trajectory has {longest}; record at least that many in"
+            " a row"
+        )
+    segments = history.segments(horizon)
+    measured = [str(name) for name in group(idata, "observed_data")["state"].values]
+    extra = [
+        name
+        for i, name in enumerate(STATE)
+        if name not in measured and np.isfinite(segments.observed[..., i]).any()
+    ]
+    if extra:
+        raise HistoryError(
+            f"update: the history measures {', '.join(extra)}, of which the posterior knows no"
+            f" noise, only of {', '.join(measured)}; leave those columns empty, or fit all data"
+            " anew"
+        )
+
+
+def check_engine(idata: Any, problem: Problem) -> None:
+    """Refuse a posterior whose stored likelihoods are not what this problem's engine gives."""
+    some = {"transition": slice(_CHECKED)}
+    few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
+    held = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
+    first = problem_of(held, {one.effect for one in problem.effects})
+    phi, sigma = parameter_draws(problem, idata)
+    now = first.log_density(first.residual(phi[0]), sigma[0])
+    then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()
+    off = float(np.median(np.abs(now - then[:_CHECKED])))
+    if not off < _SAME:
+        raise PosteriorError(
+            f"update: the posterior's likelihoods are not what this engine gives (half of them are"
+            f" off by {off:.2g} or more): it was made with start noise, other effects or another"
+            " version; fit all data anew"
+        )

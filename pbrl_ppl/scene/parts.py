@@ -1,0 +1,185 @@
+"""Parts of a scene: bodies, walls and joints, frozen and checked when they are built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene.checks import (
+    Point,
+    flag,
+    hyper_parameters,
+    known_parameters,
+    label,
+    nearest,
+    vector,
+)
+from pbrl_ppl.scene.shape import Shape
+
+WORLD = "world"
+"""The name of the ground in a joint."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body: what is known of it, and what is to be inferred.
+
+    Attributes
+    ----------
+    name : str
+        Name, as in the history's ``body`` column.
+    shape : Shape
+        Outline (m).
+    wheel : bool
+        Whether an anisotropic-friction wheel is part of its prior.
+    static : bool
+        Whether it never moves; it then needs a `pose`.
+    known : tuple of (str, float)
+        Parameters that are given, not inferred; a mapping is accepted.
+    prior : tuple of (str, tuple of (str, float))
+        Hyper-parameters (``mu``, ``sigma``, ``kappa``) that replace the defaults, of Table 1's
+        parameters and of declared effects' (``linear_drag_coefficient``); a mapping of mappings is
+        accepted.
+    effects : tuple of str
+        Effects of the catalogue that are declared from the start.
+    pose : tuple of float, optional
+        ``x, y, theta`` (m, m, rad) of a static body.
+
+    Raises
+    ------
+    SceneError
+        If a name, number or combination is impossible.
+
+    Examples
+    --------
+    >>> Body("cart", Shape.box(1.0, 0.6), known={"mass": 2.0}).known
+    (('mass', 2.0),)
+    """
+
+    name: str
+    shape: Shape
+    wheel: bool = False
+    static: bool = False
+    known: tuple[tuple[str, float], ...] = ()
+    prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
+    effects: tuple[str, ...] = ()
+    pose: tuple[float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        label(self.name, "body: name")
+        where = f'body "{self.name}"'
+        if self.name == WORLD:
+            raise SceneError(f'{where}: "world" is the name of the ground; call the body otherwise')
+        if not isinstance(self.shape, Shape):
+            raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
+        flag(self.wheel, f"{where}: wheel")
+        flag(self.static, f"{where}: static")
+        object.__setattr__(self, "known", known_parameters(self.known, where))
+        if isinstance(self.effects, str) or not isinstance(self.effects, Iterable):
+            raise SceneError(f"{where}: effects is {self.effects!r}, expected a list of names")
+        effects = tuple(label(effect, f"{where}: effects") for effect in self.effects)
+        if len(set(effects)) < len(effects):
+            raise SceneError(f"{where}: effects {list(effects)} names one twice; drop it")
+        object.__setattr__(self, "effects", effects)
+        object.__setattr__(self, "prior", hyper_parameters(self.prior, where, effects))
+        for name in dict(self.known).keys() & dict(self.prior).keys():
+            raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
+        if self.pose is not None:
+            object.__setattr__(self, "pose", vector(self.pose, 3, f"{where}: pose"))
+        if self.static and self.pose is None:
+            raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
+        if self.static and self.wheel:
+            raise SceneError(f"{where}: a static body cannot have a wheel; drop one of the two")
+
+
+@dataclass(frozen=True)
+class Wall:
+    """An immovable segment between two points of the world (m); TOML keys ``from`` and ``to``."""
+
+    start: Point
+    end: Point
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "start", vector(self.start, 2, "wall: from"))
+        object.__setattr__(self, "end", vector(self.end, 2, "wall: to"))
+        if self.start == self.end:
+            raise SceneError(f"wall: from and to are both {list(self.start)}; its length is zero")
+
+
+@dataclass(frozen=True)
+class Joint:
+    """J_d: a joint between two bodies, or a body and the world; what is left out is inferred.
+
+    Attributes
+    ----------
+    kind : str
+        ``"distance"``, which keeps the distance that the anchors have in the bodies' reference
+        poses (zero is a hinge), or ``"hinge"``.
+    bodies : tuple of str, optional
+        Two names; ``"world"`` is the ground. None where which bodies it joins (the indices ``i_a``
+        and ``i_b`` of Table 1) is to be inferred.
+    anchor_a, anchor_b : tuple of float, optional
+        Where it holds the first and the second, each in that body's frame (m). Of a joint that is
+        not known these are the centres of the anchors' priors, or None for the default.
+    known : bool
+        Whether the anchors are given (True) or to be inferred.
+    name : str, optional
+        What its parameters are labelled with; by default its place in the scene: ``joint1``, ...
+
+    Raises
+    ------
+    SceneError
+        If a kind, name or number is impossible, or a known joint lacks one.
+
+    Examples
+    --------
+    >>> Joint("hinge", known=False).bodies is None  # which bodies, and where, is to be inferred
+    True
+    """
+
+    kind: str
+    bodies: tuple[str, str] | None = None
+    anchor_a: Point | None = None
+    anchor_b: Point | None = None
+    known: bool = True
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.name is not None:
+            label(self.name, "joint: name")
+        if self.kind not in ("hinge", "distance"):
+            raise SceneError(
+                f'joint: kind is {self.kind!r}, expected "hinge" or "distance"'
+                f"{nearest(self.kind, ('hinge', 'distance'))}"
+            )
+        flag(self.known, "joint: known")
+        if self.known and None in (self.bodies, self.anchor_a, self.anchor_b):
+            raise SceneError(
+                "joint: it lacks bodies, anchor_a or anchor_b; add them, or set known = false to"
+                " infer what is left out"
+            )
+        where = "joint"
+        if self.bodies is not None:
+            bodies = self._check_bodies(self.bodies)
+            where = f"joint of {bodies[0]} and {bodies[1]}"
+        for key in ("anchor_a", "anchor_b"):
+            anchor = getattr(self, key)
+            if anchor is not None and self.bodies is None:
+                raise SceneError(
+                    f"{where}: it has {key} and no bodies; in which body's frame is the anchor? Add"
+                    f" bodies, or drop {key}"
+                )
+            if anchor is not None:
+                object.__setattr__(self, key, vector(anchor, 2, f"{where}: {key}"))
+
+    def _check_bodies(self, names: object) -> tuple[str, str]:
+        if isinstance(names, str) or not isinstance(names, Iterable):
+            raise SceneError(f"joint: bodies is {names!r}, expected two names")
+        bodies = tuple(label(name, "joint: bodies") for name in names)
+        if len(bodies) != 2:
+            raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
+        if bodies[0] == bodies[1]:
+            raise SceneError(f'joint: it joins "{bodies[0]}" with itself; name two bodies')
+        object.__setattr__(self, "bodies", bodies)
+        return bodies

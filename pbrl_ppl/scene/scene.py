@@ -1,0 +1,257 @@
+"""Scenes: the known part of the physics (Gamma): shapes, walls, joints, gravity and the clock.
+
+Everything here is frozen and hashable, in SI units, and checked when it is built, whether it comes
+from a TOML file or from Python.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene import toml as scene_toml
+from pbrl_ppl.scene.checks import PARAMETER_NAMES, Point, finite, located, nearest, positive, vector
+from pbrl_ppl.scene.parts import WORLD, Body, Joint, Wall
+from pbrl_ppl.scene.shape import Shape
+
+__all__ = ["PARAMETER_NAMES", "WORLD", "Body", "Joint", "Point", "Scene", "Shape", "Wall"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Scene:
+    """Everything that is known before a measurement (Gamma, and what Phi is to contain).
+
+    Attributes
+    ----------
+    gravity : tuple of float
+        Acceleration in the plane (m/s^2).
+    normal_gravity : float
+        Acceleration that presses bodies on the floor (m/s^2); 0 in a side view.
+    time_step : float
+        Time between samples (s).
+    substeps : int
+        Engine steps a sample.
+    bodies : tuple of Body
+        At least one that is not static.
+    walls : tuple of Wall
+        Immovable segments.
+    joints : tuple of Joint
+        Hinges and distance joints.
+
+    Raises
+    ------
+    SceneError
+        If the parts do not fit together.
+
+    Examples
+    --------
+    >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
+    >>> Scene.from_toml(scene.to_toml()) == scene
+    True
+    """
+
+    time_step: float
+    bodies: tuple[Body, ...]
+    gravity: Point = (0.0, 0.0)
+    normal_gravity: float = 0.0
+    substeps: int = 10
+    walls: tuple[Wall, ...] = ()
+    joints: tuple[Joint, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "gravity", vector(self.gravity, 2, "[world]: gravity"))
+        normal = finite(self.normal_gravity, "[world]: normal_gravity")
+        if normal < 0:
+            raise SceneError(f"[world]: normal_gravity is {normal}, expected 0 or more")
+        object.__setattr__(self, "normal_gravity", normal)
+        object.__setattr__(self, "time_step", positive(self.time_step, "[world]: time_step"))
+        steps: Any = self.substeps
+        if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+            raise SceneError(f"[world]: substeps is {steps!r}, expected a whole number from 1 up")
+        object.__setattr__(self, "substeps", int(steps))
+        for key, kind in (("bodies", Body), ("walls", Wall), ("joints", Joint)):
+            parts = tuple(getattr(self, key))
+            for part in parts:
+                if not isinstance(part, kind):
+                    raise SceneError(f"scene: {key} holds {part!r}, expected a {kind.__name__}")
+            object.__setattr__(self, key, parts)
+        self._check_bodies()
+        self._check_joints()
+
+    def _check_bodies(self) -> None:
+        names = [body.name for body in self.bodies]
+        for name in names:
+            if names.count(name) > 1:
+                raise SceneError(f'scene: {names.count(name)} bodies are called "{name}"; rename')
+        if not self.dynamic:
+            raise SceneError("scene: it has no body that moves; add a [[body]]")
+        for body in self.bodies:
+            if body.wheel and self.normal_gravity <= 0:
+                raise SceneError(
+                    f'body "{body.name}": wheel = true but nothing presses it on the floor; set '
+                    "normal_gravity (9.81 in a top view) in [world], or wheel = false"
+                )
+
+    def _check_joints(self) -> None:
+        names = [WORLD, *(body.name for body in self.bodies)]
+        for name in self.joint_names:
+            if self.joint_names.count(name) > 1:
+                raise SceneError(f'scene: two joints are called "{name}"; rename one')
+        for position, joint in enumerate(self.joints, start=1):
+            where = f"[[joint]] number {position}"
+            for name in joint.bodies or ():
+                if name not in names:
+                    raise SceneError(f'{where}: there is no body "{name}"{nearest(name, names)}')
+            could = joint.bodies or names
+            if not any(body.name in could for body in self.dynamic):
+                raise SceneError(
+                    f"{where}: neither {could[0]} nor {could[1]} can move; join a moving body"
+                )
+            for body in self.bodies:
+                inferred_rod = not joint.known and joint.kind == "distance"
+                if inferred_rod and body.name in could and body.pose is None:
+                    raise SceneError(
+                        f'{where}: its anchors are to be inferred and body "{body.name}" has no'
+                        " pose; a distance joint keeps the distance that its anchors have in the"
+                        " reference pose: add pose = [x, y, theta] to the body"
+                    )
+
+    @classmethod
+    def load(cls, path: str | Path) -> Scene:
+        """Read a scene from a TOML file.
+
+        Raises
+        ------
+        SceneError
+            If the file is missing, is not TOML (says the line), or describes an impossible scene.
+        """
+        path = Path(path)
+        try:
+            text = path.read_text(encoding="utf-8")
+        except FileNotFoundError:
+            raise SceneError(f"scene {path}: there is no such file; check the path") from None
+        except (OSError, UnicodeDecodeError) as error:
+            raise SceneError(f"scene {path}: cannot be read as UTF-8 text: {error}") from None
+        with located(f"scene {path}"):
+            return cls.from_toml(text)
+
+    @classmethod
+    def from_toml(cls, text: str) -> Scene:
+        """Build a scene from TOML text.
+
+        Raises
+        ------
+        SceneError
+            As `load`; an unknown key is named with its table and the nearest known key.
+        """
+        world, arrays = scene_toml.read(text)
+        bodies, walls, joints = [], [], []
+        for where, table in arrays["body"]:
+            with located(where):
+                bodies.append(Body(**{**table, "shape": Shape(**table["shape"])}))
+        for where, table in arrays["wall"]:
+            with located(where):
+                walls.append(Wall(table["from"], table["to"]))
+        for where, table in arrays["joint"]:
+            with located(where):
+                joints.append(Joint(**table))
+        return cls(bodies=tuple(bodies), walls=tuple(walls), joints=tuple(joints), **world)
+
+    def to_toml(self) -> str:
+        """Return TOML text from which `from_toml` builds an equal scene."""
+        world = ("gravity", "normal_gravity", "time_step", "substeps")
+        sections = [("[world]", {key: getattr(self, key) for key in world})]
+        for body in self.bodies:
+            table = dict(vars(body), shape=vars(body.shape), known=dict(body.known))
+            table["prior"] = {name: dict(hyper) for name, hyper in body.prior}
+            sections.append(("[[body]]", table))
+        sections += [("[[wall]]", {"from": w.start, "to": w.end}) for w in self.walls]
+        sections += [("[[joint]]", vars(joint)) for joint in self.joints]
+        return scene_toml.write(sections)
+
+    @property
+    def dynamic(self) -> tuple[Body, ...]:
+        """The bodies that are not static, in order."""
+        return tuple(body for body in self.bodies if not body.static)
+
+    @property
+    def joinable(self) -> tuple[str, ...]:
+        """What the indices ``i_a`` and ``i_b`` of an inferred joint count: moving bodies, world."""
+        return (*(body.name for body in self.dynamic), WORLD)
+
+    @property
+    def joint_names(self) -> tuple[str, ...]:
+        """One name a joint: its own, or ``joint1``, ``joint2``, ... by its place in the file."""
+        return tuple(
+            joint.name or f"joint{number}" for number, joint in enumerate(self.joints, start=1)
+        )
+
+    @property
+    def extent(self) -> tuple[float, float, float, float] | None:
+        """Where walls and reference poses are: ``x_min, x_max, y_min, y_max`` (m), if any are."""
+        points = [end for wall in self.walls for end in (wall.start, wall.end)]
+        for body in self.bodies:
+            if body.pose is not None:
+                x_min, x_max, y_min, y_max = body.shape.bounds
+                reach = max(-x_min, x_max, -y_min, y_max)
+                x, y = body.pose[:2]
+                points += [(x - reach, y - reach), (x + reach, y + reach)]
+        if not points:
+            return None
+        x, y = np.array(points).T
+        return float(x.min()), float(x.max()), float(y.min()), float(y.max())
+
+    def body(self, name: str) -> Body:
+        """Return the body of this name.
+
+        Raises
+        ------
+        SceneError
+            If there is none; the nearest name is given.
+        """
+        for body in self.bodies:
+            if body.name == name:
+                return body
+        names = [body.name for body in self.bodies]
+        raise SceneError(f'scene: there is no body "{name}"{nearest(name, names)}')
+
+    def replace(self, **changes: Any) -> Scene:
+        """Return a scene with these attributes changed, checked again."""
+        return dataclasses.replace(self, **changes)
+
+    def subset(self, names: Iterable[str]) -> Scene:
+        """Return the scene without its other moving bodies, and without the joints that hold those.
+
+        Raises
+        ------
+        SceneError
+            If a name is no moving body's.
+        """
+        kept = {self.body(name).name for name in names}
+        bodies = tuple(body for body in self.bodies if body.static or body.name in kept)
+        there = {WORLD, *(body.name for body in bodies)}
+        joints = tuple(
+            dataclasses.replace(joint, name=name)
+            for name, joint in zip(self.joint_names, self.joints, strict=True)
+            if joint.bodies is None or set(joint.bodies) <= there
+        )
+        return self.replace(bodies=bodies, joints=joints)
+
+    def with_effects(self, body_name: str, *names: str) -> Scene:
+        """Return a scene in which this body has these effects declared as well.
+
+        Raises
+        ------
+        SceneError
+            If there is no such body.
+        """
+        body = self.body(body_name)
+        effects = tuple(dict.fromkeys((*body.effects, *names)))
+        changed = dataclasses.replace(body, effects=effects)
+        return self.replace(bodies=tuple(changed if b is body else b for b in self.bodies))

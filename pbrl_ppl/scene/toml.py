@@ -1,0 +1,106 @@
+"""Scenes as TOML: documents read with every key checked, and values written."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene.checks import nearest
+
+Table = dict[str, Any]
+
+KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "the file": (("world",), ("body", "wall", "joint")),
+    "[world]": (("time_step",), ("gravity", "normal_gravity", "substeps")),
+    "body": (
+        ("name", "shape"),
+        ("wheel", "static", "known", "prior", "effects", "pose"),
+    ),
+    "shape": (("kind",), ("size", "radius", "vertices")),
+    "wall": (("from", "to"), ()),
+    "joint": (("kind",), ("bodies", "anchor_a", "anchor_b", "known", "name")),
+}
+"""Required and optional keys of each table."""
+
+
+def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
+    """Return ``[world]``, and for each array of tables where a table is and the table.
+
+    Raises
+    ------
+    SceneError
+        If the text is not TOML (says the line), or a key is unknown or missing.
+    """
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise SceneError(f"not TOML: {error}") from None
+    _check_keys(document, "the file", *KEYS["the file"])
+    _check_keys(document["world"], "[world]", *KEYS["[world]"])
+    arrays: dict[str, list[tuple[str, Table]]] = {}
+    for key in ("body", "wall", "joint"):
+        arrays[key] = list(_tables(document, key))
+        for where, table in arrays[key]:
+            _check_keys(table, where, *KEYS[key])
+            if key == "body":
+                _check_keys(table["shape"], f"shape of {where}", *KEYS["shape"])
+    return document["world"], arrays
+
+
+def write(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
+    """Return TOML text of tables with these headers; entries that are None are left out."""
+    parts = []
+    for header, table in sections:
+        lines = [f"{key} = {_value(item)}" for key, item in table.items() if item is not None]
+        parts.append("\n".join([header, *lines, ""]))
+    return "\n".join(parts)
+
+
+def _check_keys(
+    table: object, where: str, required: Sequence[str], optional: Sequence[str]
+) -> None:
+    """Refuse a table with unknown keys or without the required ones."""
+    known = (*required, *optional)
+    if not isinstance(table, Mapping):
+        raise SceneError(f"{where} is {table!r}, expected a table of {', '.join(known)}")
+    for key in table:
+        if key not in known:
+            raise SceneError(f'unknown key "{key}" in {where}{nearest(key, known)}')
+    for key in required:
+        if key not in table:
+            raise SceneError(f'{where} has no "{key}"; add it')
+
+
+def _tables(document: Table, key: str) -> Iterator[tuple[str, Table]]:
+    """Yield where it is and the table, for each of an array of tables."""
+    array = document.get(key, [])
+    if not isinstance(array, list):
+        raise SceneError(f"{key} is not an array of tables; write [[{key}]], with two brackets")
+    for number, table in enumerate(array, start=1):
+        where = f"[[{key}]] number {number}"
+        if isinstance(table, Mapping) and isinstance(table.get("name"), str):
+            where += f' ("{table["name"]}")'
+        yield where, table
+
+
+def _value(item: Any) -> str:
+    """Return one TOML value: a string, boolean, number, list or inline table."""
+    if isinstance(item, bool):
+        return "true" if item else "false"
+    if isinstance(item, str):
+        # TOML's basic strings take JSON's escapes, except that DEL must be escaped in TOML.
+        return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(item, Mapping):
+        return _inline(item)
+    if isinstance(item, tuple | list):
+        return "[" + ", ".join(_value(part) for part in item) + "]"
+    return repr(item)
+
+
+def _inline(table: Mapping[str, Any]) -> str:
+    """Return an inline table; entries that are None are left out."""
+    pairs = [f"{key} = {_value(item)}" for key, item in table.items() if item is not None]
+    return "{ " + ", ".join(pairs) + " }" if pairs else "{}"

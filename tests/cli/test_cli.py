@@ -1,0 +1,231 @@
+"""The command line: results on success, one message and exit code 2 on bad input."""
+
+import os
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pbrl_ppl.cli import main
+from pbrl_ppl.errors import ConvergenceWarning, HistoryError
+from pbrl_ppl.report import report
+from pbrl_ppl.report.report import FILES, Loop
+from tests.report.test_report import made_up
+
+SCENE = """
+[world]
+time_step = 0.1
+substeps = 4
+
+[[body]]
+name = "puck"
+shape = { kind = "circle", radius = 0.1 }
+"""
+HEADER = "trajectory,step,time,body,x,y,theta,vx,vy,omega,force_x,force_y,torque\n"
+
+
+@pytest.fixture
+def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a scene and histories, to run in; its paths are short in messages."""
+    (tmp_path / "scene.toml").write_text(SCENE)
+    rows = [
+        f"{i},{step},{0.1 * step},puck,{step},{'' if step == 1 else 0},0,1,0,0,"
+        + (",," if step == 2 else "0,0,0")
+        for i in range(2)
+        for step in range(3)
+    ]
+    for name in ("train.csv", "test.csv"):
+        (tmp_path / name).write_text(HEADER + "\n".join(rows) + "\n")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.fixture
+def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any, Any, dict[str, Any]]]:
+    """What the long work was called with; it is over at once."""
+    seen: list[tuple[Any, Any, Any, dict[str, Any]]] = []
+
+    def close_loop(scene: Any, train: Any, test: Any, **options: Any) -> Loop:
+        options.pop("progress")("fitting [all] of it")
+        seen.append((scene, train, test, options))
+        return Loop(made_up())
+
+    monkeypatch.setattr(report, "close_loop", close_loop)
+    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    return seen
+
+
+def fails(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """Run, expect code 2 and one line that begins with error, and return that."""
+    assert main(argv) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    messages = [line for line in captured.err.splitlines() if not line.startswith("[")]
+    assert len(messages) == 1, captured.err
+    assert messages[0].startswith("error: ")
+    assert "Traceback" not in captured.err
+    return messages[0]
+
+
+def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    code = main(["close-loop", "scene.toml", "train.csv", "--test", "test.csv", "-o", "a/out"])
+    captured = capsys.readouterr()
+    assert code == 0
+    assert captured.out.splitlines() == [
+        "Something was missing: a force against the motion that grows with the speed (linear drag)"
+        " on the cart.",
+        "report: a/out/report.html",
+    ]
+    stages = [line.partition("] ")[2] for line in captured.err.splitlines()]
+    assert "fitting [all] of it" in stages
+    assert stages[-1] == "writing the report"
+    assert sorted(p.name for p in (files / "a" / "out").iterdir()) == sorted(FILES)
+    scene, train, test, options = calls[0]
+    assert scene.substeps == 4
+    assert train.n_transitions == test.n_transitions == 4
+    assert options == {"seed": 1}
+
+
+@pytest.mark.usefixtures("files")
+def test_close_loop_options(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    options = "--seed 7 --substeps 20 --horizon 2 --draws 300 --quiet --estimate-velocities"
+    argv = ["close-loop", "scene.toml", "train.csv", "-o", "out", *options.split()]
+    assert main(argv) == 0
+    assert capsys.readouterr().err == ""
+    scene, _, test, given = calls[0]
+    assert scene.substeps == 20
+    assert test is None
+    assert given == {"seed": 7, "horizon": 2, "draws": 300}
+    assert main(argv) == 2
+    assert "has content already" in capsys.readouterr().err
+    assert len(calls) == 1
+    assert main([*argv, "--overwrite"]) == 0
+
+
+@pytest.mark.usefixtures("files")
+def test_missing_files(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    loop = ("close-loop", "-o", "out")
+    assert "nope.toml" in fails(capsys, *loop, "nope.toml", "train.csv")
+    assert "nope.csv" in fails(capsys, *loop, "scene.toml", "nope.csv")
+    assert "nope.nc" in fails(capsys, *loop, "scene.toml", "train.csv", "--test", "nope.nc")
+    assert "nope.toml" in fails(capsys, "check", "nope.toml", "train.csv")
+    assert not calls
+    assert not Path("out").exists()
+
+
+def test_bad_files(files: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (files / "scene.toml").write_text(SCENE.replace("substeps", "subteps"))
+    message = fails(capsys, "check", "scene.toml", "train.csv")
+    assert "subteps" in message and "substeps" in message and "[world]" in message
+    (files / "scene.toml").write_text(SCENE + "bounce = [[[\n")
+    fails(capsys, "check", "scene.toml", "train.csv")
+    (files / "scene.toml").write_bytes(b"\xff\xfe")
+    fails(capsys, "check", "scene.toml", "train.csv")
+    # the puck moves along y = 0
+    (files / "scene.toml").write_text(SCENE + "[[wall]]\nfrom = [-9, 0]\nto = [9, 0]\n")
+    message = fails(capsys, "check", "scene.toml", "train.csv")
+    assert 'history trajectory 0, step 0: body "puck" and the wall' in message
+    (files / "scene.toml").write_text(SCENE)
+    (files / "train.csv").write_text("")
+    fails(capsys, "check", "scene.toml", "train.csv")
+    fails(capsys, "check", "scene.toml", "scene.toml")
+    fails(capsys, "check", "scene.toml", ".")
+    fails(capsys, "check", ".", "test.csv")
+
+
+def test_output_in_the_way(
+    files: Path, calls: list[Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    loop = ("close-loop", "scene.toml", "train.csv", "-o")
+    assert "is a file" in fails(capsys, *loop, "train.csv")
+    assert "is a file" in fails(capsys, *loop, "train.csv/below/it", "--overwrite")
+    assert "has content already" in fails(capsys, *loop, ".")
+    assert not calls
+    assert sorted(p.name for p in files.iterdir()) == ["scene.toml", "test.csv", "train.csv"]
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["close-loop", "scene.toml"],
+        ["close-loop", "scene.toml", "train.csv"],
+        ["close-loop", "scene.toml", "train.csv", "-o", "out", "--substeps", "0"],
+        ["close-loop", "scene.toml", "train.csv", "-o", "out", "--seed", "x"],
+        ["check", "scene.toml", "train.csv", "--overwite"],
+        ["close_the_loop"],
+    ],
+)
+def test_bad_usage(argv: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(argv) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and captured.err
+    assert "Traceback" not in captured.err
+
+
+@pytest.mark.usefixtures("files")
+@pytest.mark.parametrize("problem", [HistoryError("one\nmessage"), KeyboardInterrupt()])
+def test_trouble_in_the_long_work(
+    problem: BaseException,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def close_loop(*args: Any, **options: Any) -> Loop:
+        raise problem
+
+    monkeypatch.setattr(report, "close_loop", close_loop)
+    code = main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"])
+    interrupted = isinstance(problem, KeyboardInterrupt)
+    assert code == (130 if interrupted else 2)
+    expected = "interrupted; nothing was written" if interrupted else "error: one message"
+    assert capsys.readouterr().err.strip() == expected
+    assert not Path("out").exists()
+
+
+@pytest.mark.usefixtures("files")
+def test_warnings_are_one_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def close_loop(*args: Any, **options: Any) -> Loop:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always")  # the test run makes errors of them
+            warnings.warn("w_y did\nnot converge", ConvergenceWarning, stacklevel=2)
+        return Loop(made_up())
+
+    monkeypatch.setattr(report, "close_loop", close_loop)
+    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 0
+    assert capsys.readouterr().err.strip() == "warning: w_y did not converge"
+
+
+@pytest.mark.usefixtures("files")
+def test_check(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", "scene.toml", "train.csv"]) == 0
+    out = capsys.readouterr().out
+    for words in ("puck", "2", "4 (2 in a trajectory)", "0.1 s, 4 engine steps", "2 of 6", "none"):
+        assert words in out
+
+
+def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("pbrl-ppl ")
+    assert main(["close-loop", "--help"]) == 0
+    assert "--overwrite" in capsys.readouterr().out
+
+
+def run(*argv: str) -> list[str]:
+    code = "import sys; from pbrl_ppl.cli import main; sys.exit(main())"
+    return [sys.executable, "-c", code, *argv]
+
+
+@pytest.mark.usefixtures("files")
+def test_process() -> None:
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    got = subprocess.run(
+        run("check", "scene.toml", "nope.csv"), capture_output=True, text=True, env=environment
+    )
+    assert got.returncode == 2
+    assert got.stdout == ""
+    assert got.stderr.count("\n") == 1 and got.stderr.startswith("error: ")

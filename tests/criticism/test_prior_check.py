@@ -1,0 +1,150 @@
+"""Could the prior have made these data: yes for good ones; wrong units and masses are named."""
+
+import dataclasses
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pbrl_ppl as pp
+from pbrl_ppl.criticism.prior_check import QUANTILES, prior_predictive_check
+from pbrl_ppl.errors import FitError
+from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.report import plots
+from tests.model.test_model import CART, STATE, cart_scene, simulated_history
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return cart_scene()
+
+
+@pytest.fixture(scope="module")
+def history(scene):
+    return simulated_history(scene, CART, seed=2, trajectories=6, intervals=12)
+
+
+def scaled(history, scene, columns, factor) -> History:
+    rows = history.to_dataframe()
+    rows[columns] *= factor
+    return History.from_dataframe(rows, scene)
+
+
+def named(check) -> set[str]:
+    return {sentence.split(" of ")[0] for sentence in check.sentences}
+
+
+def test_good_data_pass(scene, history) -> None:
+    check = pp.prior_predictive_check(physics_model(scene, history), seed=1)
+    assert check.sentences == ()
+    assert check.diverged == 0
+    share = check.dataset["share_inside"]
+    assert dict(share.sizes) == {"body": 1, "state": 6}
+    assert float(share.min()) > 0.75
+    assert dict(check.dataset["measured"].sizes) == {"body": 1, "state": 6, "quantile": 5}
+
+
+def test_the_measured_side_is_the_data_s(scene, history) -> None:
+    check = prior_predictive_check(physics_model(scene, history, horizon=2), draws=50)
+    assert check.seconds == pytest.approx(0.2)
+    segments = history.segments(2)
+    change = (segments.observed[:, -1] - segments.start)[:, 0, STATE.index("vx")]
+    one = check.dataset.sel(body="cart", state="vx")
+    assert float(one["measured_sd"]) == pytest.approx(change.std())
+    assert float(one["measured_largest"]) == pytest.approx(np.abs(change).max())
+    np.testing.assert_allclose(one["measured"], np.quantile(change, QUANTILES))
+
+
+def test_same_seed_same_answer(scene, history) -> None:
+    model = physics_model(scene, history)
+    first, again, other = (prior_predictive_check(model, draws=50, seed=s) for s in (1, 1, 2))
+    assert first.dataset.identical(again.dataset)
+    assert not first.dataset.identical(other.dataset)
+
+
+def test_degrees_are_named(scene, history) -> None:
+    degrees = scaled(history, scene, ["theta", "omega"], 180 / np.pi)
+    check = prior_predictive_check(physics_model(scene, degrees))
+    assert {"theta", "omega"} <= named(check)
+    sentence = next(each for each in check.sentences if each.startswith("omega of cart"))
+    largest = float(check.dataset["measured_largest"].sel(state="omega").item())
+    assert f"changes by up to {largest:.3g} rad/s in 0.1 s; under the prior 94 %" in sentence
+    beyond = float(check.dataset["share_beyond"].sel(state="omega").item())
+    assert f"reaches {100 * beyond:.0f} % of the measured ones: check units" in sentence
+
+
+def test_degrees_of_the_angle_alone(scene, history) -> None:
+    """The angle no longer moves as its rate says."""
+    check = prior_predictive_check(
+        physics_model(scene, scaled(history, scene, ["theta"], 180 / np.pi))
+    )
+    assert named(check) == {"theta"}
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e-3])
+def test_a_mass_wrong_by_a_thousand_is_named(scene, history, factor) -> None:
+    def check(mass):
+        prior = {"mass": {"mu": float(np.log(mass)), "sigma": 0.5}}
+        body = dataclasses.replace(scene.bodies[0], prior=prior)
+        return prior_predictive_check(physics_model(scene.replace(bodies=(body,)), history))
+
+    assert check(CART["mass"]).sentences == ()
+    assert {"vx", "vy"} <= named(check(factor * CART["mass"]))
+
+
+def test_missing_cells_count_on_neither_side(scene, history) -> None:
+    rows = history.to_dataframe()
+    rows.loc[rows.index % 3 == 1, "x"] = np.nan
+    rows.loc[0, "omega"] = np.nan
+    holed = History.from_dataframe(rows, scene)
+    check = prior_predictive_check(physics_model(scene, holed))
+    assert check.sentences == ()
+    segments = holed.segments(1)
+    change = (segments.observed[:, -1] - segments.start)[:, 0, 0]
+    assert np.isnan(change).any()
+    one = check.dataset.sel(body="cart", state="x")
+    assert float(one["measured_sd"]) == pytest.approx(np.nanstd(change))
+    assert float(one["share_inside"]) > 0.75
+
+
+def test_draws_that_diverge_are_left_out_and_counted(scene, history, monkeypatch) -> None:
+    model = physics_model(scene, history)
+    honest = type(model.problem).predict
+
+    def sometimes(problem, phi):
+        states = honest(problem, phi)
+        states[phi[:, 0] > np.exp(1.0)] = np.nan  # the upper half of the masses
+        return states
+
+    monkeypatch.setattr(type(model.problem), "predict", sometimes)
+    check = prior_predictive_check(model, draws=60)
+    assert 10 < check.diverged < 50
+    assert any(f"diverged on {check.diverged} of 60 draws" in each for each in check.sentences)
+    assert np.isfinite(check.dataset["predicted"]).all()
+    monkeypatch.setattr(type(model.problem), "predict", lambda p, phi: np.nan * honest(p, phi))
+    with pytest.raises(FitError, match="diverged on 60 of 60 draws"):
+        prior_predictive_check(model, draws=60)
+
+
+def test_everything_known(history) -> None:
+    scene = cart_scene(known=CART)
+    check = prior_predictive_check(physics_model(scene, history), draws=50)
+    assert check.sentences == ()
+
+
+def test_refusals(scene, history) -> None:
+    with pytest.raises(FitError, match="was not made by physics_model"):
+        prior_predictive_check(pm.Model())
+    with pytest.raises(ValueError, match="draws is 1, expected at least 50"):
+        prior_predictive_check(physics_model(scene, history), draws=1)
+
+
+def test_picture(scene, history) -> None:
+    check = prior_predictive_check(physics_model(scene, history), draws=50)
+    figure = plots.plot_prior_check(check)
+    titles = [axes.get_title() for axes in figure.axes if axes.get_visible()]
+    assert [title.split(":")[0] for title in titles] == [f"{name} of cart" for name in STATE]
+    share = float(check.dataset["share_inside"].sel(state="vx").item())
+    assert f"{100 * share:.0f} % as expected" in titles[STATE.index("vx")]
+    assert len(plots.png(figure)) > 10_000

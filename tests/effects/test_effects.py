@@ -1,0 +1,275 @@
+"""The catalogue: each effect's law, its null value, what is said of it, and attaching."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pbrl_ppl.effects import Effect, EffectParameter, attach, catalogue
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from tests.worlds import BY_NAME, G, body, predict, simulator, state
+
+BOX = Shape.box(0.9, 0.55)
+MASS = 2.0
+INERTIA = MASS * BOX.unit_moment
+NAMES = [
+    "linear_drag",
+    "quadratic_drag",
+    "angular_drag",
+    "constant_force",
+    "body_force",
+    "constant_torque",
+    "push_offset",
+    "actuator_rotation",
+    "inertia_scale",
+    "pivot_friction",
+    "pivot_damping",
+]
+PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+
+
+def free(time_step: float = 1.0, substeps: int = 200) -> Scene:
+    bodies = (body("puck", BOX, mass=MASS),)
+    return Scene(time_step=time_step, substeps=substeps, bodies=bodies)
+
+
+def full_scene() -> Scene:
+    """A wheeled cart with an arm hinged to it, between walls."""
+    cart = body("cart", BOX, wheel=True, mass=MASS, r=0.3, mu_c=0.3, mu_x=0.05, mu_y=0.4, w_x=-0.2)
+    return Scene(
+        time_step=0.1,
+        normal_gravity=G,
+        bodies=(cart, body("arm", Shape.box(0.05, 0.4), mass=0.3)),
+        walls=(Wall((-1.0, -2.0), (-1.0, 2.0)), Wall((1.0, -2.0), (1.0, 2.0))),
+        joints=(Joint("hinge", ("cart", "arm"), (0.5, 0.0), (0.0, 0.2)),),
+    )
+
+
+# -- what is said of them --------------------------------------------------------------------------
+
+
+def test_catalogue_has_the_promised_names_once() -> None:
+    names = [effect.name for effect in catalogue]
+    assert len(set(names)) == len(names)
+    assert set(NAMES) <= set(names)
+
+
+@pytest.mark.parametrize("effect", catalogue, ids=lambda effect: effect.name)
+def test_every_effect_says_what_it_is(effect) -> None:
+    assert len(effect.sentence) > 20
+    assert effect.reference
+    assert hash(effect) == hash(dataclasses.replace(effect))
+    for parameter in effect.parameters:
+        assert parameter.unit
+        lower, upper = parameter.prior.support
+        assert lower <= parameter.null <= upper
+        assert lower <= parameter.prior.centre <= upper
+        draws = parameter.prior.sample(np.random.default_rng(0), 100)
+        assert np.isfinite(draws).all()
+
+
+@PATHS
+@pytest.mark.parametrize("name", NAMES)
+def test_null_value_is_no_effect(name, path) -> None:
+    scene = full_scene()
+    rng = np.random.default_rng(8)
+    start = rng.normal(0, 1, (15, 2, 6)) * [0.2, 0.2, 1, 2, 2, 2]
+    actions = rng.normal(0, 5, (15, 2, 2, 3))
+    without = simulator(scene, path=path)(np.zeros(0), start, actions)
+    effect = BY_NAME[name]
+    sim = simulator(scene, (effect,), path=path)
+    null = np.repeat(effect.null, sim.layout.size // len(effect.parameters))
+    np.testing.assert_array_equal(sim(null, start, actions), without)
+    away = sim(null + 0.3, start, actions)
+    assert np.abs(away - without).max() > 1e-4
+
+
+# -- the laws --------------------------------------------------------------------------------------
+
+
+@PATHS
+@pytest.mark.parametrize("c", [0.5, 4.0])
+def test_linear_drag_decays_exponentially(c, path) -> None:
+    k = c / MASS
+    got = predict(free(), state(vx=1.5, vy=-1.0), effects={"linear_drag": c}, path=path)[0, 0]
+    share = -math.expm1(-k) / k
+    expected = state(1.5 * share, -share, 0, 1.5 * math.exp(-k), -math.exp(-k))
+    np.testing.assert_allclose(got, expected, atol=2e-4 * c)
+
+
+@PATHS
+def test_quadratic_drag(path) -> None:
+    """|v| = v0 / (1 + c v0 t / m) along a straight line of length m/c log(1 + c v0 t / m)."""
+    c, speed = 1.3, 2.5
+    grown = 1 + c * speed / MASS
+    start = state(vx=0.6 * speed, vy=0.8 * speed)
+    got = predict(free(), start, effects={"quadratic_drag": c}, path=path)[0, 0]
+    way, left = MASS / c * math.log(grown), speed / grown
+    expected = state(0.6 * way, 0.8 * way, 0, 0.6 * left, 0.8 * left)
+    np.testing.assert_allclose(got, expected, atol=2e-4)
+
+
+@PATHS
+def test_angular_drag_decays_exponentially(path) -> None:
+    c = 0.2
+    k = c / INERTIA
+    got = predict(free(), state(vx=1.0, omega=3.0), effects={"angular_drag": c}, path=path)[0, 0]
+    expected = state(1.0, 0, -3 * math.expm1(-k) / k, 1.0, 0, 3 * math.exp(-k))
+    np.testing.assert_allclose(got, expected, atol=1e-4)
+
+
+@PATHS
+def test_constant_wrenches(path) -> None:
+    effects = {"constant_force": (1.0, -2.0), "constant_torque": 0.3}
+    got = predict(free(), state(omega=1.0), (0.5, 0.5, 0.1), effects=effects, path=path)[0, 0]
+    a = np.array([1.5 / MASS, -1.5 / MASS, 0.4 / INERTIA])
+    np.testing.assert_allclose(
+        got, np.array([*(a / 2), *a]) + state(theta=1.0, omega=1.0), atol=1e-10
+    )
+
+
+@PATHS
+def test_body_force_turns_with_the_body(path) -> None:
+    """Turning at omega, a body-fixed force sums to F (sin wt, 1 - cos wt) / (m w)."""
+    force, omega = 3.0, 2.0
+    got = predict(free(), state(omega=omega), effects={"body_force": (force, 0.0)}, path=path)[0, 0]
+    k = force / (MASS * omega)
+    np.testing.assert_allclose(
+        got[3:5], [k * math.sin(omega), k * (1 - math.cos(omega))], atol=2e-4
+    )
+    sideways = predict(free(), state(theta=0.4), effects={"body_force": (0.0, force)}, path=path)
+    a = force / MASS
+    np.testing.assert_allclose(
+        sideways[0, 0, 3:], [-a * math.sin(0.4), a * math.cos(0.4), 0.0], atol=1e-10
+    )
+
+
+@PATHS
+def test_push_offset_is_the_moment_of_the_force(path) -> None:
+    offset, force, theta = np.array([0.1, -0.05]), np.array([3.0, 1.0]), 0.7
+    short = free(time_step=1e-3, substeps=10)
+    got = predict(
+        short, state(theta=theta), (*force, 0.2), effects={"push_offset": offset}, path=path
+    )[0, 0]
+    c, s = math.cos(theta), math.sin(theta)
+    arm = np.array([[c, -s], [s, c]]) @ offset
+    torque = 0.2 + arm[0] * force[1] - arm[1] * force[0]
+    np.testing.assert_allclose(got[3:5] / 1e-3, force / MASS, rtol=1e-9)
+    assert got[5] / 1e-3 == pytest.approx(torque / INERTIA, rel=1e-4)
+
+
+@PATHS
+def test_push_offset_moves_only_the_commanded_force(path) -> None:
+    effects = {"push_offset": (0.3, 0.2), "constant_force": (5.0, 5.0), "linear_drag": 1.0}
+    got = predict(free(), state(vx=1.0), effects=effects, path=path)
+    np.testing.assert_allclose(got[0, 0, [2, 5]], 0.0, atol=1e-12)
+
+
+@PATHS
+def test_actuator_rotation_turns_the_commanded_force(path) -> None:
+    effects = {"actuator_rotation": 0.3, "constant_force": (0.0, 1.0)}
+    got = predict(free(), state(theta=1.0), (4.0, 0.0, 0.2), effects=effects, path=path)[0, 0]
+    a = np.array([4 * math.cos(0.3), 4 * math.sin(0.3) + 1.0]) / MASS
+    np.testing.assert_allclose(got[3:], [*a, 0.2 / INERTIA], atol=1e-10)
+
+
+@PATHS
+def test_inertia_scale(path) -> None:
+    got = predict(free(), state(), (1.0, 0, 0.3), effects={"inertia_scale": 1.7}, path=path)[0, 0]
+    np.testing.assert_allclose(got[3:], [1 / MASS, 0, 0.3 / (1.7 * INERTIA)], atol=1e-10)
+
+
+@PATHS
+def test_pivot_effects_at_the_centroid(path) -> None:
+    """A disc that spins about its own centre: pure torque laws, without gravity's share."""
+    disc = body("disc", Shape.circle(0.2), mass=MASS)
+    joint = Joint("hinge", ("world", "disc"), (0.0, 0.0), (0.0, 0.0))
+    scene = Scene(time_step=1.0, substeps=200, bodies=(disc,), joints=(joint,))
+    inertia = MASS * 0.2**2 / 2
+    c = 0.05
+    damped = predict(scene, state(omega=3.0), effects={"pivot_damping": c}, path=path)[0, 0]
+    assert damped[5] == pytest.approx(3.0 * math.exp(-c / inertia), abs=1e-3)
+    rubbed = predict(scene, state(omega=3.0), effects={"pivot_friction": c}, path=path)[0, 0]
+    assert rubbed[5] == pytest.approx(3.0 - c / inertia, abs=1e-6)
+    stopped = predict(scene, state(omega=3.0), effects={"pivot_friction": 4 * c}, path=path)[0, 0]
+    assert stopped[5] == pytest.approx(0.0, abs=1e-9)
+    assert stopped[2] == pytest.approx(3.0**2 / 2 * inertia / (4 * c), abs=1e-3)
+
+
+def test_pivot_damping_acts_on_the_relative_speed() -> None:
+    """Two discs that turn together about one axle lose nothing to the hinge between them."""
+    discs = tuple(body(name, Shape.circle(0.2), mass=MASS) for name in ("one", "two"))
+    joint = Joint("hinge", ("one", "two"), (0.0, 0.0), (0.0, 0.0))
+    scene = Scene(time_step=0.5, substeps=50, bodies=discs, joints=(joint,))
+    together = [state(omega=2.0), state(omega=2.0)]
+    effects = {"pivot_damping": 0.05, "pivot_friction": 0.02}
+    got = predict(scene, together, effects=effects)[0]
+    np.testing.assert_allclose(got[:, 5], 2.0, atol=1e-9)
+    got = predict(scene, [state(omega=3.0), state(omega=1.0)], effects={"pivot_damping": 0.05})[0]
+    inertia = MASS * 0.2**2 / 2
+    half = math.exp(-2 * 0.05 / inertia * 0.5)  # the difference decays at twice the rate
+    np.testing.assert_allclose(got[:, 5], [2 + half, 2 - half], atol=2e-3)
+
+
+# -- a user's own ----------------------------------------------------------------------------------
+
+
+def cubic(state, command, parameters, wrench):
+    wrench[0] -= parameters[0] * state[3] ** 3
+
+
+def gust(state, command, parameters, wrench):
+    wrench[1] += parameters[0] * math.sin(parameters[1] * state[0])
+
+
+def own_effects() -> tuple[Effect, Effect]:
+    drag = Prior("half_normal", sigma=10.0)
+    return (
+        Effect(
+            "cubic_drag_x",
+            (EffectParameter("coefficient", "N s^3/m^3", drag),),
+            "a force against the motion along x that grows with the cube of the speed",
+            "an example",
+            force=cubic,
+        ),
+        Effect(
+            "gust",
+            (
+                EffectParameter("force", "N", Prior("normal")),
+                EffectParameter("wave_number", "1/m", Prior("normal"), null=1.0),
+            ),
+            "a force along y that changes with the place",
+            "an example",
+            force=gust,
+        ),
+    )
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.floats(0.0, 3.0), st.floats(-2.0, 2.0))
+def test_own_effect_on_both_paths(c, speed) -> None:
+    """v = v0 / sqrt(1 + 2 c v0^2 t / m)."""
+    drag, wind = own_effects()
+    for path in ("compiled", "plain"):
+        sim = simulator(free(substeps=50), (wind, drag), path=path)
+        phi = sim.layout.to_vector(
+            {"cubic_drag_x_coefficient": c, "gust_force": 0.4, "gust_wave_number": 2.0}
+        )
+        got = sim(phi, state(vx=speed)[None, None], np.zeros((1, 1, 1, 3)))[0, 0, 0]
+        expected = speed / math.sqrt(1 + 2 * c * speed**2 / MASS)
+        assert got[3] == pytest.approx(expected, abs=5e-3)
+        if path == "compiled":
+            first = got
+    np.testing.assert_allclose(got, first, rtol=1e-12, atol=1e-12)
+
+
+def test_own_effect_may_be_declared_by_name() -> None:
+    drag, _ = own_effects()
+    puck = Body("puck", BOX, effects=("cubic_drag_x",))
+    scene = Scene(time_step=0.1, bodies=(puck,))
+    (one,) = attach(scene, effects=(*catalogue, drag))
+    assert (one.effect, one.body) == (drag, "puck")

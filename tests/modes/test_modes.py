@@ -1,0 +1,247 @@
+"""Modes: recovery from a wrong start, the wheel's symmetry, start noise and derivatives."""
+
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.modes import with_start_noise
+from pbrl_ppl.modes.search import find_mode, find_modes
+from pbrl_ppl.numerics import differentiate
+from pbrl_ppl.parameters import fold_wheels
+from pbrl_ppl.scene import Scene
+from tests.model.test_model import CART, NOISE, cart_scene, simulated_history
+
+WHEEL = ("w_x", "w_y", "w_theta", "mu_x", "mu_y")
+# r and mu_c matter in contacts only, and there is none
+KNOWN_CONTACT = {"known": {"r": 0.2, "mu_c": 0.3}}
+
+
+@pytest.fixture(scope="module")
+def history() -> History:
+    return simulated_history(cart_scene(), CART, seed=5, trajectories=8, intervals=12)
+
+
+@pytest.fixture(scope="module")
+def problem(history):
+    return physics_model(cart_scene(**KNOWN_CONTACT), history).problem
+
+
+@pytest.fixture(scope="module")
+def modes(problem):
+    return find_modes(problem, seed=3)
+
+
+def z_scores(mode, truth) -> dict[str, float]:
+    """Distance from the truth in posterior standard deviations, by name."""
+    deviation = np.sqrt(np.diag(mode.covariance))
+    labels = [label.split("[")[0] for label in mode.problem.layout.labels]
+    distance = (mode.phi - [truth[name] for name in labels]) / deviation
+    return dict(zip(labels, distance, strict=True))
+
+
+def test_recovers_the_truth_from_prior_draws(modes) -> None:
+    """No start is told anything: the best mode has the truth within 4 sd.
+
+    Six numbers, if they were normal: false alarm 4e-4.
+    """
+    z = z_scores(modes[0], CART)
+    assert set(z) == {"mass", *WHEEL}
+    assert max(np.abs(list(z.values()))) < 4, z
+
+
+def test_the_standard_deviations_are_useful(modes) -> None:
+    """96 transitions pin the cart down: a wide posterior would pass the test above for nothing."""
+    deviation = dict(
+        zip(
+            ("mass", *WHEEL),
+            np.sqrt(np.diag(modes[0].covariance)),
+            strict=True,
+        )
+    )
+    assert deviation["mass"] < 0.3
+    assert max(deviation["w_x"], deviation["w_y"]) < 0.05
+    assert deviation["w_theta"] < 0.1
+    assert max(deviation["mu_x"], deviation["mu_y"]) < 0.05
+
+
+def test_recovers_from_a_wrong_start(problem) -> None:
+    wrong = {"mass": 2.0, "w_x": 0.1, "w_y": 0.1, "w_theta": -0.5, "mu_x": 0.3, "mu_y": 0.6}
+    mode = find_mode(problem, initial=problem.layout.to_vector(wrong))
+    z = z_scores(mode, CART)
+    assert max(np.abs(list(z.values()))) < 4, z
+
+
+def test_modes_are_sorted_and_describe_themselves(problem, modes) -> None:
+    assert all(a.log_posterior >= b.log_posterior for a, b in pairwise(modes))
+    mode = modes[0]
+    p, n_cells = problem.layout.size, problem.observations.values.size
+    assert mode.jacobian.shape == (n_cells, p)
+    assert mode.covariance.shape == (p, p)
+    assert np.linalg.eigvalsh(mode.covariance).min() > 0
+    assert mode.values["mass"] == pytest.approx(mode.phi[:1])
+    # sigma is the maximum likelihood, so the whitened residual has unit mean square
+    z = mode.whitened.reshape(problem.observations.values.shape)
+    np.testing.assert_allclose((z**2).mean(axis=(0, 1, 2)), 1.0, rtol=1e-6)
+
+
+def test_same_seed_same_modes(problem, modes) -> None:
+    again = find_modes(problem, seed=3)
+    for one, other in zip(modes, again, strict=True):
+        np.testing.assert_array_equal(one.phi, other.phi)
+        np.testing.assert_array_equal(one.sigma, other.sigma)
+
+
+def test_scalar_sigma(history) -> None:
+    problem = physics_model(cart_scene(**KNOWN_CONTACT), history, sigma="scalar").problem
+    mode = find_mode(problem, initial=problem.layout.to_vector(CART))
+    assert np.ptp(mode.sigma) == 0.0
+    residual = problem.residual(mode.phi)
+    assert mode.sigma[0] == pytest.approx(np.sqrt((residual**2).mean()))
+
+
+@pytest.mark.slow
+def test_recovers_what_another_engine_made(make_history) -> None:
+    """Data from Box2D at 1 ms steps; 6 numbers within 4 sd."""
+    train, _ = make_history.simulate(21)
+    scene = cart_scene(**KNOWN_CONTACT)
+    history = History.from_dataframe(train, scene)
+    assert history.n_transitions == 360
+    problem = physics_model(scene, history, substeps=20).problem
+    truth = dict(zip(WHEEL, vars(make_history.CART.wheel).values(), strict=True))
+    truth["mass"] = make_history.CART.mass
+    z = z_scores(find_mode(problem, seed=2), truth)
+    assert max(np.abs(list(z.values()))) < 4, z
+
+
+ANGLE = st.floats(-3.1, 3.1)
+PLACE = st.floats(-0.2, 0.2)
+FRICTION = st.floats(0.01, 0.99)
+
+
+@given(x=PLACE, y=PLACE, angle=ANGLE, mu_x=FRICTION, mu_y=FRICTION)
+@settings(deadline=None, max_examples=40)
+def test_four_descriptions_of_a_wheel_are_one(problem, x, y, angle, mu_x, mu_y) -> None:
+    """w_theta + pi, and w_theta +- pi/2 with mu_x and mu_y swapped: the same predictions."""
+    layout = problem.layout
+    base = {"mass": 5.0, "w_x": x, "w_y": y}
+    same = [
+        {"w_theta": angle, "mu_x": mu_x, "mu_y": mu_y},
+        {"w_theta": angle + np.pi, "mu_x": mu_x, "mu_y": mu_y},
+        {"w_theta": angle + np.pi / 2, "mu_x": mu_y, "mu_y": mu_x},
+        {"w_theta": angle - np.pi / 2, "mu_x": mu_y, "mu_y": mu_x},
+    ]
+    phis = np.array([layout.to_vector(base | one) for one in same])
+    folded = np.array([fold_wheels(problem.layout, phi) for phi in phis])
+    first = layout.to_dict(folded[0])
+    assert first["mu_x"] <= first["mu_y"]
+    assert -np.pi / 2 - 1e-12 < first["w_theta"] <= np.pi / 2  # to rounding
+    np.testing.assert_allclose(fold_wheels(problem.layout, folded[0]), folded[0])
+    if mu_x != mu_y:
+        turn = 2 * layout.to_dict(folded)["w_theta"]
+        np.testing.assert_allclose(np.cos(turn - turn[0]), 1.0)
+        others = [i for i, name in enumerate(layout.labels) if not name.startswith("w_theta")]
+        np.testing.assert_array_equal(folded[:, others], folded[[0]][:, others].repeat(4, 0))
+    some = slice(0, 5)
+    states = problem.simulator(
+        np.vstack([phis, folded]), problem.segments.start[some], problem.segments.actions[some]
+    )
+    # the solver goes over the wheel's axes one after the other until they agree
+    np.testing.assert_allclose(states, states[[0]].repeat(8, 0), atol=1e-4)
+
+
+def test_fold_leaves_a_body_without_wheel_alone(history) -> None:
+    problem = physics_model(cart_scene(wheel=False), history).problem
+    phi = np.array([1.0, 0.2, 0.3])
+    np.testing.assert_array_equal(fold_wheels(problem.layout, phi), phi)
+
+
+def test_a_partly_known_wheel_is_not_turned(history) -> None:
+    """With w_theta given, the axes have names: mu_x may be the larger."""
+    known = KNOWN_CONTACT["known"] | {"w_theta": 0.1}
+    problem = physics_model(cart_scene(known=known), history).problem
+    phi = problem.layout.to_vector(CART | {"mu_x": 0.9, "mu_y": 0.1})
+    np.testing.assert_array_equal(fold_wheels(problem.layout, phi), phi)
+
+
+def test_start_noise_explains_what_the_residual_holds(problem, modes) -> None:
+    """The start is as noisy as the end: Eq. 11's sigma is too wide, with F it is the sensor's."""
+    mode = modes[0]
+    wider = with_start_noise(problem, mode)
+    assert wider.noise is not None
+    again = find_mode(wider, initial=mode.phi)
+    # sqrt(1 / 2N) each, twice as much for what F and the fitted parameters take: 4 such for 6
+    # numbers, false alarm below 1e-3
+    error = 2 * np.sqrt(0.5 / problem.segments.n)
+    assert (np.abs(np.log(again.sigma / NOISE)) < 4 * error).all(), again.sigma / NOISE
+    assert (mode.sigma[:2] / NOISE[:2] > 1.3).all()
+    z = z_scores(again, CART)
+    assert max(np.abs(list(z.values()))) < 4, z
+    assert again.log_posterior > mode.log_posterior
+
+
+def test_start_noise_does_not_change_the_problem_otherwise(problem, modes) -> None:
+    wider = with_start_noise(problem, modes[0])
+    assert problem.noise is None
+    assert replace(wider, noise=None).layout == problem.layout
+    np.testing.assert_array_equal(wider.residual(modes[0].phi), problem.residual(modes[0].phi))
+
+
+def test_prior_alone_where_data_say_nothing() -> None:
+    """r and mu_c without contacts: the mode is the prior's, and so is the width."""
+    history = simulated_history(cart_scene(), CART, seed=6, trajectories=2, intervals=6)
+    wheel = {name: CART[name] for name in ("mass", *WHEEL)}
+    problem = physics_model(cart_scene(known=wheel), history).problem
+    mode = find_mode(problem, seed=1)
+    found = mode.values
+    assert found["mu_c"] == pytest.approx(0.5, abs=1e-3)
+    # a log-normal's mode, exp(mu - sigma^2)
+    assert found["r"] == pytest.approx(np.exp(-2.5), rel=1e-2)
+    index = problem.layout.index("mu_c", "cart")
+    assert mode.covariance[index, index] == pytest.approx(1.0, rel=1e-6)
+
+
+def cubic(points: np.ndarray) -> np.ndarray:
+    """(x^3, x y) of points (n, 2), finite inside the unit square only."""
+    outside = ((points < 0) | (points > 1)).any(axis=1)
+    x, y = points.T
+    return np.where(outside[:, None], np.nan, np.stack([x**3, x * y], axis=1))
+
+
+@pytest.mark.parametrize(
+    ("point", "error"),
+    [
+        pytest.param((0.5, 0.5), 1e-7, id="central"),
+        pytest.param((0.0, 0.5), 1e-3, id="at the lower bound"),
+        pytest.param((1.0, 1.0), 4e-3, id="at the upper bounds"),
+        pytest.param((0.9999, 0.3), 3e-3, id="near a bound"),
+    ],
+)
+def test_differentiate(point, error) -> None:
+    """Against the analytic derivative, without a look outside the bounds."""
+    x, y = point
+    calls = []
+
+    def function(points):
+        calls.append(len(points))
+        return cubic(points)
+
+    steps = np.array([1e-3, 1e-3]) if error > 1e-6 else np.array([1e-4, 1e-4])
+    found = differentiate(function, np.array(point), steps, np.zeros(2), np.ones(2))
+    np.testing.assert_allclose(found, [[3 * x**2, 0.0], [y, x]], atol=error)
+    assert calls == [4]  # all columns in one call
+
+
+def test_recovers_the_scene_s_effect() -> None:
+    """A declared effect is a parameter as any other."""
+    scene: Scene = cart_scene(effects=("linear_drag",), **KNOWN_CONTACT)
+    truth = CART | {"linear_drag_coefficient": 3.0}
+    history = simulated_history(scene, truth, seed=9, trajectories=6, intervals=10)
+    problem = physics_model(scene, history).problem
+    z = z_scores(find_mode(problem, seed=1), truth)
+    assert max(np.abs(list(z.values()))) < 4, z

@@ -1,0 +1,32 @@
+"""One Simulator that several threads of Python use at once."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pbrl_ppl.physics import compiled
+
+CODE = """
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+from tests.physics.test_paths import cart, proposals
+
+sim, start, actions = cart(walls=True)
+phi = proposals(sim.layout, 20)
+expected = sim(phi, start, actions)
+with ThreadPoolExecutor(3) as pool:
+    results = list(pool.map(lambda _: sim(phi, start, actions), range(9)))
+raise SystemExit(not all((result == expected).all() for result in results))
+"""
+
+
+@pytest.mark.skipif(not compiled.AVAILABLE, reason="the plain path builds its worlds in each call")
+def test_calls_at_the_same_time_do_not_disturb_each_other() -> None:
+    """Chains in threads share the Op; the engine would abort the whole process, hence a child."""
+    root = Path(__file__).parents[2]
+    done = subprocess.run(
+        [sys.executable, "-c", CODE], cwd=root, timeout=60, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,522 @@
+"""The report: the right words and numbers, a page that needs nothing else, files all or none."""
+
+import copy
+import json
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import arviz as az
+import numpy as np
+import pytest
+
+from pbrl_ppl.criticism.findings import (
+    Added,
+    Candidate,
+    Errors,
+    Estimate,
+    Findings,
+    Numerical,
+    Rollout,
+    Unexplained,
+)
+from pbrl_ppl.errors import OutputError
+from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
+from pbrl_ppl.report import plots, report
+from pbrl_ppl.report.report import FILES, Loop, number, render, verdict_in_words
+from pbrl_ppl.scene import Body, Scene, Shape
+
+DRAG = "a force against the motion that grows with the speed"
+STATE = ("x", "y", "theta", "vx", "vy", "omega")
+
+
+def idata(posterior: dict[str, np.ndarray], dims: dict[str, list[str]]) -> Any:
+    """An InferenceData or a DataTree, as the installed ArviZ has it."""
+    coords = {"body": ["cart"], "linear_drag_body": ["cart"], "state": list(STATE)}
+    if az.__version__.startswith("0."):
+        return az.from_dict(posterior, coords=coords, dims=dims)
+    return az.from_dict({"posterior": posterior}, coords=coords, dims=dims)
+
+
+def made_up_posterior(stuck: bool = False) -> Any:
+    rng = np.random.default_rng(1)
+    draws = {
+        "mass": 6.5 + 0.1 * rng.normal(size=(4, 500, 1)),
+        "w_x": -0.25 + 0.01 * rng.normal(size=(4, 500, 1)),
+        "linear_drag_coefficient": 3.0 + 0.1 * rng.normal(size=(4, 500, 1)),
+        "sigma": np.exp(0.1 * rng.normal(size=(4, 500, 6))),
+    }
+    if stuck:
+        draws["w_x"] += np.arange(4).reshape(4, 1, 1)
+    dims = {"mass": ["body"], "w_x": ["body"], "sigma": ["state"]}
+    return idata(draws, dims | {"linear_drag_coefficient": ["linear_drag_body"]})
+
+
+def made_up_errors(times: float) -> Errors:
+    scales = dict(zip(STATE, (0.002, 0.002, 0.004, 0.01, 0.01, 0.02), strict=True))
+    # drag is seen in the velocities more than in the rest
+    grown = {d: s * (times if d in ("vx", "vy") else times**0.5) for d, s in scales.items()}
+    far = {d: s * times * 4 for d, s in scales.items()}
+    return Errors(grown, far, normalised_rmse=times, elpd=3000.0 - 300.0 * times)
+
+
+def made_up(verdict: str = "effects-added", stuck: bool = False) -> Findings:
+    """Small findings of each verdict, without a fit."""
+    rng = np.random.default_rng(0)
+    scene = Scene(time_step=0.1, bodies=(Body("cart", Shape.box(1.0, 0.6)),))
+    time = 0.1 * np.arange(31)
+    turn = 2.8 + 1.5 * time
+    motion = np.stack(
+        [0.6 * time, np.sin(time), turn, 0.6 + 0 * time, np.cos(time), 1.5 + 0 * time]
+    )
+    wrapped = motion.copy()
+    wrapped[2] = np.angle(np.exp(1j * turn))
+    measured = wrapped + 0.01 * rng.normal(size=motion.shape)
+    measured[1, 10:14] = np.nan
+    off = motion * (1 + 0.05 * time) + 0.02 * time
+    off[2] = np.angle(np.exp(1j * off[2]))
+    noise = {d: rng.normal(size=240) for d in STATE}
+    found = verdict == "effects-added"
+    grown = {d: r * (3.0 if d in ("vx", "vy") else 1.1) for d, r in noise.items()}
+    candidates = tuple(
+        Candidate(effect, "cart", sentence, s, dof, p, estimate, units, share)
+        for effect, sentence, s, dof, p, estimate, units, share in (
+            (
+                "linear_drag",
+                DRAG,
+                419.0,
+                1,
+                1e-80,
+                {"coefficient": 3.01},
+                {"coefficient": "kg/s"},
+                0.48,
+            ),
+            (
+                "quadratic_drag",
+                "a force that grows with its square",
+                401.5,
+                1,
+                1e-75,
+                {"coefficient": 2.2},
+                {"coefficient": "kg/m"},
+                0.4,
+            ),
+            (
+                "constant_force",
+                "the floor slopes",
+                11.0,
+                2,
+                0.04,
+                {"force_x": 0.2, "force_y": -0.1},
+                {"force_x": "N", "force_y": "N"},
+                0.9,
+            ),
+            (
+                "inertia_scale",
+                "mass is not spread evenly",
+                0.0,
+                1,
+                1.0,
+                {"scale": 1.0},
+                {"scale": "1"},
+                0.0004,
+            ),
+        )
+    )
+    if not found:
+        candidates = tuple(
+            replace(c, statistic=c.statistic / 200, p_value=0.37) for c in candidates
+        )
+    added = Added(
+        "linear_drag",
+        "cart",
+        DRAG,
+        419.0,
+        1e-80,
+        {"coefficient": Estimate(3.0, 0.1, (2.81, 3.19), "kg/s")},
+        ("quadratic_drag",),
+        210.0,
+        19.0,
+    )
+    remains = Unexplained(
+        "cart", "omega", "omega", 0.34, 0.002, "its omega is off in a way that depends on omega"
+    )
+    posterior = made_up_posterior(stuck)
+    before = made_up_errors(2.4 if verdict != "adequate" else 1.01)
+    return Findings(
+        scene=scene,
+        verdict=verdict,
+        numerical=Numerical(10, 40, 0.83) if found else Numerical(10, 10, 0.012),
+        candidates=candidates,
+        added=(added,) if found else (),
+        unexplained=remains if verdict == "unexplained" else None,
+        before=before,
+        after=made_up_errors(1.02) if found else before,
+        noise_floor=made_up_errors(1.0),
+        posterior_before=posterior,
+        posterior_after=posterior,
+        residuals_before=noise if verdict == "adequate" else grown,
+        residuals_after=noise if found else grown,
+        rollout=Rollout(
+            "cart",
+            time,
+            STATE,
+            ("m", "m", "rad", "m/s", "m/s", "rad/s"),
+            measured.T,
+            off.T if found else wrapped.T,
+            wrapped.T,
+        ),
+        horizon=1,
+        rollout_horizon=20,
+        provenance={"seed": 1, "versions": {"pymc": "5.28"}, "data_sha256": "ab" * 32},
+    )
+
+
+class Page(HTMLParser):
+    """What a browser would fetch, run or show."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.references: list[str] = []
+        self.words: list[str] = []
+        self.open: list[str] = []
+        self.feed(html)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        if tag not in ("meta", "img", "br"):
+            self.open.append(tag)
+        self.references += [v or "" for k, v in attrs if k in ("href", "src", "srcset", "action")]
+        if tag == "img":
+            assert dict(attrs)["alt"]
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if self.open[-1:] != ["style"]:
+            self.words.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.words).split())
+
+
+PAGES: dict[str, str] = {}
+
+
+def page(verdict: str) -> Page:
+    if verdict not in PAGES:  # drawing takes a second
+        PAGES[verdict] = render(made_up(verdict))
+    return Page(PAGES[verdict])
+
+
+@pytest.mark.parametrize("verdict", ["adequate", "effects-added", "unexplained"])
+def test_page_stands_alone(verdict: str) -> None:
+    got = page(verdict)
+    assert not got.open
+    assert not {"script", "link", "iframe", "object"} & set(got.tags)
+    assert got.references
+    for reference in got.references:
+        assert reference.startswith(("data:image/png;base64,", "#"))
+    assert "url(" not in PAGES[verdict] and "@import" not in PAGES[verdict]
+    assert "://" not in PAGES[verdict]
+    assert len([tag for tag in got.tags if tag == "img"]) == (
+        7 if verdict == "effects-added" else 6
+    )
+
+
+def test_page_of_an_added_effect() -> None:
+    text = page("effects-added").text
+    assert f"Something was missing: {DRAG} (linear drag) on the cart." in text
+    assert "As good as certain" in text
+    assert "less than once in 10⁸⁰ times (p = 1.0 × 10⁻⁸⁰, allowing for all 4 candidates" in text
+    assert (
+        "Its coefficient is 3.00 kg/s; with 94 % probability it lies between 2.81 and 3.19 kg/s"
+        in text
+    )
+    assert "fits them no better than quadratic drag would" in text
+    assert "fell by 57 %, from 2.40 to 1.02 times" in text
+    assert "Predicting 2.00 s ahead, the error of" in text
+    assert "gained 210 ± 19.0" in text
+    assert "10 engine steps" in text and "40 steps were used instead" in text
+    assert "force x 0.200 N, force y −0.100 N" in text
+    assert "seed 1" in text and "pymc 5.28" in text and "ab" * 32 in text
+    assert "did not converge" not in text and "Not converged" not in text
+
+
+def test_page_where_nothing_is_missing() -> None:
+    text = page("adequate").text
+    assert (
+        "Nothing is missing: the declared model explains the data up to measurement noise." in text
+    )
+    assert "chance alone brings one that close in 37 % of all cases" in text
+    assert "fell by" not in text and "After" not in text
+    assert "Where it remains" not in text
+
+
+def test_page_where_something_is_unexplained() -> None:
+    text = page("unexplained").text
+    assert "Something is missing that no effect in the catalogue explains: its omega is off" in text
+    assert "In omega of the cart, depending most on omega, which predicts 34 %" in text
+    assert "once in 500 times (p = 0.0020)" in text
+
+
+def test_page_says_what_the_data_do_not() -> None:
+    widths = (
+        Width("mass[cart]", 1.5, 0.015, 0.01, "informed"),
+        Width("r[cart]", 1.0, 0.99, 0.99, "prior only"),
+    )
+    pair = Direction((("mass[cart]", 0.6), ("push_gain_gain[cart]", -0.8)), 0.01)
+    said = Identifiability(widths, ("r[cart]", "inertia_scale_scale[cart]"), (pair,))
+    findings = replace(made_up(), identifiability=said)
+    words = " ".join(" ".join(Page(render(findings)).words).split())
+    assert "What the data say" in words
+    assert "The data say nothing about r[cart]: record contacts" in words
+    assert "nothing about inertia_scale_scale[cart]: record the body turning" in words
+    assert "mass[cart] up with push_gain_gain[cart] down" in words
+    assert "say nothing beyond the prior" in words
+    kept = findings.to_dict()["identifiability"]
+    assert kept["parameters"][1] == {
+        "parameter": "r[cart]",
+        "prior_sd": 1.0,
+        "posterior_sd": 0.99,
+        "ratio": 0.99,
+        "verdict": "prior only",
+    }
+    assert kept["directions"][0]["weights"] == {"mass[cart]": 0.6, "push_gain_gain[cart]": -0.8}
+    fine = replace(findings, identifiability=Identifiability(widths[:1], (), ()))
+    assert "Predictions depend on every parameter" in render(fine)
+    without = made_up()
+    assert "What the data say" not in render(without)
+    assert without.to_dict()["identifiability"] is None
+
+
+def test_page_says_what_did_not_converge() -> None:
+    text = Page(render(made_up("adequate", stuck=True))).text
+    assert "1 of 9 parameters did not converge" in text
+    assert "Not converged." in text and "w_x[cart]: R-hat 2." in text
+
+
+def test_names_from_files_are_escaped() -> None:
+    findings = made_up("unexplained")
+    remains = replace(findings.unexplained, body="<script>alert(1)</script>", sentence="a<b>&")
+    html = render(replace(findings, unexplained=remains))
+    assert "script" not in Page(html).tags
+    assert "a<b>&" in Page(html).text
+
+
+def test_added_effects_with_a_rest() -> None:
+    findings = made_up()
+    second = replace(findings.added[0], effect="push_offset", sentence="it turns", body="big_cart")
+    both = replace(findings, added=(findings.added[0], second))
+    assert verdict_in_words(both) == (
+        f"2 things were missing: {DRAG} (linear drag) on the cart, and it turns (push offset) on"
+        " the big cart."
+    )
+    remains = made_up("unexplained").unexplained
+    some = replace(findings, verdict="unexplained", unexplained=remains)
+    assert verdict_in_words(some).startswith(f"Part of what was missing is {DRAG}")
+    assert "Something is still missing" in verdict_in_words(some)
+    assert "Something is still missing" in Page(render(some)).text
+
+
+def test_odd_findings_still_make_a_page() -> None:
+    findings = made_up()
+    nothing = Errors({}, {}, float("nan"), float("nan"))
+    many = tuple(replace(c, body=f"b{i}") for i in range(9) for c in findings.candidates)
+    odd = replace(
+        findings,
+        noise_floor=nothing,
+        candidates=many,
+        added=(replace(findings.added[0], p_value=0.0),),
+    )
+    text = Page(render(odd)).text
+    assert "less than once in 10³⁰⁰ times (p = < 10⁻³⁰⁰" in text
+    assert "The 20 best of 36 are shown" in text
+    assert "times the measurement noise; noise alone gives –" in text
+    Page(render(replace(made_up("adequate"), candidates=(), before=nothing, after=nothing)))
+
+
+@pytest.mark.parametrize(
+    ("value", "written"),
+    [
+        (0.0, "0"),
+        (-0.05, "−0.0500"),
+        (12345.6, "12,346"),
+        (9.996, "10.00"),
+        (2.5e-7, "2.50 × 10⁻⁷"),
+        (float("inf"), "–"),
+        (None, "–"),
+    ],
+)
+def test_numbers(value: float | None, written: str) -> None:
+    assert number(value) == written
+
+
+def test_rollout_angles_have_no_jumps() -> None:
+    jumping = np.array([3.0, 3.1, np.nan, -3.1, -3.0])
+    smooth = plots.unwrap(jumping)
+    assert np.isnan(smooth[2])
+    assert np.allclose(np.delete(smooth, 2), [3.0, 3.1, 2 * np.pi - 3.1, 2 * np.pi - 3.0])
+    figure = plots.plot_rollout(made_up())
+    theta = figure.axes[2]
+    assert theta.get_ylabel() == "theta (rad)"
+    for line in theta.lines:
+        values = np.asarray(line.get_ydata(), dtype=float)
+        assert np.nanmax(np.abs(np.diff(values))) < 1.0
+        assert abs(values[0] - 2.8) < 0.1
+
+
+def test_parameters_of_most_interest() -> None:
+    shown = plots.most_interesting(made_up(stuck=True))
+    assert shown[:2] == ["linear_drag_coefficient[cart]", "w_x[cart]"]
+    assert len(shown) == plots.MOST_PARAMETERS
+
+
+def test_summary_has_the_same_columns_everywhere() -> None:
+    table = plots.summary(made_up_posterior())
+    assert list(table.columns) == ["mean", "sd", "lower", "upper", "ess_bulk", "ess_tail", "r_hat"]
+    drag = table.loc["linear_drag_coefficient[cart]"]
+    assert drag["mean"] == pytest.approx(3.0, abs=0.01)
+    assert drag["upper"] - drag["lower"] == pytest.approx(0.376, rel=0.05)
+    assert "sigma[omega]" in table.index
+
+
+def test_a_parameter_that_never_moved() -> None:
+    constant = idata({"mass": np.ones((4, 500, 1))}, {"mass": ["body"]})
+    findings = replace(made_up("adequate"), posterior_after=constant)
+    assert "mass[cart]: R-hat –" in Page(render(findings)).text
+
+
+def test_loop_stands_for_its_findings() -> None:
+    loop = Loop(made_up())
+    assert loop.verdict == "effects-added"
+    assert loop.added[0].effect == "linear_drag"
+    assert "Something was missing" in repr(loop)
+    assert {"verdict", "save", "report"} <= set(dir(loop))
+    assert copy.copy(loop).verdict == "effects-added"
+    with pytest.raises(AttributeError, match="vredict"):
+        _ = loop.vredict
+
+
+def test_close_loop_hands_over_what_it_got(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls = []
+    monkeypatch.setattr(report, "revise", lambda *args, **kw: calls.append((args, kw)) or made_up())
+    loop = report.close_loop("scene", "train", "test", seed=3)  # type: ignore[arg-type]
+    assert loop.verdict == "effects-added"
+    assert calls == [(("scene", "train", "test"), {"seed": 3})]
+
+
+def test_save_writes_the_contract(tmp_path: Path) -> None:
+    folder = tmp_path / "new" / "out"
+    assert Loop(made_up()).save(folder) == folder
+    assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
+    assert [p.name for p in tmp_path.iterdir()] == ["new"]
+    got = json.loads((folder / "report.json").read_text())
+    assert list(got) == [
+        "verdict",
+        "numerical",
+        "added",
+        "candidates",
+        "unexplained",
+        "error",
+        "identifiability",
+        "provenance",
+    ]
+    assert list(got["added"][0]) == [
+        "effect",
+        "body",
+        "statistic",
+        "p_value",
+        "parameters",
+        "not_separable_from",
+        "elpd_difference",
+        "elpd_difference_se",
+    ]
+    assert got["added"][0]["parameters"]["coefficient"] == {
+        "mean": 3.0,
+        "sd": 0.1,
+        "hdi": [2.81, 3.19],
+        "unit": "kg/s",
+    }
+    assert list(got["candidates"][0]) == [
+        "effect",
+        "body",
+        "statistic",
+        "dof",
+        "p_value",
+        "estimate",
+        "identifiable",
+    ]
+    assert list(got["error"]) == ["before", "after", "noise_floor"]
+    assert got["error"]["before"]["normalised_rmse"] == 2.4
+    assert (folder / "report.html").read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+
+
+@pytest.fixture
+def broken(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second posterior fails halfway."""
+
+    def fail(posterior: Any, path: Path) -> None:
+        path.write_bytes(b"half")
+        if path.name == "after.nc":
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(report, "save_posterior", fail)
+    monkeypatch.setattr(report, "render", lambda findings: "a page")
+
+
+@pytest.mark.usefixtures("broken")
+def test_failure_leaves_nothing(tmp_path: Path) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        Loop(made_up()).save(tmp_path / "new" / "out")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.usefixtures("broken")
+def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
+    (tmp_path / "report.html").write_text("old")
+    with pytest.raises(KeyboardInterrupt):
+        Loop(made_up()).save(tmp_path, overwrite=True)
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+    assert (tmp_path / "report.html").read_text() == "old"
+
+
+def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "save_posterior", lambda posterior, path: path.write_bytes(b"nc"))
+    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    loop = Loop(made_up())
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match=r"has content already.*--overwrite"):
+        loop.save(tmp_path)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+    loop.save(tmp_path, overwrite=True)
+    loop.save(tmp_path, overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*FILES, "notes.txt"])
+
+
+def test_folder_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "file").write_text("")
+    for place in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(OutputError, match="is a file, expected a folder"):
+            Loop(made_up()).save(place, overwrite=True)
+    (tmp_path / "out" / "after.nc").mkdir(parents=True)
+    with pytest.raises(OutputError, match=r"after\.nc in it is a folder"):
+        Loop(made_up()).save(tmp_path / "out", overwrite=True)
+    monkeypatch.setattr("os.access", lambda path, mode: False)
+    with pytest.raises(OutputError, match="no permission to write"):
+        Loop(made_up()).save(tmp_path / "new")
+
+
+def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    path = Loop(made_up()).report(tmp_path / "report.html")
+    assert path.read_text() == "a page"
+    for place in (tmp_path, tmp_path / "none" / "report.html"):
+        with pytest.raises(OutputError, match="cannot be written"):
+            Loop(made_up()).report(place)
+    assert [p.name for p in tmp_path.iterdir()] == ["report.html"]

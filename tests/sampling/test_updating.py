@@ -1,0 +1,444 @@
+"""update: the posterior of all data, from the posterior of some and the transitions that follow."""
+
+import json
+import warnings
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import pbrl_ppl as pp
+from pbrl_ppl.cli import main
+from pbrl_ppl.effects import Effect, EffectParameter, catalogue
+from pbrl_ppl.errors import (
+    BoundWarning,
+    ConvergenceWarning,
+    EffectError,
+    HistoryError,
+    PosteriorError,
+    RefitWarning,
+)
+from pbrl_ppl.history import History
+from pbrl_ppl.model import StartNoise, build_model, physics_model
+from pbrl_ppl.modes import find_mode, with_start_noise
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.posterior import problem_of
+from pbrl_ppl.posterior.store import (
+    az,
+    convergence,
+    draws,
+    from_groups,
+    group,
+    groups,
+    load_posterior,
+    save_posterior,
+    scalars,
+    scene_of,
+    smoothed,
+)
+from pbrl_ppl.sampling import fit, update
+from pbrl_ppl.sampling.rejuvenation import _Mover, rejuvenate
+from pbrl_ppl.scene import Body, Scene, Shape
+from tests.model.test_model import CART, cart_scene, simulated_history
+
+KNOWN = {"r": 0.2, "mu_c": 0.3}
+PUCKS = {"mass": [2.0, 3.0], "linear_drag_coefficient": [0.5, 1.0]}
+QUICK = {"draws": 1000, "tune": 300, "chains": 2, "cores": 1, "progress": False}
+
+
+def pucks(names="ab") -> Scene:
+    """Discs that slide with drag, 4 m apart."""
+    shape = Shape.circle(0.1)
+    bodies = (Body(name, shape, known=KNOWN, effects=("linear_drag",)) for name in names)
+    return Scene(time_step=0.1, substeps=4, bodies=tuple(bodies))
+
+
+def quiet(function, *arguments, **options):
+    """Few draws, on purpose; and whatever else a hasty fit says of itself."""
+    with warnings.catch_warnings():
+        for kind in (ConvergenceWarning, BoundWarning):
+            warnings.simplefilter("ignore", kind)
+        return function(*arguments, **options)
+
+
+def log(idata) -> list[dict]:
+    return json.loads(idata.attrs["updates"])
+
+
+def did(idata) -> list[str]:
+    return [each["did"] for each in log(idata)]
+
+
+def agree(one, other, sigmas: float = 4.0) -> None:
+    """Means and standard deviations within so many Monte Carlo standard errors.
+
+    With 14 moments and 4 standard errors, a right update fails with probability 1e-3 over seeds.
+    """
+    ess = [convergence(each)[1] for each in (one, other)]
+    flat = [scalars(each) for each in (one, other)]
+    for name in flat[0].data_vars:
+        a, b = (each[name].to_numpy().ravel() for each in flat)
+        n = np.array([each[name] for each in ess])
+        sd = b.std()
+        error = np.hypot(*(sd / np.sqrt(n)))
+        assert abs(a.mean() - b.mean()) < sigmas * error, (name, a.mean(), b.mean(), error)
+        # of a standard deviation, for tails no heavier than twice a Gaussian's variance of squares
+        assert abs(np.log(a.std() / sd)) < sigmas * error / sd, (name, a.std(), sd)
+
+
+@pytest.fixture(scope="module")
+def parts():
+    """A scene, 60 transitions, 10 that follow, and all of them."""
+    scene = pucks()
+    whole = simulated_history(scene, PUCKS, seed=3, trajectories=70, intervals=1, substeps=8)
+    return scene, whole.select(range(60)), whole.select(range(60, 70)), whole
+
+
+@pytest.fixture(scope="module")
+def first(parts):
+    scene, a, _, _ = parts
+    return quiet(fit, physics_model(scene, a), seed=1, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def whole(parts):
+    """The fit to all data, under the prior of the first data's fit."""
+    scene, _, _, both = parts
+    return quiet(fit, physics_model(scene, both), seed=2, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def one(parts, first):
+    """Two transitions more."""
+    return quiet(update, first, parts[2].select([0, 1]), seed=5)
+
+
+def test_few_transitions_are_a_matter_of_weights(parts, first, one) -> None:
+    assert pp.update is update
+    (entry,) = log(one)
+    assert entry["did"] == "reweighted"
+    assert entry["transitions"] == 2
+    assert 0.5 < entry["share"] < 1.0
+    assert entry["data_sha256"] == parts[2].select([0, 1]).data_sha256
+    assert {**one.attrs, "updates": 0, "warnings": 0}.keys() >= first.attrs.keys()
+    assert one.attrs["data_sha256"] != first.attrs["data_sha256"]
+    for name in ("posterior", "log_likelihood"):
+        before, after = group(first, name), group(one, name)
+        sizes = dict(before.sizes) | ({"transition": 62} if name == "log_likelihood" else {})
+        assert dict(after.sizes) == sizes
+        assert {v: after[v].dims for v in after} == {v: before[v].dims for v in before}
+        assert set(after.coords) == set(before.coords)
+    # every draw is one of the fit's, of the same chain, in the same order
+    ancestor = group(one, "sample_stats")["ancestor"].values
+    assert (np.diff(ancestor, axis=1) >= 0).all()
+    mass = group(first, "posterior")["mass"]
+    np.testing.assert_array_equal(
+        group(one, "posterior")["mass"].values[1], mass.values[1][ancestor[1]]
+    )
+    assert group(one, "posterior")["mass"].attrs == mass.attrs
+
+
+def test_stored_likelihoods_and_data_are_those_of_all_data(parts, one) -> None:
+    """Old columns went with their draws, new ones were added; and the file's own problem agrees."""
+    problem = problem_of(one)
+    assert problem.segments.n == 62
+    phi = problem.layout.to_vectors(draws(one), 2000)[::400]
+    sigma = draws(one)["sigma"][::400]
+    stored = group(one, "log_likelihood")["next_state"].values.reshape(2000, -1)[::400]
+    np.testing.assert_allclose(problem.log_density(problem.residual(phi), sigma), stored)
+    _, a, b, _ = parts
+    observed = np.concatenate([a.segments().observed, b.segments().observed[:2]])
+    np.testing.assert_array_equal(group(one, "observed_data")["next_state"].values, observed)
+    predicted = group(one, "posterior_predictive")["next_state"]
+    assert predicted.shape == (1, 50, *observed.shape)
+    z = (observed - predicted.values[0].mean(axis=0)) / predicted.values[0].std(axis=0)
+    # 124 cells a dimension, 50 draws for each sd: chi-squared / 124 has sd 0.13; 5 of it
+    assert (np.abs((z**2).mean(axis=(0, 1, 2)) - 1) < 0.65).all()
+
+
+def test_arviz_takes_it(one) -> None:
+    assert "mass[a]" in az.summary(one).index
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Estimated shape parameter")
+        az.loo(one)
+    # the group that the next update starts from is no obstacle
+    assert "before_updates" in groups(one)
+
+
+@pytest.mark.slow
+def test_update_is_the_full_fit(parts, first, whole) -> None:
+    """A sixth more data, whatever was done with them."""
+    new = quiet(update, first, parts[2], seed=6)
+    assert did(new) in (["reweighted"], ["moved"])
+    agree(new, whole)
+
+
+@pytest.mark.slow
+def test_moved_draws_are_the_full_fit(parts, first, whole, monkeypatch) -> None:
+    monkeypatch.setattr("pbrl_ppl.sampling.updating._MOVE", 1.0)
+    new = quiet(update, first, parts[2], seed=6)
+    assert did(new) == ["moved"]
+    assert "before_updates" not in groups(new)
+    assert np.unique(draws(new)["mass"][:, 0]).size > 900
+    agree(new, whole)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("way", ["looking ahead", "badly", "not at all"])
+def test_moves_leave_a_posterior_what_it_is(parts, whole, way, monkeypatch) -> None:
+    """1000 draws moved under their own posterior; the coarse one may be much too wide.
+
+    28 moments, 4 standard errors that leave out how draws before and after depend on each other.
+    """
+    if way == "badly":
+        rough = _Mover.rough
+        monkeypatch.setattr(_Mover, "rough", lambda self, u, noise: 0.4 * rough(self, u, noise))
+    monkeypatch.setattr(
+        "pbrl_ppl.sampling.rejuvenation._CLOSE", 0.0 if way == "not at all" else np.inf
+    )
+    problem = problem_of(whole)
+    chosen = np.arange(0, 2000, 2)
+    phi = problem.layout.to_vectors(draws(whole), 2000)[chosen]
+    sigma = draws(whole)["sigma"][chosen]
+    rng = np.random.default_rng(8)
+    moved, noise, accepted = rejuvenate(problem, phi, sigma, rng)
+    assert 0.1 < accepted < 1.0
+    ess = min(convergence(whole)[1].values())
+    n = 1 / (1 / ess + 1 / 1000)
+    for before, after in ((phi, moved), (np.log(sigma), np.log(noise))):
+        assert (before == after).all(axis=1).mean() < 0.3
+        error = before.std(axis=0) / np.sqrt(n)
+        assert (np.abs(after.mean(axis=0) - before.mean(axis=0)) < 4 * error).all()
+        assert (np.abs(np.log(after.std(axis=0) / before.std(axis=0))) < 4 / np.sqrt(n)).all()
+
+
+@pytest.mark.slow
+def test_one_at_a_time_is_all_at_once(parts, first, whole, monkeypatch) -> None:
+    """Ten updates, with draws moved on the way."""
+    monkeypatch.setattr("pbrl_ppl.sampling.updating._MOVE", 0.75)
+    idata = first
+    for i in range(10):
+        idata = quiet(update, idata, parts[2].select([i]), seed=20 + i)
+    assert set(did(idata)) == {"reweighted", "moved"}
+    assert [each["transitions"] for each in log(idata)] == [1] * 10
+    assert group(idata, "log_likelihood").sizes["transition"] == 70
+    agree(idata, whole)
+
+
+def test_reproducible_and_the_same_from_a_file(parts, first, one, tmp_path, monkeypatch) -> None:
+    """The weights go on in the file."""
+    monkeypatch.setattr("pbrl_ppl.sampling.updating._MOVE", 0.3)
+    save_posterior(one, tmp_path / "one.nc")
+    new = parts[2].select([2])
+    a, b, other = (
+        quiet(update, idata, new, seed=seed)
+        for idata, seed in ((one, 7), (load_posterior(tmp_path / "one.nc"), 7), (one, 8))
+    )
+    assert dict(a.attrs) == dict(b.attrs)
+    for name, data in groups(a).items():
+        for variable in data.data_vars:
+            np.testing.assert_array_equal(group(b, name)[variable].values, data[variable].values)
+    assert not np.array_equal(draws(a)["mass"], draws(other)["mass"])
+    # and what went in is as it was
+    assert len(log(one)) == 1
+    assert group(first, "log_likelihood").sizes["transition"] == 60
+
+
+def test_old_files_have_no_prior_of_the_noise(parts, first, one) -> None:
+    attrs = {k: v for k, v in first.attrs.items() if k not in ("sigma_prior", "start_noise")}
+    again = quiet(update, from_groups(groups(first), attrs), parts[2].select([0, 1]), seed=5)
+    np.testing.assert_array_equal(draws(again)["mass"], draws(one)["mass"])
+    problem = problem_of(from_groups(groups(first), attrs))
+    median, spread = json.loads(first.attrs["sigma_prior"])
+    np.testing.assert_allclose(problem.sigma_prior[0], median)
+    assert problem.sigma_prior[1] == spread
+
+
+@pytest.mark.slow
+def test_other_data_are_fitted_anew(parts, first) -> None:
+    """The masses are others now: nearly no draw is left, and the answer is the refit's."""
+    scene, _, _, _ = parts
+    heavy = PUCKS | {"mass": [4.0, 6.0]}
+    new = simulated_history(scene, heavy, seed=4, trajectories=40, intervals=1, substeps=8)
+    with pytest.warns(RefitWarning, match="fitted anew; look whether") as caught:
+        idata = quiet(update, first, new, seed=9, progress=False)
+    assert [each.filename for each in caught if each.category is RefitWarning] == [__file__]
+    assert did(idata) == ["refitted"]
+    assert "before_updates" not in groups(idata)
+    problem = replace(problem_of(first), history=problem_of(idata).history)
+    assert problem.segments.n == 100
+    agree(idata, quiet(fit, build_model(problem), seed=10, **QUICK))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sigma", ["scalar", "per_dimension"])
+def test_a_cart(sigma) -> None:
+    """Friction's kinks, a wheel, Student-t noise and a horizon: against the fit to all data.
+
+    The grain that friction gives the posterior makes the effective numbers optimistic: 5 errors.
+    """
+    scene = cart_scene(known=KNOWN)
+    both = simulated_history(scene, CART, seed=9, trajectories=12, intervals=10)
+    options = {"horizon": 2} if sigma == "scalar" else {"nu": 4.0}
+    first, whole = (
+        quiet(fit, physics_model(scene, h, sigma=sigma, **options), seed=1, **QUICK)
+        for h in (both.select(range(11)), both)
+    )
+    idata = quiet(update, first, both.select([11]), seed=11, progress=False)
+    assert "refitted" not in did(idata)
+    agree(idata, whole, sigmas=5.0)
+
+
+def test_missing_cells_and_dimensions(parts, first) -> None:
+    """What was not measured takes no part; a dimension of which no noise is known cannot."""
+    rows = parts[2].select([0]).to_dataframe()
+    rows.loc[rows["step"] == 1, ["x", "y", "theta", "omega"]] = np.nan
+    new = History.from_dataframe(rows, parts[0])
+    idata = quiet(update, first, new)
+    stored = group(idata, "observed_data")["next_state"].values[-1]
+    assert np.isfinite(stored).sum() == 4  # vx and vy of both
+    without = rows.copy()
+    with_all = parts[1].to_dataframe()
+    with_all.loc[with_all["step"] == 1, "omega"] = np.nan
+    no_omega = quiet(
+        fit, physics_model(parts[0], History.from_dataframe(with_all, parts[0])), seed=1,
+        **(QUICK | {"draws": 100, "tune": 50}),
+    )  # fmt: skip
+    quiet(update, no_omega, History.from_dataframe(without, parts[0]))
+    with pytest.raises(HistoryError, match=r"measures omega, of which .* leave those columns"):
+        update(no_omega, parts[2])
+
+
+def test_an_effect_of_one_s_own(parts) -> None:
+    def force(state, command, parameters, wrench):
+        wrench[0] += parameters[0]
+
+    own = Effect(
+        "breeze", (EffectParameter("force", "N", Prior("normal", sigma=1.0)),), "a breeze", "ours",
+        force=force,
+    )  # fmt: skip
+    scene = pucks("a")
+    history = simulated_history(
+        scene, {"mass": 2.0, "linear_drag_coefficient": 0.5, "breeze_force": 0.3}, seed=1,
+        trajectories=12, intervals=1, effects=[own], substeps=8,
+    )  # fmt: skip
+    idata = quiet(
+        fit, physics_model(scene, history.select(range(10)), [own]), seed=1,
+        **(QUICK | {"draws": 100, "tune": 50}),
+    )  # fmt: skip
+    new = history.select([10])
+    with pytest.raises(EffectError, match="breeze"):
+        update(idata, new)
+    assert did(quiet(update, idata, new, effects=(*catalogue, own), progress=False)) != []
+
+
+@pytest.mark.parametrize("known", ["b", "ab"])
+def test_bodies_of_which_all_is_known(known, monkeypatch) -> None:
+    """Nothing to move of them but the noise."""
+    free, given = {"known": KNOWN}, {"known": KNOWN | {"mass": 3.0}}
+    shape = Shape.circle(0.1)
+    bodies = tuple(Body(n, shape, **(given if n in known else free)) for n in "ab")
+    scene = Scene(time_step=0.1, substeps=4, bodies=bodies)
+    truth = {} if known == "ab" else {"mass": 2.0}
+    history = simulated_history(scene, truth, seed=1, trajectories=31, intervals=1, substeps=8)
+    idata = quiet(fit, physics_model(scene, history.select(range(30))), seed=1,
+                  **(QUICK | {"draws": 200, "tune": 50}))  # fmt: skip
+    monkeypatch.setattr("pbrl_ppl.sampling.updating._MOVE", 1.0)
+    assert did(quiet(update, idata, history.select([30]))) == ["moved"]
+
+
+def test_refused_histories(parts, first) -> None:
+    scene, _, b, _ = parts
+    others = pucks("xy")
+    elsewhere = simulated_history(others, PUCKS, seed=1, trajectories=1, intervals=1, substeps=8)
+    with pytest.raises(HistoryError, match=r"history is of x, y, the posterior of a, b; load it"):
+        update(first, elsewhere)
+    slow = scene.replace(time_step=0.2)
+    with pytest.raises(HistoryError, match=r"each 0\.2 s, the posterior's each 0\.1 s"):
+        update(first, simulated_history(slow, PUCKS, seed=1, trajectories=1, intervals=1))
+    once = quiet(update, first, b.select([0]))
+    for data in (parts[1], b.select([0])):
+        with pytest.raises(PosteriorError, match=r"in the posterior already.*pass only"):
+            update(once, data)
+
+
+def test_a_longer_horizon_needs_longer_trajectories(parts) -> None:
+    scene = pucks("a")
+    truth = {"mass": 2.0, "linear_drag_coefficient": 0.5}
+    history = simulated_history(scene, truth, seed=1, trajectories=31, intervals=2, substeps=8)
+    model = physics_model(scene, history.select(range(30)), horizon=2)
+    idata = quiet(fit, model, seed=1, **(QUICK | {"draws": 100, "tune": 50}))
+    assert did(quiet(update, idata, history.select([30]), progress=False)) != []
+    rows = history.select([30]).to_dataframe()
+    short = History.from_dataframe(rows[rows["step"] < 2].assign(
+        **{w: rows[w].where(rows["step"] == 0) for w in ("force_x", "force_y", "torque")}
+    ), scene)  # fmt: skip
+    with pytest.raises(HistoryError, match=r"predicts 2 intervals .* has 1; record at least"):
+        update(idata, short)
+
+
+def test_refused_posteriors(parts, first) -> None:
+    _, _, b, _ = parts
+    new = b.select([0])
+    held = groups(first)
+    for name in ("posterior_predictive", "constant_data"):
+        less = {key: data for key, data in held.items() if key != name}
+        with pytest.raises(PosteriorError, match=f"no group '{name}'"):
+            update(from_groups(less, first.attrs), new)
+    few = {
+        key: data.isel(draw=slice(20)) if key in ("posterior", "log_likelihood") else data
+        for key, data in held.items()
+    }
+    with pytest.raises(PosteriorError, match="40 draws, expected at least 100"):
+        update(from_groups(few, first.attrs), new)
+    unknown = {k: v for k, v in first.attrs.items() if k != "data_sha256"}
+    with pytest.raises(PosteriorError, match="does not say which data"):
+        update(from_groups(held, unknown), new)
+    other = scene_of(first).replace(gravity=(0.0, -9.81))
+    with pytest.raises(PosteriorError, match=r"not what this engine gives.*fit all data anew"):
+        update(from_groups(held, dict(first.attrs) | {"scene": other.to_toml()}), new)
+
+
+def test_start_noise_is_refused(parts) -> None:
+    scene, a, b, _ = parts
+    problem = physics_model(scene, a.select(range(5))).problem
+    mode = find_mode(problem, seed=1)
+    noisy = with_start_noise(problem, mode)
+    assert isinstance(noisy.noise, StartNoise)
+    idata = quiet(fit, build_model(noisy), seed=1, start=mode, **(QUICK | {"draws": 60, "tune": 9}))
+    with pytest.raises(PosteriorError, match="noise in the measured start states"):
+        update(idata, b.select([0]))
+    # a file of an older version does not say so, but its likelihoods do
+    attrs = {k: v for k, v in idata.attrs.items() if k != "start_noise"}
+    with pytest.raises(PosteriorError, match="start noise, other effects or another version"):
+        update(from_groups(groups(idata), attrs), b.select([0]))
+
+
+def test_weights_are_smoothed_alike_on_both_stacks() -> None:
+    x = np.random.default_rng(1).normal(size=1000)
+    weights, k = smoothed(x)
+    assert weights.sum() == pytest.approx(1.0)
+    assert weights.min() > 0
+    assert -0.1 < k < 0.4  # log-normal weights; and as from ArviZ 0.23
+    equal, unknown = smoothed(np.zeros(50))
+    np.testing.assert_allclose(equal, 0.02)
+    assert unknown == np.inf
+    order = np.argsort(x)
+    assert (np.diff(weights[order]) >= 0).all()
+    _, heavy = smoothed(5.0 * x)
+    assert heavy > 0.7
+
+
+def test_the_command(parts, first, tmp_path, capsys) -> None:
+    save_posterior(first, tmp_path / "first.nc")
+    parts[2].select([0, 1]).save(tmp_path / "new.csv")
+    files = [str(tmp_path / name) for name in ("first.nc", "new.csv", "second.nc")]
+    command = ["update", *files[:2], "-o", files[2], "--seed", "5"]
+    assert quiet(main, command) == 0
+    assert capsys.readouterr().out.splitlines()[0].startswith("reweighted: 2 transitions")
+    assert did(load_posterior(files[2])) == ["reweighted"]
+    assert main(command) == 2
+    assert "exists" in capsys.readouterr().err
+    command[2] = str(tmp_path / "nowhere.csv")
+    assert main([*command, "--overwrite"]) == 2
+    assert "error: history" in capsys.readouterr().err
