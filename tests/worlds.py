@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.effects import attach, catalogue
-from pbrl_ppl.effects.base import Attached, Effect
+from pbrl_ppl.effects import Attached, Effect, attach, catalogue
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import Simulator

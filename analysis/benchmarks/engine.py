@@ -29,7 +29,7 @@ import pytensor.tensor as pt
 from pbrl_ppl import Body, Scene, Shape, Simulator, SimulatorOp
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import compiled
+from pbrl_ppl.physics import calls, pointers
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Wall
 
@@ -142,23 +142,23 @@ def naive(
 def _bare(fn, world, start, step, substeps):  # type: ignore[no-untyped-def]
     body = world.bodies[0]
     for t in range(len(start)):
-        compiled._call2(fn.cpBodySetPosition, body, start[t, 0, 0], start[t, 0, 1])
-        compiled._call1(fn.cpBodySetAngle, body, start[t, 0, 2])
-        compiled._call2(fn.cpBodySetVelocity, body, start[t, 0, 3], start[t, 0, 4])
-        compiled._call1(fn.cpBodySetAngularVelocity, body, start[t, 0, 5])
+        calls.call2(fn.cpBodySetPosition, body, start[t, 0, 0], start[t, 0, 1])
+        calls.call1(fn.cpBodySetAngle, body, start[t, 0, 2])
+        calls.call2(fn.cpBodySetVelocity, body, start[t, 0, 3], start[t, 0, 4])
+        calls.call1(fn.cpBodySetAngularVelocity, body, start[t, 0, 5])
         for _ in range(substeps):
-            compiled._call1(fn.cpSpaceStep, world.space, step)
+            calls.call1(fn.cpSpaceStep, world.space, step)
 
 
 def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[], None]:
     """The engine's own C stepping of the same world from the same states, and nothing else."""
     world = World(simulator.scene)
     given = simulator._properties(phi[None])
-    world.set_properties(given.bodies[0], given.joints[0])
-    pointers = compiled.pointers(world)
+    world.set_properties(given.bodies[0, 0], given.joints[0])
+    where = pointers.pointers(world)
 
     def run() -> None:
-        _bare(compiled.FUNCTIONS, pointers, start, TIME_STEP / SUBSTEPS, SUBSTEPS)
+        _bare(calls.FUNCTIONS, where, start, TIME_STEP / SUBSTEPS, SUBSTEPS)
         if not world.bodies:  # the world must outlive its pointers
             raise RuntimeError
 

@@ -2,11 +2,12 @@
 
 from typing import Any
 
-from pbrl_ppl.effects.base import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.parameters import Prior
 
 
-def _force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
     wrench[2] -= parameters[0] * state[5]
 
 
@@ -15,5 +16,5 @@ angular_drag = Effect(
     (EffectParameter("coefficient", "N m s", Prior("half_normal", sigma=10.0)),),
     "a torque against the rotation that grows with the angular speed",
     "viscous torque, tau = -c omega",
-    force=_force,
+    Force(_law),
 )

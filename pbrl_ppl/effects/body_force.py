@@ -3,11 +3,12 @@
 import math
 from typing import Any
 
-from pbrl_ppl.effects.base import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.parameters import Prior
 
 
-def _force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
     c = math.cos(state[2])
     s = math.sin(state[2])
     wrench[0] += c * parameters[0] - s * parameters[1]
@@ -22,5 +23,5 @@ body_force = Effect(
     ),
     "a steady push in one direction of the body itself, such as a motor that never quite stops",
     "Newton's second law with a force that turns with the body",
-    force=_force,
+    Force(_law),
 )

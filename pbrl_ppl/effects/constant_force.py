@@ -2,11 +2,12 @@
 
 from typing import Any
 
-from pbrl_ppl.effects.base import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.parameters import Prior
 
 
-def _force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
     wrench[0] += parameters[0]
     wrench[1] += parameters[1]
 
@@ -19,5 +20,5 @@ constant_force = Effect(
     ),
     "a steady push in one direction of the room: the floor slopes, or a wind blows",
     "Newton's second law with a constant force",
-    force=_force,
+    Force(_law),
 )

@@ -2,11 +2,12 @@
 
 from typing import Any
 
-from pbrl_ppl.effects.base import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.parameters import Prior
 
 
-def _force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
     wrench[2] += parameters[0]
 
 
@@ -15,5 +16,5 @@ constant_torque = Effect(
     (EffectParameter("torque", "N m", Prior("normal", sigma=10.0)),),
     "a steady twist in one direction, such as a torque sensor that is off zero",
     "Euler's second law with a constant torque",
-    force=_force,
+    Force(_law),
 )

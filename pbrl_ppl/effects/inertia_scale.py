@@ -2,12 +2,13 @@
 
 from typing import Any
 
-from pbrl_ppl.effects.base import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Properties
 from pbrl_ppl.parameters import Prior
 
 
-def _modify(properties: dict[str, Any], parameters: dict[str, Any]) -> None:
-    properties["moment"] *= parameters["scale"]
+def _modify(properties: Any, parameters: Any, clock: Any) -> None:
+    properties["moment_per_mass"] = properties["moment_per_mass"] * parameters["scale"]
 
 
 inertia_scale = Effect(
@@ -15,5 +16,5 @@ inertia_scale = Effect(
     (EffectParameter("scale", "1", Prior("log_normal", mu=0.0, sigma=0.5), null=1.0),),
     "the body is easier or harder to turn than its outline suggests: mass is not spread evenly",
     "moment of inertia about the centroid as a free parameter",
-    modify=_modify,
+    Properties(_modify),
 )

@@ -2,12 +2,14 @@
 
 from typing import Any
 
-from pbrl_ppl.effects.base import Effect, EffectParameter, is_pivoted
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.hinge import is_pivoted
+from pbrl_ppl.effects.stages import Properties
 from pbrl_ppl.parameters import Prior
 
 
-def _modify(properties: dict[str, Any], parameters: dict[str, Any]) -> None:
-    properties["pivot_damping"] += parameters["coefficient"]
+def _modify(properties: Any, parameters: Any, clock: Any) -> None:
+    properties["pivot_damping"] = properties["pivot_damping"] + parameters["coefficient"]
 
 
 pivot_damping = Effect(
@@ -15,6 +17,6 @@ pivot_damping = Effect(
     (EffectParameter("coefficient", "N m s", Prior("half_normal", sigma=1.0)),),
     "viscous friction in the hinge: a torque against the rotation that grows with its speed",
     "viscous torque on the relative angular velocity, tau = -c omega",
-    modify=_modify,
+    Properties(_modify),
     applies=is_pivoted,
 )

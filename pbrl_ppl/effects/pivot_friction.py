@@ -2,13 +2,15 @@
 
 from typing import Any
 
-from pbrl_ppl.effects.base import Effect, EffectParameter, is_pivoted
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.hinge import is_pivoted
+from pbrl_ppl.effects.stages import Properties
 from pbrl_ppl.parameters import Prior
 
 
-def _modify(properties: dict[str, Any], parameters: dict[str, Any]) -> None:
+def _modify(properties: Any, parameters: Any, clock: Any) -> None:
     # the engine solves it together with the hinge, so sticking is exact
-    properties["pivot_torque"] += parameters["torque"]
+    properties["pivot_torque"] = properties["pivot_torque"] + parameters["torque"]
 
 
 pivot_friction = Effect(
@@ -16,6 +18,6 @@ pivot_friction = Effect(
     (EffectParameter("torque", "N m", Prior("half_normal", sigma=1.0)),),
     "dry friction in the hinge: a steady torque against the rotation that can also hold it still",
     "Coulomb's law of friction",
-    modify=_modify,
+    Properties(_modify),
     applies=is_pivoted,
 )

@@ -3,11 +3,12 @@
 import math
 from typing import Any
 
-from pbrl_ppl.effects.base import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.parameters import Prior
 
 
-def _force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
     c = math.cos(state[2])
     s = math.sin(state[2])
     arm_x = c * parameters[0] - s * parameters[1]
@@ -23,5 +24,5 @@ push_offset = Effect(
     ),
     "the push acts at a point beside the body's centre, and so turns it as well",
     "moment of a force about a point, tau = r x F",
-    force=_force,
+    Force(_law),
 )

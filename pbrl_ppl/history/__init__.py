@@ -1,17 +1,20 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
 from pbrl_ppl.history.files import write_atomically
-from pbrl_ppl.history.history import STATE, STATE_UNITS, History, Segments
+from pbrl_ppl.history.history import INPUT, STATE, STATE_UNITS, WRENCH, History, Segments
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
-from pbrl_ppl.history.start import fill_hinges, lever
+from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
 
 __all__ = [
+    "INPUT",
     "STATE",
     "STATE_UNITS",
+    "WRENCH",
     "History",
     "Segments",
     "fill_hinges",
     "from_segments",
+    "hung_bodies",
     "lever",
     "segment_rows",
     "write_atomically",

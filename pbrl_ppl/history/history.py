@@ -22,10 +22,13 @@ from pbrl_ppl.scene import Scene
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
-__all__ = ["STATE", "STATE_UNITS", "WRENCH", "WRENCH_UNITS", "History", "Segments"]
+__all__ = ["INPUT", "STATE", "STATE_UNITS", "WRENCH", "WRENCH_UNITS", "History", "Segments"]
 
 STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
 WRENCH_UNITS = ("N", "N", "N m")
+#: What acts in an interval: the wrench, the one before (zero before the first), the trajectory's
+#: number, and the time in it at which the interval begins and ends (s).
+INPUT = (*WRENCH, *(f"previous_{name}" for name in WRENCH), "trajectory", "begin", "end")
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,6 +45,9 @@ class Segments:
         State measured at the end of each interval; NaN where missing.
     trajectory, step : (n,) arrays of int
         Position of the trajectory and of the step where the piece starts.
+    inputs : (n, H, k, 9) array
+        Everything that acts in each interval, in the order of :data:`INPUT`: the wrench, the wrench
+        in the interval before, and when it is. The engine takes it in place of the actions.
     """
 
     start: Floats
@@ -49,6 +55,7 @@ class Segments:
     observed: Floats
     trajectory: Ints
     step: Ints
+    inputs: Floats
 
     @property
     def n(self) -> int:
@@ -76,6 +83,8 @@ class History:
         - ``start`` (trajectory, time, body, state): the state completed through hinges and
           estimated velocities;
         - ``clock`` (trajectory, time): time (s);
+        - ``number`` (trajectory,): which trajectory of the recording it is, from 0;
+        - ``before`` (trajectory, body, wrench): what acted before the first row; zero;
         - ``n_rows`` (trajectory,): number of steps.
 
     Examples
@@ -144,6 +153,12 @@ class History:
                 "start": (state_dims, start, state_units),
                 "clock": (("trajectory", "time"), table.clock, {"units": "s"}),
                 "n_rows": ("trajectory", table.n_rows),
+                "number": ("trajectory", np.arange(float(len(table.n_rows)))),
+                "before": (
+                    ("trajectory", "body", "wrench"),
+                    np.zeros((len(table.n_rows), len(scene.dynamic), len(WRENCH))),
+                    wrench_units,
+                ),
             },
             coords={
                 "trajectory": table.labels,
@@ -206,7 +221,20 @@ class History:
             observed=self.dataset["observed"].to_numpy()[trajectory[:, None], rows + 1],
             trajectory=trajectory,
             step=step,
+            inputs=self._inputs()[trajectory[:, None], rows],
         )
+
+    def _inputs(self) -> Floats:
+        """What acts in each interval, shape (trajectory, interval, body, input)."""
+        action = self.dataset["action"].to_numpy()
+        before = self.dataset["before"].to_numpy()[:, None]
+        previous = np.concatenate([before, action[:, :-1]], axis=1)
+        clock = self.dataset["clock"].to_numpy()
+        end = np.pad(clock[:, 1:], ((0, 0), (0, 1)), constant_values=np.nan)
+        number = np.broadcast_to(self.dataset["number"].to_numpy()[:, None], clock.shape)
+        when = np.stack([number, clock, end], axis=-1)[:, :, None]
+        when = np.broadcast_to(when, (*action.shape[:-1], 3))
+        return np.concatenate([action, previous, when], axis=-1)
 
     def split(self, test_fraction: float = 0.25, seed: int = 0) -> tuple[History, History]:
         """Return a part to train on and a part to test on, of whole trajectories.

@@ -13,8 +13,21 @@ Array = NDArray[np.float64]
 
 
 def from_segments(scene: Scene, start: Array, actions: Array, observed: Array) -> History:
-    """A history of segments; arguments as of :func:`segment_rows`."""
-    return History.from_dataframe(segment_rows(scene, start, actions, observed), scene)
+    """A history of segments; arguments as of :func:`segment_rows`.
+
+    Actions of shape (n, H, body, 9) are inputs as in :data:`pbrl_ppl.history.INPUT`: they also say
+    what acted before, and when.
+    """
+    wrench = actions[..., : len(WRENCH)]
+    history = History.from_dataframe(segment_rows(scene, start, wrench, observed), scene)
+    if actions.shape[-1] == len(WRENCH):
+        return history
+    previous, (number, begin, end) = actions[..., 3:6], np.moveaxis(actions[:, :, 0, 6:], -1, 0)
+    data = history.dataset.copy()
+    data["before"] = data["before"].copy(data=previous[:, 0])
+    data["number"] = data["number"].copy(data=number[:, 0])
+    data["clock"] = data["clock"].copy(data=np.concatenate([begin, end[:, -1:]], axis=1))
+    return History(data)
 
 
 def segment_rows(scene: Scene, start: Array, actions: Array, observed: Array) -> pd.DataFrame:

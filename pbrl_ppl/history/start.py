@@ -79,6 +79,18 @@ def fill_hinges(start: Floats, scene: Scene) -> None:
             body[..., columns] = np.where(np.isnan(body[..., columns]), filled, body[..., columns])
 
 
+def hung_bodies(scene: Scene) -> list[str]:
+    """Names of the moving bodies whose place follows from angles: hinges tie them to the world."""
+    moving = [body.name for body in scene.dynamic]
+    reached = {WORLD, *(body.name for body in scene.bodies if body.static)}
+    hung = []
+    for parent, child, *_ in _hinge_order(scene):
+        if parent in reached and child in moving and child not in reached:
+            reached.add(child)
+            hung.append(child)
+    return hung
+
+
 def lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
     """Return an anchor's offset from its body's origin in the world, and that offset's rate."""
     cos, sin = np.cos(state[..., 2]), np.sin(state[..., 2])

@@ -14,7 +14,7 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_funcify
 
-from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import PartedSimulator, Parts
@@ -65,7 +65,7 @@ class _EngineOp(Op):
         for name, value, shape in (
             ("phi", phi, (p,)),
             ("start", start, (None, k, 6)),
-            ("actions", actions, (None, None, k, 3)),
+            ("actions", actions, (None, None, k, None)),
         ):
             tensor = pt.cast(pt.as_tensor_variable(value), "float64")
             static = tensor.type.shape
@@ -100,11 +100,11 @@ class _EngineOp(Op):
 class SimulatorOp(_EngineOp):
     """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
 
-    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3);
-    the output has shape (transition, H, body, 6); all float64, in SI units. A transition in which
-    the engine diverges is NaN, and so is everything where phi is impossible (a mass that is not
-    positive, say): the likelihood of that is zero. The derivative by phi is by finite differences,
-    all columns in one call of the engine.
+    Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3),
+    or all of :data:`pbrl_ppl.history.INPUT` in place of the 3; the output has shape (transition, H,
+    body, 6); all float64, in SI units. A transition in which the engine diverges is NaN, and so is
+    everything where phi is impossible (a mass that is not positive, say): the likelihood of that is
+    zero. The derivative by phi is by finite differences, all columns in one call of the engine.
 
     Parameters
     ----------

@@ -10,7 +10,7 @@ import pymc as pm
 from numpy.typing import NDArray
 from scipy.special import i0e
 
-from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import (
     BODY_PARAMETERS,

@@ -1,251 +1,28 @@
-"""The compiled rollout: numba code that calls the engine's C functions by address, without the GIL.
-
-A vector argument of the C functions is a struct of two doubles passed by value. Under the System V
-and AArch64 calling conventions that is the same as two doubles, which is what is passed here; on
-other platforms :data:`AVAILABLE` is false and the plain path serves.
-"""
+"""The compiled rollout: numba code that steps the engine's C functions, without the GIL."""
 
 from __future__ import annotations
 
 import math
-import platform
-import sys
-from collections import namedtuple
-from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import types
-from numba.extending import intrinsic
-from numpy.typing import NDArray
-from pymunk import _chipmunk_cffi
 
-from pbrl_ppl.effects.base import Force
+from pbrl_ppl.physics.calls import call1, call2, call_int, call_law, call_pointer, get1, get2
 from pbrl_ppl.physics.properties import COLUMNS, JOINT_COLUMNS
-from pbrl_ppl.physics.world import DIVERGED, FAR, ITERATIONS_A_RATIO, MOST_ITERATIONS, TINY, World
-
-#: The engine's functions in use, each by the name of its address.
-Functions = namedtuple(
-    "Functions",
-    [
-        "cpSpaceStep",
-        "cpSpaceSetIterations",
-        "cpSpaceAddShape",
-        "cpSpaceRemoveShape",
-        "cpBodySetMass",
-        "cpBodySetMoment",
-        "cpBodySetPosition",
-        "cpBodySetAngle",
-        "cpBodySetVelocity",
-        "cpBodySetAngularVelocity",
-        "cpBodySetForce",
-        "cpBodySetTorque",
-        "cpBodyGetPosition",
-        "cpBodyGetAngle",
-        "cpBodyGetVelocity",
-        "cpBodyGetAngularVelocity",
-        "cpShapeSetElasticity",
-        "cpShapeSetFriction",
-        "cpConstraintSetMaxForce",
-        "cpPivotJointSetAnchorA",
-        "cpPivotJointSetAnchorB",
-        "cpPinJointSetAnchorA",
-        "cpPinJointSetAnchorB",
-        "cpPinJointSetDist",
-        "cpDampedRotarySpringSetDamping",
-    ],
+from pbrl_ppl.physics.world import (
+    DIVERGED,
+    FAR,
+    ITERATIONS_A_RATIO,
+    MOST_ITERATIONS,
+    NO_SIZE,
+    TINY,
 )
+
 _MASS, _R, _MU_C, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(
     len(COLUMNS)
 )
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 _FREE, _TOUCHED, _LOST = 0, 1, 2
-
-
-def _addresses() -> Any:
-    """Addresses of the C functions, or None where they cannot be called this way."""
-    registers = platform.machine().lower() in ("x86_64", "amd64", "aarch64", "arm64")
-    if sys.platform == "win32" or not registers:
-        return None
-    ffi, lib = _chipmunk_cffi.ffi, _chipmunk_cffi.lib
-    try:
-        return Functions(
-            *(int(ffi.cast("intptr_t", ffi.addressof(lib, name))) for name in Functions._fields)
-        )
-    except (AttributeError, ffi.error):
-        return None
-
-
-FUNCTIONS = _addresses()
-AVAILABLE = FUNCTIONS is not None
-
-
-def _void_call(n_doubles: int) -> Any:
-    """Make ``call(function, pointer, double...)`` for C functions that return nothing."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kinds = [ir.IntType(64)] + [ir.DoubleType()] * n_doubles
-        function = builder.inttoptr(args[0], ir.FunctionType(ir.VoidType(), kinds).as_pointer())
-        builder.call(function, args[1:])
-        return context.get_dummy_value()
-
-    doubles = [types.float64] * n_doubles
-    signature = types.void(types.int64, types.int64, *doubles)
-    if n_doubles == 1:
-
-        @intrinsic
-        def call1(typing: Any, function: Any, pointer: Any, a: Any) -> Any:
-            return signature, codegen
-
-        return call1
-
-    @intrinsic
-    def call2(typing: Any, function: Any, pointer: Any, a: Any, b: Any) -> Any:
-        return signature, codegen
-
-    return call2
-
-
-_call1 = _void_call(1)
-_call2 = _void_call(2)
-
-
-@intrinsic
-def _call_int(typing: Any, function: Any, pointer: Any, value: Any) -> Any:
-    """Call a C function of a pointer and an int that returns nothing."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64), ir.IntType(32)]).as_pointer()
-        value = builder.trunc(args[2], ir.IntType(32))
-        builder.call(builder.inttoptr(args[0], kind), [args[1], value])
-        return context.get_dummy_value()
-
-    return types.void(types.int64, types.int64, types.int64), codegen
-
-
-@intrinsic
-def _call_pointer(typing: Any, function: Any, pointer: Any, other: Any) -> Any:
-    """Call a C function of two pointers; what it returns, if anything, is left."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)] * 2).as_pointer()
-        builder.call(builder.inttoptr(args[0], kind), args[1:])
-        return context.get_dummy_value()
-
-    return types.void(types.int64, types.int64, types.int64), codegen
-
-
-@intrinsic
-def _get1(typing: Any, function: Any, pointer: Any) -> Any:
-    """Call a C function of a pointer that returns a double."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(ir.DoubleType(), [ir.IntType(64)]).as_pointer()
-        return builder.call(builder.inttoptr(args[0], kind), args[1:])
-
-    return types.float64(types.int64, types.int64), codegen
-
-
-@intrinsic
-def _get2(typing: Any, function: Any, pointer: Any) -> Any:
-    """Call a C function of a pointer that returns a vector."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vector = ir.LiteralStructType([ir.DoubleType(), ir.DoubleType()])
-        kind = ir.FunctionType(vector, [ir.IntType(64)]).as_pointer()
-        value = builder.call(builder.inttoptr(args[0], kind), args[1:])
-        parts = [builder.extract_value(value, 0), builder.extract_value(value, 1)]
-        return context.make_tuple(builder, signature.return_type, parts)
-
-    return types.UniTuple(types.float64, 2)(types.int64, types.int64), codegen
-
-
-@intrinsic
-def _call_law(typing: Any, function: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Call an effect's force law: four pointers to doubles."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)] * 4).as_pointer()
-        builder.call(builder.inttoptr(args[0], kind), args[1:])
-        return context.get_dummy_value()
-
-    return types.void(*[types.int64] * 5), codegen
-
-
-_DOUBLES = types.CPointer(types.float64)
-_LAWS: dict[Force, Any] = {}
-
-
-def law_address(force: Force) -> int:
-    """Compile an effect's force law to a C function, once, and give its address."""
-    if force not in _LAWS:
-        _LAWS[force] = numba.cfunc(types.void(_DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES))(force)
-    return int(_LAWS[force].address)
-
-
-class Pointers(NamedTuple):
-    """The C objects of one world, for the compiled loop."""
-
-    space: int
-    iterations: int
-    chained: NDArray[np.bool_]
-    padding: int
-    bodies: NDArray[np.int64]
-    shapes: NDArray[np.int64]
-    shape_body: NDArray[np.int64]
-    wheels: NDArray[np.int64]  # (2, wheel): the rod along x, the rod along y
-    wheel_body: NDArray[np.int64]
-    links: NDArray[np.int64]
-    link_joint: NDArray[np.int64]
-    link_rod: NDArray[np.bool_]
-    pivots: NDArray[np.int64]  # (2, pivot): the motor, the damper
-    pivot_body: NDArray[np.int64]
-    radii: NDArray[np.float64]
-    obstacles: NDArray[np.float64]
-    can_touch: NDArray[np.bool_]
-
-
-def pointers(world: World) -> Pointers:
-    """Where the C objects of a world are; the world must be kept alive."""
-    ffi = _chipmunk_cffi.ffi
-
-    def at(objects: list[Any]) -> NDArray[np.int64]:
-        return np.array([int(ffi.cast("intptr_t", each)) for each in objects], dtype=np.int64)
-
-    def whole(numbers: list[int]) -> NDArray[np.int64]:
-        return np.array(numbers, dtype=np.int64)
-
-    wheels, links, pivots = world.wheels, world.links, world.pivots
-    return Pointers(
-        space=int(ffi.cast("intptr_t", world.space._space)),
-        iterations=world.iterations,
-        chained=world.chained,
-        padding=world.padding,
-        bodies=at([body._body for body in world.bodies]),
-        shapes=at([shape._shape for _, shape in world.shapes]),
-        shape_body=whole([i for i, _ in world.shapes]),
-        wheels=np.stack(
-            [
-                at([wheel.along_x._constraint for wheel in wheels]),
-                at([wheel.along_y._constraint for wheel in wheels]),
-            ]
-        ),
-        wheel_body=whole([wheel.body for wheel in wheels]),
-        links=at([link.constraint._constraint for link in links]),
-        link_joint=whole([link.joint for link in links]),
-        link_rod=np.array([link.rod for link in links], dtype=bool),
-        pivots=np.stack(
-            [
-                at([pivot.motor._constraint for pivot in pivots]),
-                at([pivot.damper._constraint for pivot in pivots]),
-            ]
-        ),
-        pivot_body=whole([pivot.body for pivot in pivots]),
-        radii=world.radii,
-        obstacles=world.obstacles,
-        can_touch=world.can_touch,
-    )
 
 
 @numba.njit(nogil=True, cache=True)
@@ -263,28 +40,45 @@ def _iterations(world, bodies):  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def _set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     for i in range(len(world.bodies)):
-        _call1(fn.cpBodySetMass, world.bodies[i], bodies[i, _MASS])
-        _call1(fn.cpBodySetMoment, world.bodies[i], bodies[i, _MOMENT])
+        call1(fn.cpBodySetMass, world.bodies[i], bodies[i, _MASS])
+        call1(fn.cpBodySetMoment, world.bodies[i], bodies[i, _MOMENT])
     for j in range(len(world.shapes)):
         row = bodies[world.shape_body[j]]
-        _call1(fn.cpShapeSetElasticity, world.shapes[j], row[_R])
-        _call1(fn.cpShapeSetFriction, world.shapes[j], row[_MU_C])
+        call1(fn.cpShapeSetElasticity, world.shapes[j], row[_R])
+        call1(fn.cpShapeSetFriction, world.shapes[j], row[_MU_C])
     for j in range(len(world.wheel_body)):
         row = bodies[world.wheel_body[j]]
         for wheel in world.wheels[:, j]:
-            _call2(fn.cpPinJointSetAnchorA, wheel, row[_W_X], row[_W_Y])
+            call2(fn.cpPinJointSetAnchorA, wheel, row[_W_X], row[_W_Y])
     for j in range(len(world.links)):
         link, row = world.links[j], joints[world.link_joint[j]]
         if world.link_rod[j]:
-            _call2(fn.cpPinJointSetAnchorA, link, row[_A_X], row[_A_Y])
-            _call2(fn.cpPinJointSetAnchorB, link, row[_B_X], row[_B_Y])
-            _call1(fn.cpPinJointSetDist, link, row[_LENGTH])
+            call2(fn.cpPinJointSetAnchorA, link, row[_A_X], row[_A_Y])
+            call2(fn.cpPinJointSetAnchorB, link, row[_B_X], row[_B_Y])
+            call1(fn.cpPinJointSetDist, link, row[_LENGTH])
         else:
-            _call2(fn.cpPivotJointSetAnchorA, link, row[_A_X], row[_A_Y])
-            _call2(fn.cpPivotJointSetAnchorB, link, row[_B_X], row[_B_Y])
+            call2(fn.cpPivotJointSetAnchorA, link, row[_A_X], row[_A_Y])
+            call2(fn.cpPivotJointSetAnchorB, link, row[_B_X], row[_B_Y])
     for j in range(len(world.pivot_body)):
         damping = bodies[world.pivot_body[j], _DAMPING]
-        _call1(fn.cpDampedRotarySpringSetDamping, world.pivots[1, j], damping)
+        call1(fn.cpDampedRotarySpringSetDamping, world.pivots[1, j], damping)
+
+
+@numba.njit(nogil=True, cache=True)
+def _set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
+    """Place the hidden discs, as in World.set_discs."""
+    first = len(world.obstacles) - len(world.discs)
+    for j in range(len(world.discs)):
+        x, y, radius = discs[j, 0], discs[j, 1], discs[j, 2]
+        if not radius > 0.0:
+            x, y, radius = -FAR, -FAR * (j + 1.0), NO_SIZE
+        call2(fn.cpCircleShapeSetOffset, world.discs[j], x, y)
+        call1(fn.cpCircleShapeSetRadius, world.discs[j], radius)
+        call_pointer(fn.cpSpaceReindexShape, world.space, world.discs[j])
+        obstacle = world.obstacles[first + j]
+        obstacle[0] = obstacle[2] = x
+        obstacle[1] = obstacle[3] = y
+        obstacle[4] = radius
 
 
 @numba.njit(nogil=True, cache=True)
@@ -293,14 +87,14 @@ def _set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-un
     for j in range(len(world.wheel_body)):
         row = bodies[world.wheel_body[j]]
         load = on * row[_MASS] * normal_gravity
-        _call1(fn.cpConstraintSetMaxForce, world.wheels[0, j], row[_MU_X] * load)
-        _call1(fn.cpConstraintSetMaxForce, world.wheels[1, j], row[_MU_Y] * load)
+        call1(fn.cpConstraintSetMaxForce, world.wheels[0, j], row[_MU_X] * load)
+        call1(fn.cpConstraintSetMaxForce, world.wheels[1, j], row[_MU_Y] * load)
     for j in range(len(world.links)):
-        _call1(fn.cpConstraintSetMaxForce, world.links[j], np.inf if on else 0.0)
+        call1(fn.cpConstraintSetMaxForce, world.links[j], np.inf if on else 0.0)
     for j in range(len(world.pivot_body)):
         torque = on * bodies[world.pivot_body[j], _TORQUE]
-        _call1(fn.cpConstraintSetMaxForce, world.pivots[0, j], torque)
-        _call1(fn.cpConstraintSetMaxForce, world.pivots[1, j], np.inf if on else 0.0)
+        call1(fn.cpConstraintSetMaxForce, world.pivots[0, j], torque)
+        call1(fn.cpConstraintSetMaxForce, world.pivots[1, j], np.inf if on else 0.0)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -315,21 +109,21 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
         return  # nothing to forget
     if touched:
         for i in range(len(world.bodies)):
-            _call2(fn.cpBodySetPosition, world.bodies[i], FAR * (i + 1.0), FAR)
-            _call1(fn.cpBodySetAngle, world.bodies[i], 0.0)
-            _call2(fn.cpBodySetVelocity, world.bodies[i], 0.0, 0.0)
-            _call1(fn.cpBodySetAngularVelocity, world.bodies[i], 0.0)
+            call2(fn.cpBodySetPosition, world.bodies[i], FAR * (i + 1.0), FAR)
+            call1(fn.cpBodySetAngle, world.bodies[i], 0.0)
+            call2(fn.cpBodySetVelocity, world.bodies[i], 0.0, 0.0)
+            call1(fn.cpBodySetAngularVelocity, world.bodies[i], 0.0)
         for shape in world.shapes:
-            _call_pointer(fn.cpSpaceRemoveShape, world.space, shape)
+            call_pointer(fn.cpSpaceRemoveShape, world.space, shape)
         for _ in range(world.padding):  # see World._add_shapes
-            _call_pointer(fn.cpSpaceAddShape, world.space, world.shapes[0])
-            _call_pointer(fn.cpSpaceRemoveShape, world.space, world.shapes[0])
+            call_pointer(fn.cpSpaceAddShape, world.space, world.shapes[0])
+            call_pointer(fn.cpSpaceRemoveShape, world.space, world.shapes[0])
         for shape in world.shapes:
-            _call_pointer(fn.cpSpaceAddShape, world.space, shape)
+            call_pointer(fn.cpSpaceAddShape, world.space, shape)
     _set_strengths(fn, world, bodies, normal_gravity, 0.0)
-    _call_int(fn.cpSpaceSetIterations, world.space, 1)
-    _call1(fn.cpSpaceStep, world.space, TINY)
-    _call_int(fn.cpSpaceSetIterations, world.space, _iterations(world, bodies))
+    call_int(fn.cpSpaceSetIterations, world.space, 1)
+    call1(fn.cpSpaceStep, world.space, TINY)
+    call_int(fn.cpSpaceSetIterations, world.space, _iterations(world, bodies))
     _set_strengths(fn, world, bodies, normal_gravity, 1.0)
 
 
@@ -358,14 +152,77 @@ def _near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-unt
 
 
 @numba.njit(nogil=True, cache=True)
+def _act(  # type: ignore[no-untyped-def]
+    state, interval, commands, command_parameters, forces, force_parameters, begin, end, signal,
+    previous, command, wrench,
+):  # fmt: skip
+    """The wrench on each body in a substep: the command stage, then the force stage."""
+    k = len(state)
+    addresses, owners, first, memory = commands
+    known = interval.shape[1] > 3
+    for i in range(k):
+        for w in range(3):
+            command[i, w] = interval[i, w]
+            previous[i, w] = interval[i, 3 + w] if known else 0.0
+    signal[6], signal[7] = begin, end
+    for e in range(len(addresses)):
+        i = owners[e]
+        state_at = state.ctypes.data + 48 * i
+        parameters_at = command_parameters.ctypes.data + 8 * first[e]
+        for w in range(3):
+            signal[w], signal[3 + w] = command[i, w], previous[i, w]
+        call_law(
+            addresses[e], state_at, signal.ctypes.data, parameters_at, command.ctypes.data + 24 * i
+        )
+        if known and not memory[e]:
+            for w in range(3):
+                signal[w] = previous[i, w]
+            call_law(
+                addresses[e], state_at, signal.ctypes.data, parameters_at,
+                previous.ctypes.data + 24 * i,
+            )  # fmt: skip
+    addresses, owners, first = forces
+    for i in range(k):
+        for w in range(3):
+            wrench[i, w] = command[i, w]
+    for e in range(len(addresses)):
+        i = owners[e]
+        call_law(
+            addresses[e],
+            state.ctypes.data + 48 * i,
+            command.ctypes.data + 24 * i,
+            force_parameters.ctypes.data + 8 * first[e],
+            wrench.ctypes.data + 24 * i,
+        )
+
+
+@numba.njit(nogil=True, cache=True)
+def _place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyped-def]
+    """Put the rods' ends on the wheels' axes, as they will be when the engine solves for forces."""
+    for j in range(len(world.wheel_body)):
+        i = world.wheel_body[j]
+        theta = state[i, 2] + state[i, 5] * step
+        c, s = math.cos(theta), math.sin(theta)
+        w_x, w_y = bodies[i, _W_X], bodies[i, _W_Y]
+        x = state[i, 0] + state[i, 3] * step + c * w_x - s * w_y
+        y = state[i, 1] + state[i, 4] * step + s * w_x + c * w_y
+        c, s = c * axes[j, 0] - s * axes[j, 1], s * axes[j, 0] + c * axes[j, 1]
+        call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x + c, y + s)
+        call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x - s, y + c)
+
+
+@numba.njit(nogil=True, cache=True)
 def _transition(  # type: ignore[no-untyped-def]
-    fn, world, bodies, forces, force_body, force_offset, laws, start, actions, step, substeps, out
-):
+    fn, world, properties, joints, commands, command_parameters, forces, force_parameters, start,
+    inputs, time_step, normal_gravity, substeps, out,
+):  # fmt: skip
     """One transition of horizon H into ``out`` (H, body, 6); says what became of it."""
     k = len(world.bodies)
+    step = time_step / substeps
     state = start.copy()
-    command = np.zeros(3)
-    wrench = np.zeros((k, 3))
+    signal = np.zeros(8)
+    previous, command, wrench = np.zeros((k, 3)), np.zeros((k, 3)), np.zeros((k, 3))
+    bodies = properties[0]
     axes = np.empty((len(world.wheel_body), 2))
     for j in range(len(axes)):
         turn = bodies[world.wheel_body[j], _W_THETA]
@@ -374,48 +231,32 @@ def _transition(  # type: ignore[no-untyped-def]
     watch = len(world.obstacles) > 0 or k > 1
     for i in range(k):
         body = world.bodies[i]
-        _call2(fn.cpBodySetPosition, body, state[i, 0], state[i, 1])
-        _call1(fn.cpBodySetAngle, body, state[i, 2])
-        _call2(fn.cpBodySetVelocity, body, state[i, 3], state[i, 4])
-        _call1(fn.cpBodySetAngularVelocity, body, state[i, 5])
-    state_at, command_at = state.ctypes.data, command.ctypes.data
-    wrench_at, laws_at = wrench.ctypes.data, laws.ctypes.data
-    for h in range(len(actions)):
-        for _ in range(substeps):
+        call2(fn.cpBodySetPosition, body, state[i, 0], state[i, 1])
+        call1(fn.cpBodySetAngle, body, state[i, 2])
+        call2(fn.cpBodySetVelocity, body, state[i, 3], state[i, 4])
+        call1(fn.cpBodySetAngularVelocity, body, state[i, 5])
+    for h in range(len(inputs)):
+        if h > 0 and len(properties) > 1:
+            bodies = properties[h]
+            _set_properties(fn, world, bodies, joints)
+            _set_strengths(fn, world, bodies, normal_gravity, 1.0)
+            call_int(fn.cpSpaceSetIterations, world.space, _iterations(world, bodies))
+        for s in range(substeps):
+            _act(
+                state, inputs[h], commands, command_parameters, forces, force_parameters,
+                s / substeps, (s + 1) / substeps, signal, previous, command, wrench,
+            )  # fmt: skip
             for i in range(k):
-                for w in range(3):
-                    wrench[i, w] = actions[h, i, w]
-            for e in range(len(forces)):
-                i = force_body[e]
-                for w in range(3):
-                    command[w] = actions[h, i, w]
-                _call_law(
-                    forces[e],
-                    state_at + 48 * i,
-                    command_at,
-                    laws_at + 8 * force_offset[e],
-                    wrench_at + 24 * i,
-                )
-            for i in range(k):
-                _call2(fn.cpBodySetForce, world.bodies[i], wrench[i, 0], wrench[i, 1])
-                _call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
-            for j in range(len(world.wheel_body)):
-                i = world.wheel_body[j]
-                theta = state[i, 2] + state[i, 5] * step
-                c, s = math.cos(theta), math.sin(theta)
-                w_x, w_y = bodies[i, _W_X], bodies[i, _W_Y]
-                x = state[i, 0] + state[i, 3] * step + c * w_x - s * w_y
-                y = state[i, 1] + state[i, 4] * step + s * w_x + c * w_y
-                c, s = c * axes[j, 0] - s * axes[j, 1], s * axes[j, 0] + c * axes[j, 1]
-                _call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x + c, y + s)
-                _call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x - s, y + c)
-            _call1(fn.cpSpaceStep, world.space, step)
+                call2(fn.cpBodySetForce, world.bodies[i], wrench[i, 0], wrench[i, 1])
+                call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
+            _place_wheels(fn, world, bodies, state, axes, step)
+            call1(fn.cpSpaceStep, world.space, step)
             for i in range(k):
                 body = world.bodies[i]
-                state[i, 0], state[i, 1] = _get2(fn.cpBodyGetPosition, body)
-                state[i, 2] = _get1(fn.cpBodyGetAngle, body)
-                state[i, 3], state[i, 4] = _get2(fn.cpBodyGetVelocity, body)
-                state[i, 5] = _get1(fn.cpBodyGetAngularVelocity, body)
+                state[i, 0], state[i, 1] = get2(fn.cpBodyGetPosition, body)
+                state[i, 2] = get1(fn.cpBodyGetAngle, body)
+                state[i, 3], state[i, 4] = get2(fn.cpBodyGetVelocity, body)
+                state[i, 5] = get1(fn.cpBodyGetAngularVelocity, body)
                 speed = abs(state[i, 3]) + abs(state[i, 4]) + abs(state[i, 5])
                 if not speed < DIVERGED:  # also true of NaN
                     return _LOST
@@ -428,51 +269,44 @@ def _transition(  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def rollout(  # type: ignore[no-untyped-def]
-    fn,
-    world,
-    bodies,
-    joints,
-    laws,
-    forces,
-    force_body,
-    force_offset,
-    start,
-    actions,
-    time_step,
-    normal_gravity,
-    counts,
-    weights,
-    first,
-    last,
-    out,
-):
+    fn, world, given, commands, forces, start, inputs, time_step, normal_gravity, counts, weights,
+    first, last, out,
+):  # fmt: skip
     """Predict items ``first`` to ``last`` of proposals x transitions into ``out``.
 
-    ``out`` has shape (proposal * transition, H, body, 6). The transition is run with each number of
-    substeps in ``counts``, the finest first, and the weighted sum taken, which cancels the leading
-    errors; where shapes came close the finest run stands alone: a collision's time is no smooth
-    function of the substep.
+    ``given`` holds the arrays of an `EngineInput` but the indices; ``start`` is (1 or proposal,
+    transition, body, 6). ``out`` has shape (proposal * transition, H, body, 6). The transition is
+    run with each number of substeps in ``counts``, the finest first, and the weighted sum taken,
+    which cancels the leading errors; where shapes came close the finest run stands alone: a
+    collision's time is no smooth function of the substep.
 
     Returns the item at which the engine diverged (its world is then of no more use), or ``last``.
     """
-    n = len(start)
-    scratch = np.empty((actions.shape[1], actions.shape[2], 6))
+    bodies, joints, discs, command_parameters, force_parameters = given
+    n, horizon = len(inputs), inputs.shape[1]
+    scratch = np.empty((horizon, inputs.shape[2], 6))
     total = np.empty_like(scratch)
+    timed = bodies.shape[1] > 1
     proposal = -1
     state = _TOUCHED  # what an earlier call left behind is unknown
     for item in range(first, last):
         p, t = item // n, item % n
+        properties = bodies[p, t * horizon : (t + 1) * horizon] if timed else bodies[p]
         if p != proposal:
             proposal = p
-            _set_properties(fn, world, bodies[p], joints[p])
+            _set_properties(fn, world, properties[0], joints[p])
+            _set_discs(fn, world, discs[p])
         total[:] = 0.0
         for level in range(len(counts)):
             before = state
             for _ in range(2):
-                _forget(fn, world, bodies[p], normal_gravity, before)
+                if timed:
+                    _set_properties(fn, world, properties[0], joints[p])
+                _forget(fn, world, properties[0], normal_gravity, before)
                 state = _transition(
-                    fn, world, bodies[p], forces, force_body, force_offset, laws[p],
-                    start[t], actions[t], time_step / counts[level], counts[level], scratch,
+                    fn, world, properties, joints[p], commands, command_parameters[p], forces,
+                    force_parameters[p], start[p if len(start) > 1 else 0, t], inputs[t],
+                    time_step, normal_gravity, counts[level], scratch,
                 )  # fmt: skip
                 if state != _TOUCHED or before == _TOUCHED:
                     break

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics.coupling import Parts

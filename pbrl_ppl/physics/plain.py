@@ -6,19 +6,19 @@ import math
 
 import numpy as np
 
-from pbrl_ppl.effects.base import Attached
-from pbrl_ppl.physics.properties import COLUMN, Array
+from pbrl_ppl.effects import Attached, Command, Force, at_stage
+from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput
 from pbrl_ppl.physics.world import DIVERGED, World
 
 
 def rollout(
     world: World,
     effects: tuple[Attached, ...],
-    bodies: Array,
-    joints: Array,
-    laws: Array,
+    given: EngineInput,
+    proposal: int,
+    item: int,
     start: Array,
-    actions: Array,
+    inputs: Array,
     substeps: int,
 ) -> tuple[Array, bool]:
     """Step one transition of the horizon H through a new world.
@@ -28,17 +28,16 @@ def rollout(
     world : World
         A new one.
     effects : tuple of Attached
-        Effects; those with a force law act every substep.
-    bodies : ndarray
-        Engine properties of the bodies, shape (body, column).
-    joints : ndarray
-        Engine properties of the joints, shape (joint, column).
-    laws : ndarray
-        Parameters of the force laws in their order, shape (q,).
+        Effects; their command and force laws act every substep.
+    given : EngineInput
+        What the engine is given.
+    proposal, item : int
+        Which proposal, and which transition.
     start : ndarray
         Start state, shape (body, 6), SI units.
-    actions : ndarray
-        Wrench held over each interval, shape (H, body, 3), N and N m.
+    inputs : ndarray
+        What acts in each interval, shape (H, body, 3 or more): wrenches in N and N m, and the rest
+        as in :data:`pbrl_ppl.history.INPUT`.
     substeps : int
         Engine steps an interval.
 
@@ -49,25 +48,35 @@ def rollout(
     touched : bool
         Whether shapes came into contact.
     """
+    properties, joints = given.bodies[proposal], given.joints[proposal]
+    timed = len(properties) > 1
+    bodies = properties[item * len(inputs) if timed else 0]
     world.set_properties(bodies, joints)
+    world.set_discs(given.discs[proposal])
     for body, state in zip(world.bodies, start, strict=True):
         body.position, body.angle = tuple(state[:2]), state[2]
         body.velocity, body.angular_velocity = tuple(state[3:5]), state[5]
-    scene = world.scene
-    names = [body.name for body in scene.dynamic]
-    forces = [one for one in effects if one.effect.force is not None]
-    offsets = np.cumsum([0, *(len(one.effect.parameters) for one in forces)])
-    step = scene.time_step / substeps
-    states = np.empty((len(actions), len(names), 6))
+    names = [body.name for body in world.scene.dynamic]
+    commands = _laws(effects, Command, given.commands[proposal], names)
+    forces = _laws(effects, Force, given.forces[proposal], names)
+    step = world.scene.time_step / substeps
+    states = np.empty((len(inputs), len(names), 6))
     touched = False
-    for h, action in enumerate(actions):
-        for _ in range(substeps):
-            wrench = action.copy()
-            for one, begin, end in zip(forces, offsets[:-1], offsets[1:], strict=True):
-                i = names.index(one.body)
-                if one.effect.force is not None:
+    for h, interval in enumerate(inputs):
+        if timed and h > 0:
+            bodies = properties[item * len(inputs) + h]
+            world.set_properties(bodies, joints)
+        for s in range(substeps):
+            command = interval[:, :3].copy()
+            previous = interval[:, 3:6].copy() if interval.shape[1] > 3 else None
+            phase = s / substeps, (s + 1) / substeps
+            for i, attached, parameters in commands:
+                _command(attached, _state(world, i), command, previous, i, phase, parameters)
+            wrench = command.copy()
+            for i, attached, parameters in forces:
+                if isinstance(attached.effect.stage, Force):
                     state = _state(world, i)
-                    one.effect.force(state, action[i], laws[begin:end], wrench[i])
+                    attached.effect.stage.law(state, command[i], parameters, wrench[i])
             for i, body in enumerate(world.bodies):
                 body.force, body.torque = tuple(wrench[i, :2]), wrench[i, 2]
             _place_wheels(world, bodies, step)
@@ -79,6 +88,37 @@ def rollout(
         for i in range(len(names)):
             states[h, i] = _state(world, i)
     return states, touched
+
+
+def _laws(
+    effects: tuple[Attached, ...], stage: type, parameters: Array, names: list[str]
+) -> list[tuple[int, Attached, Array]]:
+    """Body, effect and parameters of each law of a stage."""
+    acting = at_stage(effects, stage)
+    edges = np.cumsum([0, *(len(one.effect.parameters) for one in acting)])
+    return [
+        (names.index(one.body), one, parameters[begin:end])
+        for one, begin, end in zip(acting, edges[:-1], edges[1:], strict=True)
+    ]
+
+
+def _command(
+    attached: Attached,
+    state: Array,
+    command: Array,
+    previous: Array | None,
+    i: int,
+    phase: tuple[float, float],
+    parameters: Array,
+) -> None:
+    """Apply a command law to a body's command, and to the one before where that is known."""
+    stage = attached.effect.stage
+    if not isinstance(stage, Command):
+        return
+    before = np.zeros(3) if previous is None else previous[i]
+    stage.law(state, np.array([*command[i], *before, *phase]), parameters, command[i])
+    if previous is not None and not stage.memory:
+        stage.law(state, np.array([*before, *before, *phase]), parameters, previous[i])
 
 
 def _state(world: World, i: int) -> Array:

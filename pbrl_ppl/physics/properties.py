@@ -1,4 +1,4 @@
-"""Phi and effects -> the numbers that the engine is given for each body, joint and force law."""
+"""Phi and effects -> the numbers that the engine is given for each body, joint, disc and law."""
 
 from __future__ import annotations
 
@@ -7,7 +7,17 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.effects import (
+    Attached,
+    Clock,
+    Command,
+    Force,
+    Properties,
+    Sensor,
+    Structure,
+    Values,
+    at_stage,
+)
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS, JOINT_INDICES, Layout
 from pbrl_ppl.scene import WORLD, Scene
@@ -40,18 +50,23 @@ class EngineInput(NamedTuple):
     Attributes
     ----------
     bodies : ndarray
-        Shape (proposal, body, column), columns as in :data:`COLUMNS`, SI units.
+        Shape (proposal, 1, body, column), columns as in :data:`COLUMNS`, SI units; or (proposal,
+        interval, body, column) where they depend on the time.
     joints : ndarray
         Shape (proposal, joint, 5), columns as in :data:`JOINT_COLUMNS`, m.
-    laws : ndarray
-        Parameters of the effects that have a force law, one after the other, shape (proposal, q).
+    discs : ndarray
+        x, y and radius of hidden discs, shape (proposal, disc, 3), m.
+    commands, forces : ndarray
+        Parameters of the command and of the force laws, one after the other, shape (proposal, q).
     indices : ndarray
         Which of ``scene.joinable`` an inferred joint holds; shape (proposal, free joint, 2).
     """
 
     bodies: Array
     joints: Array
-    laws: Array
+    discs: Array
+    commands: Array
+    forces: Array
     indices: NDArray[np.int64]
 
 
@@ -83,26 +98,35 @@ class EngineProperties:
                     moved.append((place, i, COLUMN[name]))
         self._moved = np.array(moved, dtype=int).reshape(-1, 3).T
         self._unit_moment = np.array([body.shape.unit_moment for body in scene.dynamic])
-        self._modified = [
-            (bodies.index(one.body), one.effect.modify, self._values(one, places))
-            for one in effects
-            if one.effect.modify is not None
-        ]
-        self._laws = [
-            value
-            for one in effects
-            if one.effect.force is not None
-            for value in self._values(one, places).values()
-        ]
+        self._places = places
+        self._bodies = bodies
+        #: Whether a body's numbers depend on the time.
+        self.timed = any(
+            isinstance(one.effect.stage, Properties) and one.effect.stage.timed for one in effects
+        )
+        #: How many discs the structure stage adds.
+        self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
         self._bind_joints(scene, places)
 
-    @staticmethod
-    def _values(one: Attached, places: dict[str, int]) -> dict[str, tuple[int | None, float]]:
-        """Where phi holds each parameter of an effect, and its null value where it does not."""
-        return {
-            each.name: (places.get(f"{one.effect.variable(each)}[{one.body}]"), each.null)
-            for each in one.effect.parameters
-        }
+    def values(self, one: Attached, phi: Array, axes: int = 0) -> dict[str, Array]:
+        """An effect's parameters by name, shape (proposal, 1, ...) with so many further axes.
+
+        One that is not in phi has its null value.
+        """
+        result = {}
+        for parameter in one.effect.parameters:
+            place = self._places.get(f"{one.effect.variable(parameter)}[{one.body}]")
+            column = np.full(len(phi), parameter.null) if place is None else phi[:, place]
+            result[parameter.name] = column.reshape(-1, *(1,) * axes)
+        return result
+
+    def sensors(self, phi: Array) -> list[tuple[int, Sensor, Values]]:
+        """Body, sensor and its parameters, shape (proposal, 1, 1), in their order."""
+        return [
+            (self._bodies.index(one.body), one.effect.stage, self.values(one, phi, 2))
+            for one in at_stage(self._effects, Sensor)
+            if isinstance(one.effect.stage, Sensor)
+        ]
 
     def _bind_joints(self, scene: Scene, places: dict[str, int]) -> None:
         self._anchors = np.zeros((len(scene.joints), 4))
@@ -139,13 +163,15 @@ class EngineProperties:
         at_y = poses[..., 1] + s * x + c * y
         return np.asarray(np.hypot(at_x[..., 0] - at_x[..., 1], at_y[..., 0] - at_y[..., 1]))
 
-    def __call__(self, phi: Array) -> EngineInput:
+    def __call__(self, phi: Array, clock: Clock | None = None) -> EngineInput:
         """Translate.
 
         Parameters
         ----------
         phi : ndarray
             Proposals, shape (proposal, p), in SI units.
+        clock : Clock, optional
+            When the intervals are; after the recording without it.
 
         Raises
         ------
@@ -155,25 +181,62 @@ class EngineProperties:
         """
         if not np.isfinite(phi).all():
             self._refuse_phi(phi)
-        n = len(phi)
-        bodies = np.repeat(self._known[None], n, axis=0)
+        bodies = np.repeat(self._known[None], len(phi), axis=0)
         place, body, column = self._moved
         bodies[:, body, column] = phi[:, place]
-        bodies[..., COLUMN["moment"]] = bodies[..., COLUMN["mass"]] * self._unit_moment
-
-        def value(place: int | None, null: float) -> Array:
-            return np.full(n, null) if place is None else phi[:, place]
-
-        for i, modify, values in self._modified:
-            row = {name: bodies[:, i, column] for name, column in COLUMN.items()}
-            modify(row, {name: value(*each) for name, each in values.items()})
-            bodies[:, i] = np.stack([row[name] for name in COLUMNS], axis=1)
+        bodies = self._modified(bodies, phi, clock)
         self._check(bodies)
-        laws = [value(*each) for each in self._laws]
         joints, indices = self._joints(phi)
-        return EngineInput(
-            bodies, joints, np.stack(laws, axis=1) if laws else np.zeros((n, 0)), indices
-        )
+        commands, forces = (self._law_parameters(phi, stage) for stage in (Command, Force))
+        return EngineInput(bodies, joints, self._discs(phi), commands, forces, indices)
+
+    def _modified(self, bodies: Array, phi: Array, clock: Clock | None) -> Array:
+        """The properties stage, and the moments that follow from it."""
+        modifying = at_stage(self._effects, Properties)
+        bodies[..., COLUMN["moment"]] = bodies[..., COLUMN["mass"]] * self._unit_moment
+        if not modifying:
+            return bodies[:, None]
+        never = np.full((1, 1), np.inf)
+        clock = clock if self.timed and clock is not None else Clock(never, never, never)
+        m = clock.begin.shape[1]
+        result = np.repeat(bodies[:, None], m, axis=1)
+        for name in dict.fromkeys(one.body for one in modifying):
+            i = self._bodies.index(name)
+            row = {key: result[:, :, i, column].copy() for key, column in COLUMN.items()}
+            del row["moment"]
+            row["moment_per_mass"] = np.full((len(phi), m), self._unit_moment[i])
+            for one in modifying:
+                if one.body == name and isinstance(one.effect.stage, Properties):
+                    one.effect.stage.modify(row, self.values(one, phi, 1), clock)
+            row["moment"] = row["mass"] * row["moment_per_mass"]
+            for key, column in COLUMN.items():
+                result[:, :, i, column] = row[key]
+        return result
+
+    def _law_parameters(self, phi: Array, stage: type) -> Array:
+        """Parameters of the laws of a stage, one after the other, shape (proposal, q)."""
+        columns = [
+            column
+            for one in at_stage(self._effects, stage)
+            for column in self.values(one, phi).values()
+        ]
+        return np.stack([np.zeros(len(phi)), *columns], axis=1)[:, 1:].copy()
+
+    def _discs(self, phi: Array) -> Array:
+        """The structure stage's discs, shape (proposal, disc, 3)."""
+        rows = [
+            np.stack(np.broadcast_arrays(disc.x, disc.y, disc.radius), axis=-1)
+            for one in at_stage(self._effects, Structure)
+            if isinstance(one.effect.stage, Structure)
+            for disc in one.effect.stage.discs(self.values(one, phi))
+        ]
+        discs = np.stack(rows, axis=1) if rows else np.zeros((len(phi), 0, 3))
+        if not (np.isfinite(discs).all() and (discs[..., 2] >= 0).all()):
+            raise ParameterError(
+                "a hidden disc has a place or radius that is not finite, or a radius below 0; give"
+                " finite numbers, and 0 for no disc"
+            )
+        return discs
 
     def _joints(self, phi: Array) -> tuple[Array, NDArray[np.int64]]:
         """Anchors and lengths, and what the joints of unknown bodies hold."""
@@ -212,8 +275,9 @@ class EngineProperties:
         possible = (bodies >= _LEAST) & (bodies < np.inf)
         if possible.all():
             return
-        proposal, body, column = np.argwhere(~possible)[0]
-        found, name = bodies[proposal, body, column], COLUMNS[column]
+        where_not = tuple(np.argwhere(~possible)[0])
+        *_, body, column = where_not
+        found, name = bodies[where_not], COLUMNS[column]
         where = f"body {self._scene.dynamic[body].name!r}: {name}"
         if not np.isfinite(found):
             raise ParameterError(f"{where} is not finite; give a finite number")

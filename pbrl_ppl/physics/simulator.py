@@ -7,15 +7,18 @@ from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
 from queue import SimpleQueue
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects.base import Attached
+from pbrl_ppl.effects import Attached, Clock, Command, Force, at_stage, needs_inputs
 from pbrl_ppl.errors import SimulationError
+from pbrl_ppl.history import INPUT, fill_hinges, hung_bodies
 from pbrl_ppl.numerics import differentiate
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import compiled, plain
+from pbrl_ppl.physics import calls, compiled, plain
+from pbrl_ppl.physics.pointers import pointers
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Scene
@@ -78,8 +81,8 @@ class Simulator:
             raise SimulationError(
                 f"substeps is {substeps} and threads is {threads}; both must be at least 1"
             )
-        path = path or ("compiled" if compiled.AVAILABLE else "plain")
-        if path not in PATHS or (path == "compiled" and not compiled.AVAILABLE):
+        path = path or ("compiled" if calls.AVAILABLE else "plain")
+        if path not in PATHS or (path == "compiled" and not calls.AVAILABLE):
             raise SimulationError(f"path {path!r} is not available; use one of {PATHS}")
         self.scene, self.layout, self.effects = scene, layout, effects
         self.substeps, self.threads, self.path = substeps, threads, path
@@ -90,9 +93,9 @@ class Simulator:
 
     def __getstate__(self) -> dict[str, object]:
         """Leave the C objects behind: another process builds its own."""
-        return {
-            key: value for key, value in self.__dict__.items() if key not in ("_lock", "_forces")
-        } | {"_worlds": OrderedDict()}
+        left = ("_lock", "_commands", "_forces")
+        kept = {key: value for key, value in self.__dict__.items() if key not in left}
+        return kept | {"_worlds": OrderedDict()}
 
     def __setstate__(self, state: dict[str, object]) -> None:
         """Build what was left behind."""
@@ -109,13 +112,15 @@ class Simulator:
         start : ndarray
             Start states, shape (transition, body, 6).
         actions : ndarray
-            Wrenches, shape (transition, H, body, 3), N and N m.
+            Wrenches, shape (transition, H, body, 3), N and N m; or all inputs, shape (transition,
+            H, body, 9), as in :data:`pbrl_ppl.history.INPUT`. With wrenches alone, nothing acted
+            before the first interval, and the time is after the recording.
 
         Returns
         -------
         ndarray
-            Shape (transition, H, body, 6), with a leading proposal axis if phi has one. A
-            transition in which the engine diverged is NaN.
+            As measured, shape (transition, H, body, 6), with a leading proposal axis if phi has
+            one. A transition in which the engine diverged is NaN.
 
         Raises
         ------
@@ -129,22 +134,55 @@ class Simulator:
         actions = np.ascontiguousarray(actions, dtype=float)
         self._check(phi, start, actions)
         proposals = np.atleast_2d(phi)
-        given = self._properties(proposals)
+        inputs, clock = self._inputs(actions)
+        given = self._properties(proposals, clock)
+        starts = self._states(proposals, start)
         n, horizon, k = actions.shape[:3]
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         run = self._run_plain if self.path == "plain" else self._run_compiled
         if not given.indices.shape[1]:
-            run((), given, start, actions, out.reshape(-1, horizon, k, 6))
-            return out if phi.ndim == 2 else out[0]
-        # each choice of the bodies that joints hold is a world of its own
-        choices, which = np.unique(given.indices, axis=0, return_inverse=True)
-        for i, choice in enumerate(choices):
-            joined = tuple((int(a), int(b)) for a, b in choice)
-            rows = which.ravel() == i
-            part = np.full((int(rows.sum()) * n, horizon, k, 6), np.nan)
-            run(joined, EngineInput(*(each[rows] for each in given)), start, actions, part)
-            out[rows] = part.reshape(-1, n, horizon, k, 6)
+            run((), given, starts, inputs, out.reshape(-1, horizon, k, 6))
+        else:
+            # each choice of the bodies that joints hold is a world of its own
+            choices, which = np.unique(given.indices, axis=0, return_inverse=True)
+            for i, choice in enumerate(choices):
+                joined = tuple((int(a), int(b)) for a, b in choice)
+                rows = which.ravel() == i
+                part = np.full((int(rows.sum()) * n, horizon, k, 6), np.nan)
+                own = starts[rows] if len(starts) > 1 else starts
+                run(joined, EngineInput(*(array[rows] for array in given)), own, inputs, part)
+                out[rows] = part.reshape(-1, n, horizon, k, 6)
+        for i, sensor, values in self._properties.sensors(proposals):
+            out[..., i, :] = sensor.measure(out[..., i, :], values)
         return out if phi.ndim == 2 else out[0]
+
+    def _inputs(self, actions: Array) -> tuple[Array, Clock | None]:
+        """What the engine's loop looks at, and when the intervals are."""
+        if not needs_inputs(self.effects):
+            return np.ascontiguousarray(actions[..., :3]), None
+        if actions.shape[-1] == 3:
+            previous = np.zeros_like(actions)
+            previous[:, 1:] = actions[:, :-1]
+            later = np.full_like(actions, np.inf)
+            actions = np.concatenate([actions, previous, later], axis=-1)
+        when = actions[:, :, 0, 6:].reshape(1, -1, 3)
+        return actions, Clock(*np.moveaxis(when, -1, 0))
+
+    def _states(self, phi: Array, measured: Array) -> Array:
+        """States from what was measured, shape (1 or proposal, transition, body, 6)."""
+        sensors = self._properties.sensors(phi)
+        if not sensors:
+            return measured[None]
+        states = np.repeat(measured[None], len(phi), axis=0)
+        for i, sensor, values in reversed(sensors):
+            flat = {name: value[..., 0] for name, value in values.items()}
+            states[:, :, i] = sensor.invert(states[:, :, i], flat)
+        # a hinged body's place follows from its angle
+        names = [body.name for body in self.scene.dynamic]
+        hung = [names.index(name) for name in hung_bodies(self.scene)]
+        states[:, :, hung, 0:2] = states[:, :, hung, 3:5] = np.nan
+        fill_hinges(states, self.scene)
+        return states
 
     def jacobian(self, phi: Array, start: Array, actions: Array) -> Array:
         """Derivative of the predictions by phi, by central differences in one batched call.
@@ -184,12 +222,15 @@ class Simulator:
                 f"start has shape {start.shape}, expected (transition, {k}, 6)"
                 " in the order x, y, theta, vx, vy, omega"
             )
-        if actions.ndim != 4 or actions.shape[0] != len(start) or actions.shape[2:] != (k, 3):
+        widths = (3, len(INPUT))
+        shaped = actions.ndim == 4 and actions.shape[0] == len(start) and actions.shape[2] == k
+        if not shaped or actions.shape[3] not in widths:
             raise SimulationError(
                 f"actions have shape {actions.shape}, expected ({len(start)}, H, {k}, 3)"
-                " in the order force_x, force_y, torque"
+                f" in the order force_x, force_y, torque, or {len(INPUT)} in place of 3:"
+                f" {', '.join(INPUT)}"
             )
-        if not (np.isfinite(start).all() and np.isfinite(actions).all()):
+        if not (np.isfinite(start).all() and np.isfinite(actions[..., :6]).all()):
             raise SimulationError("start states and actions must be finite; drop the missing rows")
 
     @cached_property
@@ -207,12 +248,25 @@ class Simulator:
         return np.array(counts, dtype=np.int64), weights
 
     @cached_property
-    def _forces(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    def _commands(self) -> tuple[NDArray[Any], ...]:
+        """Address, body, first parameter and memory of each command law."""
+        memory = [
+            isinstance(one.effect.stage, Command) and one.effect.stage.memory
+            for one in at_stage(self.effects, Command)
+        ]
+        return (*self._laws(Command), np.array(memory, dtype=bool))
+
+    @cached_property
+    def _forces(self) -> tuple[NDArray[Any], ...]:
         """Address, body and first parameter of each force law."""
-        attached = [one for one in self.effects if one.effect.force is not None]
+        return self._laws(Force)
+
+    def _laws(self, kind: type) -> tuple[NDArray[Any], ...]:
+        attached = at_stage(self.effects, kind)
         names = [body.name for body in self.scene.dynamic]
         sizes = [len(one.effect.parameters) for one in attached]
-        addresses = [compiled.law_address(one.effect.force) for one in attached if one.effect.force]
+        stages = [one.effect.stage for one in attached]
+        addresses = [calls.law_address(s.law) for s in stages if isinstance(s, Command | Force)]
         return (
             np.array(addresses, dtype=np.int64),
             np.array([names.index(one.body) for one in attached], dtype=np.int64),
@@ -220,18 +274,18 @@ class Simulator:
         )
 
     def _new_world(self, joined: Joined) -> World:
-        return World(self.scene, self._properties.hinges, joined)
+        return World(self.scene, self._properties.hinges, joined, self._properties.n_discs)
 
     def _run_plain(
-        self, joined: Joined, given: EngineInput, start: Array, actions: Array, out: Array
+        self, joined: Joined, given: EngineInput, starts: Array, inputs: Array, out: Array
     ) -> None:
         for item in range(len(out)):
-            p, t = divmod(item, len(start))
-            properties = given.bodies[p], given.joints[p], given.laws[p]
+            p, t = divmod(item, len(inputs))
+            start = starts[p if len(starts) > 1 else 0, t]
             total = np.zeros_like(out[item])
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
                 states, touched = plain.rollout(
-                    self._new_world(joined), self.effects, *properties, start[t], actions[t],
+                    self._new_world(joined), self.effects, given, p, t, start, inputs[t],
                     int(count),
                 )  # fmt: skip
                 if level == 0 or np.isnan(states).any():  # diverged
@@ -243,24 +297,22 @@ class Simulator:
                 out[item] = total
 
     def _run_compiled(
-        self, joined: Joined, given: EngineInput, start: Array, actions: Array, out: Array
+        self, joined: Joined, given: EngineInput, starts: Array, inputs: Array, out: Array
     ) -> None:
         shared = (
-            given.bodies, given.joints, given.laws, *self._forces, start, actions,
+            tuple(given[:-1]), self._commands, self._forces, starts, inputs,
             self.scene.time_step, self.scene.normal_gravity, *self.levels,
         )  # fmt: skip
 
         def run(engine: _Engine, first: int, last: int) -> None:
             while first < last:
-                stop = compiled.rollout(
-                    compiled.FUNCTIONS, engine.pointers, *shared, first, last, out
-                )
+                stop = compiled.rollout(calls.FUNCTIONS, engine.pointers, *shared, first, last, out)
                 if stop < last:  # diverged: that world is spoilt, and the item is lost
                     out[stop] = np.nan
                     engine.renew(self._new_world(joined))
                 first = stop + 1
 
-        steps = len(out) * actions.shape[1] * int(self.levels[0].sum())
+        steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.threads, len(out), steps // _A_THREAD))
         with self._lock:
             engines = self._worlds.setdefault(joined, [])
@@ -298,4 +350,4 @@ class _Engine:
 
     def renew(self, world: World) -> None:
         """Take another world."""
-        self.world, self.pointers = world, compiled.pointers(world)
+        self.world, self.pointers = world, pointers(world)

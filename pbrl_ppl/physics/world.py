@@ -8,7 +8,7 @@ import numpy as np
 import pymunk
 from pymunk import autogeometry
 
-from pbrl_ppl.effects.base import hanging_body
+from pbrl_ppl.effects import hanging_body
 from pbrl_ppl.physics.properties import COLUMN, Array
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 
@@ -21,6 +21,8 @@ ITERATIONS_A_RATIO, MOST_ITERATIONS = 2, 2000
 COLLISION_SLOP = 1e-4
 #: Where bodies are parked (m), and for how long (s).
 FAR, TINY = 1e5, 1e-9
+#: Radius of a disc that is not there (m).
+NO_SIZE = 1e-9
 #: Sizes of the engine's hash tables: the least that is more than what it holds.
 _TABLES = (5, 13, 23, 47, 97, 193, 389, 769, 1543, 3079, 6151, 12289)
 #: No body is this fast (m/s or rad/s): the engine has diverged.
@@ -75,6 +77,8 @@ class World:
     joined : tuple of (int, int)
         Which of ``scene.joinable`` each joint of unknown bodies holds, in the scene's order; a pair
         of equals is no joint.
+    discs : int
+        Static discs beside those of the scene; their places and sizes are properties.
     """
 
     def __init__(
@@ -82,6 +86,7 @@ class World:
         scene: Scene,
         hinges: tuple[bool, ...] = (),
         joined: tuple[tuple[int, int], ...] = (),
+        discs: int = 0,
     ) -> None:
         self.scene = scene
         self.space = pymunk.Space()
@@ -92,8 +97,14 @@ class World:
         self.wheels: list[Wheel] = []
         self.links: list[Link] = []
         self.pivots: list[Pivot] = []
+        self.discs: list[pymunk.Circle] = []
         self._by_name: dict[str, pymunk.Body] = {WORLD: self.space.static_body}
         self._add_fixed()
+        for j in range(discs):
+            self.discs.append(
+                pymunk.Circle(self.space.static_body, NO_SIZE, (-FAR, -FAR * (j + 1)))
+            )
+            self._add_static(self.discs[j])
         for i, body in enumerate(scene.dynamic):
             rigid = pymunk.Body(1.0, 1.0)
             rigid.position = FAR * (i + 1.0), FAR
@@ -108,7 +119,7 @@ class World:
         self._add_joints(hinges, joined)
         #: Which bodies are joined to other moving ones.
         self.chained = np.logical_not(self.can_touch.all(axis=1))
-        alone = len(scene.bodies) == 1 and not scene.walls
+        alone = len(scene.bodies) == 1 and not scene.walls and not discs
         self.iterations = (
             ITERATIONS_CHAINED if self.chained.any() else ITERATIONS_ALONE if alone else ITERATIONS
         )
@@ -120,6 +131,7 @@ class World:
             for body in scene.bodies
             if body.static and body.pose is not None
         ]
+        fixed += [(-FAR, -FAR, -FAR, -FAR, NO_SIZE)] * discs  # the last ones
         self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
 
     def _add_shapes(self) -> None:
@@ -200,6 +212,16 @@ class World:
         self.space.add(motor, damper)
         hanging = self._by_name[hanging_body(self.scene, joint)]
         self.pivots.append(Pivot(self.bodies.index(hanging), motor, damper))
+
+    def set_discs(self, discs: Array) -> None:
+        """Place the hidden discs; x, y and radius, shape (disc, 3). One without radius is away."""
+        first = len(self.obstacles) - len(self.discs)
+        for j, (shape, (x, y, radius)) in enumerate(zip(self.discs, discs, strict=True)):
+            there = (x, y, radius) if radius > 0 else (-FAR, -FAR * (j + 1), NO_SIZE)
+            shape.unsafe_set_offset(there[:2])
+            shape.unsafe_set_radius(there[2])
+            self.space.reindex_shape(shape)
+            self.obstacles[first + j] = (*there[:2], *there)
 
     def set_properties(self, bodies: Array, joints: Array) -> None:
         """Give the engine its numbers; shapes (body, column) and (joint, column)."""

@@ -81,8 +81,8 @@ def test_an_effect_that_can_do_nothing_is_refused() -> None:
         dataclasses.replace(drag, name="linear drag")
     with pytest.raises(EffectError, match="no parameters"):
         dataclasses.replace(drag, parameters=())
-    with pytest.raises(EffectError, match="no physics"):
-        dataclasses.replace(drag, force=None)
+    with pytest.raises(EffectError, match="expected one of Structure"):
+        dataclasses.replace(drag, stage=None)
     below = EffectParameter("coefficient", "kg/s", Prior("half_normal"), null=-1.0)
     with pytest.raises(EffectError, match=r"null value -1\.0 of coefficient"):
         dataclasses.replace(drag, parameters=(below,))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator, compiled
+from pbrl_ppl.physics import Simulator, calls
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.worlds import G, body
 
@@ -51,7 +51,7 @@ def simulator() -> Simulator:
     return Simulator(scene, build_layout(scene), threads=2)
 
 
-@pytest.mark.skipif(not compiled.AVAILABLE, reason="the plain path would take an hour")
+@pytest.mark.skipif(not calls.AVAILABLE, reason="the plain path would take an hour")
 def test_ten_million_steps_leak_nothing() -> None:
     sim = simulator()
     rng = np.random.default_rng(1)
@@ -76,7 +76,7 @@ def test_ten_million_steps_leak_nothing() -> None:
     assert peak() - before < 8
 
 
-@pytest.mark.skipif(not compiled.AVAILABLE, reason="the plain path builds its worlds in each call")
+@pytest.mark.skipif(not calls.AVAILABLE, reason="the plain path builds its worlds in each call")
 def test_lost_worlds_are_freed() -> None:
     sim = simulator()
     start = np.zeros((200, 3, 6))

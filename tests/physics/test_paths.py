@@ -9,12 +9,12 @@ from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import Simulator, compiled
+from pbrl_ppl.physics import Simulator, calls
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.worlds import G, body, simulator, state
 
 pytestmark = pytest.mark.skipif(
-    not compiled.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
+    not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
 )
 BOX = Shape.box(0.9, 0.55)
 ARM = Shape.box(0.03, 0.4)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pbrl_ppl.physics import compiled
+from pbrl_ppl.physics import calls
 
 CODE = """
 from concurrent.futures import ThreadPoolExecutor
@@ -22,7 +22,7 @@ raise SystemExit(not all((result == expected).all() for result in results))
 """
 
 
-@pytest.mark.skipif(not compiled.AVAILABLE, reason="the plain path builds its worlds in each call")
+@pytest.mark.skipif(not calls.AVAILABLE, reason="the plain path builds its worlds in each call")
 def test_calls_at_the_same_time_do_not_disturb_each_other() -> None:
     """Chains in threads share the Op; the engine would abort the whole process, hence a child."""
     root = Path(__file__).parents[2]

@@ -5,9 +5,9 @@ import warnings
 
 import numpy as np
 import pytest
+from pbrl_ppl.effects.base import Effect, EffectParameter
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects.base import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode

@@ -1,26 +1,23 @@
-"""What an effect is: a name, parameters with priors and units, and a piece of physics."""
+"""An effect: a name, parameters with priors and units, and the stage at which it acts."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import InitVar, dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.effects.stages import STAGES, Command, Force, Law, Properties, Stage
 from pbrl_ppl.errors import EffectError
+from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.scene import WORLD, Body, Joint, Scene
+from pbrl_ppl.scene import Body, Scene
 
-#: ``force(state, command, parameters, wrench)``: adds to ``wrench`` (force_x, force_y, torque) in
-#: place, given one body's state (6,), the commanded wrench (3,) and the effect's parameters (q,).
-#: It runs inside the compiled substep loop: plain arithmetic and ``math`` only.
-Force = Callable[[Any, Any, Any, Any], None]
-
-#: ``modify(properties, parameters)``: changes the engine's properties of one body in place, both
-#: dicts of arrays with one entry a proposal; keys as in ``pbrl_ppl.physics.properties``.
-Modify = Callable[[dict[str, NDArray[np.float64]], dict[str, NDArray[np.float64]]], None]
+#: ``scan(scene, history, body) -> (look, q)``: values of the parameters at which an effect is tried
+#: where its derivative at the null vanishes. NaN leaves a parameter at its null value, where the
+#: derivative is taken.
+Scan = Callable[[Scene, History, Body], NDArray[np.float64]]
 
 
 def always(scene: Scene, body: Body) -> bool:
@@ -64,24 +61,32 @@ class Effect:
         What it means, for a reader who knows no statistics.
     reference : str
         Where the law is from.
-    force : callable, optional
-        ``force(state, command, parameters, wrench)``; see :data:`Force`.
-    modify : callable, optional
-        ``modify(properties, parameters)``; see :data:`Modify`.
+    stage : Structure, Properties, Command, Force, Sensor or Noise
+        What it changes; see :mod:`pbrl_ppl.effects.stages`. Those of an earlier stage act first,
+        whatever the order of the effects.
     applies : callable
         ``applies(scene, body) -> bool``.
+    scan : callable, optional
+        Where to look for it if its derivative at the null vanishes; see :data:`Scan`.
+    force : callable, optional
+        Short for ``stage=Force(force)``.
+
+    Raises
+    ------
+    EffectError
+        If it has no name, no parameters or no stage, or a null value outside its prior's support.
 
     Examples
     --------
-    >>> from pbrl_ppl.parameters.priors import Prior
-    >>> def force(state, command, parameters, wrench):
+    >>> from pbrl_ppl.parameters import Prior
+    >>> def law(state, command, parameters, wrench):
     ...     wrench[0] -= parameters[0] * state[3] ** 3
     >>> cubic_drag = Effect(
     ...     "cubic_drag_x",
     ...     (EffectParameter("coefficient", "N s^3/m^3", Prior("half_normal", sigma=10.0)),),
     ...     "a force against the motion along x that grows with the cube of the speed",
     ...     "an example",
-    ...     force=force,
+    ...     Force(law),
     ... )
     >>> cubic_drag.on("cart").body
     'cart'
@@ -91,18 +96,25 @@ class Effect:
     parameters: tuple[EffectParameter, ...]
     sentence: str
     reference: str
-    force: Force | None = None
-    modify: Modify | None = None
+    stage: Stage = None  # type: ignore[assignment]  # never None once made
     applies: Callable[[Scene, Body], bool] = always
+    scan: Scan | None = None
+    force: InitVar[Law | None] = None
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, force: Law | None) -> None:
         """Refuse an effect that cannot do anything."""
         if not self.name.isidentifier():
             raise EffectError(f"effect name {self.name!r} is not an identifier; use letters and _")
         if not self.parameters:
             raise EffectError(f"effect {self.name} has no parameters; give it at least one")
-        if self.force is None and self.modify is None:
-            raise EffectError(f"effect {self.name} has no physics; give it force= or modify=")
+        if force is not None and self.stage is None:
+            object.__setattr__(self, "stage", Force(force))
+        elif force is not None or not isinstance(self.stage, STAGES):
+            names = ", ".join(stage.__name__ for stage in STAGES)
+            raise EffectError(
+                f"effect {self.name}: stage is {self.stage!r}, expected one of {names}, or a law"
+                " as force="
+            )
         for parameter in self.parameters:
             lower, upper = parameter.prior.support
             if not lower <= parameter.null <= upper:
@@ -135,36 +147,19 @@ class Attached:
     @property
     def variables(self) -> tuple[str, ...]:
         """Names of its parameters' random variables in a model."""
-        return tuple(self.effect.variable(each) for each in self.effect.parameters)
+        return tuple(self.effect.variable(parameter) for parameter in self.effect.parameters)
 
 
-def is_pivoted(scene: Scene, body: Body) -> bool:
-    """Whether the body hangs in a hinge; the friction of a hinge belongs to the body that does."""
-    return any(hanging_body(scene, joint) == body.name for joint in _hinges(scene))
+def at_stage(effects: tuple[Attached, ...], stage: type) -> list[Attached]:
+    """Those that act at a stage, in their order."""
+    return [attached for attached in effects if isinstance(attached.effect.stage, stage)]
 
 
-def _hinges(scene: Scene) -> list[Joint]:
-    return [joint for joint in scene.joints if joint.kind == "hinge" and joint.bodies]
-
-
-def hanging_body(scene: Scene, joint: Joint) -> str:
-    """Name of the body that hangs in a hinge: the one farther from the world along the hinges.
-
-    Raises
-    ------
-    EffectError
-        If which bodies the hinge joins is not known.
-    """
-    if joint.bodies is None:
-        raise EffectError("which bodies the hinge joins is to be inferred; none hangs in it yet")
-    fixed = {WORLD, *(body.name for body in scene.bodies if body.static)}
-    depth = dict.fromkeys(fixed, 0)
-    pairs = [each.bodies for each in _hinges(scene) if each.bodies]
-    for _ in pairs:
-        for pair in pairs:
-            for near, far in (pair, pair[::-1]):
-                if near in depth and far not in depth:
-                    depth[far] = depth[near] + 1
-    # of two bodies that nothing ties to the world, the second hangs on the first
-    first, second = joint.bodies
-    return first if depth.get(first, 0) > depth.get(second, 1) else second
+def needs_inputs(effects: tuple[Attached, ...]) -> bool:
+    """Whether an effect looks at the command before, or at the clock."""
+    stages = [attached.effect.stage for attached in effects]
+    return any(
+        (isinstance(stage, Command) and stage.memory)
+        or (isinstance(stage, Properties) and stage.timed)
+        for stage in stages
+    )
