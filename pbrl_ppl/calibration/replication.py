@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -115,7 +114,7 @@ def simulated(design: Problem, values: Array) -> Problem:
     observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)
     observed[..., list(observations.columns)] = np.where(observations.measured, values, np.nan)
     history = from_segments(design.scene, segments.start, segments.actions, observed)
-    return replace(design, history=history)
+    return design.with_data(history=history)
 
 
 def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, Any]) -> Record:
@@ -179,7 +178,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
 
 def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
     """What is ranked, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
-    if problem.scalar_sigma:
+    if problem.noise.scalar:
         sigma = sigma[:, :1]
     return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])
 
@@ -187,5 +186,5 @@ def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -
 def labels(problem: Problem) -> tuple[str, ...]:
     """Names of what is ranked, such as ``mass[cart]``."""
     names = problem.observations.names
-    sigma = ("sigma",) if problem.scalar_sigma else tuple(f"sigma[{name}]" for name in names)
+    sigma = ("sigma",) if problem.noise.scalar else tuple(f"sigma[{name}]" for name in names)
     return (*problem.layout.labels, *sigma, "log_likelihood")

@@ -151,7 +151,7 @@ def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) 
     }
     return PriorCheck(
         dataset.assign_coords(coords),
-        problem.horizon * problem.scene.time_step,
+        problem.data.horizon * problem.scene.time_step,
         draws,
         int(draws - good.sum()),
     )

@@ -114,17 +114,17 @@ def choose_modes(
     typical = np.log(median)
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
     every = np.ones(len(typical))
-    if problem.scalar_sigma:
+    if problem.noise.scalar:
         typical, counts = typical.mean(keepdims=True), counts.sum(keepdims=True)
 
     def density(log_sigma: Array) -> Array:
         sigma = np.exp(log_sigma) * every
-        each = [logsumexp(part.log_joint(sigma, problem.nu), axis=1) for part in parts]
+        each = [logsumexp(part.log_joint(sigma, problem.noise.nu), axis=1) for part in parts]
         prior = -0.5 * (((log_sigma - typical) / spread) ** 2).sum(axis=1)
         return np.asarray(np.sum(each, axis=0) + prior)
 
     begin = np.log(_rough_sigma(problem, parts, median))
-    begin = begin.mean(keepdims=True) if problem.scalar_sigma else begin
+    begin = begin.mean(keepdims=True) if problem.noise.scalar else begin
     found = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
     # log sigma of n residuals has about this precision; wider, for modes that mix
     shape = _WIDER**2 / (2.0 * counts + spread**-2.0)
@@ -146,7 +146,7 @@ def choose_modes(
         sigmas.append(np.exp(log_sigma))
         modes = np.zeros((draws, len(problem.scene.dynamic)), dtype=np.intp)
         for own, part in zip(parts, problem.simulator.parts, strict=True):
-            joint = own.log_joint(np.exp(log_sigma) * every, problem.nu)
+            joint = own.log_joint(np.exp(log_sigma) * every, problem.noise.nu)
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
             modes[:, part.bodies] = own.indices[which]

@@ -7,7 +7,6 @@ import json
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
 from pbrl_ppl.history import STATE, History, Segments, from_segments
-from pbrl_ppl.model import Modes, Observations, Problem, sigma_prior
+from pbrl_ppl.model import Modes, Noise, Observations, Problem, sigma_prior
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws
 from pbrl_ppl.posterior.identification import uninformed
@@ -135,7 +134,7 @@ def evaluate(
     """
     likelihood = np.empty((len(phi), problem.segments.n))
     predictive = []
-    wide = replace(problem, threads=max(problem.threads, 2))
+    wide = problem.with_physics(threads=max(problem.physics.threads, 2))
     size = max(_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE // problem.segments.n)
     for begin in range(0, len(phi), size):
         part = slice(begin, begin + size)
@@ -186,16 +185,19 @@ def problem_of(
         none = np.zeros(len(start), dtype=np.int64)
         segments = Segments(start, actions, observed, none, none)
         median, spread = sigma_prior(Observations(values, columns), segments)
-    return Problem(
-        scene=scene,
-        history=from_segments(scene, start, actions, observed) if history is None else history,
-        effects=attach(scene, (), effects),
+    noise = Noise(
+        scalar="state" not in group(idata, "posterior")["sigma"].dims,
+        nu=float(attrs["nu"]) if "nu" in attrs else None,
+        prior=(tuple(float(each) for each in median), float(spread)),
+    )
+    return Problem.of(
+        scene,
+        from_segments(scene, start, actions, observed) if history is None else history,
+        attach(scene, (), effects),
         horizon=int(attrs["horizon"]),
         substeps=int(attrs["substeps"]),
-        scalar_sigma="state" not in group(idata, "posterior")["sigma"].dims,
-        nu=float(attrs["nu"]) if "nu" in attrs else None,
-        sigma_prior=(tuple(float(each) for each in median), float(spread)),
         columns=columns,
+        noise=noise,
         modes=Modes.from_json(str(attrs["modes"])) if "modes" in attrs else None,
     )
 
@@ -238,21 +240,21 @@ def _origin(problem: Problem, seed: int) -> dict[str, Any]:
     for body in scene.dynamic:
         new = [
             one.effect.name
-            for one in problem.effects
+            for one in problem.physics.effects
             if one.body == body.name and one.effect.name not in body.effects
         ]
         scene = scene.with_effects(body.name, *new)
     return attributes(
         scene,
-        effects=[[one.effect.name, one.body] for one in problem.effects],
+        effects=[[one.effect.name, one.body] for one in problem.physics.effects],
         seed=seed,
-        horizon=problem.horizon,
-        **({} if problem.nu is None else {"nu": problem.nu}),
+        horizon=problem.data.horizon,
+        **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
         **({} if problem.modes is None else {"modes": problem.modes.to_json()}),
-        substeps=problem.substeps,
+        substeps=problem.physics.substeps,
         sigma_prior=[[float(each) for each in median], float(spread)],
-        start_noise=int(problem.noise is not None),
-        data_sha256=problem.history.data_sha256,
+        start_noise=int(problem.noise.start is not None),
+        data_sha256=problem.data.history.data_sha256,
         versions=versions(),
     )
 
@@ -326,7 +328,7 @@ def _trouble(
                 " shape and the frame of the body, or look for an effect that the model lacks"
                 " (pbrl-ppl close-loop)",
             )
-    silent = uninformed(idata, effects={one.effect for one in problem.effects})
+    silent = uninformed(idata, effects={one.effect for one in problem.physics.effects})
     if silent:
         yield (
             UninformedWarning,

@@ -93,7 +93,8 @@ def _metropolis(job: Job) -> Any:
     else:
         jumps = None
     # an exact step of one block, in engine steps; where that is little, looking ahead is no use
-    cost = problem.simulator.steps * problem.segments.n * problem.horizon / len(problem.parts)
+    engine = problem.simulator
+    cost = engine.steps * problem.segments.n * problem.data.horizon / len(engine.parts)
     if cost > _LITTLE:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
@@ -325,7 +326,7 @@ def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:
     problem = model.problem
     phi, sigma, mode, accepted = choose_modes(problem, draws, chains, seed)
     values: dict[str, Any] = problem.layout.to_dict(phi)
-    values |= {"mode": mode, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
+    values |= {"mode": mode, "sigma": sigma[..., 0] if problem.noise.scalar else sigma}
     return as_trace(model, values, {"accept": accepted})
 
 

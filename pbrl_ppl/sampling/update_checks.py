@@ -93,7 +93,7 @@ def check_engine(idata: Any, problem: Problem) -> None:
     some = {"transition": slice(_CHECKED)}
     few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
     held = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
-    first = problem_of(held, {one.effect for one in problem.effects})
+    first = problem_of(held, {one.effect for one in problem.physics.effects})
     phi, sigma = parameter_draws(problem, idata)
     now = first.log_density(first.residual(phi[0]), sigma[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()

@@ -294,7 +294,7 @@ def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
 def _walkers(problem: Problem, like: xr.Dataset, phi: Array, sigma: Array) -> xr.Dataset:
     """Vectors (draw, p) and (draw, state) as named draws, shaped like others."""
     named = problem.layout.to_dict(phi)
-    named["sigma"] = sigma[:, 0] if problem.scalar_sigma else sigma
+    named["sigma"] = sigma[:, 0] if problem.noise.scalar else sigma
     return like.assign(
         {
             name: (like[name].dims, values.reshape(like[name].shape))

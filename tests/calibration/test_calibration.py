@@ -17,7 +17,7 @@ from pbrl_ppl.calibration.replication import Record, Truth, draw_truths, simulat
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, build_model, physics_model
+from pbrl_ppl.model import Noise, Problem, build_model, physics_model
 from pbrl_ppl.report import plots
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.model.test_model import CART, OBJECT_MODE, cart_scene, simulated_history
@@ -252,7 +252,7 @@ def test_sigma_s_prior_is_the_design_s(puck: tuple[Scene, History]) -> None:
     """Whatever is simulated, sigma has the prior that it was drawn from."""
     scene, history = puck
     design = design_of(history, scene)
-    fixed = Problem(scene, history, (), 1, 2, sigma_prior=((0.5,) * 6, 1.5))
+    fixed = Problem.of(scene, history, substeps=2, noise=Noise(prior=((0.5,) * 6, 1.5)))
     point = {"mass_log__": np.zeros(1), "sigma_log__": np.linspace(-1.0, 1.0, 6)}
     densities = []
     for problem in (fixed, simulated(fixed, 7.0 * design.observations.values)):

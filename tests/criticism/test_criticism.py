@@ -33,7 +33,7 @@ QUICK = {"angular_drag", "push_offset"}
 
 
 def mode_of(scene, history, horizon=1, initial=None):
-    problem = Problem(scene, history, attach(scene), horizon, scene.substeps, threads=2)
+    problem = Problem.of(scene, history, attach(scene), horizon=horizon, threads=2)
     mode = find_mode(problem, seed=3, initial=initial)
     for _ in range(2):
         mode = find_mode(with_start_noise(mode.problem, mode), initial=mode.phi)
@@ -42,7 +42,7 @@ def mode_of(scene, history, horizon=1, initial=None):
 
 def ranked(scene, history, **options):
     mode = mode_of(scene, history, **options)
-    return rank_candidates(mode, candidates(scene, mode.problem.effects))
+    return rank_candidates(mode, candidates(scene, mode.problem.physics.effects))
 
 
 @pytest.fixture(scope="module")

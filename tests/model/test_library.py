@@ -79,7 +79,7 @@ def test_ambiguous_modes_have_the_brute_force_probabilities(names) -> None:
         noise=(0.01, 0.01, 0.01, 0.04, 0.04, 0.1), substeps=4,
     )  # fmt: skip
     model = physics_model(scene, history, modes=modes, sigma="scalar")
-    assert len(model.problem.parts) == len(names)
+    assert len(model.problem.simulator.parts) == len(names)
     idata = quick(model)
     expected = brute_force(model.problem, modes)
     assert (expected > 0.005).sum() >= 2

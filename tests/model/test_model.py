@@ -113,7 +113,11 @@ def expected_logp(model: pm.Model, point: Mapping[str, np.ndarray], priors) -> f
     problem = model.problem
     layout, segments = problem.layout, problem.segments
     simulator = Simulator(
-        problem.scene, layout, problem.effects, substeps=problem.substeps, path="plain"
+        problem.scene,
+        layout,
+        problem.physics.effects,
+        substeps=problem.physics.substeps,
+        path="plain",
     )
     predicted = simulator(layout.to_vector(point), segments.start, segments.actions)
     residual = segments.observed - predicted
@@ -127,7 +131,7 @@ def expected_logp(model: pm.Model, point: Mapping[str, np.ndarray], priors) -> f
     change = segments.observed - segments.start[:, None]
     change[..., 2] = np.angle(np.exp(1j * change[..., 2]))
     median = 0.1 * np.sqrt(np.nanmean(change[..., measured] ** 2, axis=(0, 1, 2)))
-    if problem.scalar_sigma:
+    if problem.noise.scalar:
         median = np.exp(np.log(median).mean())
     return total + stats.lognorm(s=2.0, scale=median).logpdf(point["sigma"]).sum()
 

@@ -199,7 +199,7 @@ def test_evidence_is_that_of_a_fine_grid() -> None:
             (pm.TruncatedNormal.dist(mu=0.5, sigma=1.0, lower=0.0, upper=1.0), grid[:, 1]),
         )
     )
-    model = physics_model(problem.scene, problem.history, sigma="scalar")
+    model = physics_model(problem.scene, problem.data.history, sigma="scalar")
     law = model["sigma"]
     sigma = np.exp(log_sigma)
     of_sigma = pm.logp(law, sigma).eval() + log_sigma  # d sigma = sigma d log sigma

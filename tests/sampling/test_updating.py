@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -250,8 +249,8 @@ def test_old_files_have_no_prior_of_the_noise(parts, first, one) -> None:
     np.testing.assert_array_equal(draws(again)["mass"], draws(one)["mass"])
     problem = problem_of(from_groups(groups(first), attrs))
     median, spread = json.loads(first.attrs["sigma_prior"])
-    np.testing.assert_allclose(problem.sigma_prior[0], median)
-    assert problem.sigma_prior[1] == spread
+    np.testing.assert_allclose(problem.noise.prior[0], median)
+    assert problem.noise.prior[1] == spread
 
 
 @pytest.mark.slow
@@ -265,7 +264,7 @@ def test_other_data_are_fitted_anew(parts, first) -> None:
     assert [each.filename for each in caught if each.category is RefitWarning] == [__file__]
     assert did(idata) == ["refitted"]
     assert "before_updates" not in groups(idata)
-    problem = replace(problem_of(first), history=problem_of(idata).history)
+    problem = problem_of(first).with_data(history=problem_of(idata).data.history)
     assert problem.segments.n == 100
     agree(idata, quiet(fit, build_model(problem), seed=10, **QUICK))
 
