@@ -7,13 +7,14 @@ from types import ModuleType
 import pytest
 from hypothesis import settings
 
+from pbrl_ppl.state import STATE, WRENCH
+
 # the same examples everywhere, and no test that fails because a machine is slow
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
 ROOT = Path(__file__).parents[1]
-STATE = ["x", "y", "theta", "vx", "vy", "omega"]
-COLUMNS = ["trajectory", "step", "time", "body", *STATE, "force_x", "force_y", "torque"]
+COLUMNS = ["trajectory", "step", "time", "body", *STATE, *WRENCH]
 
 
 @pytest.fixture(scope="session")

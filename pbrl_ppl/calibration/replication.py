@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.calibration.ranks import MOST_DRAWS, rank
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
-from pbrl_ppl.history import STATE, from_segments
+from pbrl_ppl.history import from_segments
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws
 from pbrl_ppl.sampling import fit
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 #: One replication's numbers, by name, each a list over the parameters.

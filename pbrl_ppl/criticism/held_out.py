@@ -12,9 +12,10 @@ from scipy.special import logsumexp
 from pbrl_ppl.criticism.findings import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import STATE_UNITS, Problem, StartNoise
+from pbrl_ppl.model import Problem, StartNoise
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
+from pbrl_ppl.state import STATE_UNITS
 
 Array = NDArray[np.float64]
 

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.criticism.findings import Unexplained
-from pbrl_ppl.model import STATE
 from pbrl_ppl.modes import Mode
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 

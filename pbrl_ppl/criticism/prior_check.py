@@ -14,8 +14,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import STATE, STATE_UNITS, Problem
+from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import HDI_PROB, group
+from pbrl_ppl.state import STATE, STATE_UNITS
 
 Array = NDArray[np.float64]
 

@@ -1,13 +1,11 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
 from pbrl_ppl.history.files import write_atomically
-from pbrl_ppl.history.history import STATE, STATE_UNITS, History, Segments
+from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
 from pbrl_ppl.history.start import fill_hinges, lever
 
 __all__ = [
-    "STATE",
-    "STATE_UNITS",
     "History",
     "Segments",
     "fill_hinges",

@@ -12,8 +12,9 @@ import numpy.typing as npt
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.files import COLUMNS, STATE, WRENCH
+from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.state import STATE, WRENCH
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]

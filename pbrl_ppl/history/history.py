@@ -14,18 +14,14 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.files import STATE, WRENCH, read_table, to_table, write_dataset
+from pbrl_ppl.history.files import read_table, to_table, write_dataset
 from pbrl_ppl.history.rows import arrays
 from pbrl_ppl.history.start import complete_start
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-
-__all__ = ["STATE", "STATE_UNITS", "WRENCH", "WRENCH_UNITS", "History", "Segments"]
-
-STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
-WRENCH_UNITS = ("N", "N", "N m")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pbrl_ppl.history.history import STATE, WRENCH, History
+from pbrl_ppl.history.history import History
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE, WRENCH
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.cells import Floats, Ints, Rows, read_rows
-from pbrl_ppl.history.files import WRENCH
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import WRENCH
 
 TIME_TOLERANCE = 0.01
 """How far an interval may be from the scene's time step, as a share of it."""

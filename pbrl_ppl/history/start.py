@@ -7,8 +7,8 @@ import numpy.typing as npt
 from scipy.signal import savgol_filter
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.files import STATE
 from pbrl_ppl.scene import WORLD, Point, Scene
+from pbrl_ppl.state import STATE
 
 Floats = npt.NDArray[np.float64]
 

@@ -4,8 +4,6 @@ from pbrl_ppl.model.data import Data
 from pbrl_ppl.model.declaration import build_model, physics_model
 from pbrl_ppl.model.library import Modes
 from pbrl_ppl.model.likelihood import (
-    STATE,
-    STATE_UNITS,
     Observations,
     StartNoise,
     estimate_sigma,
@@ -22,8 +20,6 @@ from pbrl_ppl.model.table1 import build_layout
 from pbrl_ppl.model.transition import Transition
 
 __all__ = [
-    "STATE",
-    "STATE_UNITS",
     "Data",
     "Modes",
     "Noise",

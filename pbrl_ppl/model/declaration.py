@@ -13,13 +13,14 @@ import pytensor.tensor as pt
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.history import History
 from pbrl_ppl.model.library import Modes
-from pbrl_ppl.model.likelihood import STATE, StartNoise, next_state_logp, next_state_random
+from pbrl_ppl.model.likelihood import StartNoise, next_state_logp, next_state_random
 from pbrl_ppl.model.noise import Noise
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.parameters import Block, Layout
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE, WRENCH
 
 
 def physics_model(
@@ -204,7 +205,7 @@ def _coords(problem: Problem) -> dict[str, Any]:
         "body": [body.name for body in problem.scene.dynamic],
         "full_state": list(STATE),
         "state": list(problem.observations.names),
-        "wrench": ["force_x", "force_y", "torque"],
+        "wrench": list(WRENCH),
         "transition": np.arange(segments.n),
         "step": np.arange(1, problem.data.horizon + 1),
     }

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.history import STATE, segment_rows, write_atomically
+from pbrl_ppl.history import segment_rows, write_atomically
 from pbrl_ppl.physics import check_placement, overlap
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
@@ -24,6 +24,7 @@ from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.risk import tail_mean
 from pbrl_ppl.planning.search import Found
 from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
-from pbrl_ppl.history import STATE, History, Segments, from_segments
+from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.model import Modes, Noise, Observations, Problem, sigma_prior
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws
@@ -29,6 +29,7 @@ from pbrl_ppl.posterior.store import (
     groups,
     scene_of,
 )
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 

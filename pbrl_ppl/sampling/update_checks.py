@@ -9,8 +9,9 @@ import numpy as np
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import STATE, Problem
+from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, scene_of
+from pbrl_ppl.state import STATE
 
 #: With fewer draws there is nothing to choose from.
 _LEAST_DRAWS = 100

@@ -11,8 +11,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pbrl_ppl.errors import HistoryError, OutputError
-from pbrl_ppl.history.history import STATE, WRENCH, History
+from pbrl_ppl.history import History
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl.state import STATE, WRENCH
 
 DATA = Path(__file__).parents[2].parent / "shared" / "data"
 needs_data = pytest.mark.skipif(

@@ -13,10 +13,11 @@ from scipy import stats
 
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import EffectError, HistoryError, SimulationError
-from pbrl_ppl.history.history import STATE, WRENCH, History
+from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, StartNoise, build_layout, physics_model
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl.state import STATE, WRENCH
 
 MODELS = Path(__file__).parents[2] / "models"
 BY_NAME = {effect.name: effect for effect in catalogue}

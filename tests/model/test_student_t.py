@@ -13,6 +13,7 @@ from pbrl_ppl.model.likelihood import log_density, next_state_logp, next_state_r
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws
 from pbrl_ppl.sampling import fit
+from pbrl_ppl.state import STATE
 from tests.model.test_model import CART, NOISE, cart_scene, simulated_history
 
 NU = 4.0
@@ -33,7 +34,7 @@ def spoilt(scene, clean) -> History:
     """One next state in twelve is off by 20 to 60 standard deviations, as after a hidden bump."""
     rng = np.random.default_rng(12)
     frame: pd.DataFrame = clean.to_dataframe()
-    columns = ["x", "y", "theta", "vx", "vy", "omega"]
+    columns = list(STATE)
     # the last row of a trajectory is nobody's start state
     last = frame.groupby("trajectory").tail(1).index[::2]
     off = rng.uniform(20, 60, (len(last), 6)) * rng.choice([-1, 1], (len(last), 6))

@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError, PosteriorError, UninformedWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.model import STATE, Problem, build_layout, physics_model
+from pbrl_ppl.model import Problem, build_layout, physics_model
 from pbrl_ppl.modes import Mode, find_mode, weigh
 from pbrl_ppl.modes.configurations import (
     ATTRIBUTE,
@@ -42,7 +42,8 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling import fit, mixture
 from pbrl_ppl.scene import WORLD, Joint, Scene, Shape
-from tests.model.test_model import WRENCH, simulated_history
+from pbrl_ppl.state import STATE, WRENCH
+from tests.model.test_model import simulated_history
 from tests.modes.test_joints import HINGED, reference_anchors, scene
 from tests.worlds import G, body
 

@@ -26,9 +26,9 @@ from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.report import plots, report
 from pbrl_ppl.report.report import FILES, Loop, number, render, verdict_in_words
 from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.state import STATE, STATE_UNITS
 
 DRAG = "a force against the motion that grows with the speed"
-STATE = ("x", "y", "theta", "vx", "vy", "omega")
 
 
 def idata(posterior: dict[str, np.ndarray], dims: dict[str, list[str]]) -> Any:
@@ -162,7 +162,7 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Findings:
             "cart",
             time,
             STATE,
-            ("m", "m", "rad", "m/s", "m/s", "rad/s"),
+            STATE_UNITS,
             measured.T,
             off.T if found else wrapped.T,
             wrapped.T,
