@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.effects import Attached, Effect, EffectParameter, catalogue
     from pbrl_ppl.errors import PbrlError
     from pbrl_ppl.history import History, Segments
-    from pbrl_ppl.model import Modes, SimulatorOp, Transition, physics_model
+    from pbrl_ppl.model import ParameterLibrary, SimulatorOp, Transition, physics_model
     from pbrl_ppl.modes import joint_probabilities
     from pbrl_ppl.parameters import Prior
     from pbrl_ppl.physics import Simulator
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from pbrl_ppl.posterior import (
         Identifiability,
         identify,
-        learned_modes,
+        learned_library,
+        library_probabilities,
         load_posterior,
-        mode_probabilities,
         save_posterior,
         uninformed,
         updated_scene,
@@ -52,7 +52,7 @@ __all__ = [
     "Identifiability",
     "Joint",
     "Loop",
-    "Modes",
+    "ParameterLibrary",
     "PbrlError",
     "Plan",
     "Prior",
@@ -72,9 +72,9 @@ __all__ = [
     "fit",
     "identify",
     "joint_probabilities",
-    "learned_modes",
+    "learned_library",
+    "library_probabilities",
     "load_posterior",
-    "mode_probabilities",
     "physics_model",
     "plan",
     "prior_predictive_check",
@@ -110,7 +110,7 @@ _MODULES = {
         "Segments",
     ),
     "model": (
-        "Modes",
+        "ParameterLibrary",
         "SimulatorOp",
         "Transition",
         "physics_model",
@@ -130,9 +130,9 @@ _MODULES = {
     "posterior": (
         "Identifiability",
         "identify",
-        "learned_modes",
+        "learned_library",
         "load_posterior",
-        "mode_probabilities",
+        "library_probabilities",
         "save_posterior",
         "uninformed",
         "updated_scene",

@@ -2,7 +2,7 @@
 
 from pbrl_ppl.model.data import Data
 from pbrl_ppl.model.declaration import build_model, physics_model
-from pbrl_ppl.model.library import Modes
+from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
     Observations,
     StartNoise,
@@ -21,9 +21,9 @@ from pbrl_ppl.model.transition import Transition
 
 __all__ = [
     "Data",
-    "Modes",
     "Noise",
     "Observations",
+    "ParameterLibrary",
     "Physics",
     "Problem",
     "SimulatorOp",

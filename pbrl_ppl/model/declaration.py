@@ -12,7 +12,7 @@ import pytensor.tensor as pt
 
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.history import History
-from pbrl_ppl.model.library import Modes
+from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import StartNoise, next_state_logp, next_state_random
 from pbrl_ppl.model.noise import Noise
 from pbrl_ppl.model.op import SimulatorOp
@@ -34,7 +34,7 @@ def physics_model(
     substeps: int | None = None,
     noise: StartNoise | None = None,
     threads: int = 1,
-    modes: Modes | None = None,
+    library: ParameterLibrary | None = None,
 ) -> pm.Model:
     """Declare the model of the paper's section 3.2 for a scene and a history.
 
@@ -60,9 +60,9 @@ def physics_model(
         exact, as in the paper.
     threads : int
         Engine worlds that run side by side within one evaluation.
-    modes : Modes, optional
+    library : ParameterLibrary, optional
         Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
-        ``mode`` holds the bodies' choices, and the parameters follow from it.
+        ``library_index`` holds the bodies' choices, and the parameters follow from it.
 
     Returns
     -------
@@ -79,9 +79,9 @@ def physics_model(
         If bodies start deep inside each other or a wall, or a hinge's bodies apart.
     ValueError
         If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0, or both
-        ``modes`` and ``noise`` are given.
+        ``library`` and ``noise`` are given.
     ParameterError
-        If ``modes`` do not fit the scene's bodies.
+        If the library does not fit the scene's bodies.
 
     Examples
     --------
@@ -101,8 +101,10 @@ def physics_model(
         raise ValueError(f"horizon is {horizon}, expected at least 1")
     if nu is not None and not 0 < nu < np.inf:
         raise ValueError(f"nu is {nu}, expected degrees of freedom above 0, or None for a Gaussian")
-    if modes is not None and noise is not None:
-        raise ValueError("modes and noise are given; modes take start states as exact: drop noise")
+    if library is not None and noise is not None:
+        raise ValueError(
+            "library and noise are given; a library takes start states as exact: drop noise"
+        )
     problem = Problem.of(
         scene,
         history,
@@ -111,7 +113,7 @@ def physics_model(
         substeps=substeps,
         threads=threads,
         noise=Noise(scalar=sigma == "scalar", start=noise, nu=nu),
-        modes=modes,
+        library=library,
     )
     return build_model(problem)
 
@@ -130,8 +132,8 @@ def build_model(problem: Problem) -> pm.Model:
         )
         # Table 1
         table1: dict[str, Any] = {}
-        if problem.modes is not None:
-            table1 = _chosen(problem, problem.modes)
+        if problem.library is not None:
+            table1 = _chosen(problem, problem.library)
         else:
             for block in layout.blocks:
                 index = _index(block, layout, table1)
@@ -164,14 +166,15 @@ def build_model(problem: Problem) -> pm.Model:
     return model
 
 
-def _chosen(problem: Problem, modes: Modes) -> dict[str, Any]:
-    """Which mode each body has, and the parameters that follow from that."""
+def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
+    """Which parameter set each body has, and the parameters that follow from that."""
     names = [body.name for body in problem.scene.dynamic]
-    table = modes.table(problem.layout, problem.scene)
-    mode = pm.Categorical("mode", p=np.stack([modes.prior(name) for name in names]), dims="body")
+    table = library.table(problem.layout, problem.scene)
+    p = np.stack([library.prior(name) for name in names])
+    index = pm.Categorical("library_index", p=p, dims="body")
     result = {}
     for block, place in problem.layout.slices():
-        own = mode[[names.index(owner) for owner in block.owners]]
+        own = index[[names.index(owner) for owner in block.owners]]
         value = pt.as_tensor(table[place])[np.arange(len(block.owners)), own]
         result[block.name] = pm.Deterministic(block.name, value, dims=_dim(problem, block))
     return result

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.history import History, Segments, fill_hinges
 from pbrl_ppl.model.data import Data
-from pbrl_ppl.model.library import Modes
+from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import Observations, log_density, next_state_random, whiten
 from pbrl_ppl.model.noise import Noise, sigma_prior
 from pbrl_ppl.model.physics import Physics
@@ -37,14 +37,14 @@ class Problem:
         What predicts them.
     noise : Noise
         How they scatter about the predictions.
-    modes : Modes, optional
+    library : ParameterLibrary, optional
         Parameter sets of which each body has one, in place of Table 1.
     """
 
     data: Data
     physics: Physics
     noise: Noise
-    modes: Modes | None = None
+    library: ParameterLibrary | None = None
 
     @classmethod
     def of(
@@ -58,7 +58,7 @@ class Problem:
         threads: int = 1,
         columns: tuple[int, ...] | None = None,
         noise: Noise | None = None,
-        modes: Modes | None = None,
+        library: ParameterLibrary | None = None,
     ) -> Problem:
         """Build one from a scene and a history; by default all is as in the paper.
 
@@ -75,7 +75,7 @@ class Problem:
                 threads,
             ),
             Noise() if noise is None else noise,
-            modes,
+            library,
         )
 
     def with_data(self, **changes: Any) -> Problem:

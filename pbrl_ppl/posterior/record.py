@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
 from pbrl_ppl.history import History, Segments, from_segments
-from pbrl_ppl.model import Modes, Noise, Observations, Problem, sigma_prior
+from pbrl_ppl.model import Noise, Observations, ParameterLibrary, Problem, sigma_prior
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws
 from pbrl_ppl.posterior.identification import uninformed
@@ -199,7 +199,7 @@ def problem_of(
         substeps=int(attrs["substeps"]),
         columns=columns,
         noise=noise,
-        modes=Modes.from_json(str(attrs["modes"])) if "modes" in attrs else None,
+        library=ParameterLibrary.from_json(str(attrs["library"])) if "library" in attrs else None,
     )
 
 
@@ -215,7 +215,7 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
 def _folded(problem: Problem, trace: Any) -> xr.Dataset:
     """The posterior with each wheel in one of its equal descriptions, the same in all chains."""
     posterior = group(trace, "posterior").copy(deep=True)
-    if problem.modes is not None:  # the draws are the modes' own
+    if problem.library is not None:  # the draws are the library's own
         return posterior
     layout = problem.layout
     phi, _ = parameter_draws(problem, trace)
@@ -251,7 +251,7 @@ def _origin(problem: Problem, seed: int) -> dict[str, Any]:
         seed=seed,
         horizon=problem.data.horizon,
         **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
-        **({} if problem.modes is None else {"modes": problem.modes.to_json()}),
+        **({} if problem.library is None else {"library": problem.library.to_json()}),
         substeps=problem.physics.substeps,
         sigma_prior=[[float(each) for each in median], float(spread)],
         start_noise=int(problem.noise.start is not None),
@@ -313,7 +313,7 @@ def _trouble(
             f" (want <= {MAX_RHAT}), effective sample size {ess[worst_ess]:.0f} for {worst_ess}"
             f" (want >= {MIN_ESS}); {more}",
         )
-    if problem.modes is not None:  # what follows compares with Table 1
+    if problem.library is not None:  # what follows compares with Table 1
         return
     phi, _ = parameter_draws(problem, idata)
     ends = problem.layout.supports(phi)

@@ -164,7 +164,7 @@ def _updated(
             return checked(problem, result), how | {"did": "reweighted"}
     # from here on all data are needed
     whole = problem_of(from_groups(groups(idata) | data, idata.attrs), effects)
-    if share < _REFIT or heavy or whole.modes is not None:  # modes cannot be moved by steps
+    if share < _REFIT or heavy or whole.library is not None:  # sets cannot be moved by steps
         why = f"their tail has a shape k of {k:.2g}" if heavy else f"worth {share:.1%} of the draws"
         warnings.warn(
             f"update: the new data leave the posterior so far behind ({why}) that all of them are"
