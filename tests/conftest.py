@@ -7,22 +7,19 @@ from types import ModuleType
 import pytest
 from hypothesis import settings
 
+from tests.helpers.places import RECORDED, ROOT
+
 # the same examples everywhere, and no test that fails because a machine is slow
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
-
-ROOT = Path(__file__).parents[1]
-STATE = ["x", "y", "theta", "vx", "vy", "omega"]
-COLUMNS = ["trajectory", "step", "time", "body", *STATE, "force_x", "force_y", "torque"]
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of recorded histories beside the project; tests on it are skipped where it is not."""
-    folder = ROOT.parent / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip(f"no recorded histories at {folder}")
-    return folder
+    if not RECORDED.is_dir():
+        pytest.skip(f"no recorded histories at {RECORDED}")
+    return RECORDED
 
 
 @pytest.fixture(scope="session")

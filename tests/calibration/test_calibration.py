@@ -20,7 +20,9 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_model, physics_model
 from pbrl_ppl.report import plots
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
-from tests.model.test_model import CART, OBJECT_MODE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
+from tests.helpers.marks import OBJECT_MODE
 
 # from here on every model is also drawn from
 pytestmark = OBJECT_MODE

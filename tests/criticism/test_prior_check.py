@@ -9,10 +9,11 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism.prior_check import QUANTILES, prior_predictive_check
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.history import History
+from pbrl_ppl.history import STATE, History
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.report import plots
-from tests.model.test_model import CART, STATE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
 
 
 @pytest.fixture(scope="module")

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.history.history import STATE, WRENCH, History
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from tests.helpers.places import RECORDED
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
 needs_data = pytest.mark.skipif(
-    not DATA.is_dir(), reason="../shared/data is not beside the repository"
+    not RECORDED.is_dir(), reason="../shared/data is not beside the repository"
 )
 
 BOX = Shape.box(0.2, 0.4)
@@ -59,7 +59,7 @@ def test_arrays_hold_the_rows() -> None:
 
 @needs_data
 def test_all_the_data_loads() -> None:
-    paths = sorted(DATA.rglob("*.csv"))
+    paths = sorted(RECORDED.rglob("*.csv"))
     assert paths
     for path in paths:
         scene = Scene.load(path.parent / "scene.toml")

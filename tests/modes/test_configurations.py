@@ -14,7 +14,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError, PosteriorError, UninformedWarning
-from pbrl_ppl.history import History
+from pbrl_ppl.history.history import WRENCH, History
 from pbrl_ppl.model import STATE, Problem, build_layout, physics_model
 from pbrl_ppl.modes import Mode, find_mode, weigh
 from pbrl_ppl.modes.configurations import (
@@ -42,9 +42,9 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling import fit, mixture
 from pbrl_ppl.scene import WORLD, Joint, Scene, Shape
-from tests.model.test_model import WRENCH, simulated_history
-from tests.modes.test_joints import HINGED, reference_anchors, scene
-from tests.worlds import G, body
+from tests.helpers.histories import simulated_history
+from tests.helpers.joints import HINGED, reference_anchors, scene
+from tests.helpers.worlds import G, body
 
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

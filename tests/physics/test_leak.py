@@ -9,7 +9,7 @@ import pytest
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.physics import Simulator, compiled
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-from tests.worlds import G, body
+from tests.helpers.worlds import G, body
 
 pytestmark = pytest.mark.slow
 MIB = (
