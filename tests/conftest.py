@@ -13,6 +13,36 @@ from tests.helpers.places import RECORDED, ROOT
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
+#: Rooms below the model: their tests are the same whatever generation of PyMC and ArviZ is there.
+BELOW_THE_MODEL = ("scene", "parameters", "history", "effects", "physics")
+#: Files that take longest, longest first: workers begin with them, and fill up with the short ones.
+LONGEST = (
+    "criticism/test_revision.py",
+    "modes/test_configurations.py",
+    "sampling/test_updating.py",
+    "posterior/test_updated_prior.py",
+    "sampling/test_fitting.py",
+    "criticism/test_criticism.py",
+    "domains/test_namo.py",
+    "planning/test_planning_modes.py",
+    "planning/test_planning_loop.py",
+)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what one generation is enough for, and put the longest files first."""
+    tests = ROOT / "tests"
+
+    def place(item: pytest.Item) -> int:
+        name = item.path.relative_to(tests).as_posix() if tests in item.path.parents else ""
+        return LONGEST.index(name) if name in LONGEST else len(LONGEST)
+
+    for item in items:
+        if item.path.parent.parent == tests and item.path.parent.name in BELOW_THE_MODEL:
+            item.add_marker("one_stack")
+    items.sort(key=place)
+
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:

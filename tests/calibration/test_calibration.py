@@ -542,7 +542,7 @@ def test_processes_give_the_same_numbers(puck: tuple[Scene, History]) -> None:
     xr.testing.assert_identical(here.dataset, there.dataset)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cart_is_calibrated() -> None:
     """The whole pipeline on 12 transitions of a wheeled cart; false-alarm rate 2 %, fixed seed."""
     scene = cart_scene(prior=PRIOR, known={"r": 0.2, "mu_c": 0.3}).replace(substeps=5)
