@@ -20,7 +20,9 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Noise, Problem, build_model, physics_model
 from pbrl_ppl.report import plots
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
-from tests.model.test_model import CART, OBJECT_MODE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
+from tests.helpers.marks import OBJECT_MODE
 
 # from here on every model is also drawn from
 pytestmark = OBJECT_MODE
@@ -540,7 +542,7 @@ def test_processes_give_the_same_numbers(puck: tuple[Scene, History]) -> None:
     xr.testing.assert_identical(here.dataset, there.dataset)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cart_is_calibrated() -> None:
     """The whole pipeline on 12 transitions of a wheeled cart; false-alarm rate 2 %, fixed seed."""
     scene = cart_scene(prior=PRIOR, known={"r": 0.2, "mu_c": 0.3}).replace(substeps=5)

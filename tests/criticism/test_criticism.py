@@ -13,7 +13,8 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import find_mode, with_start_noise
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.conftest import COLUMNS, ROOT
+from tests.helpers.histories import COLUMNS
+from tests.helpers.places import ROOT
 
 EFFECTS = {effect.name: effect for effect in catalogue}
 

@@ -14,10 +14,10 @@ from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
+from tests.helpers.places import RECORDED
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
 needs_data = pytest.mark.skipif(
-    not DATA.is_dir(), reason="../shared/data is not beside the repository"
+    not RECORDED.is_dir(), reason="../shared/data is not beside the repository"
 )
 
 BOX = Shape.box(0.2, 0.4)
@@ -60,7 +60,7 @@ def test_arrays_hold_the_rows() -> None:
 
 @needs_data
 def test_all_the_data_loads() -> None:
-    paths = sorted(DATA.rglob("*.csv"))
+    paths = sorted(RECORDED.rglob("*.csv"))
     assert paths
     for path in paths:
         scene = Scene.load(path.parent / "scene.toml")

@@ -20,7 +20,9 @@ from pbrl_ppl.posterior import save_posterior as save
 from pbrl_ppl.posterior.store import az, convergence, draws, from_groups, group, load_posterior
 from pbrl_ppl.sampling import fit, update
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
-from tests.model.test_model import MODELS, OBJECT_MODE, simulated_history
+from tests.helpers.histories import simulated_history
+from tests.helpers.marks import OBJECT_MODE
+from tests.helpers.places import MODELS
 
 KNOWN = {"r": 0.2, "mu_c": 0.3}
 NOISE = (0.002, 0.002, 0.004, 0.01, 0.01, 0.02)

@@ -14,7 +14,8 @@ from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.state import STATE
-from tests.model.test_model import CART, NOISE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import NOISE, simulated_history
 
 NU = 4.0
 

@@ -43,9 +43,9 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.sampling import fit, mixture
 from pbrl_ppl.scene import WORLD, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
-from tests.model.test_model import simulated_history
-from tests.modes.test_joints import HINGED, reference_anchors, scene
-from tests.worlds import G, body
+from tests.helpers.histories import simulated_history
+from tests.helpers.joints import HINGED, reference_anchors, scene
+from tests.helpers.worlds import G, body
 
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

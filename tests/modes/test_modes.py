@@ -14,7 +14,8 @@ from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.numerics import differentiate
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.scene import Scene
-from tests.model.test_model import CART, NOISE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import NOISE, simulated_history
 
 WHEEL = ("w_x", "w_y", "w_theta", "mu_x", "mu_y")
 # r and mu_c matter in contacts only, and there is none

@@ -14,7 +14,8 @@ from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import draws, identify, uninformed
 from pbrl_ppl.sampling import fit
-from tests.model.test_model import CART, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
 
 CONTACT = {"r": 0.2, "mu_c": 0.3}
 QUICK = {"draws": 500, "tune": 300, "chains": 2, "cores": 1, "progress": False}

@@ -36,7 +36,8 @@ from pbrl_ppl.posterior.store import (
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.sampling.starts import unconstrain
 from pbrl_ppl.scene import Shape
-from tests.model.test_model import CART, NOISE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import NOISE, simulated_history
 
 PARAMETERS = ("mass", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
 UNITS = ("kg", "m", "m", "rad", "1", "1")

@@ -38,7 +38,8 @@ from pbrl_ppl.posterior.store import (
 from pbrl_ppl.sampling import fit, update
 from pbrl_ppl.sampling.rejuvenation import _Mover, rejuvenate
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.model.test_model import CART, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
 
 KNOWN = {"r": 0.2, "mu_c": 0.3}
 PUCKS = {"mass": [2.0, 3.0], "linear_drag_coefficient": [0.5, 1.0]}

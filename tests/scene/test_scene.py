@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
+from tests.helpers.places import RECORDED
 
 CART = """
 [world]
@@ -65,9 +64,9 @@ def test_python_mappings_equal_toml() -> None:
     assert body == Scene.from_toml(CART).body("cart")
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not beside the repository")
+@pytest.mark.skipif(not RECORDED.is_dir(), reason="../shared/data is not beside the repository")
 def test_reads_every_scene_of_the_data() -> None:
-    paths = sorted(DATA.rglob("scene.toml"))
+    paths = sorted(RECORDED.rglob("scene.toml"))
     assert paths
     for path in paths:
         scene = Scene.load(path)
