@@ -115,7 +115,7 @@ class Modes:
             If a joint is to be inferred, a mode lacks a parameter, has one that no body has, or has
             a value that a body cannot have while the mode is possible for it.
         """
-        bodies = [body.name for body in scene.dynamic]
+        bodies = [body.name for body in scene.moving]
         for name, _ in self.probabilities or ():
             if name not in (*bodies, *self.names):
                 raise ParameterError(
@@ -123,7 +123,7 @@ class Modes:
                     f"{nearest(name, (*bodies, *self.names))}"
                 )
         wanted = [block.name for block in layout.blocks]
-        known = {key for body in scene.dynamic for key, _ in body.known}
+        known = {key for body in scene.moving for key, _ in body.known}
         for name, values in self.sets:
             for key in dict(values):
                 if key not in wanted and key not in known:

@@ -206,6 +206,9 @@ class Problem:
         result = []
         for body in range(k):
             for column, h in zip(columns, steps, strict=True):
+                if self.scene.moving[body].kinematic:  # its path is given, not measured
+                    result.append(np.zeros((n, self.observations.values[0].size)))
+                    continue
                 plus, minus = raw.copy(), raw.copy()
                 plus[:, body, column] += h
                 minus[:, body, column] -= h
@@ -300,6 +303,12 @@ def physics_model(
         raise ValueError(f"nu is {nu}, expected degrees of freedom above 0, or None for a Gaussian")
     if modes is not None and noise is not None:
         raise ValueError("modes and noise are given; modes take start states as exact: drop noise")
+    longest = int(history.dataset["n_rows"].max()) - 1
+    if horizon > longest:
+        raise HistoryError(
+            f"horizon is {horizon} intervals, and the longest trajectory has {longest}; use a"
+            " shorter horizon"
+        )
     problem = Problem(
         scene=scene,
         history=history,
@@ -364,7 +373,7 @@ def build_model(problem: Problem) -> pm.Model:
 
 def _chosen(problem: Problem, modes: Modes) -> dict[str, Any]:
     """Which mode each body has, and the parameters that follow from that."""
-    names = [body.name for body in problem.scene.dynamic]
+    names = [body.name for body in problem.scene.moving]
     table = modes.table(problem.layout, problem.scene)
     mode = pm.Categorical("mode", p=np.stack([modes.prior(name) for name in names]), dims="body")
     result = {}
@@ -417,7 +426,7 @@ def _coords(problem: Problem) -> dict[str, Any]:
     """Coordinates by name: every dimension of the model says what it runs over."""
     segments = problem.segments
     coords: dict[str, Any] = {
-        "body": [body.name for body in problem.scene.dynamic],
+        "body": [body.name for body in problem.scene.moving],
         "full_state": list(STATE),
         "state": list(problem.observations.names),
         "wrench": ["force_x", "force_y", "torque"],
@@ -433,6 +442,6 @@ def _dim(problem: Problem, block: Block) -> str:
     """``body`` where all moving bodies have the parameter, else a dimension of its own."""
     if block.of == "joint":
         return "joint" if not block.name.startswith("i_") else "free_joint"
-    if len(block.owners) == len(problem.scene.dynamic):
+    if len(block.owners) == len(problem.scene.moving):
         return "body"
     return f"{block.effect or block.name}_body"
