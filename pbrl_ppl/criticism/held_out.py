@@ -132,7 +132,7 @@ class HeldOut:
         ]
         origin = np.where(np.isfinite(start[0, body]), start[0, body], np.nan)
         return Rollout(
-            body=scene.dynamic[body].name,
+            body=scene.moving[body].name,
             time=np.arange(length + 1, dtype=float) * scene.time_step,
             names=problem.observations.names,
             units=tuple(STATE_UNITS[d] for d in columns),

@@ -146,7 +146,7 @@ def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) 
     predicted = observations.wrapped(ends - first)
     dataset = _compare(predicted, measured)
     coords = {
-        "body": [body.name for body in problem.scene.dynamic],
+        "body": [body.name for body in problem.scene.moving],
         "state": list(observations.names),
         "quantile": list(QUANTILES),
     }

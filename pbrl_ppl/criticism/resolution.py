@@ -35,7 +35,7 @@ def choose_horizon(mode: Mode) -> Mode:
         mode = noisy(mode if horizon == 1 else find_mode(problem, initial=mode.phi))
         noise = mode.problem.noise.start
         gain = noise.gain if noise else np.ones((1, 1))
-        cells = len(mode.problem.scene.dynamic) * len(mode.sigma)  # of the last interval
+        cells = len(mode.problem.scene.moving) * len(mode.sigma)  # of the last interval
         spread = np.sqrt(np.maximum(gain[:, -cells:] ** 2 - 1.0, 0.0))
         worst = float(np.median(spread, axis=0).max())
         tried.append((worst, mode))

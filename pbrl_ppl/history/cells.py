@@ -75,7 +75,7 @@ def read_rows(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
         raise HistoryError(f"{source}: it has no rows; expected one for each body at each step")
 
     labels, trajectory = _trajectories(frame["trajectory"], line)
-    known = [body.name for body in scene.dynamic]
+    known = [body.name for body in scene.moving]
     body = _bodies(frame["body"], line, known, scene)
 
     def numbers(name: str) -> Floats:

@@ -11,6 +11,7 @@ import pymc as pm
 import pytensor.tensor as pt
 
 from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import StartNoise, next_state_logp, next_state_random
@@ -105,6 +106,12 @@ def physics_model(
         raise ValueError(
             "library and noise are given; a library takes start states as exact: drop noise"
         )
+    longest = int(history.dataset["n_rows"].max()) - 1
+    if horizon > longest:
+        raise HistoryError(
+            f"horizon is {horizon} intervals, and the longest trajectory has {longest}; use a"
+            " shorter horizon"
+        )
     problem = Problem.of(
         scene,
         history,
@@ -168,7 +175,7 @@ def build_model(problem: Problem) -> pm.Model:
 
 def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
     """Which parameter set each body has, and the parameters that follow from that."""
-    names = [body.name for body in problem.scene.dynamic]
+    names = [body.name for body in problem.scene.moving]
     table = library.table(problem.layout, problem.scene)
     p = np.stack([library.prior(name) for name in names])
     index = pm.Categorical("library_index", p=p, dims="body")
@@ -205,7 +212,7 @@ def _coords(problem: Problem) -> dict[str, Any]:
     """Coordinates by name: every dimension of the model says what it runs over."""
     segments = problem.segments
     coords: dict[str, Any] = {
-        "body": [body.name for body in problem.scene.dynamic],
+        "body": [body.name for body in problem.scene.moving],
         "full_state": list(STATE),
         "state": list(problem.observations.names),
         "wrench": list(WRENCH),
@@ -221,6 +228,6 @@ def _dim(problem: Problem, block: Block) -> str:
     """``body`` where all moving bodies have the parameter, else a dimension of its own."""
     if block.of == "joint":
         return "joint" if not block.name.startswith("i_") else "free_joint"
-    if len(block.owners) == len(problem.scene.dynamic):
+    if len(block.owners) == len(problem.scene.moving):
         return "body"
     return f"{block.effect or block.name}_body"

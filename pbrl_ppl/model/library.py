@@ -116,7 +116,7 @@ class ParameterLibrary:
             If a joint is to be inferred, a set lacks a parameter, has one that no body has, or has
             a value that a body cannot have while the set is possible for it.
         """
-        bodies = [body.name for body in scene.dynamic]
+        bodies = [body.name for body in scene.moving]
         for name, _ in self.probabilities or ():
             if name not in (*bodies, *self.names):
                 raise ParameterError(
@@ -124,7 +124,7 @@ class ParameterLibrary:
                     f"{nearest(name, (*bodies, *self.names))}"
                 )
         wanted = [block.name for block in layout.blocks]
-        known = {key for body in scene.dynamic for key, _ in body.known}
+        known = {key for body in scene.moving for key, _ in body.known}
         for name, values in self.sets:
             for key in dict(values):
                 if key not in wanted and key not in known:

@@ -48,7 +48,11 @@ class Observations:
             d for d in range(len(STATE)) if observed.size and np.isfinite(observed[..., d]).any()
         )
         if not measured:
-            raise HistoryError("history: it has no measured next state; record at least two rows")
+            raise HistoryError(
+                "history: it has no measured next state within"
+                f" {segments.horizon} interval{'s' * (segments.horizon > 1)} of a complete state;"
+                " use a longer horizon, or record more"
+            )
         columns = measured if columns is None else columns
         return cls(observed[..., columns], columns)
 

@@ -60,7 +60,7 @@ class _EngineOp(Op):
         SimulationError
             If an input has the wrong number of dimensions or a static shape that does not fit.
         """
-        k, p = len(self.scene.dynamic), self.layout.size
+        k, p = len(self.scene.moving), self.layout.size
         inputs = []
         for name, value, shape in (
             ("phi", phi, (p,)),
@@ -125,7 +125,7 @@ class SimulatorOp(_EngineOp):
 
     @property
     def _last(self) -> tuple[int, ...]:
-        return len(self.scene.dynamic), 6
+        return len(self.scene.moving), 6
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         return self.simulator.recall(phi, start, actions)
@@ -151,7 +151,7 @@ class JacobianOp(_EngineOp):
 
     @property
     def _last(self) -> tuple[int, ...]:
-        return len(self.scene.dynamic), 6, self.layout.size
+        return len(self.scene.moving), 6, self.layout.size
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         return self.simulator.jacobian(phi, start, actions)

@@ -197,6 +197,9 @@ class Problem:
         result = []
         for body in range(k):
             for column, h in zip(columns, steps, strict=True):
+                if self.scene.moving[body].kinematic:  # its path is given, not measured
+                    result.append(np.zeros((n, self.observations.values[0].size)))
+                    continue
                 plus, minus = raw.copy(), raw.copy()
                 plus[:, body, column] += h
                 minus[:, body, column] -= h

@@ -230,7 +230,7 @@ def _states(problem: Problem, body: str) -> Array:
     rows = rows[:: -(-len(rows) // _ROWS)]
     if body == WORLD:
         return np.zeros((len(rows), 6))
-    names = [each.name for each in problem.scene.dynamic]
+    names = [each.name for each in problem.scene.moving]
     return np.asarray(rows[:, names.index(body)])
 
 

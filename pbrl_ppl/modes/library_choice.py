@@ -30,7 +30,7 @@ class _Combinations:
     """Every combination of parameter sets of one part's bodies: its prior and its residuals."""
 
     def __init__(self, problem: Problem, part: Part, table: Array) -> None:
-        names = [body.name for body in problem.scene.dynamic]
+        names = [body.name for body in problem.scene.moving]
         bodies = [names[i] for i in part.bodies]
         library = problem.library
         if library is None:
@@ -144,14 +144,14 @@ def choose_from_library(
         accepted.append(moved.reshape(draws, _THIN).mean(axis=1))
         log_sigma = x[kept[drawn]]
         sigmas.append(np.exp(log_sigma))
-        index = np.zeros((draws, len(problem.scene.dynamic)), dtype=np.intp)
+        index = np.zeros((draws, len(problem.scene.moving)), dtype=np.intp)
         for own, part in zip(parts, problem.simulator.parts, strict=True):
             joint = own.log_joint(np.exp(log_sigma) * every, problem.noise.nu)
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
             index[:, part.bodies] = own.indices[which]
         chosen.append(index)
-    names = [body.name for body in problem.scene.dynamic]
+    names = [body.name for body in problem.scene.moving]
     owners = [owner for block in problem.layout.blocks for owner in block.owners]
     every_index = np.stack(chosen)
     of = every_index[..., [names.index(owner) for owner in owners]]

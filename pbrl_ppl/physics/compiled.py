@@ -192,6 +192,7 @@ class Pointers(NamedTuple):
     chained: NDArray[np.bool_]
     padding: int
     bodies: NDArray[np.int64]
+    kinematic: NDArray[np.bool_]
     shapes: NDArray[np.int64]
     shape_body: NDArray[np.int64]
     wheels: NDArray[np.int64]  # (2, wheel): the rod along x, the rod along y
@@ -223,6 +224,7 @@ def pointers(world: World) -> Pointers:
         chained=world.chained,
         padding=world.padding,
         bodies=at([body._body for body in world.bodies]),
+        kinematic=world.kinematic,
         shapes=at([shape._shape for _, shape in world.shapes]),
         shape_body=whole([i for i, _ in world.shapes]),
         wheels=np.stack(
@@ -263,6 +265,8 @@ def _iterations(world, bodies):  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def _set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     for i in range(len(world.bodies)):
+        if world.kinematic[i]:
+            continue
         _call1(fn.cpBodySetMass, world.bodies[i], bodies[i, _MASS])
         _call1(fn.cpBodySetMoment, world.bodies[i], bodies[i, _MOMENT])
     for j in range(len(world.shapes)):
@@ -358,6 +362,17 @@ def _near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-unt
 
 
 @numba.njit(nogil=True, cache=True)
+def _drive(fn, world, state, action):  # type: ignore[no-untyped-def]
+    """Give the kinematic bodies the velocities of the interval that begins."""
+    for i in range(len(world.bodies)):
+        if world.kinematic[i]:
+            for w in range(3):
+                state[i, 3 + w] = action[i, w]
+            _call2(fn.cpBodySetVelocity, world.bodies[i], action[i, 0], action[i, 1])
+            _call1(fn.cpBodySetAngularVelocity, world.bodies[i], action[i, 2])
+
+
+@numba.njit(nogil=True, cache=True)
 def _transition(  # type: ignore[no-untyped-def]
     fn, world, bodies, forces, force_body, force_offset, laws, start, actions, step, substeps, out
 ):
@@ -381,6 +396,7 @@ def _transition(  # type: ignore[no-untyped-def]
     state_at, command_at = state.ctypes.data, command.ctypes.data
     wrench_at, laws_at = wrench.ctypes.data, laws.ctypes.data
     for h in range(len(actions)):
+        _drive(fn, world, state, actions[h])
         for _ in range(substeps):
             for i in range(k):
                 for w in range(3):
@@ -397,6 +413,8 @@ def _transition(  # type: ignore[no-untyped-def]
                     wrench_at + 24 * i,
                 )
             for i in range(k):
+                if world.kinematic[i]:
+                    continue
                 _call2(fn.cpBodySetForce, world.bodies[i], wrench[i, 0], wrench[i, 1])
                 _call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
             for j in range(len(world.wheel_body)):

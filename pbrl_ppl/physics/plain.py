@@ -38,7 +38,8 @@ def rollout(
     start : ndarray
         Start state, shape (body, 6), SI units.
     actions : ndarray
-        Wrench held over each interval, shape (H, body, 3), N and N m.
+        Wrench held over each interval, shape (H, body, 3), N and N m; of a kinematic body its
+        velocity, m/s and rad/s.
     substeps : int
         Engine steps an interval.
 
@@ -54,13 +55,14 @@ def rollout(
         body.position, body.angle = tuple(state[:2]), state[2]
         body.velocity, body.angular_velocity = tuple(state[3:5]), state[5]
     scene = world.scene
-    names = [body.name for body in scene.dynamic]
+    names = [body.name for body in scene.moving]
     forces = [one for one in effects if one.effect.force is not None]
     offsets = np.cumsum([0, *(len(one.effect.parameters) for one in forces)])
     step = scene.time_step / substeps
     states = np.empty((len(actions), len(names), 6))
     touched = False
     for h, action in enumerate(actions):
+        _drive(world, action)
         for _ in range(substeps):
             wrench = action.copy()
             for one, begin, end in zip(forces, offsets[:-1], offsets[1:], strict=True):
@@ -69,6 +71,8 @@ def rollout(
                     state = _state(world, i)
                     one.effect.force(state, action[i], laws[begin:end], wrench[i])
             for i, body in enumerate(world.bodies):
+                if world.kinematic[i]:
+                    continue
                 body.force, body.torque = tuple(wrench[i, :2]), wrench[i, 2]
             _place_wheels(world, bodies, step)
             world.space.step(step)
@@ -79,6 +83,13 @@ def rollout(
         for i in range(len(names)):
             states[h, i] = _state(world, i)
     return states, touched
+
+
+def _drive(world: World, action: Array) -> None:
+    """Give the kinematic bodies the velocities of the interval that begins."""
+    for i in np.flatnonzero(world.kinematic):
+        body = world.bodies[i]
+        body.velocity, body.angular_velocity = tuple(action[i, :2]), action[i, 2]
 
 
 def _state(world: World, i: int) -> Array:

@@ -109,7 +109,8 @@ class Simulator:
         start : ndarray
             Start states, shape (transition, body, 6).
         actions : ndarray
-            Wrenches, shape (transition, H, body, 3), N and N m.
+            Wrenches, shape (transition, H, body, 3), N and N m; of a kinematic body its velocity
+            over the interval, m/s and rad/s.
 
         Returns
         -------
@@ -173,7 +174,7 @@ class Simulator:
         )  # fmt: skip
 
     def _check(self, phi: Array, start: Array, actions: Array) -> None:
-        k, p = len(self.scene.dynamic), self.layout.size
+        k, p = len(self.scene.moving), self.layout.size
         if phi.ndim not in (1, 2) or phi.shape[-1] != p:
             raise SimulationError(
                 f"phi has shape {phi.shape}, expected ({p},) or (proposal, {p}):"
@@ -199,7 +200,7 @@ class Simulator:
         The engine's error is a series in the substep (Richardson, 1911): two runs cancel its first
         term, three its second as well. Friction of a wheel has kinks that a third run amplifies.
         """
-        wheels = any(body.wheel for body in self.scene.dynamic)
+        wheels = any(body.wheel for body in self.scene.moving)
         runs = (2 if wheels else 3) if self.extrapolate else 1
         counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
         powers = np.vander(1.0 / np.array(counts), increasing=True).T
@@ -210,7 +211,7 @@ class Simulator:
     def _forces(self) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
         """Address, body and first parameter of each force law."""
         attached = [one for one in self.effects if one.effect.force is not None]
-        names = [body.name for body in self.scene.dynamic]
+        names = [body.name for body in self.scene.moving]
         sizes = [len(one.effect.parameters) for one in attached]
         addresses = [compiled.law_address(one.effect.force) for one in attached if one.effect.force]
         return (

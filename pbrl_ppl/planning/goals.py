@@ -158,13 +158,13 @@ class Goal:
         for target in self.targets:
             if target.body not in moving:
                 raise GoalError(
-                    f'goal: the scene has no moving body "{target.body}"'
+                    f'goal: the scene has no moving body "{target.body}" that can be pushed'
                     f"{nearest(target.body, moving)}"
                 )
 
     def places(self, scene: Scene) -> list[int]:
         """Where the targets' bodies are among the scene's moving ones."""
-        moving = [body.name for body in scene.dynamic]
+        moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
     def errors(self, scene: Scene, states: Array) -> Array:

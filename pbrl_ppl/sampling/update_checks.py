@@ -55,7 +55,7 @@ def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
 def check_history(idata: Any, history: History) -> None:
     """Refuse a history of other bodies, dimensions or sampling, or of nothing to go on with."""
     scene, horizon = scene_of(idata), int(idata.attrs["horizon"])
-    names = tuple(body.name for body in scene.dynamic)
+    names = tuple(body.name for body in scene.moving)
     if history.bodies != names:
         raise HistoryError(
             f"update: the history is of {', '.join(history.bodies)}, the posterior of"
@@ -66,13 +66,6 @@ def check_history(idata: Any, history: History) -> None:
         raise HistoryError(
             f"update: the history has a row each {step:g} s, the posterior's each"
             f" {scene.time_step:g} s; load it with the posterior's scene"
-        )
-    longest = int(history.dataset["n_rows"].max()) - 1
-    if longest < horizon:
-        raise HistoryError(
-            f"update: the posterior predicts {horizon} interval{'s' * (horizon > 1)} from one"
-            f" state, and the longest new trajectory has {longest}; record at least that many in"
-            " a row"
         )
     segments = history.segments(horizon)
     measured = [str(name) for name in group(idata, "observed_data")["state"].values]
