@@ -6,18 +6,28 @@ PYTEST_ARGS ?=
 BIN := $(VENV)/bin
 CART := models/shopping_cart
 
-.PHONY: demo test test-fast lint clean
+.PHONY: demo test test-fast test-generation test-long lint clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
 	$(BIN)/pbrl-ppl close-loop $(CART)/scene.toml $(CART)/recorded/train.csv \
 	    --test $(CART)/recorded/test.csv -o out/demo --overwrite
 
+# A file's fixtures are made once, by the worker that has it; tests/conftest.py has the order.
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 10
+
 test: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist worksteal --durations 10 $(PYTEST_ARGS)
+	$(PYTEST) $(PYTEST_ARGS)
 
 test-fast: $(VENV)/.installed-test
-	$(BIN)/python -m pytest -n 2 --dist worksteal -m 'not slow' $(PYTEST_ARGS)
+	$(PYTEST) -m 'not slow and not long' $(PYTEST_ARGS)
+
+# what may differ between the generations of PyMC and ArviZ
+test-generation: $(VENV)/.installed-test
+	$(PYTEST) -m 'not slow and not long and not one_stack' $(PYTEST_ARGS)
+
+test-long: $(VENV)/.installed-test
+	$(PYTEST) -m long $(PYTEST_ARGS)
 
 lint: $(VENV)/.installed-lint
 	$(BIN)/ruff check .

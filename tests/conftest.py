@@ -7,22 +7,49 @@ from types import ModuleType
 import pytest
 from hypothesis import settings
 
+from tests.helpers.places import RECORDED, ROOT
+
 # the same examples everywhere, and no test that fails because a machine is slow
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
-ROOT = Path(__file__).parents[1]
-STATE = ["x", "y", "theta", "vx", "vy", "omega"]
-COLUMNS = ["trajectory", "step", "time", "body", *STATE, "force_x", "force_y", "torque"]
+#: Rooms below the model: their tests are the same whatever generation of PyMC and ArviZ is there.
+BELOW_THE_MODEL = ("scene", "parameters", "history", "effects", "physics")
+#: Files that take longest, longest first: workers begin with them, and fill up with the short ones.
+LONGEST = (
+    "criticism/test_revision.py",
+    "modes/test_configurations.py",
+    "sampling/test_updating.py",
+    "posterior/test_updated_prior.py",
+    "sampling/test_fitting.py",
+    "criticism/test_criticism.py",
+    "domains/test_namo.py",
+    "planning/test_planning_modes.py",
+    "planning/test_planning_loop.py",
+)
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what one generation is enough for, and put the longest files first."""
+    tests = ROOT / "tests"
+
+    def place(item: pytest.Item) -> int:
+        name = item.path.relative_to(tests).as_posix() if tests in item.path.parents else ""
+        return LONGEST.index(name) if name in LONGEST else len(LONGEST)
+
+    for item in items:
+        if item.path.parent.parent == tests and item.path.parent.name in BELOW_THE_MODEL:
+            item.add_marker("one_stack")
+    items.sort(key=place)
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
     """Folder of recorded histories beside the project; tests on it are skipped where it is not."""
-    folder = ROOT.parent / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip(f"no recorded histories at {folder}")
-    return folder
+    if not RECORDED.is_dir():
+        pytest.skip(f"no recorded histories at {RECORDED}")
+    return RECORDED
 
 
 @pytest.fixture(scope="session")

@@ -1,44 +1,17 @@
 """PyMC 5 with ArviZ 0.x and PyMC 6 with ArviZ 1.x: the same posterior, and files of each other.
 
-``data/`` holds a fit of each generation; ``python -m tests.test_stacks`` writes the running one's.
+``data/`` holds a fit of each generation; ``python -m tests.helpers.stacks`` writes them.
 """
 
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from pbrl_ppl.history import History
-from pbrl_ppl.model import physics_model
 from pbrl_ppl.posterior.store import az, draws, group, load_posterior, save_posterior, scene_of
-from pbrl_ppl.sampling import fit, update
-from pbrl_ppl.scene import Body, Scene, Shape
-from tests.model.test_model import simulated_history
-
-GENERATIONS = ("5", "6")
-DATA = Path(__file__).parent / "data"
-SCENE = Scene(
-    time_step=0.1,
-    normal_gravity=9.81,
-    bodies=(Body("puck", Shape.circle(0.2), known={"r": 0.5, "mu_c": 0.3}),),
-)
-
-
-def history(seed: int, trajectories: int = 3) -> History:
-    """A pushed puck."""
-    truth = {"mass": 2.0}
-    return simulated_history(SCENE, truth, seed=seed, trajectories=trajectories, intervals=4)
-
-
-def file(generation: str) -> Path:
-    return DATA / f"puck-pymc{generation}.nc"
-
-
-def fitted() -> Any:
-    """The puck's posterior on the running generation."""
-    return fit(physics_model(SCENE, history(1)), seed=3, draws=500, chains=2, progress=False)
+from pbrl_ppl.sampling import update
+from tests.helpers.stacks import GENERATIONS, SCENE, file, fitted, history
 
 
 @pytest.fixture(scope="module")
@@ -75,8 +48,3 @@ def test_a_file_of_either_generation_is_whole_and_of_use(generation: str, tmp_pa
     save_posterior(further, tmp_path / "again.nc")
     again = load_posterior(tmp_path / "again.nc")
     np.testing.assert_array_equal(draws(again)["mass"], draws(further)["mass"])
-
-
-if __name__ == "__main__":
-    DATA.mkdir(exist_ok=True)
-    save_posterior(fitted(), file(version("pymc").split(".")[0]))

@@ -265,7 +265,7 @@ class PythonLoop(Op):
             values,
             problem.scene.dynamic[0].shape,
             problem.scene.walls,
-            problem.substeps,
+            problem.physics.substeps,
         )
 
 

@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Generator, Iterable, Mapping
 from concurrent.futures import Executor, as_completed
 from contextlib import closing
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -130,13 +129,11 @@ def calibrate(
         )
     median, spread = sigma_prior(design.observations, design.segments)
     # a prior that looked at the simulated data would not be the one they were simulated from
-    design = replace(design, sigma_prior=(tuple(median.tolist()), spread))
+    design = design.with_noise(prior=(tuple(median.tolist()), spread))
     settings = {"draws": draws, "tune": tune, "chains": chains, **options}
     about = _about(design, seed, settings)
     store = None if folder is None else _opened(Path(folder), about)
     truths, redrawn = draw_truths(design, replications, seed)
-    # without what was computed, it is small enough to send
-    design = replace(design)
     done: dict[int, Record] = {}
     failures: dict[int, str] = {}
     tasks = {}
@@ -204,14 +201,14 @@ def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str,
     """All that a replication's numbers depend on, as JSON has it."""
     about = {
         "scene": design.scene.to_toml(),
-        "history": design.history.data_sha256,
+        "history": design.data.history.data_sha256,
         "effects": [[one.effect.name, one.body, repr(one.effect.parameters)]
-                    for one in design.effects],
-        "horizon": design.horizon,
-        "substeps": design.substeps,
-        "scalar_sigma": design.scalar_sigma,
-        "nu": design.nu,
-        "sigma_prior": design.sigma_prior,
+                    for one in design.physics.effects],
+        "horizon": design.data.horizon,
+        "substeps": design.physics.substeps,
+        "scalar_sigma": design.noise.scalar,
+        "nu": design.noise.nu,
+        "sigma_prior": design.noise.prior,
         "seed": seed,
         "settings": dict(settings),
         "versions": versions(),

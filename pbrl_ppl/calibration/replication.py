@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,11 +13,12 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.calibration.ranks import MOST_DRAWS, rank
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
-from pbrl_ppl.history import STATE, from_segments
+from pbrl_ppl.history import from_segments
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws
 from pbrl_ppl.sampling import fit
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 #: One replication's numbers, by name, each a list over the parameters.
@@ -114,8 +114,8 @@ def simulated(design: Problem, values: Array) -> Problem:
     segments, observations = design.segments, design.observations
     observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)
     observed[..., list(observations.columns)] = np.where(observations.measured, values, np.nan)
-    history = from_segments(design.scene, segments.start, segments.actions, observed)
-    return replace(design, history=history)
+    history = from_segments(design.scene, segments.start, segments.inputs, observed)
+    return design.with_data(history=history)
 
 
 def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, Any]) -> Record:
@@ -179,7 +179,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
 
 def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
     """What is ranked, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
-    if problem.scalar_sigma:
+    if problem.noise.scalar:
         sigma = sigma[:, :1]
     return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])
 
@@ -187,5 +187,5 @@ def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -
 def labels(problem: Problem) -> tuple[str, ...]:
     """Names of what is ranked, such as ``mass[cart]``."""
     names = problem.observations.names
-    sigma = ("sigma",) if problem.scalar_sigma else tuple(f"sigma[{name}]" for name in names)
+    sigma = ("sigma",) if problem.noise.scalar else tuple(f"sigma[{name}]" for name in names)
     return (*problem.layout.labels, *sigma, "log_likelihood")

@@ -41,7 +41,7 @@ def _contents(scene: Scene, history: History) -> Table:
     )
     table = Table(show_header=False, box=None)
     for name, value in (
-        ("moving bodies", ", ".join(body.name for body in scene.dynamic)),
+        ("moving bodies", ", ".join(body.name for body in scene.moving)),
         ("walls, joints", f"{len(scene.walls)}, {len(scene.joints)}"),
         ("trajectories", f"{history.n_trajectories}"),
         ("transitions", f"{history.n_transitions} ({intervals} in a trajectory)"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,10 @@ from scipy.special import logsumexp
 from pbrl_ppl.criticism.findings import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import STATE_UNITS, Problem, StartNoise
+from pbrl_ppl.model import Problem, StartNoise
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
+from pbrl_ppl.state import STATE_UNITS
 
 Array = NDArray[np.float64]
 
@@ -40,9 +41,8 @@ class HeldOut:
 
     def problem(self, mode: Mode, horizon: int | None = None) -> Problem:
         """A mode's problem on the held-out history, with its start noise linearised there."""
-        problem = replace(
-            mode.problem, history=self.history, noise=None, horizon=horizon or mode.problem.horizon
-        )
+        length = mode.problem.data.horizon if horizon is None else horizon
+        problem = mode.problem.with_data(history=self.history, horizon=length)
         if problem.observations.columns != mode.problem.observations.columns:
             raise HistoryError(
                 f"test history measures {', '.join(problem.observations.names)}, the training"
@@ -50,7 +50,7 @@ class HeldOut:
             )
         measured = problem.observations.measured.reshape(problem.segments.n, -1)
         sensitivity = problem.sensitivity(mode.phi, mode.sigma)
-        return replace(problem, noise=StartNoise.of(sensitivity, measured, mode.sigma))
+        return problem.with_noise(start=StartNoise.of(sensitivity, measured, mode.sigma))
 
     def gains(self, before: Mode, after: Mode) -> Array:
         """Held-out log predictive density gained, shape (transition,)."""
@@ -86,8 +86,8 @@ class HeldOut:
         phi, sigma = parameter_draws(mode.problem, posterior)
         chosen = pick.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
         return Errors(
-            one_step_rmse=_rmse(replace(problem, horizon=1, noise=None), mode),
-            rollout_rmse=_rmse(replace(problem, horizon=rollout, noise=None), mode),
+            one_step_rmse=_rmse(problem.with_data(horizon=1), mode),
+            rollout_rmse=_rmse(problem.with_data(horizon=rollout), mode),
             normalised_rmse=_normalised(self.problem(scale), mode, scale),
             elpd=float(_elpd(problem, phi[chosen], sigma[chosen]).sum()),
         )
@@ -97,7 +97,8 @@ class HeldOut:
 
         def expected(problem: Problem) -> dict[str, float]:
             names = problem.observations.names
-            gain = problem.noise.gain if problem.noise else np.ones(1)
+            noise = problem.noise.start
+            gain = noise.gain if noise else np.ones(1)
             gain = np.broadcast_to(gain, (problem.segments.n, gain.shape[-1]))
             gain = gain.reshape(problem.observations.values.shape)[:, -1]
             seen = problem.observations.measured[:, -1]
@@ -118,9 +119,9 @@ class HeldOut:
         """Follow the body that moves most over the first held-out trajectory."""
         scene = revised.problem.scene
         length = int(self.history.dataset["n_rows"].min()) - 1
-        problem = replace(revised.problem, history=self.history, horizon=length, noise=None)
+        problem = revised.problem.with_data(history=self.history, horizon=length)
         first = slice(0, 1)
-        start, actions = problem.segments.start[first], problem.segments.actions[first]
+        start, actions = problem.segments.start[first], problem.segments.inputs[first]
         measured = problem.observations.values[0]
         columns = problem.observations.columns
         spread = np.nanstd(measured, axis=0)
@@ -131,7 +132,7 @@ class HeldOut:
         ]
         origin = np.where(np.isfinite(start[0, body]), start[0, body], np.nan)
         return Rollout(
-            body=scene.dynamic[body].name,
+            body=scene.moving[body].name,
             time=np.arange(length + 1, dtype=float) * scene.time_step,
             names=problem.observations.names,
             units=tuple(STATE_UNITS[d] for d in columns),
@@ -176,5 +177,6 @@ def _normalised(scale: Problem, mode: Mode, unit: Mode) -> float:
 
 
 def _whitened(scale: Problem, mode: Mode, unit: Mode) -> Array:
-    model = replace(mode.problem, history=scale.history, horizon=scale.horizon, noise=scale.noise)
+    physics = mode.problem.physics
+    model = scale.with_physics(effects=physics.effects, substeps=physics.substeps)
     return model.whitened(mode.phi, unit.sigma)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -151,12 +151,12 @@ class _Loop:
 
     def declared_mode(self, horizon: int | None, substeps: int | None) -> Mode:
         """Mode of the declared model, with the horizon chosen and the engine's error small."""
-        problem = Problem(
-            scene=self.scene,
-            history=self.train,
-            effects=attach(self.scene, (), self.catalogue),
+        problem = Problem.of(
+            self.scene,
+            self.train,
+            attach(self.scene, (), self.catalogue),
             horizon=1 if horizon is None else horizon,
-            substeps=substeps or self.scene.substeps,
+            substeps=substeps,
             threads=2,
         )
         mode = find_mode(problem, seed=self.seed)
@@ -165,7 +165,7 @@ class _Loop:
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
         """Candidate effects for a model."""
-        return candidates(self.scene, mode.problem.effects, self.catalogue)
+        return candidates(self.scene, mode.problem.physics.effects, self.catalogue)
 
     def best_addition(self, mode: Mode, ranked: list[Signature]) -> _Step | None:
         """Refit with the leading candidates; the best that held-out data confirm, or None."""
@@ -195,8 +195,8 @@ class _Loop:
 
     def _refit(self, mode: Mode, signature: Signature) -> Mode:
         """Mode with the candidate in the model, under the same noise structure."""
-        effects = (*mode.problem.effects, signature.attached)
-        problem = replace(mode.problem, effects=effects)
+        effects = (*mode.problem.physics.effects, signature.attached)
+        problem = mode.problem.with_physics(effects=effects)
         labels = list(problem.layout.labels)
         phi = np.array([prior.centre for prior in problem.layout.priors])
         for label, value in zip(mode.problem.layout.labels, mode.phi, strict=True):
@@ -230,8 +230,8 @@ class _Loop:
         return mode, sorted(steps, key=lambda each: -each.elpd_difference)
 
     def _without(self, mode: Mode, effect: Attached) -> Mode:
-        kept = tuple(each for each in mode.problem.effects if each != effect)
-        problem = replace(mode.problem, effects=kept)
+        kept = tuple(each for each in mode.problem.physics.effects if each != effect)
+        problem = mode.problem.with_physics(effects=kept)
         labels = mode.problem.layout.labels
         phi = [mode.phi[labels.index(label)] for label in problem.layout.labels]
         return noisy(find_mode(problem, initial=np.array(phi)), rounds=1)
@@ -240,9 +240,9 @@ class _Loop:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
         problem = mode.problem
         if draws is None:
-            steps = problem.segments.n * problem.horizon * problem.simulator.steps
+            steps = problem.segments.n * problem.data.horizon * problem.simulator.steps
             draws = DRAWS if steps < LONG else DRAWS // 2
-        model = build_model(replace(problem, threads=1))
+        model = build_model(problem.with_physics(threads=1))
         tune = max(LEAST_TUNE, 5 * draws // 8)
         fitted = fit(model, seed=self.seed, draws=draws, tune=tune, start=mode, progress=False)
         if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
@@ -260,7 +260,7 @@ class _Loop:
         after: Any,
     ) -> Findings:
         """Put everything together."""
-        horizon = revised.problem.horizon
+        horizon = revised.problem.data.horizon
         held_out = self.held_out
         rollout = held_out.rollout_horizon(horizon, self.scene.time_step)
         errors = [
@@ -276,7 +276,9 @@ class _Loop:
         return Findings(
             scene=self.scene,
             verdict=verdict,
-            numerical=Numerical(self.scene.substeps, revised.problem.substeps, shift(revised)),
+            numerical=Numerical(
+                self.scene.substeps, revised.problem.physics.substeps, shift(revised)
+            ),
             candidates=tuple(each.candidate for each in first),
             added=tuple(_added(step, revised, after) for step in steps),
             unexplained=remainder,
@@ -309,7 +311,7 @@ def _added(step: _Step, revised: Mode, posterior: Any) -> Added:
     """Summarise an added effect with its posterior."""
     candidate, effect = step.signature.candidate, step.signature.attached.effect
     named = posterior_draws(posterior)
-    bodies = [one.body for one in revised.problem.effects if one.effect.name == effect.name]
+    bodies = [one.body for one in revised.problem.physics.effects if one.effect.name == effect.name]
     estimates = {}
     for parameter in effect.parameters:
         values = named[effect.variable(parameter)][:, bodies.index(candidate.body)]

@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.criticism.findings import Unexplained
-from pbrl_ppl.model import STATE
 from pbrl_ppl.modes import Mode
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 
@@ -57,15 +57,18 @@ def find_remainder(mode: Mode, *, seed: int = 0) -> Unexplained | None:
     """
     rng = np.random.default_rng(seed)
     problem = mode.problem
-    n, k = problem.segments.n, len(problem.scene.dynamic)
+    n, k = problem.segments.n, len(problem.scene.moving)
+    tests = len(problem.scene.dynamic)
     chosen = np.sort(rng.permutation(n)[:_MOST])
     columns = problem.observations.columns
     # a segment's residual in one number a dimension: independent cells, so their scaled sum
-    target = mode.whitened.reshape(n, problem.horizon, k, len(columns)).sum(1)
-    target = target[chosen] / np.sqrt(problem.horizon)
+    target = mode.whitened.reshape(n, problem.data.horizon, k, len(columns)).sum(1)
+    target = target[chosen] / np.sqrt(problem.data.horizon)
     groups = problem.segments.trajectory[chosen]
     best: Unexplained | None = None
-    for i, body in enumerate(problem.scene.dynamic):
+    for i, body in enumerate(problem.scene.moving):
+        if body.kinematic:
+            continue
         features = _features(mode, i)[chosen]
         y = target[:, i] - target[:, i].mean(axis=0)
         kernels = _kernels(features)
@@ -75,7 +78,7 @@ def find_remainder(mode: Mode, *, seed: int = 0) -> Unexplained | None:
             [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
         )
         at = int(np.argmax(shares))
-        p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * k
+        p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * tests
         if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE:
             continue
         if best is None or shares[at] > best.share:

@@ -14,8 +14,9 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import STATE, STATE_UNITS, Problem
+from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import HDI_PROB, group
+from pbrl_ppl.state import STATE, STATE_UNITS
 
 Array = NDArray[np.float64]
 
@@ -145,13 +146,13 @@ def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) 
     predicted = observations.wrapped(ends - first)
     dataset = _compare(predicted, measured)
     coords = {
-        "body": [body.name for body in problem.scene.dynamic],
+        "body": [body.name for body in problem.scene.moving],
         "state": list(observations.names),
         "quantile": list(QUANTILES),
     }
     return PriorCheck(
         dataset.assign_coords(coords),
-        problem.horizon * problem.scene.time_step,
+        problem.data.horizon * problem.scene.time_step,
         draws,
         int(draws - good.sum()),
     )

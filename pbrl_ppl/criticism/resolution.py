@@ -26,15 +26,16 @@ def noisy(mode: Mode, rounds: int = 2) -> Mode:
 
 def choose_horizon(mode: Mode) -> Mode:
     """Shortest horizon at which the start state's noise does not drown the prediction."""
-    longest = int(mode.problem.history.dataset["n_rows"].min()) - 1
+    longest = int(mode.problem.data.history.dataset["n_rows"].min()) - 1
     tried: list[tuple[float, Mode]] = []
     for horizon in HORIZONS:
         if horizon > max(1, longest // 2):
             break
-        problem = replace(mode.problem, horizon=horizon, noise=None)
+        problem = mode.problem.with_data(horizon=horizon)
         mode = noisy(mode if horizon == 1 else find_mode(problem, initial=mode.phi))
-        gain = mode.problem.noise.gain if mode.problem.noise else np.ones((1, 1))
-        cells = len(mode.problem.scene.dynamic) * len(mode.sigma)  # of the last interval
+        noise = mode.problem.noise.start
+        gain = noise.gain if noise else np.ones((1, 1))
+        cells = len(mode.problem.scene.moving) * len(mode.sigma)  # of the last interval
         spread = np.sqrt(np.maximum(gain[:, -cells:] ** 2 - 1.0, 0.0))
         worst = float(np.median(spread, axis=0).max())
         tried.append((worst, mode))
@@ -45,21 +46,21 @@ def choose_horizon(mode: Mode) -> Mode:
 
 def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
     """Double the substeps until that no longer moves predictions, and refit."""
-    begin = mode.problem.substeps
-    while shift(mode) > SMALL_SHIFT and mode.problem.substeps < MOST_SUBSTEPS:
-        finer = replace(mode.problem, substeps=2 * mode.problem.substeps)
+    begin = mode.problem.physics.substeps
+    while shift(mode) > SMALL_SHIFT and mode.problem.physics.substeps < MOST_SUBSTEPS:
+        finer = mode.problem.with_physics(substeps=2 * mode.problem.physics.substeps)
         mode = replace(mode, problem=finer)
-    if mode.problem.substeps == begin:
+    if mode.problem.physics.substeps == begin:
         return mode
-    say(f"using {mode.problem.substeps} engine steps an interval")
+    say(f"using {mode.problem.physics.substeps} engine steps an interval")
     return noisy(mode, rounds=1)
 
 
 def shift(mode: Mode) -> float:
     """Root mean square change of predictions in noise units if the substeps are doubled."""
     problem = mode.problem
-    finer = replace(problem, substeps=2 * problem.substeps)
+    finer = problem.with_physics(substeps=2 * problem.physics.substeps)
     change = (problem.residual(mode.phi) - finer.residual(mode.phi)) / mode.sigma
-    if problem.noise is not None:
-        change = change / problem.noise.gain.reshape(change.shape)
+    if problem.noise.start is not None:
+        change = change / problem.noise.start.gain.reshape(change.shape)
     return float(np.sqrt(np.nanmean(change**2, axis=(0, 1, 2)).max()))

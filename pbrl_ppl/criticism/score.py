@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -101,7 +101,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
     """
     problem, p = mode.problem, len(mode.phi)
     priors = problem.layout.priors
-    wide = replace(problem, effects=(*problem.effects, *candidates))
+    wide = problem.with_physics(effects=(*problem.physics.effects, *candidates))
     # declared parameters come first in both layouts, block by block, so look each one up
     labels = wide.layout.labels
     declared = [labels.index(label) for label in problem.layout.labels]

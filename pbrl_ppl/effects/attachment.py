@@ -73,7 +73,7 @@ def attach(
         if one.body not in bodies:
             raise EffectError(
                 f"effect {one.effect.name} is put on {one.body!r}, which is not a moving body of"
-                f" the scene (those are {', '.join(bodies)})"
+                f" the scene, or is kinematic (effects may be put on {', '.join(bodies)})"
             )
         if not one.effect.applies(scene, bodies[one.body]):
             raise EffectError(f"effect {one.effect.name} does not apply to body {one.body!r}")

@@ -25,7 +25,7 @@ def hanging_body(scene: Scene, joint: Joint) -> str:
     """
     if joint.bodies is None:
         raise EffectError("which bodies the hinge joins is to be inferred; none hangs in it yet")
-    fixed = {WORLD, *(body.name for body in scene.bodies if body.static)}
+    fixed = {WORLD, *(body.name for body in scene.bodies if body.static or body.kinematic)}
     depth = dict.fromkeys(fixed, 0)
     pairs = [each.bodies for each in _hinges(scene) if each.bodies]
     for _ in pairs:

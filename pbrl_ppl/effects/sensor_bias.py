@@ -6,8 +6,8 @@ import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.stages import Sensor
-from pbrl_ppl.history import STATE, STATE_UNITS
 from pbrl_ppl.parameters import Prior
+from pbrl_ppl.state import STATE, STATE_UNITS
 
 
 def _bias(parameters: Any) -> Any:

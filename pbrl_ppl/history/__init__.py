@@ -1,15 +1,11 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
 from pbrl_ppl.history.files import write_atomically
-from pbrl_ppl.history.history import INPUT, STATE, STATE_UNITS, WRENCH, History, Segments
+from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
 from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
 
 __all__ = [
-    "INPUT",
-    "STATE",
-    "STATE_UNITS",
-    "WRENCH",
     "History",
     "Segments",
     "fill_hinges",

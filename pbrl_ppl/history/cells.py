@@ -12,8 +12,9 @@ import numpy.typing as npt
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.files import COLUMNS, STATE, WRENCH
+from pbrl_ppl.history.files import COLUMNS
 from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.state import STATE, WRENCH
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -74,7 +75,7 @@ def read_rows(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
         raise HistoryError(f"{source}: it has no rows; expected one for each body at each step")
 
     labels, trajectory = _trajectories(frame["trajectory"], line)
-    known = [body.name for body in scene.dynamic]
+    known = [body.name for body in scene.moving]
     body = _bodies(frame["body"], line, known, scene)
 
     def numbers(name: str) -> Floats:

@@ -14,9 +14,8 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
+from pbrl_ppl.state import STATE, WRENCH
 
-STATE = ("x", "y", "theta", "vx", "vy", "omega")
-WRENCH = ("force_x", "force_y", "torque")
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
 SUFFIXES = (".csv", ".parquet", ".nc")
 

@@ -14,21 +14,16 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.files import STATE, WRENCH, read_table, to_table, write_dataset
+from pbrl_ppl.history.files import read_table, to_table, write_dataset
+from pbrl_ppl.history.paths import kinematic_bodies, path_velocities
+from pbrl_ppl.history.pieces import cut
 from pbrl_ppl.history.rows import arrays
 from pbrl_ppl.history.start import complete_start
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
-
-__all__ = ["INPUT", "STATE", "STATE_UNITS", "WRENCH", "WRENCH_UNITS", "History", "Segments"]
-
-STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
-WRENCH_UNITS = ("N", "N", "N m")
-#: What acts in an interval: the wrench, the one before (zero before the first), the trajectory's
-#: number, and the time in it at which the interval begins and ends (s).
-INPUT = (*WRENCH, *(f"previous_{name}" for name in WRENCH), "trajectory", "begin", "end")
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,14 +35,17 @@ class Segments:
     start : (n, k, 6) array
         State to start from, complete (m, m, rad, m/s, m/s, rad/s).
     actions : (n, H, k, 3) array
-        Wrench in each interval (N, N, N m).
+        Wrench in each interval (N, N, N m); of a kinematic body the velocity that leads along its
+        path (m/s, m/s, rad/s). Zero after a trajectory's end.
     observed : (n, H, k, 6) array
-        State measured at the end of each interval; NaN where missing.
+        State measured at the end of each interval; NaN where missing, after a trajectory's end, and
+        for kinematic bodies, which nothing has to explain.
     trajectory, step : (n,) arrays of int
         Position of the trajectory and of the step where the piece starts.
     inputs : (n, H, k, 9) array
-        Everything that acts in each interval, in the order of :data:`INPUT`: the wrench, the wrench
-        in the interval before, and when it is. The engine takes it in place of the actions.
+        Everything that acts in each interval, in the order of :data:`pbrl_ppl.state.INPUT`: the
+        wrench, the wrench in the interval before, and when it is. The engine takes it in place of
+        the actions.
     """
 
     start: Floats
@@ -79,13 +77,16 @@ class History:
         - ``observed`` (trajectory, time, body, state): the measured state; NaN where missing
           (m, m, rad, m/s, m/s, rad/s);
         - ``action`` (trajectory, time, body, wrench): held over the interval that starts there;
-          NaN on a trajectory's last row and after (N, N, N m);
+          NaN on a trajectory's last row and after, without a meaning for a kinematic body
+          (N, N, N m);
         - ``start`` (trajectory, time, body, state): the state completed through hinges and
           estimated velocities;
         - ``clock`` (trajectory, time): time (s);
         - ``number`` (trajectory,): which trajectory of the recording it is, from 0;
         - ``before`` (trajectory, body, wrench): what acted before the first row; zero;
-        - ``n_rows`` (trajectory,): number of steps.
+        - ``n_rows`` (trajectory,): number of steps;
+
+        and the coordinate ``kinematic`` (body,): whether a body follows its recorded path.
 
     Examples
     --------
@@ -163,7 +164,8 @@ class History:
             coords={
                 "trajectory": table.labels,
                 "time": np.arange(table.clock.shape[1]),
-                "body": [body.name for body in scene.dynamic],
+                "body": [body.name for body in scene.moving],
+                "kinematic": ("body", kinematic_bodies(scene)),
                 "state": list(STATE),
                 "wrench": list(WRENCH),
             },
@@ -188,7 +190,10 @@ class History:
     def segments(self, horizon: int = 1) -> Segments:
         """Cut every trajectory into pieces of ``horizon`` intervals that do not overlap.
 
-        What is left over at a trajectory's end, and pieces whose start is incomplete, are dropped.
+        Pieces start where the state is complete. What is left over at a trajectory's end is
+        dropped, but a trajectory that gives no whole piece gives one that its end cuts short:
+        nothing is measured after it. So bodies that were seen before and after a long push need a
+        horizon as long as the longest trajectory.
 
         Raises
         ------
@@ -198,35 +203,31 @@ class History:
         if isinstance(horizon, bool) or not isinstance(horizon, int | np.integer) or horizon < 1:
             raise HistoryError(f"horizon is {horizon!r}, expected a whole number from 1 up")
         intervals = self.dataset["n_rows"].to_numpy() - 1
-        if horizon > intervals.max():
-            raise HistoryError(
-                f"horizon is {horizon} intervals, and the longest trajectory has "
-                f"{intervals.max()}; use a shorter horizon"
-            )
-        counts = intervals // horizon
-        trajectory = np.repeat(np.arange(len(counts)), counts)
-        step = np.concatenate([np.arange(count) * horizon for count in counts])
         start = self.dataset["start"].to_numpy()
-        complete = np.isfinite(start[trajectory, step]).all(axis=(1, 2))
-        trajectory, step = trajectory[complete], step[complete]
+        complete = np.isfinite(start).all(axis=(-1, -2))
+        trajectory, step = cut(complete, intervals, int(horizon))
         if not len(step):
             raise HistoryError(
                 f"no segment of {horizon} intervals starts from a complete state; use another "
                 "horizon, or measure the states there"
             )
+        follows = self.dataset["kinematic"].to_numpy()
+        action = self.dataset["action"].to_numpy().copy()
+        time_step = float(self.dataset.attrs["time_step"])
+        action[:, :-1, follows] = path_velocities(start[:, :, follows, :3], time_step)
         rows = step[:, None] + np.arange(horizon)
-        return Segments(
-            start=start[trajectory, step],
-            actions=self.dataset["action"].to_numpy()[trajectory[:, None], rows],
-            observed=self.dataset["observed"].to_numpy()[trajectory[:, None], rows + 1],
-            trajectory=trajectory,
-            step=step,
-            inputs=self._inputs()[trajectory[:, None], rows],
-        )
+        after = rows >= intervals[trajectory][:, None]
+        rows = np.where(after, 0, rows)
+        inputs = self._inputs(action)[trajectory[:, None], rows]
+        observed = self.dataset["observed"].to_numpy()[trajectory[:, None], rows + 1]
+        inputs[after, :, :6] = 0.0
+        observed[after] = np.nan
+        observed[:, :, follows] = np.nan
+        actions = inputs[..., : len(WRENCH)]
+        return Segments(start[trajectory, step], actions, observed, trajectory, step, inputs)
 
-    def _inputs(self) -> Floats:
+    def _inputs(self, action: Floats) -> Floats:
         """What acts in each interval, shape (trajectory, interval, body, input)."""
-        action = self.dataset["action"].to_numpy()
         before = self.dataset["before"].to_numpy()[:, None]
         previous = np.concatenate([before, action[:, :-1]], axis=1)
         clock = self.dataset["clock"].to_numpy()
@@ -258,6 +259,11 @@ class History:
             self.select(sorted(shuffled[n_test:].tolist())),
             self.select(sorted(shuffled[:n_test].tolist())),
         )
+
+    def numbered(self, first: float) -> History:
+        """Return the same trajectories, numbered on from ``first``: a recording made after others."""
+        number = self.dataset["number"]
+        return History(self.dataset.assign(number=number - number.min() + first))
 
     def select(self, trajectories: Sequence[int] | Ints) -> History:
         """Return the trajectories at these positions, in this order.

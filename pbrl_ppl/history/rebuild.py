@@ -6,8 +6,10 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pbrl_ppl.history.history import STATE, WRENCH, History
+from pbrl_ppl.history.history import History
+from pbrl_ppl.history.paths import kinematic_bodies
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE, WRENCH
 
 Array = NDArray[np.float64]
 
@@ -15,7 +17,7 @@ Array = NDArray[np.float64]
 def from_segments(scene: Scene, start: Array, actions: Array, observed: Array) -> History:
     """A history of segments; arguments as of :func:`segment_rows`.
 
-    Actions of shape (n, H, body, 9) are inputs as in :data:`pbrl_ppl.history.INPUT`: they also say
+    Actions of shape (n, H, body, 9) are inputs as in :data:`pbrl_ppl.state.INPUT`: they also say
     what acted before, and when.
     """
     wrench = actions[..., : len(WRENCH)]
@@ -40,20 +42,24 @@ def segment_rows(scene: Scene, start: Array, actions: Array, observed: Array) ->
     start : ndarray
         Complete start states, shape (n, body, 6), SI units.
     actions : ndarray
-        Wrenches, shape (n, H, body, 3).
+        Wrenches, shape (n, H, body, 3); of a kinematic body its velocities.
     observed : ndarray
         Next states, shape (n, H, body, 6), NaN where missing.
     """
     n, h, k = actions.shape[:3]
     states = np.concatenate([start[:, None], observed], axis=1)
     wrenches = np.concatenate([actions, np.full((n, 1, k, len(WRENCH)), np.nan)], axis=1)
+    follows = kinematic_bodies(scene)
+    way = scene.time_step * np.cumsum(actions[:, :, follows], axis=1)
+    states[:, 1:, follows, :3] = start[:, None, follows, :3] + way
+    wrenches[:, :, follows] = np.nan
     trajectory, step, body = np.indices((n, h + 1, k)).reshape(3, -1)
     return pd.DataFrame(
         {
             "trajectory": trajectory,
             "step": step,
             "time": step * scene.time_step,
-            "body": np.array([each.name for each in scene.dynamic])[body],
+            "body": np.array([each.name for each in scene.moving])[body],
             **dict(zip(STATE, states.reshape(-1, len(STATE)).T, strict=True)),
             **dict(zip(WRENCH, wrenches.reshape(-1, len(WRENCH)).T, strict=True)),
         }

@@ -11,8 +11,9 @@ import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.cells import Floats, Ints, Rows, read_rows
-from pbrl_ppl.history.files import WRENCH
+from pbrl_ppl.history.paths import check_paths, kinematic_bodies
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import WRENCH
 
 TIME_TOLERANCE = 0.01
 """How far an interval may be from the scene's time step, as a share of it."""
@@ -50,11 +51,12 @@ def arrays(frame: pd.DataFrame, scene: Scene, source: str) -> Arrays:
     # Trajectories may alternate in the file; inside each one, the file's order counts.
     order = np.argsort(rows.trajectory, kind="stable")
     first, position = _steps(rows, order, scene)
-    k = len(scene.dynamic)
+    k = len(scene.moving)
     starts = np.flatnonzero(first)
     n_rows = np.zeros(len(rows.labels), dtype=np.int64)
     np.maximum.at(n_rows, rows.trajectory, position + 1)
     _complete(rows, scene, position, n_rows)
+    check_paths(rows, scene)
     shape = (len(rows.labels), int(n_rows.max()), k)
     state = np.full((*shape, 6), np.nan)
     action = np.full((*shape, 3), np.nan)
@@ -86,7 +88,7 @@ def _steps(rows: Rows, order: Ints, scene: Scene) -> tuple[npt.NDArray[np.bool_]
         first = begins | (jump != 0)
     inside = ~begins
     group = np.cumsum(first) - 1
-    pair = group * len(scene.dynamic) + rows.body[order]
+    pair = group * len(scene.moving) + rows.body[order]
     again = np.ones(len(order), dtype=bool)
     again[np.unique(pair, return_index=True)[1]] = False
     # In the order of the cures: rows out of order or twice look like gaps further on.
@@ -114,7 +116,7 @@ def _raise_time(rows: Rows, row: int, kind: str, change: float, jump: int, scene
     at, of = rows.at(row), rows.of(row)
     step = 0 if rows.step is None else int(rows.step[row])
     moment = f"time {rows.time[row]:.6g} s" if rows.step is None else f"step {step}"
-    name = scene.dynamic[rows.body[row]].name
+    name = scene.moving[rows.body[row]].name
     dt = scene.time_step
     messages = {
         "back": f"time goes back by {-change:.6g} s in {of}; sort the rows or drop the duplicate",
@@ -133,7 +135,7 @@ def _raise_time(rows: Rows, row: int, kind: str, change: float, jump: int, scene
 
 def _complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> None:
     """Check that each body is there at each step, with an action before the last."""
-    names = [body.name for body in scene.dynamic]
+    names = [body.name for body in scene.moving]
     k = len(names)
     offset = np.cumsum(n_rows) - n_rows
     cell = (offset[rows.trajectory] + position) * k + rows.body
@@ -151,7 +153,9 @@ def _complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> None:
             f"{rows.of(row)}; expected one of each body at each step; add it, with empty cells for "
             "what was not measured"
         )
-    empty = np.isnan(rows.action) & (position < n_rows[rows.trajectory] - 1)[:, None]
+    pushed = ~kinematic_bodies(scene)[rows.body]  # a kinematic body's path is its action
+    before_last = position < n_rows[rows.trajectory] - 1
+    empty = np.isnan(rows.action) & (before_last & pushed)[:, None]
     if empty.any():
         row, column = (int(i) for i in np.argwhere(empty)[0])
         raise HistoryError(

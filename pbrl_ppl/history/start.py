@@ -7,8 +7,9 @@ import numpy.typing as npt
 from scipy.signal import savgol_filter
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.files import STATE
+from pbrl_ppl.history.paths import fill_path_velocities
 from pbrl_ppl.scene import WORLD, Point, Scene
+from pbrl_ppl.state import STATE
 
 Floats = npt.NDArray[np.float64]
 
@@ -21,7 +22,8 @@ def complete_start(state: Floats, scene: Scene, *, estimate_velocities: bool) ->
     state : (trajectory, time, body, 6) array
         Measured states, NaN where missing (m, m, rad, m/s, m/s, rad/s).
     scene : Scene
-        Its known hinges give positions and velocities from angles.
+        Its known hinges give positions and velocities from angles; its kinematic bodies' positions
+        give their velocities.
     estimate_velocities : bool
         Whether velocities that were never measured are estimated from positions.
 
@@ -31,6 +33,7 @@ def complete_start(state: Floats, scene: Scene, *, estimate_velocities: bool) ->
         If no step before a trajectory's last has a complete state.
     """
     start = state.copy()
+    fill_path_velocities(start, scene)
     if estimate_velocities:
         # The angular velocity first: hinges turn it into velocities.
         _estimate(start, state, (5,), scene.time_step)
@@ -45,7 +48,7 @@ def complete_start(state: Floats, scene: Scene, *, estimate_velocities: bool) ->
 
 def _incomplete(start: Floats, scene: Scene) -> str:
     parts = []
-    for i, body in enumerate(scene.dynamic):
+    for i, body in enumerate(scene.moving):
         lacking = [name for j, name in enumerate(STATE) if np.isnan(start[:, :, i, j]).all()]
         if lacking:
             parts.append(f'{", ".join(lacking)} of body "{body.name}"')
@@ -59,7 +62,7 @@ def _incomplete(start: Floats, scene: Scene) -> str:
 
 def fill_hinges(start: Floats, scene: Scene) -> None:
     """Fill missing x, y, vx, vy of hinged bodies in place, breadth first from the world."""
-    position = {body.name: i for i, body in enumerate(scene.dynamic)}
+    position = {body.name: i for i, body in enumerate(scene.moving)}
     for parent, child, at_parent, at_child in _hinge_order(scene):
         if child not in position:
             continue

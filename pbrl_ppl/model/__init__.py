@@ -1,9 +1,9 @@
 """Table 1, Eqs. 11 and 12, the engine as a pytensor Op, and the `pm.Model` made of them."""
 
-from pbrl_ppl.model.library import Modes
+from pbrl_ppl.model.data import Data
+from pbrl_ppl.model.declaration import build_model, physics_model
+from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
-    STATE,
-    STATE_UNITS,
     Observations,
     StartNoise,
     estimate_sigma,
@@ -12,17 +12,19 @@ from pbrl_ppl.model.likelihood import (
     robust,
     whiten,
 )
+from pbrl_ppl.model.noise import Noise, sigma_prior
 from pbrl_ppl.model.op import SimulatorOp
-from pbrl_ppl.model.problem import COARSE, Problem, build_model, physics_model, sigma_prior
+from pbrl_ppl.model.physics import Physics
+from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.table1 import build_layout
 from pbrl_ppl.model.transition import Transition
 
 __all__ = [
-    "COARSE",
-    "STATE",
-    "STATE_UNITS",
-    "Modes",
+    "Data",
+    "Noise",
     "Observations",
+    "ParameterLibrary",
+    "Physics",
     "Problem",
     "SimulatorOp",
     "StartNoise",

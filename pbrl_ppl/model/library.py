@@ -18,31 +18,32 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Modes:
+class ParameterLibrary:
     """Named parameter sets of which each body has one: the paper's categorical prior.
 
     Parameters
     ----------
     sets : mapping of str to mapping of str to float
-        For each mode its parameters by name, SI units, such as
+        For each set its parameters by name, SI units, such as
         ``{"cart": {"mass": 8.0, "mu_x": 0.05, ...}, "table": {...}}``. A body takes those that it
         has; what the scene knows of it stays as it is.
     probabilities : mapping, optional
-        Of the modes by name, ``{"cart": 0.7, "table": 0.3}``, or for each body its own,
-        ``{"sofa": {"table": 1.0}}``; modes left out have none, bodies left out and all bodies
-        without it take every mode as likely. They are scaled to add up to one.
+        Of the sets by name, ``{"cart": 0.7, "table": 0.3}``, or for each body its own,
+        ``{"sofa": {"table": 1.0}}``; sets left out have none, bodies left out and all bodies
+        without it take every set as likely. They are scaled to add up to one.
 
     Raises
     ------
     ParameterError
-        If there is no mode, or a value or probability is not a finite number.
+        If there is no set, or a value or probability is not a finite number.
 
     Examples
     --------
-    >>> modes = Modes({"light": {"mass": 2.0}, "heavy": {"mass": 9.0}}, {"light": 3, "heavy": 1})
-    >>> modes.names
+    >>> sets = {"light": {"mass": 2.0}, "heavy": {"mass": 9.0}}
+    >>> library = ParameterLibrary(sets, {"light": 3, "heavy": 1})
+    >>> library.names
     ('light', 'heavy')
-    >>> modes.prior("sofa")
+    >>> library.prior("sofa")
     array([0.75, 0.25])
     """
 
@@ -53,12 +54,12 @@ class Modes:
         """Freeze the mappings."""
         sets = dict(self.sets)
         if not sets:
-            raise ParameterError("modes: there are none; name at least one parameter set")
+            raise ParameterError("library: it is empty; name at least one parameter set")
         for name, values in sets.items():
             for key, value in dict(values).items():
                 if not np.isfinite(value):
                     raise ParameterError(
-                        f"mode {name!r}: {key} is {value}, expected a finite number"
+                        f"parameter set {name!r}: {key} is {value}, expected a finite number"
                     )
         object.__setattr__(self, "sets", _frozen({k: dict(v) for k, v in sets.items()}))
         given = dict(self.probabilities or {})
@@ -66,13 +67,13 @@ class Modes:
         every = {k: v for k, v in given.items() if k not in nested}
         if every and nested:
             raise ParameterError(
-                "modes: probabilities are by mode or by body, not both; give each body's own"
+                "library: probabilities are by set or by body, not both; give each body's own"
             )
-        for where, each in ({"modes": every} if every else nested).items():
+        for where, each in ({"the library": every} if every else nested).items():
             wrong = [name for name in each if name not in self.names]
             if wrong:
                 raise ParameterError(
-                    f"probabilities of {where}: there is no mode {wrong[0]!r}"
+                    f"probabilities of {where}: there is no set {wrong[0]!r}"
                     f"{nearest(wrong[0], self.names)}"
                 )
             values = np.array(list(each.values()), dtype=float)
@@ -84,7 +85,7 @@ class Modes:
         object.__setattr__(self, "probabilities", _frozen(given) if given else None)
 
     @classmethod
-    def from_json(cls, text: str) -> Modes:
+    def from_json(cls, text: str) -> ParameterLibrary:
         """Read what :meth:`to_json` wrote."""
         return cls(*json.loads(text))
 
@@ -95,11 +96,11 @@ class Modes:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the modes, in the order of the index."""
+        """Names of the sets, in the order of the index."""
         return tuple(name for name, _ in self.sets)
 
     def prior(self, body: str) -> Array:
-        """Probability of each mode for a body, shape (mode,)."""
+        """Probability of each set for a body, shape (set,)."""
         given: dict[str, Any] = dict(self.probabilities or {})
         if any(isinstance(each, tuple) for each in given.values()):
             given = dict(given.get(body, ()))
@@ -107,44 +108,44 @@ class Modes:
         return p / p.sum() if p.sum() else np.full(len(p), 1.0 / len(p))
 
     def table(self, layout: Layout, scene: Scene) -> Array:
-        """Every entry of phi under every mode, shape (p, mode).
+        """Every entry of phi under every set, shape (p, set).
 
         Raises
         ------
         ParameterError
-            If a joint is to be inferred, a mode lacks a parameter, has one that no body has, or has
-            a value that a body cannot have while the mode is possible for it.
+            If a joint is to be inferred, a set lacks a parameter, has one that no body has, or has
+            a value that a body cannot have while the set is possible for it.
         """
-        bodies = [body.name for body in scene.dynamic]
+        bodies = [body.name for body in scene.moving]
         for name, _ in self.probabilities or ():
             if name not in (*bodies, *self.names):
                 raise ParameterError(
-                    f"probabilities: {name!r} is neither a mode nor a moving body"
+                    f"probabilities: {name!r} is neither a parameter set nor a moving body"
                     f"{nearest(name, (*bodies, *self.names))}"
                 )
         wanted = [block.name for block in layout.blocks]
-        known = {key for body in scene.dynamic for key, _ in body.known}
+        known = {key for body in scene.moving for key, _ in body.known}
         for name, values in self.sets:
             for key in dict(values):
                 if key not in wanted and key not in known:
                     raise ParameterError(
-                        f"mode {name!r} has {key!r}, which is no parameter of a body of the scene"
-                        f"{nearest(key, wanted)}"
+                        f"parameter set {name!r} has {key!r}, which is no parameter of a body of"
+                        f" the scene{nearest(key, wanted)}"
                     )
         rows = []
         for block in layout.blocks:
             if block.of == "joint":
                 raise ParameterError(
-                    f"modes: the joint {block.owners[0]} is to be inferred, and modes are of"
-                    " bodies; say in the scene what the joint is"
+                    f"library: the joint {block.owners[0]} is to be inferred, and a library"
+                    " is of bodies; say in the scene what the joint is"
                 )
             for owner, law in zip(block.owners, block.priors, strict=True):
                 row = [dict(values).get(block.name, np.nan) for _, values in self.sets]
                 rows.append(row)
                 lower, upper = law.support
                 for name, value, p in zip(self.names, row, self.prior(owner), strict=True):
-                    where = f"mode {name!r}: {block.name} of body {owner!r}"
-                    cure = f"give the mode probability 0 for {owner!r}, or correct it"
+                    where = f"parameter set {name!r}: {block.name} of body {owner!r}"
+                    cure = f"give the set probability 0 for {owner!r}, or correct it"
                     if p and np.isnan(value):
                         raise ParameterError(f"{where} is missing; add it, or {cure}")
                     if p and not (lower <= value <= upper and (value or block.name != "mass")):

@@ -13,13 +13,10 @@ from scipy.optimize import minimize
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import Segments
+from pbrl_ppl.state import STATE, THETA
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-
-STATE = ("x", "y", "theta", "vx", "vy", "omega")
-STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
-_THETA = STATE.index("theta")
 
 
 @dataclass(frozen=True)
@@ -48,10 +45,14 @@ class Observations:
         """
         observed = segments.observed
         measured = tuple(
-            d for d in range(6) if observed.size and np.isfinite(observed[..., d]).any()
+            d for d in range(len(STATE)) if observed.size and np.isfinite(observed[..., d]).any()
         )
         if not measured:
-            raise HistoryError("history: it has no measured next state; record at least two rows")
+            raise HistoryError(
+                "history: it has no measured next state within"
+                f" {segments.horizon} interval{'s' * (segments.horizon > 1)} of a complete state;"
+                " use a longer horizon, or record more"
+            )
         columns = measured if columns is None else columns
         return cls(observed[..., columns], columns)
 
@@ -68,7 +69,7 @@ class Observations:
     def wrapped(self, difference: Array) -> Array:
         """Differences of states, shape (..., state), with angles wrapped in place to (-pi, pi]."""
         for i, d in enumerate(self.columns):
-            if d == _THETA:
+            if d == THETA:
                 difference[..., i] = np.pi - np.mod(np.pi - difference[..., i], 2 * np.pi)
         return difference
 
@@ -299,8 +300,8 @@ def next_state_logp(
     measured = observations.measured
     n = len(measured)
     residual = value - predicted  # s' - f(s, a; Phi)
-    if _THETA in observations.columns:
-        theta = observations.columns.index(_THETA)
+    if THETA in observations.columns:
+        theta = observations.columns.index(THETA)
         wrapped = np.pi - pt.mod(np.pi - residual[..., theta], 2 * np.pi)
         residual = pt.set_subtensor(residual[..., theta], wrapped)
     z = (residual / sigma * measured).reshape((n, -1))

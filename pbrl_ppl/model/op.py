@@ -60,7 +60,7 @@ class _EngineOp(Op):
         SimulationError
             If an input has the wrong number of dimensions or a static shape that does not fit.
         """
-        k, p = len(self.scene.dynamic), self.layout.size
+        k, p = len(self.scene.moving), self.layout.size
         inputs = []
         for name, value, shape in (
             ("phi", phi, (p,)),
@@ -101,7 +101,7 @@ class SimulatorOp(_EngineOp):
     """``next_states = f(phi, start, actions)``, the deterministic part of Eq. 7.
 
     Inputs are phi (p,), start states (transition, body, 6) and wrenches (transition, H, body, 3),
-    or all of :data:`pbrl_ppl.history.INPUT` in place of the 3; the output has shape (transition, H,
+    or all of :data:`pbrl_ppl.state.INPUT` in place of the 3; the output has shape (transition, H,
     body, 6); all float64, in SI units. A transition in which the engine diverges is NaN, and so is
     everything where phi is impossible (a mass that is not positive, say): the likelihood of that is
     zero. The derivative by phi is by finite differences, all columns in one call of the engine.
@@ -125,7 +125,7 @@ class SimulatorOp(_EngineOp):
 
     @property
     def _last(self) -> tuple[int, ...]:
-        return len(self.scene.dynamic), 6
+        return len(self.scene.moving), 6
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         return self.simulator.recall(phi, start, actions)
@@ -151,7 +151,7 @@ class JacobianOp(_EngineOp):
 
     @property
     def _last(self) -> tuple[int, ...]:
-        return len(self.scene.dynamic), 6, self.layout.size
+        return len(self.scene.moving), 6, self.layout.size
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         return self.simulator.jacobian(phi, start, actions)

@@ -21,7 +21,7 @@ from pbrl_ppl.parameters import (
     Layout,
     Prior,
 )
-from pbrl_ppl.scene import WORLD, Body, Scene, nearest
+from pbrl_ppl.scene import CONTACT_NAMES, WORLD, Body, Scene, nearest
 
 Array = NDArray[np.float64]
 
@@ -151,6 +151,13 @@ def _joint_blocks(scene: Scene) -> list[Block]:
     return blocks
 
 
+def _has(body: Body, name: str) -> bool:
+    """Whether a moving body has a parameter of Table 1."""
+    if body.kinematic:
+        return name in CONTACT_NAMES
+    return body.wheel or name not in WHEEL_PARAMETERS
+
+
 def _union(priors: tuple[Prior, ...]) -> Prior:
     """A prior over the support of all of these: what is known before the index is."""
     if len(set(priors)) == 1:
@@ -175,7 +182,7 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
         If a body's ``prior`` names a parameter that neither it nor its effects have, or makes no
         distribution.
     """
-    for body in scene.dynamic:
+    for body in scene.moving:
         names = [
             *BODY_PARAMETERS,
             *(v for one in effects if one.body == body.name for v in one.variables),
@@ -189,9 +196,7 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
     blocks = []
     for name, unit in BODY_PARAMETERS.items():
         bodies = [
-            body
-            for body in scene.dynamic
-            if name not in dict(body.known) and (body.wheel or name not in WHEEL_PARAMETERS)
+            body for body in scene.moving if name not in dict(body.known) and _has(body, name)
         ]
         if bodies:
             priors = tuple(table1(body)[name] for body in bodies)

@@ -79,7 +79,7 @@ class Transition:
         self._check_start = check_start
         self._simulator = Simulator(scene, layout, attached, substeps=substeps, threads=threads)
         # impossible parameters are refused here, not at the first call
-        k = len(scene.dynamic)
+        k = len(scene.moving)
         self._simulator(self.phi, np.zeros((0, k, 6)), np.zeros((0, 1, k, 3)))
 
     def __call__(self, state_action: ArrayLike) -> Array:
@@ -90,7 +90,7 @@ class Transition:
         state_action : array_like
             Shape (..., 6 k + 4): the bodies' states ``x, y, theta, vx, vy, omega`` one after the
             other, then the number of the body that is pushed (0 to k - 1) and its wrench
-            ``force_x, force_y, torque``; m, rad, s, N.
+            ``force_x, force_y, torque``; m, rad, s, N. A kinematic body is pushed by its velocity.
 
         Returns
         -------
@@ -105,7 +105,7 @@ class Transition:
             bodies lie deep inside each other or a wall.
         """
         x = np.asarray(state_action, dtype=float)
-        k = len(self.scene.dynamic)
+        k = len(self.scene.moving)
         if x.ndim == 0 or x.shape[-1] != 6 * k + 4:
             raise SimulationError(
                 f"Eq. 2: the input has shape {x.shape}, expected (..., {6 * k + 4}): 6 numbers for"
@@ -118,7 +118,7 @@ class Transition:
         if wrong.any():
             raise SimulationError(
                 f"Eq. 2: the body that is pushed is {pushed[wrong][0]:g}, expected a whole number"
-                f" from 0 to {k - 1}: {', '.join(body.name for body in self.scene.dynamic)}"
+                f" from 0 to {k - 1}: {', '.join(body.name for body in self.scene.moving)}"
             )
         wrenches = np.zeros((len(flat), 1, k, 3))
         wrenches[np.arange(len(flat)), 0, pushed.astype(int)] = flat[:, 6 * k + 1 :]
@@ -133,7 +133,9 @@ class Transition:
         start : array_like
             Start states, shape (transition, body, 6), SI units.
         wrenches : array_like
-            Held over each interval, shape (transition, H, body, 3), N and N m.
+            Held over each interval, shape (transition, H, body, 3), N and N m. Those of a kinematic
+            body are its velocity over the interval (m/s, m/s, rad/s): its path is part of the
+            action.
 
         Returns
         -------

@@ -3,14 +3,14 @@
 from pbrl_ppl.modes.configurations import ATTRIBUTE, Weighed, doubts, joint_probabilities, stored
 from pbrl_ppl.modes.joint_search import weigh
 from pbrl_ppl.modes.laplace import Mode, posterior_steps, with_start_noise
-from pbrl_ppl.modes.library_choice import choose_modes
+from pbrl_ppl.modes.library_choice import choose_from_library
 from pbrl_ppl.modes.search import find_mode
 
 __all__ = [
     "ATTRIBUTE",
     "Mode",
     "Weighed",
-    "choose_modes",
+    "choose_from_library",
     "doubts",
     "find_mode",
     "joint_probabilities",

@@ -66,10 +66,10 @@ class Configuration:
     def problem(self, problem: Problem) -> Problem:
         """The problem of the parameters that are left, all of them continuous.
 
-        Bodies deep inside each other that nothing joins are pushed apart there, as in the whole
-        problem, which leaves them alone when it checks the start states.
+        The data stay, and with them their check: bodies deep inside each other that nothing joins
+        here are pushed apart, for one configuration must not refuse what the others explain.
         """
-        return replace(problem, scene=self.scene(problem.scene), checked=True)
+        return problem.with_physics(scene=self.scene(problem.scene))
 
 
 @dataclass(frozen=True, eq=False)

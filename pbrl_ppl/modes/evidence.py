@@ -65,7 +65,7 @@ class Coordinates:
         self._centre = np.log(median)
         sigma = np.log(mode.sigma)
         self._counts = self.problem.observations.measured.sum((0, 1, 2))
-        if self.problem.scalar_sigma:
+        if self.problem.noise.scalar:
             self._centre, sigma = self._centre.mean(keepdims=True), sigma[:1]
             self._counts = self._counts.sum(keepdims=True)
         z = [float(law.standard(x)) for law, x in zip(self._laws, mode.phi, strict=True)]
@@ -107,7 +107,7 @@ class Coordinates:
         precision[own, own] += 2.0 * self._counts * self._spread**2
         covariance = np.linalg.inv(precision)
         # a density's mode moves with its coordinates: where the data are silent, to the origin
-        residual = np.nan_to_num(robust(mode.whitened, self.problem.nu)).ravel()
+        residual = np.nan_to_num(robust(mode.whitened, self.problem.noise.nu)).ravel()
         pull = np.concatenate([-jacobian.T @ residual, np.zeros(len(own))])
         whole = covariance @ (pull - self.origin)
         tried = self.origin + np.array([0.0, 0.25, 0.5, 1.0])[:, None] * whole

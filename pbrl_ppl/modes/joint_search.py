@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +12,7 @@ from scipy.optimize import least_squares
 from scipy.special import logsumexp
 
 from pbrl_ppl.history import lever
-from pbrl_ppl.model import COARSE, Problem
+from pbrl_ppl.model import Problem
 from pbrl_ppl.modes.configurations import Configuration, Weighed, configurations
 from pbrl_ppl.modes.evidence import Evidence, importance, laplace
 from pbrl_ppl.modes.laplace import Mode
@@ -114,7 +113,7 @@ def _leading(
 
 def _apart(problem: Problem, seed: int) -> Mode:
     """The mode of a problem without joints of unknown bodies."""
-    return _best(problem, find_modes(_coarse(problem), seed=seed), -np.inf)
+    return _best(problem, find_modes(problem.coarse, seed=seed), -np.inf)
 
 
 def _joint(problem: Problem, configuration: Configuration, apart: Mode, worth: float) -> Mode:
@@ -132,8 +131,7 @@ def _joint(problem: Problem, configuration: Configuration, apart: Mode, worth: f
 
 
 def _climbed(problem: Problem, starts: list[Array]) -> list[Mode]:
-    coarse = _coarse(problem)
-    return [find_mode(coarse, initial=start, rounds=_ROUGH) for start in starts]
+    return [find_mode(problem.coarse, initial=start, rounds=_ROUGH) for start in starts]
 
 
 def _best(problem: Problem, rough: list[Mode], worth: float) -> Mode:
@@ -146,10 +144,6 @@ def _best(problem: Problem, rough: list[Mode], worth: float) -> Mode:
     return first if first.log_posterior < worth else find_mode(problem, initial=first.phi)
 
 
-def _coarse(problem: Problem) -> Problem:
-    return replace(problem, substeps=min(COARSE, problem.substeps), extrapolate=False)
-
-
 def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed: int) -> Mode:
     """Look for a better mode with the anchors where they are, and the bodies anywhere."""
     problem = mode.problem
@@ -159,7 +153,7 @@ def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed
     places = _anchor_places(problem, configuration)
     draws[:, places] = mode.phi[places]
     draws = inside(priors, draws)
-    z = np.nan_to_num(_coarse(problem).whitened(draws, mode.sigma), nan=1e6)
+    z = np.nan_to_num(problem.coarse.whitened(draws, mode.sigma), nan=1e6)
     order = np.argsort(np.log1p(z**2).sum(axis=(1, 2)))[:_STARTS]
     return _best(problem, _climbed(problem, [draws[i] for i in order]), worth)
 
@@ -231,12 +225,12 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
 
 def _states(problem: Problem, body: str) -> Array:
     """A body's recorded start states, shape (row, 6); the world's are zero."""
-    start = problem.history.dataset["start"].to_numpy()
+    start = problem.data.history.dataset["start"].to_numpy()
     rows = start[np.isfinite(start).all(axis=(-1, -2))]
     rows = rows[:: -(-len(rows) // _ROWS)]
     if body == WORLD:
         return np.zeros((len(rows), 6))
-    names = [each.name for each in problem.scene.dynamic]
+    names = [each.name for each in problem.scene.moving]
     return np.asarray(rows[:, names.index(body)])
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -109,7 +109,7 @@ def climb(
 
     def whole(points: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
         z = problem.whitened(points, sigma, engine).reshape(*points.shape[:-1], -1)
-        z = robust(z, problem.nu)
+        z = robust(z, problem.noise.nu)
         z = np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
         return np.concatenate([z, prior_residual(priors, points)], axis=-1)
 
@@ -157,18 +157,18 @@ def profile_sigma(problem: Problem, residual: Array) -> Array:
     residual : ndarray
         Shape (transition, H, body, state).
     """
-    measured, noise = problem.observations.measured, problem.noise
+    measured, noise = problem.observations.measured, problem.noise.start
     residual = np.nan_to_num(residual, nan=FAR_OFF)
     sigma = estimate_sigma(residual, measured, None)
-    gaussian = problem.nu is None
-    if problem.scalar_sigma and gaussian:
+    gaussian = problem.noise.nu is None
+    if problem.noise.scalar and gaussian:
         z = whiten(residual, np.ones_like(sigma), noise)
         return np.full_like(sigma, max(np.sqrt((z**2).sum() / measured.sum()), 1e-9))
     if noise is None and gaussian:
         return sigma
     begin = np.log(sigma if noise is None else sigma / np.median(noise.gain))
     every = np.ones_like(sigma)
-    if problem.scalar_sigma:
+    if problem.noise.scalar:
         begin = begin.mean(keepdims=True)
 
     def cost(log_sigma: Array) -> float:
@@ -189,11 +189,14 @@ def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> 
     lower, upper = box(priors)
 
     def residual(points: Array, engine: PartedSimulator | None = None) -> Array:
-        z = robust(problem.whitened(points, sigma, engine), problem.nu).reshape(len(points), -1)
+        z = robust(problem.whitened(points, sigma, engine), problem.noise.nu).reshape(
+            len(points), -1
+        )
         return np.concatenate([np.nan_to_num(z), prior_residual(priors, points)], axis=-1)
 
     begin = 1e-3 * problem.layout.scale(phi)
-    _, steps = posterior_steps(partial(residual, engine=problem.coarse), phi, lower, upper, begin)
+    rough = partial(residual, engine=problem.coarse.simulator)
+    _, steps = posterior_steps(rough, phi, lower, upper, begin)
     jacobian = differentiate(residual, phi, steps, lower, upper)
     precision = jacobian.T @ jacobian
     covariance = np.linalg.pinv(precision, hermitian=True)
@@ -208,4 +211,4 @@ def with_start_noise(problem: Problem, mode: Mode) -> Problem:
     measured = problem.observations.measured.reshape(problem.segments.n, -1)
     sensitivity = problem.sensitivity(mode.phi, mode.sigma)
     sigma = estimate_sigma(problem.residual(mode.phi), problem.observations.measured, sensitivity)
-    return replace(problem, noise=StartNoise.of(sensitivity, measured, sigma))
+    return problem.with_noise(start=StartNoise.of(sensitivity, measured, sigma))

@@ -1,4 +1,4 @@
-"""The posterior of which mode each body has: summed over all of them, exactly."""
+"""The posterior of which parameter set each body has: summed over all of them, exactly."""
 
 from __future__ import annotations
 
@@ -27,22 +27,22 @@ _NUMBERS = 4_000_000
 
 
 class _Combinations:
-    """Every combination of modes of one part's bodies: its prior and its residuals."""
+    """Every combination of parameter sets of one part's bodies: its prior and its residuals."""
 
     def __init__(self, problem: Problem, part: Part, table: Array) -> None:
-        names = [body.name for body in problem.scene.dynamic]
+        names = [body.name for body in problem.scene.moving]
         bodies = [names[i] for i in part.bodies]
-        modes = problem.modes
-        if modes is None:
-            raise FitError("fit: the model has no modes to choose among")
-        priors = [modes.prior(body) for body in bodies]
+        library = problem.library
+        if library is None:
+            raise FitError("fit: the model has no library to choose from")
+        priors = [library.prior(body) for body in bodies]
         possible = [np.flatnonzero(p) for p in priors]
         count = prod(len(each) for each in possible)
         measured = problem.observations.values[:, :, part.bodies]
         if count * measured.size > _MOST:
             raise FitError(
                 f"fit: {', '.join(bodies)} meet in this history, so that {count} combinations of"
-                f" modes are to be summed over; give some modes probability 0 for some bodies,"
+                f" parameter sets are to be summed over; give some probability 0 for some bodies,"
                 " record the bodies apart, or sample the model with pm.sample"
             )
         self.observations = Observations(measured, problem.observations.columns)
@@ -55,7 +55,7 @@ class _Combinations:
         phi = table[part.places, self.indices[:, whose]].reshape(count, -1)
         segments = problem.segments
         states = part.simulator(
-            phi, segments.start[:, part.bodies], segments.actions[:, :, part.bodies]
+            phi, segments.start[:, part.bodies], problem.inputs[:, :, part.bodies]
         )
         self.residual = self.observations.residual(states)
 
@@ -71,10 +71,10 @@ class _Combinations:
         return np.asarray(result + self.log_prior)
 
 
-def choose_modes(
+def choose_from_library(
     problem: Problem, draws: int, chains: int, seed: int
 ) -> tuple[Array, Array, Ints, Array]:
-    """Draw sigma from its marginal posterior, and the modes given sigma.
+    """Draw sigma from its marginal posterior, and the parameter sets given sigma.
 
     Given sigma, bodies that have nothing to do with each other are independent, and the sum over
     every combination is a product of sums. Sigma is drawn by an independence Metropolis sampler
@@ -83,7 +83,7 @@ def choose_modes(
     Parameters
     ----------
     problem : Problem
-        With modes.
+        With a library.
     draws, chains : int
         Draws of each chain, and chains.
     seed : int
@@ -95,8 +95,8 @@ def choose_modes(
         Parameters, shape (chain, draw, p).
     sigma : ndarray
         Shape (chain, draw, state), or (chain, draw, 1) for a scalar sigma.
-    modes : ndarray of int
-        Shape (chain, draw, body).
+    index : ndarray of int
+        Of the parameter set in the library, shape (chain, draw, body).
     accepted : ndarray
         Share of the proposals of sigma that were, shape (chain, draw).
 
@@ -105,28 +105,28 @@ def choose_modes(
     FitError
         If bodies that meet have too many combinations.
     """
-    if problem.modes is None:
-        raise FitError("fit: the model has no modes to choose among")
+    if problem.library is None:
+        raise FitError("fit: the model has no library to choose from")
     rng = np.random.default_rng(seed)
-    table = problem.modes.table(problem.layout, problem.scene)
+    table = problem.library.table(problem.layout, problem.scene)
     parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
     median, spread = problem.noise_prior
     typical = np.log(median)
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
     every = np.ones(len(typical))
-    if problem.scalar_sigma:
+    if problem.noise.scalar:
         typical, counts = typical.mean(keepdims=True), counts.sum(keepdims=True)
 
     def density(log_sigma: Array) -> Array:
         sigma = np.exp(log_sigma) * every
-        each = [logsumexp(part.log_joint(sigma, problem.nu), axis=1) for part in parts]
+        each = [logsumexp(part.log_joint(sigma, problem.noise.nu), axis=1) for part in parts]
         prior = -0.5 * (((log_sigma - typical) / spread) ** 2).sum(axis=1)
         return np.asarray(np.sum(each, axis=0) + prior)
 
     begin = np.log(_rough_sigma(problem, parts, median))
-    begin = begin.mean(keepdims=True) if problem.scalar_sigma else begin
+    begin = begin.mean(keepdims=True) if problem.noise.scalar else begin
     found = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
-    # log sigma of n residuals has about this precision; wider, for modes that mix
+    # log sigma of n residuals has about this precision; wider, for combinations that mix
     shape = _WIDER**2 / (2.0 * counts + spread**-2.0)
     proposal = stats.multivariate_t(found, np.diag(shape), df=_TAIL)
     n = draws * _THIN + _BURN
@@ -144,19 +144,19 @@ def choose_modes(
         accepted.append(moved.reshape(draws, _THIN).mean(axis=1))
         log_sigma = x[kept[drawn]]
         sigmas.append(np.exp(log_sigma))
-        modes = np.zeros((draws, len(problem.scene.dynamic)), dtype=np.intp)
+        index = np.zeros((draws, len(problem.scene.moving)), dtype=np.intp)
         for own, part in zip(parts, problem.simulator.parts, strict=True):
-            joint = own.log_joint(np.exp(log_sigma) * every, problem.nu)
+            joint = own.log_joint(np.exp(log_sigma) * every, problem.noise.nu)
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
-            modes[:, part.bodies] = own.indices[which]
-        chosen.append(modes)
-    names = [body.name for body in problem.scene.dynamic]
+            index[:, part.bodies] = own.indices[which]
+        chosen.append(index)
+    names = [body.name for body in problem.scene.moving]
     owners = [owner for block in problem.layout.blocks for owner in block.owners]
-    every_mode = np.stack(chosen)
-    of = every_mode[..., [names.index(owner) for owner in owners]]
+    every_index = np.stack(chosen)
+    of = every_index[..., [names.index(owner) for owner in owners]]
     phi = table[np.arange(len(owners)), of]
-    return phi, np.stack(sigmas), every_mode, np.stack(accepted)
+    return phi, np.stack(sigmas), every_index, np.stack(accepted)
 
 
 def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> Array:

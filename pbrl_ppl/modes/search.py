@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import COARSE, Problem, estimate_sigma
+from pbrl_ppl.model import Problem, estimate_sigma
 from pbrl_ppl.modes.laplace import FAR_OFF, STALLED, Mode, Peak, climb, finish
 from pbrl_ppl.parameters import box, fold_wheels, inside, prior_draws, prior_residual
 
@@ -81,12 +81,12 @@ def find_modes(
         )
     if initial is not None:
         if rounds is not None:
-            first = climb(problem, inside(priors, initial), problem.coarse, rounds)
+            first = climb(problem, inside(priors, initial), problem.coarse.simulator, rounds)
             return [finish(problem, *first)]
-        near = climb(problem, inside(priors, initial), problem.coarse)
+        near = climb(problem, inside(priors, initial), problem.coarse.simulator)
         return [finish(problem, *_polish(problem, near))]
     if not priors:  # everything is known but the noise
-        return [finish(problem, *climb(problem, np.zeros(0), problem.coarse))]
+        return [finish(problem, *climb(problem, np.zeros(0), problem.coarse.simulator))]
     few = problem.segments.n <= _FEW
     starts = (16 if few else 4) if starts is None else starts
     screened = (1000 if few else 48) if screened is None else screened
@@ -102,14 +102,14 @@ def find_modes(
     # log(1 + z^2): a good start fits most transitions, not the worst one
     order = np.argsort(np.log1p(np.minimum(z, FAR_OFF) ** 2).sum(axis=1))
     begin = draws[order[:starts]]
-    steps = problem.simulator.steps * problem.segments.n * problem.horizon
+    steps = problem.simulator.steps * problem.segments.n * problem.data.horizon
     if few and len(priors) <= _MOST_EVOLVED and steps * _POPULATION * _GENERATIONS < _AFFORDED:
         begin = np.vstack([begin, _evolve(problem, rng)])
     rough = [climb(part, phi, part.simulator) for phi in begin]
     rough.sort(key=lambda result: -result[2])
     found = _distinct(part, rough)
     if not few:
-        found = [climb(problem, phi, problem.coarse) for phi, _, _ in found[:_POLISHED]]
+        found = [climb(problem, phi, problem.coarse.simulator) for phi, _, _ in found[:_POLISHED]]
     found.sort(key=lambda result: -result[2])
     best = _polish(problem, found[0])
     return [finish(problem, *result) for result in (best, *found[1:])]
@@ -166,15 +166,15 @@ def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
 
 def _part(problem: Problem, transitions: int) -> Problem:
     """The problem, roughly, on evenly chosen trajectories of about so many transitions."""
-    history = problem.history
-    rough = replace(problem, substeps=min(COARSE, problem.substeps), extrapolate=False)
+    history = problem.data.history
     share = transitions / max(problem.segments.n, 1)
     count = max(2, math.ceil(share * history.n_trajectories))
-    if problem.noise is not None or count >= history.n_trajectories:
-        return rough
+    if problem.noise.start is not None or count >= history.n_trajectories:
+        return problem.coarse
     chosen = np.linspace(0, history.n_trajectories - 1, count).astype(int)
-    part = replace(rough, history=history.select(chosen))
-    return part if part.observations.columns == problem.observations.columns else rough
+    part = problem.coarse.with_data(history=history.select(chosen))
+    same = part.observations.columns == problem.observations.columns
+    return part if same else problem.coarse
 
 
 def find_mode(

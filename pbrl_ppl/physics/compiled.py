@@ -40,6 +40,8 @@ def _iterations(world, bodies):  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def _set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     for i in range(len(world.bodies)):
+        if world.kinematic[i]:
+            continue
         call1(fn.cpBodySetMass, world.bodies[i], bodies[i, _MASS])
         call1(fn.cpBodySetMoment, world.bodies[i], bodies[i, _MOMENT])
     for j in range(len(world.shapes)):
@@ -212,6 +214,17 @@ def _place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-unty
 
 
 @numba.njit(nogil=True, cache=True)
+def _drive(fn, world, state, action):  # type: ignore[no-untyped-def]
+    """Give the kinematic bodies the velocities of the interval that begins."""
+    for i in range(len(world.bodies)):
+        if world.kinematic[i]:
+            for w in range(3):
+                state[i, 3 + w] = action[i, w]
+            call2(fn.cpBodySetVelocity, world.bodies[i], action[i, 0], action[i, 1])
+            call1(fn.cpBodySetAngularVelocity, world.bodies[i], action[i, 2])
+
+
+@numba.njit(nogil=True, cache=True)
 def _transition(  # type: ignore[no-untyped-def]
     fn, world, properties, joints, commands, command_parameters, forces, force_parameters, start,
     inputs, time_step, normal_gravity, substeps, out,
@@ -241,12 +254,15 @@ def _transition(  # type: ignore[no-untyped-def]
             _set_properties(fn, world, bodies, joints)
             _set_strengths(fn, world, bodies, normal_gravity, 1.0)
             call_int(fn.cpSpaceSetIterations, world.space, _iterations(world, bodies))
+        _drive(fn, world, state, inputs[h])
         for s in range(substeps):
             _act(
                 state, inputs[h], commands, command_parameters, forces, force_parameters,
                 s / substeps, (s + 1) / substeps, signal, previous, command, wrench,
             )  # fmt: skip
             for i in range(k):
+                if world.kinematic[i]:
+                    continue
                 call2(fn.cpBodySetForce, world.bodies[i], wrench[i, 0], wrench[i, 1])
                 call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
             _place_wheels(fn, world, bodies, state, axes, step)

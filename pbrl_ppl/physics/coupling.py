@@ -18,6 +18,8 @@ Parts = tuple[tuple[str, ...], ...]
 def independent_parts(scene: Scene, history: History) -> Parts:
     """Moving bodies in parts that never come near each other and share no joint.
 
+    A kinematic body counts as any other: bodies that it meets are in one part, for it is in one.
+
     Each part has a likelihood of its own given the noise, so that many bodies cost what each of
     them costs alone.
 
@@ -31,7 +33,7 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     Returns
     -------
     tuple of tuple of str
-        Names, in the order of ``scene.dynamic``.
+        Names, in the order of ``scene.moving``.
 
     Examples
     --------
@@ -47,7 +49,7 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     >>> independent_parts(scene, History.from_dataframe(pd.DataFrame(rows).assign(**rest), scene))
     (('a', 'b'), ('c',))
     """
-    names = [body.name for body in scene.dynamic]
+    names = [body.name for body in scene.moving]
     k = len(names)
     together = np.zeros((k, k), dtype=bool)
     for joint in scene.joints:
@@ -60,15 +62,19 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     intervals = history.dataset["n_rows"].to_numpy() - 1
     inside = np.arange(place.shape[1] - 1) < intervals[:, None]
     begin, end = place[:, :-1][inside], place[:, 1:][inside]  # (interval, body, 2)
-    reach = [body.shape.bounding_radius for body in scene.dynamic]
+    reach = [body.shape.bounding_radius for body in scene.moving]
     for i in range(k):
         for j in range(i):
             least = (1.0 + _SHARE) * (reach[i] + reach[j])
             together[i, j] |= _meet(begin[:, i] - begin[:, j], end[:, i] - end[:, j], least)
     count, part = connected_components(together, directed=False)
+    driven = np.array([body.kinematic for body in scene.moving])
+    for which in range(count):  # a kinematic body that meets none goes with the first that moves
+        if driven[part == which].all():
+            part[part == which] = part[~driven][0]
     return tuple(
         tuple(name for name, own in zip(names, part, strict=True) if own == which)
-        for which in range(count)
+        for which in np.unique(part)
     )
 
 

@@ -71,7 +71,7 @@ class PartedSimulator:
         threads: int = 1,
         extrapolate: bool = True,
     ) -> None:
-        names = [body.name for body in scene.dynamic]
+        names = [body.name for body in scene.moving]
         parts = (tuple(names),) if parts is None else parts
         given = [name for part in parts for name in part]
         if sorted(given) != sorted(names):
@@ -92,7 +92,7 @@ class PartedSimulator:
                 extrapolate=extrapolate,
             )
             places = np.array([labels.index(label) for label in chosen.labels], dtype=int)
-            bodies = np.array([names.index(body.name) for body in own.dynamic], dtype=int)
+            bodies = np.array([names.index(body.name) for body in own.moving], dtype=int)
             self.parts.append(Part(simulator, places, bodies))
 
     @property

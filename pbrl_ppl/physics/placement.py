@@ -37,7 +37,7 @@ def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | No
     scene : Scene
         Shapes, walls, static bodies and joints.
     start : ndarray
-        Start states, shape (transition, body, 6), bodies in the order of ``scene.dynamic``:
+        Start states, shape (transition, body, 6), bodies in the order of ``scene.moving``:
         x, y, theta, vx, vy, omega (m, m, rad, m/s, m/s, rad/s).
     where : callable, optional
         ``where(i)`` is what a message calls transition ``i``; ``transition i`` by default.
@@ -64,7 +64,7 @@ def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | No
     pbrl_ppl.errors.SimulationError: transition 0: bodies "a" and "b" overlap by 0.12 m, allowed ...
     """
     start = np.asarray(start, dtype=float)
-    k = len(scene.dynamic)
+    k = len(scene.moving)
     if start.ndim != 3 or start.shape[1:] != (k, 6):
         raise SimulationError(
             f"start has shape {start.shape}, expected (transition, {k}, 6)"
@@ -112,7 +112,7 @@ def overlap(scene: Scene, poses: Array) -> Array:
     scene : Scene
         Shapes, walls, static bodies and joints.
     poses : ndarray
-        Shape (n, body, 3), bodies in the order of ``scene.dynamic``: x, y, theta (m, m, rad).
+        Shape (n, body, 3), bodies in the order of ``scene.moving``: x, y, theta (m, m, rad).
     """
     world = _solids(scene)
     poses = np.concatenate(
@@ -138,7 +138,7 @@ def overlap(scene: Scene, poses: Array) -> Array:
 
 def _apart(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
     """First transition and message of every known joint whose anchors are not where they must."""
-    moving = {body.name: i for i, body in enumerate(scene.dynamic)}
+    moving = {body.name: i for i, body in enumerate(scene.moving)}
     reference = {body.name: body.pose or _ORIGIN for body in scene.bodies} | {WORLD: _ORIGIN}
     for joint in scene.joints:
         if not joint.known or joint.bodies is None:
@@ -198,7 +198,7 @@ class _Solids:
 
 @lru_cache(maxsize=16)
 def _solids(scene: Scene) -> _Solids:
-    moving = [_solid(body) for body in scene.dynamic]
+    moving = [_solid(body) for body in scene.moving]
     ends = [np.array([wall.start, wall.end]) for wall in scene.walls]
     walls = [_Solid(WORLD, ((end, 0.0),), end, 0.0, np.inf) for end in ends]
     static = [body for body in scene.bodies if body.static]

@@ -36,8 +36,9 @@ def rollout(
     start : ndarray
         Start state, shape (body, 6), SI units.
     inputs : ndarray
-        What acts in each interval, shape (H, body, 3 or more): wrenches in N and N m, and the rest
-        as in :data:`pbrl_ppl.history.INPUT`.
+        What acts in each interval, shape (H, body, 3 or more): wrenches in N and N m, of a
+        kinematic body its velocity in m/s and rad/s, and the rest
+        as in :data:`pbrl_ppl.state.INPUT`.
     substeps : int
         Engine steps an interval.
 
@@ -56,7 +57,7 @@ def rollout(
     for body, state in zip(world.bodies, start, strict=True):
         body.position, body.angle = tuple(state[:2]), state[2]
         body.velocity, body.angular_velocity = tuple(state[3:5]), state[5]
-    names = [body.name for body in world.scene.dynamic]
+    names = [body.name for body in world.scene.moving]
     commands = _laws(effects, Command, given.commands[proposal], names)
     forces = _laws(effects, Force, given.forces[proposal], names)
     step = world.scene.time_step / substeps
@@ -66,6 +67,7 @@ def rollout(
         if timed and h > 0:
             bodies = properties[item * len(inputs) + h]
             world.set_properties(bodies, joints)
+        _drive(world, interval)
         for s in range(substeps):
             command = interval[:, :3].copy()
             previous = interval[:, 3:6].copy() if interval.shape[1] > 3 else None
@@ -78,6 +80,8 @@ def rollout(
                     state = _state(world, i)
                     attached.effect.stage.law(state, command[i], parameters, wrench[i])
             for i, body in enumerate(world.bodies):
+                if world.kinematic[i]:
+                    continue
                 body.force, body.torque = tuple(wrench[i, :2]), wrench[i, 2]
             _place_wheels(world, bodies, step)
             world.space.step(step)
@@ -119,6 +123,13 @@ def _command(
     stage.law(state, np.array([*command[i], *before, *phase]), parameters, command[i])
     if previous is not None and not stage.memory:
         stage.law(state, np.array([*before, *before, *phase]), parameters, previous[i])
+
+
+def _drive(world: World, action: Array) -> None:
+    """Give the kinematic bodies the velocities of the interval that begins."""
+    for i in np.flatnonzero(world.kinematic):
+        body = world.bodies[i]
+        body.velocity, body.angular_velocity = tuple(action[i, :2]), action[i, 2]
 
 
 def _state(world: World, i: int) -> Array:

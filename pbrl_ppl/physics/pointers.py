@@ -19,6 +19,7 @@ class Pointers(NamedTuple):
     chained: NDArray[np.bool_]
     padding: int
     bodies: NDArray[np.int64]
+    kinematic: NDArray[np.bool_]
     shapes: NDArray[np.int64]
     shape_body: NDArray[np.int64]
     wheels: NDArray[np.int64]  # (2, wheel): the rod along x, the rod along y
@@ -51,6 +52,7 @@ def pointers(world: World) -> Pointers:
         chained=world.chained,
         padding=world.padding,
         bodies=at([body._body for body in world.bodies]),
+        kinematic=world.kinematic,
         shapes=at([shape._shape for _, shape in world.shapes]),
         shape_body=whole([i for i, _ in world.shapes]),
         wheels=np.stack(

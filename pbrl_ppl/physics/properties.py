@@ -86,18 +86,20 @@ class EngineProperties:
     def __init__(self, scene: Scene, effects: tuple[Attached, ...], layout: Layout) -> None:
         self._scene, self._effects, self._layout = scene, effects, layout
         places = {label: i for i, label in enumerate(layout.labels)}
-        bodies = [body.name for body in scene.dynamic]
+        bodies = [body.name for body in scene.moving]
         self._known = np.zeros((len(bodies), len(COLUMNS)))
         moved = []  # (place in phi, body, column)
-        for i, body in enumerate(scene.dynamic):
-            known = dict(body.known)
+        for i, body in enumerate(scene.moving):
+            known = dict(body.known) | (
+                {"mass": 1.0} if body.kinematic else {}
+            )  # of no consequence
             for name in BODY_PARAMETERS:
                 self._known[i, COLUMN[name]] = known.get(name, 0.0)
                 place = places.get(f"{name}[{body.name}]")
                 if place is not None:
                     moved.append((place, i, COLUMN[name]))
         self._moved = np.array(moved, dtype=int).reshape(-1, 3).T
-        self._unit_moment = np.array([body.shape.unit_moment for body in scene.dynamic])
+        self._unit_moment = np.array([body.shape.unit_moment for body in scene.moving])
         self._places = places
         self._bodies = bodies
         #: Whether a body's numbers depend on the time.
@@ -131,7 +133,8 @@ class EngineProperties:
     def _bind_joints(self, scene: Scene, places: dict[str, int]) -> None:
         self._anchors = np.zeros((len(scene.joints), 4))
         self._held = np.zeros((len(scene.joints), 2), dtype=int)
-        holders = [*scene.joinable, *(body.name for body in scene.bodies if body.static)]
+        fixed = (body.name for body in scene.bodies if body.static or body.kinematic)
+        holders = [*scene.joinable, *fixed]
         poses = {body.name: body.pose for body in scene.bodies} | {WORLD: None}
         self._poses = np.array([poses[name] or (0.0, 0.0, 0.0) for name in holders])
         moved, free = [], []
@@ -278,7 +281,7 @@ class EngineProperties:
         where_not = tuple(np.argwhere(~possible)[0])
         *_, body, column = where_not
         found, name = bodies[where_not], COLUMNS[column]
-        where = f"body {self._scene.dynamic[body].name!r}: {name}"
+        where = f"body {self._scene.moving[body].name!r}: {name}"
         if not np.isfinite(found):
             raise ParameterError(f"{where} is not finite; give a finite number")
         expected = "a positive number" if name in _POSITIVE else "zero or more"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Clock, Command, Force, at_stage, needs_inputs
 from pbrl_ppl.errors import SimulationError
-from pbrl_ppl.history import INPUT, fill_hinges, hung_bodies
+from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.numerics import differentiate
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import calls, compiled, plain
@@ -22,6 +22,7 @@ from pbrl_ppl.physics.pointers import pointers
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import INPUT
 
 PATHS = ("compiled", "plain")
 #: Step of a finite difference as a share of a parameter's scale: about the cube root of the
@@ -112,9 +113,10 @@ class Simulator:
         start : ndarray
             Start states, shape (transition, body, 6).
         actions : ndarray
-            Wrenches, shape (transition, H, body, 3), N and N m; or all inputs, shape (transition,
-            H, body, 9), as in :data:`pbrl_ppl.history.INPUT`. With wrenches alone, nothing acted
-            before the first interval, and the time is after the recording.
+            Wrenches, shape (transition, H, body, 3), N and N m; of a kinematic body its velocity
+            over the interval, m/s and rad/s. Or all inputs, shape (transition, H, body, 9), as in
+            :data:`pbrl_ppl.state.INPUT`: with wrenches alone, nothing acted before the first
+            interval, and the time is after the recording.
 
         Returns
         -------
@@ -211,7 +213,7 @@ class Simulator:
         )  # fmt: skip
 
     def _check(self, phi: Array, start: Array, actions: Array) -> None:
-        k, p = len(self.scene.dynamic), self.layout.size
+        k, p = len(self.scene.moving), self.layout.size
         if phi.ndim not in (1, 2) or phi.shape[-1] != p:
             raise SimulationError(
                 f"phi has shape {phi.shape}, expected ({p},) or (proposal, {p}):"
@@ -240,7 +242,7 @@ class Simulator:
         The engine's error is a series in the substep (Richardson, 1911): two runs cancel its first
         term, three its second as well. Friction of a wheel has kinks that a third run amplifies.
         """
-        wheels = any(body.wheel for body in self.scene.dynamic)
+        wheels = any(body.wheel for body in self.scene.moving)
         runs = (2 if wheels else 3) if self.extrapolate else 1
         counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
         powers = np.vander(1.0 / np.array(counts), increasing=True).T
@@ -263,7 +265,7 @@ class Simulator:
 
     def _laws(self, kind: type) -> tuple[NDArray[Any], ...]:
         attached = at_stage(self.effects, kind)
-        names = [body.name for body in self.scene.dynamic]
+        names = [body.name for body in self.scene.moving]
         sizes = [len(one.effect.parameters) for one in attached]
         stages = [one.effect.stage for one in attached]
         addresses = [calls.law_address(s.law) for s in stages if isinstance(s, Command | Force)]

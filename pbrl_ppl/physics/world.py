@@ -101,12 +101,14 @@ class World:
         self._by_name: dict[str, pymunk.Body] = {WORLD: self.space.static_body}
         self._add_fixed()
         for j in range(discs):
-            self.discs.append(
-                pymunk.Circle(self.space.static_body, NO_SIZE, (-FAR, -FAR * (j + 1)))
-            )
+            away = -FAR, -FAR * (j + 1)
+            self.discs.append(pymunk.Circle(self.space.static_body, NO_SIZE, away))
             self._add_static(self.discs[j])
-        for i, body in enumerate(scene.dynamic):
-            rigid = pymunk.Body(1.0, 1.0)
+        #: Which bodies go where they are told, at the velocities that their actions hold.
+        self.kinematic = np.array([body.kinematic for body in scene.moving])
+        for i, body in enumerate(scene.moving):
+            kind = pymunk.Body.KINEMATIC if body.kinematic else pymunk.Body.DYNAMIC
+            rigid = pymunk.Body(1.0, 1.0, kind)
             rigid.position = FAR * (i + 1.0), FAR
             self.bodies.append(rigid)
             self._by_name[body.name] = rigid
@@ -117,14 +119,14 @@ class World:
         self._add_shapes()
         self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
         self._add_joints(hinges, joined)
-        #: Which bodies are joined to other moving ones.
-        self.chained = np.logical_not(self.can_touch.all(axis=1))
+        #: Which bodies that forces move are joined to other moving ones.
+        self.chained = np.logical_not(self.can_touch.all(axis=1)) & ~self.kinematic
         alone = len(scene.bodies) == 1 and not scene.walls and not discs
         self.iterations = (
             ITERATIONS_CHAINED if self.chained.any() else ITERATIONS_ALONE if alone else ITERATIONS
         )
         #: What the near-contact test needs: circles about bodies, and segments with a radius.
-        self.radii = np.array([body.shape.bounding_radius for body in scene.dynamic])
+        self.radii = np.array([body.shape.bounding_radius for body in scene.moving])
         fixed = [(*wall.start, *wall.end, 0.0) for wall in scene.walls]
         fixed += [
             (*body.pose[:2], *body.pose[:2], body.shape.bounding_radius)
@@ -230,6 +232,8 @@ class World:
         enough = min(ITERATIONS_A_RATIO * ratio, MOST_ITERATIONS)
         self.space.iterations = max(self.iterations, int(enough))
         for i, body in enumerate(self.bodies):
+            if self.kinematic[i]:
+                continue
             body.mass = bodies[i, COLUMN["mass"]]
             body.moment = bodies[i, COLUMN["moment"]]
         for i, shape in self.shapes:

@@ -159,7 +159,9 @@ class ActionSet:
         scene = scene_of(idata)
         given = group(idata, "constant_data")["actions"].to_numpy()
         actions: list[Action] = []
-        for i, body in enumerate(scene.dynamic):
+        for i, body in enumerate(scene.moving):
+            if body.kinematic:  # its path was the action, not a push
+                continue
             sizes = np.hypot(given[..., i, 0], given[..., i, 1]).ravel(), abs(given[..., i, 2])
             force, torque = (
                 float(np.quantile(s[s > 0], _QUANTILE)) if (s > 0).any() else 0.0 for s in sizes
@@ -188,8 +190,9 @@ class ActionSet:
         for action in self.actions:
             if action.body not in moving:
                 raise GoalError(
-                    f'actions: the scene has no moving body "{action.body}"'
-                    f"{nearest(action.body, moving)}"
+                    f'actions: the scene has no moving body "{action.body}" that can be pushed'
+                    f"{nearest(action.body, moving)} (a kinematic body stays where it starts in a"
+                    " plan; Transition.predict takes its path)"
                 )
         self.intervals(scene)
 
@@ -218,7 +221,7 @@ class ActionSet:
         heading : ndarray
             The bodies' angles, shape (n, body), rad.
         """
-        names = [body.name for body in scene.dynamic]
+        names = [body.name for body in scene.moving]
         own = np.array([names.index(action.body) for action in self.actions])[which]
         given = np.array([(*action.force, action.torque) for action in self.actions])[which]
         turns = np.array([action.frame == "body" for action in self.actions])[which]

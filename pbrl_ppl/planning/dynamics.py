@@ -114,8 +114,8 @@ class Dynamics:
         return cls(
             problem.scene,
             phi[chosen],
-            noise=(sigma[chosen], problem.observations.columns, problem.nu),
-            substeps=problem.substeps,
+            noise=(sigma[chosen], problem.observations.columns, problem.noise.nu),
+            substeps=problem.physics.substeps,
             threads=threads,
             declared=effects,
         )

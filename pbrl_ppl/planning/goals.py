@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.state import POSE
 
 Array = NDArray[np.float64]
 
@@ -57,7 +58,7 @@ class Target:
                 continue
             if isinstance(value, bool) or not isinstance(value, int | float | np.number):
                 raise GoalError(f"goal of {self.body}: {each.name} is {value!r}, expected a number")
-            positive = each.name not in ("x", "y", "theta")
+            positive = each.name not in POSE
             if not math.isfinite(value) or (positive and value <= 0):
                 what = "a positive number" if positive else "a finite number"
                 raise GoalError(f"goal of {self.body}: {each.name} is {value}, expected {what}")
@@ -157,13 +158,13 @@ class Goal:
         for target in self.targets:
             if target.body not in moving:
                 raise GoalError(
-                    f'goal: the scene has no moving body "{target.body}"'
+                    f'goal: the scene has no moving body "{target.body}" that can be pushed'
                     f"{nearest(target.body, moving)}"
                 )
 
     def places(self, scene: Scene) -> list[int]:
         """Where the targets' bodies are among the scene's moving ones."""
-        moving = [body.name for body in scene.dynamic]
+        moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
     def errors(self, scene: Scene, states: Array) -> Array:

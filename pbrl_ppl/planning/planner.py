@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.history import STATE, segment_rows, write_atomically
+from pbrl_ppl.history import segment_rows, write_atomically
 from pbrl_ppl.physics import check_placement, overlap
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
@@ -24,6 +24,7 @@ from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.risk import tail_mean
 from pbrl_ppl.planning.search import Found
 from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 
@@ -235,7 +236,7 @@ def _described(
         {
             "draw": np.arange(len(states)),
             "time": ("time", scene.time_step * np.arange(states.shape[1]), {"units": "s"}),
-            "body": [body.name for body in scene.dynamic],
+            "body": [body.name for body in scene.moving],
             "state": list(STATE),
         },
     )
@@ -260,7 +261,7 @@ def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) 
     GoalError
         If a body is unknown or its state incomplete, or bodies lie inside each other.
     """
-    names = [body.name for body in scene.dynamic]
+    names = [body.name for body in scene.moving]
     if isinstance(start, Mapping):
         for name in start:
             if name not in names:
@@ -268,7 +269,7 @@ def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) 
                     f'start: the scene has no moving body "{name}"{nearest(name, names)}'
                 )
         states = np.zeros((len(names), len(STATE)))
-        for i, body in enumerate(scene.dynamic):
+        for i, body in enumerate(scene.moving):
             if body.name not in start and body.pose is None:
                 raise GoalError(
                     f"start: nothing says where {body.name} is; give {body.name} = x, y, theta"

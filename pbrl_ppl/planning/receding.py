@@ -71,7 +71,7 @@ class Horizon:
         noise: bool,
         rng: np.random.Generator,
     ) -> None:
-        self.dynamics, self.goal, self.rng = dynamics, goal, rng
+        self.movings, self.goal, self.rng = dynamics, goal, rng
         self.samples, self.iterations = samples, iterations
         self.tail, self.noise = tail, noise
         self.most = _strongest(dynamics.scene, actions)
@@ -106,13 +106,13 @@ class Horizon:
 
     def _cost(self, start: Array, tried: Array) -> Array:
         """L2 distance from the goal, its mean on the way and at the end, speed there, contacts."""
-        scene, horizon = self.dynamics.scene, tried.shape[1]
+        scene, horizon = self.movings.scene, tried.shape[1]
         states = np.repeat(start[:, None], len(tried), axis=1)
         cost = np.zeros(len(tried))
         for t in range(horizon):
-            states = self.dynamics.step(states, tried[:, t])
+            states = self.movings.step(states, tried[:, t])
             if self.noise:
-                states = self.dynamics.noisy(states, self.rng)
+                states = self.movings.noisy(states, self.rng)
             self.generated += len(tried)
             far = tail_mean(self.goal.distance(scene, states), self.tail)
             cost += far / horizon + scene.time_step * contact_cost(self.goal, scene, states)
@@ -195,8 +195,8 @@ def mppi(
 
 def _strongest(scene: Scene, actions: ActionSet) -> Array:
     """The strongest wrench on each body, shape (body, 3), N, N, N m."""
-    most = np.zeros((len(scene.dynamic), 3))
-    for i, body in enumerate(scene.dynamic):
+    most = np.zeros((len(scene.moving), 3))
+    for i, body in enumerate(scene.moving):
         force, torque = actions.strongest(body.name)
         most[i] = force, force, torque
     return most

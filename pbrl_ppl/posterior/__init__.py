@@ -2,7 +2,7 @@
 
 from pbrl_ppl.posterior.identifiability import Identifiability
 from pbrl_ppl.posterior.identification import identify, uninformed
-from pbrl_ppl.posterior.learned_library import learned_modes, mode_probabilities
+from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
 from pbrl_ppl.posterior.record import (
     MIN_ESS,
     checked,
@@ -45,9 +45,9 @@ __all__ = [
     "groups",
     "identify",
     "interval",
-    "learned_modes",
+    "learned_library",
+    "library_probabilities",
     "load_posterior",
-    "mode_probabilities",
     "parameter_draws",
     "predictive_rows",
     "problem_of",

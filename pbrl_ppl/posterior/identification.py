@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Effect, attach, catalogue
-from pbrl_ppl.model import STATE, Observations, build_layout, whiten
+from pbrl_ppl.model import Observations, build_layout, whiten
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, MIXED, Layout, Prior, fold_draws, inside
 from pbrl_ppl.physics import Simulator
@@ -22,6 +22,7 @@ from pbrl_ppl.posterior.identifiability import (
     Width,
 )
 from pbrl_ppl.posterior.store import group, scalars, scene_of
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 

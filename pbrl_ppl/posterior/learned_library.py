@@ -1,4 +1,4 @@
-"""Modes from posteriors that were learned before, and what a posterior says of them."""
+"""A parameter library from posteriors that were learned before, and what a posterior says of it."""
 
 from __future__ import annotations
 
@@ -10,35 +10,35 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import Modes
+from pbrl_ppl.model import ParameterLibrary
 from pbrl_ppl.posterior.store import group, scalars, scene_of
 
 Array = NDArray[np.float64]
 #: Parameters that are angles, whose mean is a direction.
 _ANGLES = ("w_theta",)
 #: What a posterior holds beside parameters.
-_OTHERS = ("mode", "sigma")
+_OTHERS = ("library_index", "sigma")
 
 
-def learned_modes(
+def learned_library(
     posteriors: Mapping[str, Any], probabilities: Mapping[str, Any] | None = None
-) -> Modes:
-    """The means of posteriors, each learned on its own, as modes to choose among.
+) -> ParameterLibrary:
+    """The means of posteriors, each learned on its own, as parameter sets to choose among.
 
     Parameters
     ----------
     posteriors : mapping of str to InferenceData or DataTree
-        By the name that the mode will have; of one that has several bodies each is a mode, called
-        ``name.body``. What its scene knew of a body goes into the mode.
+        By the name that the set will have; of one that has several bodies each is a set, called
+        ``name.body``. What its scene knew of a body goes into the set.
     probabilities : mapping, optional
-        As for :class:`pbrl_ppl.Modes`.
+        As for :class:`pbrl_ppl.ParameterLibrary`.
 
     Examples
     --------
     ::
 
         learned = {name: pp.load_posterior(f"{name}.nc") for name in ("cart", "table")}
-        model = pp.physics_model(scene, history, modes=pp.learned_modes(learned))
+        model = pp.physics_model(scene, history, library=pp.learned_library(learned))
     """
     sets: dict[str, dict[str, float]] = {}
     for name, idata in posteriors.items():
@@ -50,26 +50,26 @@ def learned_modes(
                 if owner == body.name and key not in _OTHERS:
                     found[key] = _mean(key, values.to_numpy())
             sets[name if len(scene.dynamic) == 1 else f"{name}.{body.name}"] = found
-    return Modes(sets, probabilities)
+    return ParameterLibrary(sets, probabilities)
 
 
-def mode_probabilities(idata: Any) -> pd.DataFrame:
-    """Posterior probability of every mode: one row a body, one column a mode.
+def library_probabilities(idata: Any) -> pd.DataFrame:
+    """Posterior probability of every parameter set: one row a body, one column a set.
 
     Parameters
     ----------
     idata : InferenceData or DataTree
-        As made by :func:`pbrl_ppl.fit` from a model with ``modes``.
+        As made by :func:`pbrl_ppl.fit` from a model with a ``library``.
 
     Raises
     ------
     PosteriorError
-        If it is of a model without modes.
+        If it is of a model without a library.
     """
-    if "modes" not in idata.attrs:
-        raise PosteriorError("posterior: its model has no modes; pass modes= to physics_model")
-    names = Modes.from_json(str(idata.attrs["modes"])).names
-    index = group(idata, "posterior")["mode"].transpose("chain", "draw", "body")
+    if "library" not in idata.attrs:
+        raise PosteriorError("posterior: its model has no library; pass library= to physics_model")
+    names = ParameterLibrary.from_json(str(idata.attrs["library"])).names
+    index = group(idata, "posterior")["library_index"].transpose("chain", "draw", "body")
     share = {name: (index == i).mean(("chain", "draw")) for i, name in enumerate(names)}
     return pd.DataFrame(
         {name: each.to_numpy() for name, each in share.items()}, index=index["body"].to_numpy()

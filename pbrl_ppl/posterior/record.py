@@ -7,7 +7,6 @@ import json
 import sys
 import warnings
 from collections.abc import Iterable, Iterator
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,8 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
-from pbrl_ppl.history import STATE, History, Segments, from_segments
-from pbrl_ppl.model import Modes, Observations, Problem, sigma_prior
+from pbrl_ppl.history import History, Segments, from_segments
+from pbrl_ppl.model import Noise, Observations, ParameterLibrary, Problem, sigma_prior
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws
 from pbrl_ppl.posterior.identification import uninformed
@@ -30,6 +29,7 @@ from pbrl_ppl.posterior.store import (
     groups,
     scene_of,
 )
+from pbrl_ppl.state import INPUT, STATE
 
 Array = NDArray[np.float64]
 
@@ -135,7 +135,7 @@ def evaluate(
     """
     likelihood = np.empty((len(phi), problem.segments.n))
     predictive = []
-    wide = replace(problem, threads=max(problem.threads, 2))
+    wide = problem.with_physics(threads=max(problem.physics.threads, 2))
     size = max(_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE // problem.segments.n)
     for begin in range(0, len(phi), size):
         part = slice(begin, begin + size)
@@ -184,19 +184,26 @@ def problem_of(
         median, spread = json.loads(str(attrs["sigma_prior"]))
     else:  # a file of an older version
         none = np.zeros(len(start), dtype=np.int64)
-        segments = Segments(start, actions, observed, none, none)
+        segments = Segments(start, actions, observed, none, none, actions)
         median, spread = sigma_prior(Observations(values, columns), segments)
-    return Problem(
-        scene=scene,
-        history=from_segments(scene, start, actions, observed) if history is None else history,
-        effects=attach(scene, (), effects),
+    noise = Noise(
+        scalar="state" not in group(idata, "posterior")["sigma"].dims,
+        nu=float(attrs["nu"]) if "nu" in attrs else None,
+        prior=(tuple(float(each) for each in median), float(spread)),
+    )
+    if history is None:
+        history = from_segments(scene, start, actions, observed)
+    elif actions.shape[-1] == len(INPUT):  # recorded since
+        history = history.numbered(float(actions[..., INPUT.index("trajectory")].max()) + 1.0)
+    return Problem.of(
+        scene,
+        history,
+        attach(scene, (), effects),
         horizon=int(attrs["horizon"]),
         substeps=int(attrs["substeps"]),
-        scalar_sigma="state" not in group(idata, "posterior")["sigma"].dims,
-        nu=float(attrs["nu"]) if "nu" in attrs else None,
-        sigma_prior=(tuple(float(each) for each in median), float(spread)),
         columns=columns,
-        modes=Modes.from_json(str(attrs["modes"])) if "modes" in attrs else None,
+        noise=noise,
+        library=ParameterLibrary.from_json(str(attrs["library"])) if "library" in attrs else None,
     )
 
 
@@ -212,7 +219,7 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
 def _folded(problem: Problem, trace: Any) -> xr.Dataset:
     """The posterior with each wheel in one of its equal descriptions, the same in all chains."""
     posterior = group(trace, "posterior").copy(deep=True)
-    if problem.modes is not None:  # the draws are the modes' own
+    if problem.library is not None:  # the draws are the library's own
         return posterior
     layout = problem.layout
     phi, _ = parameter_draws(problem, trace)
@@ -238,21 +245,21 @@ def _origin(problem: Problem, seed: int) -> dict[str, Any]:
     for body in scene.dynamic:
         new = [
             one.effect.name
-            for one in problem.effects
+            for one in problem.physics.effects
             if one.body == body.name and one.effect.name not in body.effects
         ]
         scene = scene.with_effects(body.name, *new)
     return attributes(
         scene,
-        effects=[[one.effect.name, one.body] for one in problem.effects],
+        effects=[[one.effect.name, one.body] for one in problem.physics.effects],
         seed=seed,
-        horizon=problem.horizon,
-        **({} if problem.nu is None else {"nu": problem.nu}),
-        **({} if problem.modes is None else {"modes": problem.modes.to_json()}),
-        substeps=problem.substeps,
+        horizon=problem.data.horizon,
+        **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
+        **({} if problem.library is None else {"library": problem.library.to_json()}),
+        substeps=problem.physics.substeps,
         sigma_prior=[[float(each) for each in median], float(spread)],
-        start_noise=int(problem.noise is not None),
-        data_sha256=problem.history.data_sha256,
+        start_noise=int(problem.noise.start is not None),
+        data_sha256=problem.data.history.data_sha256,
         versions=versions(),
     )
 
@@ -310,7 +317,7 @@ def _trouble(
             f" (want <= {MAX_RHAT}), effective sample size {ess[worst_ess]:.0f} for {worst_ess}"
             f" (want >= {MIN_ESS}); {more}",
         )
-    if problem.modes is not None:  # what follows compares with Table 1
+    if problem.library is not None:  # what follows compares with Table 1
         return
     phi, _ = parameter_draws(problem, idata)
     ends = problem.layout.supports(phi)
@@ -326,7 +333,7 @@ def _trouble(
                 " shape and the frame of the body, or look for an effect that the model lacks"
                 " (pbrl-ppl close-loop)",
             )
-    silent = uninformed(idata, effects={one.effect for one in problem.effects})
+    silent = uninformed(idata, effects={one.effect for one in problem.physics.effects})
     if silent:
         yield (
             UninformedWarning,

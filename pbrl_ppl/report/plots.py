@@ -22,8 +22,8 @@ from scipy.stats import binom, chi2, gaussian_kde, norm
 from pbrl_ppl.calibration import Calibration, bins
 from pbrl_ppl.criticism import Findings, PriorCheck
 from pbrl_ppl.effects import catalogue
-from pbrl_ppl.history import STATE, STATE_UNITS
 from pbrl_ppl.posterior import DATATREE, HDI_PROB, scalars
+from pbrl_ppl.state import STATE, STATE_UNITS
 
 Array = NDArray[np.float64]
 

@@ -50,7 +50,7 @@ def draw_scene(
     for body in scene.bodies:
         if body.static and body.pose is not None:
             axes.add_patch(_outline(body, np.array(body.pose), color=_STATIC))
-    for i, (body, state) in enumerate(zip(scene.dynamic, states, strict=True)):
+    for i, (body, state) in enumerate(zip(scene.moving, states, strict=True)):
         how: dict[str, Any] = {
             "facecolor": _colour(i),
             "edgecolor": "black",
@@ -145,7 +145,7 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
     times = [*range(0, states.shape[1] - 1, every), states.shape[1] - 1]
     figure = Figure(figsize=(6.0, 6.0), layout="constrained")
     axes = figure.add_subplot()
-    reach = max(body.shape.bounding_radius for body in plan.scene.dynamic)
+    reach = max(body.shape.bounding_radius for body in plan.scene.moving)
     places = states[..., :2].reshape(-1, 2)
     places = np.concatenate([places, *(_place(target) for target in plan.goal.targets)])
     low, high = places.min(axis=0) - 2 * reach, places.max(axis=0) + 2 * reach

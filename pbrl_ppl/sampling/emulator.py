@@ -99,7 +99,7 @@ def emulate(
     for block in blocks:
         q[block.places] = block.mean
     widest = max(len(part.places) for part in problem.simulator.parts)
-    close = _CLOSE * np.sqrt(len(problem.parts))  # each part is judged alone
+    close = _CLOSE * np.sqrt(len(problem.simulator.parts))  # each part is judged alone
     for degree in _DEGREES:
         runs = max(_LEAST, _A_COEFFICIENT * _terms(np.zeros(widest), degree).size)
         if runs > _MOST:

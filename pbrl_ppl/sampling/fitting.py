@@ -14,7 +14,7 @@ import xarray as xr
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode, choose_modes, find_mode, weigh
+from pbrl_ppl.modes import Mode, choose_from_library, find_mode, weigh
 from pbrl_ppl.posterior import complete, from_groups, group, groups
 from pbrl_ppl.sampling.emulator import emulate
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
@@ -93,7 +93,8 @@ def _metropolis(job: Job) -> Any:
     else:
         jumps = None
     # an exact step of one block, in engine steps; where that is little, looking ahead is no use
-    cost = problem.simulator.steps * problem.segments.n * problem.horizon / len(problem.parts)
+    engine = problem.simulator
+    cost = engine.steps * problem.segments.n * problem.data.horizon / len(engine.parts)
     if cost > _LITTLE:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
@@ -156,7 +157,7 @@ def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]
     per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
     given = {
         "start": (("transition", "body", "full_state"), segments.start),
-        "actions": (("transition", "step", "body", "wrench"), segments.actions),
+        "actions": (("transition", "step", "body", "wrench"), problem.inputs),
     }
     observed = {
         "next_state": (("transition", "step", "body", "state"), problem.observations.values)
@@ -214,7 +215,7 @@ def fit(
     Multi-start least squares finds the mode, from about which the chains start. Where the scene
     does not say which bodies a joint joins, every choice is fitted by itself, and their draws are
     mixed by their evidences; :func:`pbrl_ppl.joint_probabilities` gives those. A model with
-    ``modes`` needs no chain: all choices are summed over.
+    a ``library`` needs no chain: all choices are summed over.
 
     Parameters
     ----------
@@ -269,13 +270,13 @@ def fit(
         raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
     if method not in METHODS:
         raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
-    if problem.modes is not None:
+    if problem.library is not None:
         if method != _DEFAULT or start is not None:
             raise FitError(
-                "fit: a model of modes is summed over exactly; leave out method= and start="
+                "fit: a model with a library is summed over exactly; leave out method= and start="
             )
         trace = _summed(model, METHODS[method].draws if draws is None else draws, chains, seed)
-        return complete(problem, trace, seed=seed, method="exact sum over modes")
+        return complete(problem, trace, seed=seed, method="exact sum over the library")
     chosen = METHODS[method]
     draws = chosen.draws if draws is None else draws
     if method == "map":
@@ -321,11 +322,11 @@ def fit(
 
 
 def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:
-    """Draws of a model of modes, by summing over them."""
+    """Draws of a model with a library, by summing over its choices."""
     problem = model.problem
-    phi, sigma, mode, accepted = choose_modes(problem, draws, chains, seed)
+    phi, sigma, index, accepted = choose_from_library(problem, draws, chains, seed)
     values: dict[str, Any] = problem.layout.to_dict(phi)
-    values |= {"mode": mode, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
+    values |= {"library_index": index, "sigma": sigma[..., 0] if problem.noise.scalar else sigma}
     return as_trace(model, values, {"accept": accepted})
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +60,8 @@ def rejuvenate(
     accepted : float
         Share of the moves that the exact posterior accepted.
     """
-    mover = _Mover(replace(problem, threads=max(problem.threads, 2)), phi, sigma)
+    wide = problem.with_physics(threads=max(problem.physics.threads, 2))
+    mover = _Mover(wide, phi, sigma)
     begin, rates = mover.u.copy(), []
     for turn in range(_ROUNDS):
         rates.append(np.mean([mover.move(group, rng) for group in mover.groups()]))
@@ -91,12 +91,12 @@ class _Mover:
         median, self.spread = problem.noise_prior
         self.typical = np.log(median)
         self.noise = np.log(sigma)
-        if problem.scalar_sigma:
+        if problem.noise.scalar:
             self.typical = self.typical.mean(keepdims=True)
             self.noise = self.noise[:, :1].copy()
         self.parts = problem.simulator.parts
-        if problem.noise is not None:  # it mixes the bodies' residuals
-            self.parts = problem.engine(1, threads=1, extrapolate=False).parts[:1]
+        if problem.noise.start is not None:  # it mixes the bodies' residuals
+            self.parts = problem.physics.changed(parts=None).simulator.parts
         self.blocks = [
             Gaussian(part.places, self.u[:, part.places].mean(axis=0), _spread(self.u, part.places))
             for part in self.parts
@@ -105,7 +105,7 @@ class _Mover:
         self.of_noise = Gaussian(columns, self.noise.mean(axis=0), _spread(self.noise, columns))
         # the coarse engine's error is taken off where most of the posterior is
         centre = self.phi(self.u.mean(axis=0))
-        self.coarse = problem.coarse
+        self.coarse = problem.coarse.simulator
         self.correction = problem.predict(centre) - problem.predict(centre, self.coarse)
         self.look_ahead: bool | None = None
 
@@ -137,7 +137,7 @@ class _Mover:
         for j, part in enumerate(self.parts):
             own = residual[..., part.bodies, :]
             seen = measured[..., part.bodies, :]
-            result[:, j] = log_density(own, sigma, None, seen, problem.nu).sum(axis=-1)
+            result[:, j] = log_density(own, sigma, None, seen, problem.noise.nu).sum(axis=-1)
         return result
 
     def exact(self, u: Array, noise: Array) -> tuple[Array, Array]:

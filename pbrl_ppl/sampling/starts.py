@@ -55,7 +55,7 @@ def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
     ``model.initial_point()`` has them too, and compiles a function for that.
     """
     shapes: dict[str, tuple[int, ...]] = {b.name: (len(b.owners),) for b in problem.layout.blocks}
-    shapes["sigma"] = () if problem.scalar_sigma else (len(problem.observations.columns),)
+    shapes["sigma"] = () if problem.noise.scalar else (len(problem.observations.columns),)
     return {
         value.name: np.zeros(shapes[model.values_to_rvs[value].name])
         for value in model.continuous_value_vars
@@ -100,7 +100,7 @@ def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     """Mean and covariance of log sigma: the latter half the inverse of the measurements."""
     counts = problem.observations.measured.sum((0, 1, 2))
     mean = np.log(mode.sigma)
-    if problem.scalar_sigma:
+    if problem.noise.scalar:
         counts, mean = counts.sum(keepdims=True), mean[:1]
     return mean, np.diag(0.5 / np.maximum(counts, 1))
 

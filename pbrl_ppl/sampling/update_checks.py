@@ -9,8 +9,9 @@ import numpy as np
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import STATE, Problem
+from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, scene_of
+from pbrl_ppl.state import STATE
 
 #: With fewer draws there is nothing to choose from.
 _LEAST_DRAWS = 100
@@ -54,7 +55,7 @@ def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
 def check_history(idata: Any, history: History) -> None:
     """Refuse a history of other bodies, dimensions or sampling, or of nothing to go on with."""
     scene, horizon = scene_of(idata), int(idata.attrs["horizon"])
-    names = tuple(body.name for body in scene.dynamic)
+    names = tuple(body.name for body in scene.moving)
     if history.bodies != names:
         raise HistoryError(
             f"update: the history is of {', '.join(history.bodies)}, the posterior of"
@@ -65,13 +66,6 @@ def check_history(idata: Any, history: History) -> None:
         raise HistoryError(
             f"update: the history has a row each {step:g} s, the posterior's each"
             f" {scene.time_step:g} s; load it with the posterior's scene"
-        )
-    longest = int(history.dataset["n_rows"].max()) - 1
-    if longest < horizon:
-        raise HistoryError(
-            f"update: the posterior predicts {horizon} interval{'s' * (horizon > 1)} from one"
-            f" state, and the longest new trajectory has {longest}; record at least that many in"
-            " a row"
         )
     segments = history.segments(horizon)
     measured = [str(name) for name in group(idata, "observed_data")["state"].values]
@@ -93,7 +87,7 @@ def check_engine(idata: Any, problem: Problem) -> None:
     some = {"transition": slice(_CHECKED)}
     few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
     held = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
-    first = problem_of(held, {one.effect for one in problem.effects})
+    first = problem_of(held, {one.effect for one in problem.physics.effects})
     phi, sigma = parameter_draws(problem, idata)
     now = first.log_density(first.residual(phi[0]), sigma[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()

@@ -164,7 +164,7 @@ def _updated(
             return checked(problem, result), how | {"did": "reweighted"}
     # from here on all data are needed
     whole = problem_of(from_groups(groups(idata) | data, idata.attrs), effects)
-    if share < _REFIT or heavy or whole.modes is not None:  # modes cannot be moved by steps
+    if share < _REFIT or heavy or whole.library is not None:  # sets cannot be moved by steps
         why = f"their tail has a shape k of {k:.2g}" if heavy else f"worth {share:.1%} of the draws"
         warnings.warn(
             f"update: the new data leave the posterior so far behind ({why}) that all of them are"
@@ -276,7 +276,7 @@ def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
     segments, result = problem.segments, {}
     new = {
         "start": segments.start,
-        "actions": segments.actions,
+        "actions": problem.inputs,
         "next_state": problem.observations.values,
     }
     for name in ("observed_data", "constant_data"):
@@ -294,7 +294,7 @@ def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
 def _walkers(problem: Problem, like: xr.Dataset, phi: Array, sigma: Array) -> xr.Dataset:
     """Vectors (draw, p) and (draw, state) as named draws, shaped like others."""
     named = problem.layout.to_dict(phi)
-    named["sigma"] = sigma[:, 0] if problem.scalar_sigma else sigma
+    named["sigma"] = sigma[:, 0] if problem.noise.scalar else sigma
     return like.assign(
         {
             name: (like[name].dims, values.reshape(like[name].shape))

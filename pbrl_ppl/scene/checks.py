@@ -16,6 +16,9 @@ Point = tuple[float, float]
 PARAMETER_NAMES = ("mass", "r", "mu_c", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
 """The parameters of a body, in the order of Table 1."""
 
+CONTACT_NAMES = ("r", "mu_c")
+"""Those of them that a contact needs: all that a kinematic body has."""
+
 HYPER_NAMES = ("mu", "sigma", "kappa")
 
 

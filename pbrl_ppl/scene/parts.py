@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene.checks import (
+    CONTACT_NAMES,
     Point,
     flag,
     hyper_parameters,
@@ -35,6 +36,9 @@ class Body:
         Whether an anisotropic-friction wheel is part of its prior.
     static : bool
         Whether it never moves; it then needs a `pose`.
+    kinematic : bool
+        Whether it follows its recorded path whatever it meets, as a robot's finger does; of its
+        parameters only ``r`` and ``mu_c`` matter then.
     known : tuple of (str, float)
         Parameters that are given, not inferred; a mapping is accepted.
     prior : tuple of (str, tuple of (str, float))
@@ -44,7 +48,7 @@ class Body:
     effects : tuple of str
         Effects of the catalogue that are declared from the start.
     pose : tuple of float, optional
-        ``x, y, theta`` (m, m, rad) of a static body.
+        ``x, y, theta`` (m, m, rad) of a static body; of another, its reference pose.
 
     Raises
     ------
@@ -61,6 +65,7 @@ class Body:
     shape: Shape
     wheel: bool = False
     static: bool = False
+    kinematic: bool = False
     known: tuple[tuple[str, float], ...] = ()
     prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
     effects: tuple[str, ...] = ()
@@ -91,6 +96,25 @@ class Body:
             raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
         if self.static and self.wheel:
             raise SceneError(f"{where}: a static body cannot have a wheel; drop one of the two")
+        flag(self.kinematic, f"{where}: kinematic")
+        if self.kinematic:
+            self._check_kinematic(where)
+
+    def _check_kinematic(self, where: str) -> None:
+        """Refuse what acts on bodies that forces move."""
+        for name in ("static", "wheel", "effects"):
+            if getattr(self, name):
+                raise SceneError(
+                    f"{where}: it is kinematic, it goes where its path leads, and has {name} ="
+                    f" {getattr(self, name)!r}; drop one of the two"
+                )
+        for table in ("known", "prior"):
+            for name, _ in getattr(self, table):
+                if name not in CONTACT_NAMES:
+                    raise SceneError(
+                        f"{where}: it is kinematic and {table} has {name}, which does not matter"
+                        f" then; expected {' or '.join(CONTACT_NAMES)}; drop it"
+                    )
 
 
 @dataclass(frozen=True)

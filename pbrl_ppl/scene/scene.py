@@ -38,7 +38,7 @@ class Scene:
     substeps : int
         Engine steps a sample.
     bodies : tuple of Body
-        At least one that is not static.
+        At least one of them dynamic: neither static nor kinematic.
     walls : tuple of Wall
         Immovable segments.
     joints : tuple of Joint
@@ -90,7 +90,10 @@ class Scene:
             if names.count(name) > 1:
                 raise SceneError(f'scene: {names.count(name)} bodies are called "{name}"; rename')
         if not self.dynamic:
-            raise SceneError("scene: it has no body that moves; add a [[body]]")
+            raise SceneError(
+                "scene: it has no body that moves freely; add a [[body]] that is neither static nor"
+                " kinematic"
+            )
         for body in self.bodies:
             if body.wheel and self.normal_gravity <= 0:
                 raise SceneError(
@@ -111,7 +114,8 @@ class Scene:
             could = joint.bodies or names
             if not any(body.name in could for body in self.dynamic):
                 raise SceneError(
-                    f"{where}: neither {could[0]} nor {could[1]} can move; join a moving body"
+                    f"{where}: neither {could[0]} nor {could[1]} can move freely; join a body that"
+                    " is neither static nor kinematic"
                 )
             for body in self.bodies:
                 inferred_rod = not joint.known and joint.kind == "distance"
@@ -176,13 +180,18 @@ class Scene:
         return scene_toml.write(sections)
 
     @property
-    def dynamic(self) -> tuple[Body, ...]:
-        """The bodies that are not static, in order."""
+    def moving(self) -> tuple[Body, ...]:
+        """The bodies that are not static, in order: those of a history and of arrays of states."""
         return tuple(body for body in self.bodies if not body.static)
 
     @property
+    def dynamic(self) -> tuple[Body, ...]:
+        """The moving bodies that forces move: those that are not kinematic, in order."""
+        return tuple(body for body in self.moving if not body.kinematic)
+
+    @property
     def joinable(self) -> tuple[str, ...]:
-        """What the indices ``i_a`` and ``i_b`` of an inferred joint count: moving bodies, world."""
+        """What the indices ``i_a``, ``i_b`` of an inferred joint count: dynamic bodies, world."""
         return (*(body.name for body in self.dynamic), WORLD)
 
     @property

@@ -17,7 +17,7 @@ KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "[world]": (("time_step",), ("gravity", "normal_gravity", "substeps")),
     "body": (
         ("name", "shape"),
-        ("wheel", "static", "known", "prior", "effects", "pose"),
+        ("wheel", "static", "kinematic", "known", "prior", "effects", "pose"),
     ),
     "shape": (("kind",), ("size", "radius", "vertices")),
     "wall": (("from", "to"), ()),

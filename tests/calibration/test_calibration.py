@@ -17,10 +17,12 @@ from pbrl_ppl.calibration.replication import Record, Truth, draw_truths, simulat
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, build_model, physics_model
+from pbrl_ppl.model import Noise, Problem, build_model, physics_model
 from pbrl_ppl.report import plots
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
-from tests.model.test_model import CART, OBJECT_MODE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
+from tests.helpers.marks import OBJECT_MODE
 
 # from here on every model is also drawn from
 pytestmark = OBJECT_MODE
@@ -252,7 +254,7 @@ def test_sigma_s_prior_is_the_design_s(puck: tuple[Scene, History]) -> None:
     """Whatever is simulated, sigma has the prior that it was drawn from."""
     scene, history = puck
     design = design_of(history, scene)
-    fixed = Problem(scene, history, (), 1, 2, sigma_prior=((0.5,) * 6, 1.5))
+    fixed = Problem.of(scene, history, substeps=2, noise=Noise(prior=((0.5,) * 6, 1.5)))
     point = {"mass_log__": np.zeros(1), "sigma_log__": np.linspace(-1.0, 1.0, 6)}
     densities = []
     for problem in (fixed, simulated(fixed, 7.0 * design.observations.values)):
@@ -540,7 +542,7 @@ def test_processes_give_the_same_numbers(puck: tuple[Scene, History]) -> None:
     xr.testing.assert_identical(here.dataset, there.dataset)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_cart_is_calibrated() -> None:
     """The whole pipeline on 12 transitions of a wheeled cart; false-alarm rate 2 %, fixed seed."""
     scene = cart_scene(prior=PRIOR, known={"r": 0.2, "mu_c": 0.3}).replace(substeps=5)

@@ -13,7 +13,8 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
 from pbrl_ppl.report import report
 from pbrl_ppl.report.report import FILES, Loop
-from tests.report.test_report import made_up
+from tests.helpers.made_up import made_up
+from tests.helpers.places import ROOT
 
 SCENE = """
 [world]
@@ -222,7 +223,7 @@ def run(*argv: str) -> list[str]:
 
 @pytest.mark.usefixtures("files")
 def test_process() -> None:
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parents[2])}
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
     got = subprocess.run(
         run("check", "scene.toml", "nope.csv"), capture_output=True, text=True, env=environment
     )

@@ -13,7 +13,8 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import find_mode, with_start_noise
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.conftest import COLUMNS, ROOT
+from tests.helpers.histories import COLUMNS
+from tests.helpers.places import ROOT
 
 EFFECTS = {effect.name: effect for effect in catalogue}
 
@@ -33,7 +34,7 @@ QUICK = {"angular_drag", "push_offset"}
 
 
 def mode_of(scene, history, horizon=1, initial=None):
-    problem = Problem(scene, history, attach(scene), horizon, scene.substeps, threads=2)
+    problem = Problem.of(scene, history, attach(scene), horizon=horizon, threads=2)
     mode = find_mode(problem, seed=3, initial=initial)
     for _ in range(2):
         mode = find_mode(with_start_noise(mode.problem, mode), initial=mode.phi)
@@ -42,7 +43,7 @@ def mode_of(scene, history, horizon=1, initial=None):
 
 def ranked(scene, history, **options):
     mode = mode_of(scene, history, **options)
-    return rank_candidates(mode, candidates(scene, mode.problem.effects))
+    return rank_candidates(mode, candidates(scene, mode.problem.physics.effects))
 
 
 @pytest.fixture(scope="module")

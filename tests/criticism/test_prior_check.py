@@ -12,7 +12,9 @@ from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.report import plots
-from tests.model.test_model import CART, STATE, cart_scene, simulated_history
+from pbrl_ppl.state import STATE
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,8 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import revise
-from tests.conftest import COLUMNS, ROOT
+from tests.helpers.histories import COLUMNS
+from tests.helpers.places import ROOT
 
 #: Effect in the truth file -> name in the catalogue, and its parameters' names.
 NAMES = {

@@ -6,18 +6,18 @@ import json
 import math
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 from scipy.special import ellipk
 
+from tests.helpers.places import RECORDED, ROOT
+
 pytest.importorskip("Box2D", reason="Box2D makes the histories; install the extra `test`")
 
-ROOT = Path(__file__).parents[2]
 CART_FOLDER, PENDULUM_FOLDER = ROOT / "models/shopping_cart", ROOT / "models/pendulum"
-NULL_DATA = ROOT.parent / "shared/data/cart-null"
+NULL_DATA = RECORDED / "cart-null"
 STATE = ["x", "y", "theta", "vx", "vy", "omega"]
 WRENCH = ["force_x", "force_y", "torque"]
 G = 9.81

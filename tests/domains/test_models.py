@@ -5,7 +5,7 @@ import importlib.util
 import numpy as np
 
 import pbrl_ppl as pp
-from tests.conftest import ROOT
+from tests.helpers.places import ROOT
 
 
 def test_the_cart_written_out_is_the_cart_declared():

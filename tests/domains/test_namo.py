@@ -15,7 +15,7 @@ import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
 from pbrl_ppl.report.scene_plots import draw_goal, draw_motion, draw_scene
 from pbrl_ppl.sampling import fitting
-from tests.conftest import ROOT
+from tests.helpers.places import ROOT
 
 #: What the model believes before it has touched anything, roughly: the medians of the prior.
 BELIEVED = {

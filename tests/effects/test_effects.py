@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pbrl_ppl.effects import Effect, EffectParameter, attach, catalogue
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-from tests.worlds import BY_NAME, G, body, predict, simulator, state
+from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 
 BOX = Shape.box(0.9, 0.55)
 MASS = 2.0

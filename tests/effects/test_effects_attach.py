@@ -8,7 +8,7 @@ from pbrl_ppl.effects import EffectParameter, attach, candidates
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Joint, Scene, Shape
-from tests.worlds import BY_NAME, body
+from tests.helpers.worlds import BY_NAME, body
 
 BOX = Shape.box(0.9, 0.55)
 

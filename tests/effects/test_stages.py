@@ -21,7 +21,7 @@ from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-from tests.worlds import BY_NAME, G, body, phi_of, predict, state
+from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, state
 
 BOX = Shape.box(0.9, 0.55)
 MASS = 2.0

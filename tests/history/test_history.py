@@ -11,12 +11,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pbrl_ppl.errors import HistoryError, OutputError
-from pbrl_ppl.history.history import STATE, WRENCH, History
+from pbrl_ppl.history import History
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl.state import STATE, WRENCH
+from tests.helpers.places import RECORDED
 
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
 needs_data = pytest.mark.skipif(
-    not DATA.is_dir(), reason="../shared/data is not beside the repository"
+    not RECORDED.is_dir(), reason="../shared/data is not beside the repository"
 )
 
 BOX = Shape.box(0.2, 0.4)
@@ -59,7 +60,7 @@ def test_arrays_hold_the_rows() -> None:
 
 @needs_data
 def test_all_the_data_loads() -> None:
-    paths = sorted(DATA.rglob("*.csv"))
+    paths = sorted(RECORDED.rglob("*.csv"))
     assert paths
     for path in paths:
         scene = Scene.load(path.parent / "scene.toml")
@@ -204,6 +205,26 @@ def test_segments_with_incomplete_start_are_dropped() -> None:
     assert not np.isnan(segments.start).any()
 
 
+def test_trajectories_shorter_than_the_horizon_end_early() -> None:
+    frame = table(PAIR, steps=(3, 5, 4))
+    history = History.from_dataframe(frame, PAIR)
+    segments = history.segments(4)
+    assert segments.trajectory.tolist() == [0, 1, 2]
+    assert segments.step.tolist() == [0, 0, 0]
+    assert np.isfinite(segments.observed).all(axis=(2, 3)).sum(axis=1).tolist() == [2, 4, 3]
+    np.testing.assert_array_equal(segments.actions[0, 2:], 0.0)
+    np.testing.assert_array_equal(segments.observed[0, :2], history.segments(2).observed[0])
+    assert history.segments(9).horizon == 9
+
+
+def test_segments_start_at_the_first_complete_state() -> None:
+    frame = table(steps=(7,))
+    frame.loc[[0, 3, 4], "x"] = math.nan
+    assert History.from_dataframe(frame, CART).segments(2).step.tolist() == [1]
+    frame.loc[4, "x"] = 0.0
+    assert History.from_dataframe(frame, CART).segments(2).step.tolist() == [1, 4]
+
+
 def test_split_and_select() -> None:
     history = History.from_dataframe(table(steps=(3, 4, 2, 5, 3)), CART)
     train, test = history.split(0.4, seed=3)
@@ -227,8 +248,6 @@ def test_bad_requests() -> None:
     for horizon in (0, True, 1.5):
         with pytest.raises(HistoryError, match="expected a whole number"):
             history.segments(horizon)
-    with pytest.raises(HistoryError, match="longest trajectory has 3"):
-        history.segments(4)
     with pytest.raises(HistoryError, match="cannot be split"):
         history.select([0]).split()
     with pytest.raises(HistoryError, match="between 0 and 1"):

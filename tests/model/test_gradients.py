@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.model.test_model import simulated_history
+from tests.helpers.histories import simulated_history
 
 TRUTH = {"mass": 3.0, "linear_drag_coefficient": 2.0, "constant_force_force_x": 1.0}
 TRUTH |= {"constant_force_force_y": -0.5}

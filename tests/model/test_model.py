@@ -1,9 +1,7 @@
 """physics_model: an ordinary pm.Model with the prior of Table 1 and the likelihood of Eq. 11."""
 
 import math
-from collections.abc import Iterable, Mapping
-from pathlib import Path
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 import pandas as pd
@@ -11,84 +9,19 @@ import pymc as pm
 import pytest
 from scipy import stats
 
-from pbrl_ppl.effects import attach, catalogue
+from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EffectError, HistoryError, SimulationError
-from pbrl_ppl.history.history import STATE, WRENCH, History
-from pbrl_ppl.model import Problem, StartNoise, build_layout, physics_model
+from pbrl_ppl.history import History
+from pbrl_ppl.model import Problem, StartNoise, physics_model
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl.state import STATE, WRENCH
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import NOISE, simulated_history
+from tests.helpers.marks import OBJECT_MODE
+from tests.helpers.places import MODELS
 
-MODELS = Path(__file__).parents[2] / "models"
 BY_NAME = {effect.name: effect for effect in catalogue}
-NOISE = (0.002, 0.002, 0.004, 0.01, 0.01, 0.02)  # m, m, rad, m/s, m/s, rad/s
-# PyMC 6 compiles to numba, which has no truncated normal draws and cannot compile a random
-# function of our own: it says that it runs them in Python. Nothing is wrong.
-OBJECT_MODE = pytest.mark.filterwarnings("ignore:Numba will use object mode:UserWarning")
-
-
-def simulated_history(
-    scene: Scene,
-    truth: Mapping[str, object],
-    *,
-    seed: int,
-    trajectories: int = 4,
-    intervals: int = 10,
-    effects: Iterable = (),
-    noise: float | tuple[float, ...] = NOISE,
-    wrench_sd: tuple[float, float, float] = (12.0, 12.0, 2.0),
-    start_sd: tuple[float, ...] = (1.0, 1.0, 1.5, 1.0, 1.0, 0.8),
-    poses: Any = None,
-    substeps: int = 40,
-) -> History:
-    """A history made with the package's engine.
-
-    The bodies start 4 m apart, or at rest in these poses (body, 3).
-    """
-    rng = np.random.default_rng(seed)
-    attached = attach(scene, effects)
-    layout = build_layout(scene, attached)
-    simulator = Simulator(scene, layout, attached, substeps=substeps)
-    names = [body.name for body in scene.dynamic]
-    k = len(names)
-    start = rng.normal(0.0, start_sd, (trajectories, k, 6))
-    start[..., 0] += 4.0 * np.arange(k)
-    if poses is not None:
-        start[..., :3], start[..., 3:] = poses, 0.0
-    actions = rng.normal(0.0, wrench_sd, (trajectories, intervals, k, 3))
-    states = simulator(layout.to_vector(truth), start, actions)
-    states = np.concatenate([start[:, None], states], axis=1)
-    states += rng.standard_normal(states.shape) * noise
-    rows = [
-        {
-            "trajectory": t,
-            "time": i * scene.time_step,
-            "body": name,
-            **dict(zip(STATE, states[t, i, j], strict=True)),
-            **(dict(zip(WRENCH, actions[t, i, j], strict=True)) if i < intervals else {}),
-        }
-        for t in range(trajectories)
-        for i in range(intervals + 1)
-        for j, name in enumerate(names)
-    ]
-    return History.from_dataframe(pd.DataFrame(rows), scene)
-
-
-def cart_scene(**options) -> Scene:
-    """A wheeled cart on a floor, seen from above, in a room without walls."""
-    cart = Body("cart", Shape.box(0.9, 0.55), **({"wheel": True} | options))
-    return Scene(time_step=0.1, normal_gravity=9.81, bodies=(cart,))
-
-
-CART = {
-    "mass": 6.5,
-    "r": 0.2,
-    "mu_c": 0.3,
-    "w_x": -0.25,
-    "w_y": 0.0,
-    "w_theta": 0.1,
-    "mu_x": 0.04,
-    "mu_y": 0.45,
-}
 
 
 @pytest.fixture(scope="module")
@@ -113,7 +46,11 @@ def expected_logp(model: pm.Model, point: Mapping[str, np.ndarray], priors) -> f
     problem = model.problem
     layout, segments = problem.layout, problem.segments
     simulator = Simulator(
-        problem.scene, layout, problem.effects, substeps=problem.substeps, path="plain"
+        problem.scene,
+        layout,
+        problem.physics.effects,
+        substeps=problem.physics.substeps,
+        path="plain",
     )
     predicted = simulator(layout.to_vector(point), segments.start, segments.actions)
     residual = segments.observed - predicted
@@ -127,7 +64,7 @@ def expected_logp(model: pm.Model, point: Mapping[str, np.ndarray], priors) -> f
     change = segments.observed - segments.start[:, None]
     change[..., 2] = np.angle(np.exp(1j * change[..., 2]))
     median = 0.1 * np.sqrt(np.nanmean(change[..., measured] ** 2, axis=(0, 1, 2)))
-    if problem.scalar_sigma:
+    if problem.noise.scalar:
         median = np.exp(np.log(median).mean())
     return total + stats.lognorm(s=2.0, scale=median).logpdf(point["sigma"]).sum()
 

@@ -14,7 +14,7 @@ from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.model import SimulatorOp, build_layout
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-from tests.worlds import G
+from tests.helpers.worlds import G
 
 BOX = Shape.box(0.9, 0.55)
 MODES = pytest.mark.parametrize("mode", [None, "FAST_COMPILE"])

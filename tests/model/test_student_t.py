@@ -1,7 +1,5 @@
 """Student-t noise: its density, its draws, and what outliers do to a fit with and without it."""
 
-from dataclasses import replace
-
 import numpy as np
 import pandas as pd
 import pytensor.tensor as pt
@@ -15,7 +13,9 @@ from pbrl_ppl.model.likelihood import log_density, next_state_logp, next_state_r
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws
 from pbrl_ppl.sampling import fit
-from tests.model.test_model import CART, NOISE, cart_scene, simulated_history
+from pbrl_ppl.state import STATE
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import NOISE, simulated_history
 
 NU = 4.0
 
@@ -35,7 +35,7 @@ def spoilt(scene, clean) -> History:
     """One next state in twelve is off by 20 to 60 standard deviations, as after a hidden bump."""
     rng = np.random.default_rng(12)
     frame: pd.DataFrame = clean.to_dataframe()
-    columns = ["x", "y", "theta", "vx", "vy", "omega"]
+    columns = list(STATE)
     # the last row of a trajectory is nobody's start state
     last = frame.groupby("trajectory").tail(1).index[::2]
     off = rng.uniform(20, 60, (len(last), 6)) * rng.choice([-1, 1], (len(last), 6))
@@ -96,7 +96,7 @@ def test_scalar_sigma_and_start_noise_are_allowed(scene, clean) -> None:
     mode = find_mode(problem, seed=1)
     assert np.ptp(mode.sigma) == 0
     assert np.isfinite(mode.log_posterior)
-    assert replace(problem, nu=None).nu is None
+    assert problem.with_noise(nu=None).noise.nu is None
 
 
 @pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")

@@ -6,7 +6,7 @@ import pytest
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.model import Transition
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
-from tests.worlds import G
+from tests.helpers.worlds import G
 
 PUCK = Shape.circle(0.1)
 

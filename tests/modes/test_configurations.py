@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError, PosteriorError, UninformedWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.model import STATE, Problem, build_layout, physics_model
+from pbrl_ppl.model import Problem, build_layout, physics_model
 from pbrl_ppl.modes import Mode, find_mode, weigh
 from pbrl_ppl.modes.configurations import (
     ATTRIBUTE,
@@ -42,9 +42,10 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling import fit, mixture
 from pbrl_ppl.scene import WORLD, Joint, Scene, Shape
-from tests.model.test_model import WRENCH, simulated_history
-from tests.modes.test_joints import HINGED, reference_anchors, scene
-from tests.worlds import G, body
+from pbrl_ppl.state import STATE, WRENCH
+from tests.helpers.histories import simulated_history
+from tests.helpers.joints import HINGED, reference_anchors, scene
+from tests.helpers.worlds import G, body
 
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
@@ -199,7 +200,7 @@ def test_evidence_is_that_of_a_fine_grid() -> None:
             (pm.TruncatedNormal.dist(mu=0.5, sigma=1.0, lower=0.0, upper=1.0), grid[:, 1]),
         )
     )
-    model = physics_model(problem.scene, problem.history, sigma="scalar")
+    model = physics_model(problem.scene, problem.data.history, sigma="scalar")
     law = model["sigma"]
     sigma = np.exp(log_sigma)
     of_sigma = pm.logp(law, sigma).eval() + log_sigma  # d sigma = sigma d log sigma

@@ -1,7 +1,5 @@
 """Joints whose bodies and anchors are inferred: the engine, phi's layout and the model."""
 
-from dataclasses import replace
-
 import numpy as np
 import pymc as pm
 import pytest
@@ -12,32 +10,12 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import build_layout, physics_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Simulator
-from pbrl_ppl.scene import WORLD, Joint, Scene, Shape, Wall
-from tests.model.test_model import simulated_history
-from tests.worlds import G, body
+from pbrl_ppl.scene import WORLD, Joint, Scene
+from tests.helpers.histories import simulated_history
+from tests.helpers.joints import HINGED, NAMES, POSES, reference_anchors, scene
 
 KINDS = pytest.mark.parametrize("kind", ["hinge", "distance"])
 PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
-POSES = ((0.0, 0.0, 0.0), (1.2, 0.1, 0.4), (2.5, -0.2, -0.3), (0.3, 2.0, 0.0))
-#: Boxes a and b overlap, as hinged bodies do, and the hinge lies in both.
-HINGED = (POSES[0], (0.75, 0.05, 0.4), *POSES[2:])
-PIN = (0.35, 0.05)
-NAMES = ("a", "b", "c", "d")
-
-
-def scene(*joints: Joint, walls: bool = False, poses=POSES) -> Scene:
-    """Four wheeled boxes of which everything is known, and joints."""
-    wheel = {"mu_x": 0.02, "mu_y": 0.2, "w_x": 0.1}
-    shape = Shape.box(0.8, 0.5)
-    bodies = (
-        body(name, shape, wheel=True, mass=mass, **wheel)
-        for name, mass in zip(NAMES, (1.0, 2.0, 1.5, 3.0), strict=True)
-    )
-    placed = tuple(replace(each, pose=pose) for each, pose in zip(bodies, poses, strict=True))
-    edge = (Wall((-9.0, -9.0), (9.0, -9.0)),) if walls else ()
-    return Scene(
-        time_step=0.1, normal_gravity=G, bodies=placed, joints=joints, walls=edge, substeps=10
-    )
 
 
 def simulator(*joints: Joint, **options) -> Simulator:
@@ -51,17 +29,6 @@ def data(n: int = 10) -> tuple[np.ndarray, np.ndarray]:
     start[..., :3] = POSES
     start[..., 3:] = rng.normal(0, 0.5, (n, 4, 3))
     return start, rng.normal(0, [8.0, 8.0, 1.0], (n, 2, 4, 3))
-
-
-def reference_anchors(first: int, second: int, point=PIN, poses=HINGED) -> list[float]:
-    """The world point in both bodies' frames, in their reference poses."""
-    anchors = []
-    for i in (first, second):
-        x, y, theta = poses[i]
-        c, s = np.cos(theta), np.sin(theta)
-        dx, dy = point[0] - x, point[1] - y
-        anchors += [c * dx + s * dy, -s * dx + c * dy]
-    return anchors
 
 
 # -- the engine ------------------------------------------------------------------------------------

@@ -1,6 +1,5 @@
 """Modes: recovery from a wrong start, the wheel's symmetry, start noise and derivatives."""
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -15,7 +14,8 @@ from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.numerics import differentiate
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.scene import Scene
-from tests.model.test_model import CART, NOISE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import NOISE, simulated_history
 
 WHEEL = ("w_x", "w_y", "w_theta", "mu_x", "mu_y")
 # r and mu_c matter in contacts only, and there is none
@@ -173,7 +173,7 @@ def test_start_noise_explains_what_the_residual_holds(problem, modes) -> None:
     """The start is as noisy as the end: Eq. 11's sigma is too wide, with F it is the sensor's."""
     mode = modes[0]
     wider = with_start_noise(problem, mode)
-    assert wider.noise is not None
+    assert wider.noise.start is not None
     again = find_mode(wider, initial=mode.phi)
     # sqrt(1 / 2N) each, twice as much for what F and the fitted parameters take: 4 such for 6
     # numbers, false alarm below 1e-3
@@ -187,8 +187,9 @@ def test_start_noise_explains_what_the_residual_holds(problem, modes) -> None:
 
 def test_start_noise_does_not_change_the_problem_otherwise(problem, modes) -> None:
     wider = with_start_noise(problem, modes[0])
-    assert problem.noise is None
-    assert replace(wider, noise=None).layout == problem.layout
+    assert problem.noise.start is None
+    assert wider.physics is problem.physics
+    assert wider.data is problem.data
     np.testing.assert_array_equal(wider.residual(modes[0].phi), problem.residual(modes[0].phi))
 
 

@@ -9,9 +9,8 @@ import pytest
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.physics import Simulator, calls
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-from tests.worlds import G, body
+from tests.helpers.worlds import G, body
 
-pytestmark = pytest.mark.slow
 MIB = (
     1024 if sys.platform.startswith("linux") else 1024**2
 )  # ru_maxrss is in KiB, on a Mac in bytes
@@ -51,6 +50,7 @@ def simulator() -> Simulator:
     return Simulator(scene, build_layout(scene), threads=2)
 
 
+@pytest.mark.long
 @pytest.mark.skipif(not calls.AVAILABLE, reason="the plain path would take an hour")
 def test_ten_million_steps_leak_nothing() -> None:
     sim = simulator()
@@ -76,6 +76,7 @@ def test_ten_million_steps_leak_nothing() -> None:
     assert peak() - before < 8
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not calls.AVAILABLE, reason="the plain path builds its worlds in each call")
 def test_lost_worlds_are_freed() -> None:
     sim = simulator()

@@ -12,7 +12,8 @@ from pbrl_ppl.parameters import inside
 from pbrl_ppl.physics import PartedSimulator, Simulator, independent_parts
 from pbrl_ppl.sampling.starts import gaussian_blocks
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-from tests.conftest import COLUMNS, ROOT
+from tests.helpers.histories import COLUMNS
+from tests.helpers.places import RECORDED
 
 NAMES = ("a", "b", "c", "d")
 JOINT = Joint("hinge", ("a", "b"), (0.3, 0.0), (-0.3, 0.0))
@@ -81,7 +82,7 @@ def test_joints_couple() -> None:
 
 
 def test_recorded_pairs_that_collide_stay_together() -> None:
-    folder = ROOT.parent / "shared" / "data" / "pair-null"
+    folder = RECORDED / "pair-null"
     if not folder.exists():
         pytest.skip(f"{folder} is not there")
     scene = Scene.load(folder / "scene.toml")

@@ -2,16 +2,16 @@
 
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
 from pbrl_ppl.physics import calls
+from tests.helpers.places import ROOT
 
 CODE = """
 from concurrent.futures import ThreadPoolExecutor
 import numpy as np
-from tests.physics.test_paths import cart, proposals
+from tests.helpers.engines import cart, proposals
 
 sim, start, actions = cart(walls=True)
 phi = proposals(sim.layout, 20)
@@ -25,8 +25,7 @@ raise SystemExit(not all((result == expected).all() for result in results))
 @pytest.mark.skipif(not calls.AVAILABLE, reason="the plain path builds its worlds in each call")
 def test_calls_at_the_same_time_do_not_disturb_each_other() -> None:
     """Chains in threads share the Op; the engine would abort the whole process, hence a child."""
-    root = Path(__file__).parents[2]
     done = subprocess.run(
-        [sys.executable, "-c", CODE], cwd=root, timeout=60, capture_output=True, text=True
+        [sys.executable, "-c", CODE], cwd=ROOT, timeout=60, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.scene import Joint, Scene, Shape
-from tests.worlds import G, body, predict, simulator
+from tests.helpers.worlds import G, body, predict, simulator
 
 NOISE = np.array([0.002, 0.002, 0.004, 0.01, 0.01, 0.02])
 

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pbrl_ppl.scene import Joint, Scene, Shape
-from tests.worlds import BY_NAME, G, body, phi_of, predict, simulator
+from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, simulator
 
 LEVER = 0.18  # m, from a link's middle to either of its hinges
 BOB = Shape.circle(0.05)  # at each link's middle: links two apart do not touch

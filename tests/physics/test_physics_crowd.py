@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-from tests.worlds import BY_NAME, G, body, phi_of, predict, simulator
+from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, simulator
 
 number = st.floats(-2.0, 2.0)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
-from tests.worlds import BY_NAME, G, body, phi_of, simulator
+from tests.helpers.worlds import BY_NAME, G, body, phi_of, simulator
 
 N = 200
 

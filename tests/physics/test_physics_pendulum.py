@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import ellipk
 
 from pbrl_ppl.scene import Joint, Scene, Shape
-from tests.worlds import G, body, predict, state
+from tests.helpers.worlds import G, body, predict, state
 
 ARM = Shape.box(0.03, 0.4)
 MASS, LEVER = 0.5, 0.18

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
-from tests.worlds import G, body, predict
+from tests.helpers.worlds import G, body, predict
 
 BOX = Shape.box(0.9, 0.55)
 number = st.floats(-3.0, 3.0)

@@ -12,30 +12,11 @@ from pbrl_ppl.model import Transition
 from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal, plan
 from pbrl_ppl.planning.bound import TimeToGo
-from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-from tests.worlds import body, state
+from pbrl_ppl.scene import Joint, Scene, Shape, Wall
+from tests.helpers.pucks import ACROSS, FORCE, FREE, MASS, PUSHES, ROOM, known
+from tests.helpers.worlds import body, state
 
-MASS, FORCE = 2.0, 4.0
-FREE = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2), known={"r": 0.0, "mu_c": 0}),))
-ROOM = FREE.replace(
-    walls=tuple(
-        Wall(a, b)
-        for a, b in [
-            ((-3.0, -3.0), (3.0, -3.0)), ((3.0, -3.0), (3.0, 3.0)), ((3.0, 3.0), (-3.0, 3.0)),
-            ((-3.0, 3.0), (-3.0, -3.0)), ((0.0, -3.0), (0.0, 1.0)),
-        ]
-    )
-)  # fmt: skip
-PUSHES = ActionSet.box(
-    "puck", forces=(-FORCE, 0.0, FORCE), lateral=(-FORCE, 0.0, FORCE), frame="world",
-    durations=(0.1, 0.3),
-)  # fmt: skip
-ACROSS = {"puck": (-1.5, -1.0, 0.0)}, {"puck": (1.5, -1.0, None)}
-
-
-def known(scene: Scene = FREE, *masses: float) -> Dynamics:
-    """A puck of one mass, or one a draw."""
-    return Dynamics(scene, np.array(masses or (MASS,))[:, None])
+pytestmark = pytest.mark.one_stack  # nothing is fitted here
 
 
 # -- dynamics --------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.errors import GoalError, PosteriorError
 from pbrl_ppl.planning import ActionSet, Dynamics, plan
 from pbrl_ppl.posterior import draws, from_groups, groups, load_posterior, save_posterior
-from tests.test_stacks import DATA, GENERATIONS, file, fitted
+from tests.helpers.stacks import DATA, GENERATIONS, file, fitted
 
 START, GOAL = {"puck": (0.0, 0.0, 0.0)}, {"puck": (1.5, 0.5, None)}
 #: What PyMC 5 planned on the file that PyMC 5 wrote, and on that of PyMC 6.

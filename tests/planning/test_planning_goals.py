@@ -13,8 +13,9 @@ from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning import Action, ActionSet, Goal, Target
 from pbrl_ppl.planning.risk import tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
-from tests.worlds import body, state
+from tests.helpers.worlds import body, state
 
+pytestmark = pytest.mark.one_stack  # nothing is fitted here
 PUCK = Scene(time_step=0.1, bodies=(body("puck", Shape.circle(0.2)),))
 TWO = PUCK.replace(bodies=(*PUCK.bodies, body("box", Shape.box(0.6, 0.8))))
 angles = st.floats(-10, 10)

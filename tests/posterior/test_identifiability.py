@@ -5,16 +5,17 @@ import warnings
 
 import numpy as np
 import pytest
-from pbrl_ppl.effects.base import Effect, EffectParameter
 
 import pbrl_ppl as pp
+from pbrl_ppl.effects import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import draws, identify, uninformed
 from pbrl_ppl.sampling import fit
-from tests.model.test_model import CART, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
 
 CONTACT = {"r": 0.2, "mu_c": 0.3}
 QUICK = {"draws": 500, "tune": 300, "chains": 2, "cores": 1, "progress": False}

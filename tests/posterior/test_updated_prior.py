@@ -18,7 +18,9 @@ from pbrl_ppl.posterior import draws, from_groups, group, groups
 from pbrl_ppl.posterior.updated_prior import moment_matched, updated_scene
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.model.test_model import CART, OBJECT_MODE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
+from tests.helpers.marks import OBJECT_MODE
 
 CONTACT = {"r": 0.2, "mu_c": 0.3}
 DRAG = {"linear_drag_coefficient": 3.0}

@@ -7,8 +7,8 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.planning import plan
 from pbrl_ppl.report import animate_plan
-from tests.planning.test_planning import ACROSS, PUSHES, ROOM, known
-from tests.test_stacks import file
+from tests.helpers.pucks import ACROSS, PUSHES, ROOM, known
+from tests.helpers.stacks import file
 
 
 def test_a_plan_becomes_a_moving_picture_of_its_length(tmp_path) -> None:

@@ -14,7 +14,8 @@ from pbrl_ppl.sampling import fit, fitting
 from pbrl_ppl.sampling.emulator import Emulator, emulate
 from pbrl_ppl.sampling.starts import gaussian_blocks
 from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
-from tests.model.test_model import CART, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
 
 
 def two_parts(sizes: tuple[int, int]) -> SimpleNamespace:

@@ -36,7 +36,8 @@ from pbrl_ppl.posterior.store import (
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.sampling.starts import unconstrain
 from pbrl_ppl.scene import Shape
-from tests.model.test_model import CART, NOISE, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import NOISE, simulated_history
 
 PARAMETERS = ("mass", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
 UNITS = ("kg", "m", "m", "rad", "1", "1")
@@ -106,7 +107,7 @@ def test_origin(model, fitted) -> None:
     assert scene_of(fitted) == model.problem.scene
     assert json.loads(attrs["effects"]) == []
     assert (attrs["seed"], attrs["horizon"], attrs["substeps"]) == (1, 1, 10)
-    assert attrs["data_sha256"] == model.problem.history.data_sha256
+    assert attrs["data_sha256"] == model.problem.data.history.data_sha256
     versions = json.loads(attrs["versions"])
     assert versions["pymc"] == pm.__version__
     assert versions["numpy"] == np.__version__
@@ -222,7 +223,9 @@ def test_effects_and_scalar_sigma_and_horizon(model) -> None:
     drag = next(effect for effect in catalogue if effect.name == "linear_drag")
     problem = model.problem
     scene = cart_scene(known={name: CART[name] for name in CART if name != "mass"})
-    small = physics_model(scene, problem.history, [drag], sigma="scalar", horizon=2, substeps=8)
+    small = physics_model(
+        scene, problem.data.history, [drag], sigma="scalar", horizon=2, substeps=8
+    )
     with pytest.warns(ConvergenceWarning):
         idata = fit(small, seed=3, **(QUICK | {"draws": 50, "tune": 100}))
     assert json.loads(idata.attrs["effects"]) == [["linear_drag", "cart"]]
@@ -234,7 +237,9 @@ def test_effects_and_scalar_sigma_and_horizon(model) -> None:
     assert posterior["linear_drag_coefficient"].attrs["units"] == "kg/s"
     assert (posterior["linear_drag_coefficient"].values >= 0).all()
     # scene and effects are enough to build the model again
-    again = physics_model(scene_of(idata), problem.history, sigma="scalar", horizon=2, substeps=8)
+    again = physics_model(
+        scene_of(idata), problem.data.history, sigma="scalar", horizon=2, substeps=8
+    )
     assert {rv.name for rv in again.free_RVs} == {rv.name for rv in small.free_RVs}
 
 
@@ -342,7 +347,7 @@ def test_an_interrupted_fit_goes_on(model, interrupted) -> None:
 
 def test_a_start_of_another_model_is_refused(model, interrupted) -> None:
     scene = cart_scene()  # r and mu_c are unknown here
-    other = physics_model(scene, model.problem.history)
+    other = physics_model(scene, model.problem.data.history)
     with pytest.raises(PosteriorError, match="has no r, mu_c"):
         fit(other, start=interrupted, progress=False)
 
@@ -380,7 +385,9 @@ def test_a_parameter_at_its_bound_is_named(model) -> None:
         pytest.warns(BoundWarning, match=r"w_x\[cart\] is pressed against .*close-loop"),
     ):
         idata = fit(
-            physics_model(scene.replace(bodies=(small,)), model.problem.history), seed=1, **QUICK
+            physics_model(scene.replace(bodies=(small,)), model.problem.data.history),
+            seed=1,
+            **QUICK,
         )
     assert any("w_x[cart]" in each for each in json.loads(idata.attrs["warnings"]))
 
@@ -393,7 +400,7 @@ def test_a_parameter_that_the_data_say_nothing_about_is_named(model) -> None:
         warnings.catch_warnings(),
     ):
         warnings.simplefilter("ignore", ConvergenceWarning)
-        fit(physics_model(scene, model.problem.history), seed=1, **QUICK)
+        fit(physics_model(scene, model.problem.data.history), seed=1, **QUICK)
 
 
 def test_unknown_method(model) -> None:

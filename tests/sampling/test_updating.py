@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -39,7 +38,8 @@ from pbrl_ppl.posterior.store import (
 from pbrl_ppl.sampling import fit, update
 from pbrl_ppl.sampling.rejuvenation import _Mover, rejuvenate
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.model.test_model import CART, cart_scene, simulated_history
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
 
 KNOWN = {"r": 0.2, "mu_c": 0.3}
 PUCKS = {"mass": [2.0, 3.0], "linear_drag_coefficient": [0.5, 1.0]}
@@ -250,8 +250,8 @@ def test_old_files_have_no_prior_of_the_noise(parts, first, one) -> None:
     np.testing.assert_array_equal(draws(again)["mass"], draws(one)["mass"])
     problem = problem_of(from_groups(groups(first), attrs))
     median, spread = json.loads(first.attrs["sigma_prior"])
-    np.testing.assert_allclose(problem.sigma_prior[0], median)
-    assert problem.sigma_prior[1] == spread
+    np.testing.assert_allclose(problem.noise.prior[0], median)
+    assert problem.noise.prior[1] == spread
 
 
 @pytest.mark.slow
@@ -265,7 +265,7 @@ def test_other_data_are_fitted_anew(parts, first) -> None:
     assert [each.filename for each in caught if each.category is RefitWarning] == [__file__]
     assert did(idata) == ["refitted"]
     assert "before_updates" not in groups(idata)
-    problem = replace(problem_of(first), history=problem_of(idata).history)
+    problem = problem_of(first).with_data(history=problem_of(idata).data.history)
     assert problem.segments.n == 100
     agree(idata, quiet(fit, build_model(problem), seed=10, **QUICK))
 

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
-
-DATA = Path(__file__).parents[2].parent / "shared" / "data"
+from tests.helpers.places import RECORDED
 
 CART = """
 [world]
@@ -65,9 +64,9 @@ def test_python_mappings_equal_toml() -> None:
     assert body == Scene.from_toml(CART).body("cart")
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is not beside the repository")
+@pytest.mark.skipif(not RECORDED.is_dir(), reason="../shared/data is not beside the repository")
 def test_reads_every_scene_of_the_data() -> None:
-    paths = sorted(DATA.rglob("scene.toml"))
+    paths = sorted(RECORDED.rglob("scene.toml"))
     assert paths
     for path in paths:
         scene = Scene.load(path)
@@ -365,3 +364,36 @@ def test_joint_of_two_things_that_cannot_move():
     joint = Joint("hinge", ("table", "world"), (0, 0), (0, 0))
     with pytest.raises(SceneError, match="neither table nor world can move"):
         Scene(time_step=0.1, bodies=(table, puck), joints=(joint,))
+
+
+def test_kinematic_bodies_are_moving_and_not_dynamic() -> None:
+    finger = Body("finger", Shape.circle(0.01), kinematic=True, known={"mu_c": 0.5})
+    scene = Scene(time_step=0.1, bodies=(finger, Body("puck", Shape.circle(0.1))))
+    assert [body.name for body in scene.moving] == ["finger", "puck"]
+    assert [body.name for body in scene.dynamic] == ["puck"]
+    assert scene.joinable == ("puck", "world")
+    assert Scene.from_toml(scene.to_toml()) == scene
+    with pytest.raises(SceneError, match="no body that moves freely"):
+        Scene(time_step=0.1, bodies=(finger,))
+    joint = Joint("hinge", ("finger", "world"), (0, 0), (0, 0))
+    with pytest.raises(SceneError, match="neither finger nor world can move freely"):
+        scene.replace(joints=(joint,))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"wheel": True}, "it is kinematic.* has wheel = True; drop one"),
+        ({"static": True, "pose": (0, 0, 0)}, "it is kinematic.* has static = True"),
+        ({"effects": ("linear_drag",)}, "it is kinematic.* has effects"),
+        (
+            {"known": {"mass": 1.0}},
+            "known has mass, which does not matter then; expected r or mu_c",
+        ),
+        ({"prior": {"mass": {"mu": 1.0}}}, "prior has mass"),
+        ({"kinematic": 1}, "kinematic is 1, expected true or false"),
+    ],
+)
+def test_kinematic_bodies_have_nothing_that_forces_act_on(options, message) -> None:
+    with pytest.raises(SceneError, match=message):
+        Body("finger", Shape.circle(0.01), **{"kinematic": True} | options)

@@ -1,4 +1,4 @@
-"""Small scenes for tests: bodies of which everything is known, and a prediction in one call."""
+"""Bodies of which everything is known, and a prediction in one call."""
 
 from collections.abc import Mapping
 from typing import Any

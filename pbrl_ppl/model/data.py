@@ -1,0 +1,63 @@
+"""What a model is fitted to: a history cut into segments, and what was measured along them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from functools import cached_property
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import History, Segments
+from pbrl_ppl.model.likelihood import Observations
+from pbrl_ppl.physics import check_history
+from pbrl_ppl.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Data:
+    """A history and how far ahead it is predicted.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene; start states that it does not allow are refused.
+    history : History
+        Measured transitions.
+    horizon : int
+        Intervals predicted from one measured state; 1 is the paper's Eq. 11.
+    columns : tuple of int, optional
+        State dimensions that the likelihood is over; those measured anywhere by default.
+    """
+
+    scene: Scene
+    history: History
+    horizon: int = 1
+    columns: tuple[int, ...] | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave what was computed behind when it goes to another process."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @cached_property
+    def segments(self) -> Segments:
+        """Measured segments of the horizon's length, their start states checked.
+
+        Raises
+        ------
+        HistoryError
+            If no trajectory is long enough.
+        SimulationError
+            If bodies start deep inside each other or a wall, or a hinge's bodies apart.
+        """
+        segments = self.history.segments(self.horizon)
+        if not segments.n:
+            raise HistoryError(
+                f"history: no trajectory is long enough for a horizon of {self.horizon} intervals;"
+                " choose a shorter one"
+            )
+        check_history(self.scene, self.history, segments)
+        return segments
+
+    @cached_property
+    def observations(self) -> Observations:
+        """What was measured at the segments' steps."""
+        return Observations.of(self.segments, self.columns)

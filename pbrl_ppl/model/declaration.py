@@ -1,0 +1,231 @@
+"""(scene, history, effects) -> pm.Model: Table 1 prior, Eq. 11 likelihood, named coordinates."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from functools import partial
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+
+from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import History
+from pbrl_ppl.model.library import ParameterLibrary
+from pbrl_ppl.model.likelihood import StartNoise, next_state_logp, next_state_random
+from pbrl_ppl.model.noise import Noise
+from pbrl_ppl.model.op import SimulatorOp
+from pbrl_ppl.model.problem import Problem
+from pbrl_ppl.model.table1 import random_variable
+from pbrl_ppl.parameters import Block, Layout
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import INPUT, STATE
+
+
+def physics_model(
+    scene: Scene,
+    history: History,
+    effects: Iterable[Effect | Attached] = (),
+    *,
+    horizon: int = 1,
+    sigma: str = "per_dimension",
+    nu: float | None = None,
+    substeps: int | None = None,
+    noise: StartNoise | None = None,
+    threads: int = 1,
+    library: ParameterLibrary | None = None,
+) -> pm.Model:
+    """Declare the model of the paper's section 3.2 for a scene and a history.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry, and which parameters are known.
+    history : History
+        Measured transitions.
+    effects : iterable of Effect or Attached
+        Effects beside those that the scene declares.
+    horizon : int
+        Intervals predicted from one measured state; 1 is Eq. 11.
+    sigma : str
+        ``per_dimension`` or ``scalar`` (the paper's Eq. 11).
+    nu : float, optional
+        Degrees of freedom of Student-t noise, for recordings full of contacts, whose residuals have
+        heavy tails; 4 is usual. Sigma is then its scale. Gaussian without it.
+    substeps : int, optional
+        Engine steps an interval; the scene's by default.
+    noise : StartNoise, optional
+        Spread of the start state's noise over the predictions; without it the start counts as
+        exact, as in the paper.
+    threads : int
+        Engine worlds that run side by side within one evaluation.
+    library : ParameterLibrary, optional
+        Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
+        ``library_index`` holds the bodies' choices, and the parameters follow from it.
+
+    Returns
+    -------
+    pymc.Model
+        An ordinary model; its ``problem`` attribute is the :class:`Problem` it was made from.
+
+    Raises
+    ------
+    EffectError
+        If an effect is unknown or does not apply.
+    HistoryError
+        If the history has nothing to fit at this horizon.
+    SimulationError
+        If bodies start deep inside each other or a wall, or a hinge's bodies apart.
+    ValueError
+        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0, or both
+        ``library`` and ``noise`` are given.
+    ParameterError
+        If the library does not fit the scene's bodies.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from pbrl_ppl.scene.scene import Body, Shape
+    >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2)),))
+    >>> rows = pd.DataFrame({"trajectory": 0, "time": [0.0, 0.1], "body": "puck", "x": [0.0, 0.1],
+    ...     "y": 0.0, "theta": 0.0, "vx": 1.0, "vy": 0.0, "omega": 0.0,
+    ...     "force_x": 0.0, "force_y": 0.0, "torque": 0.0})
+    >>> model = physics_model(scene, History.from_dataframe(rows, scene))
+    >>> [variable.name for variable in model.free_RVs]
+    ['mass', 'r', 'mu_c', 'sigma']
+    """
+    if sigma not in ("per_dimension", "scalar"):
+        raise ValueError(f"sigma is {sigma!r}, expected 'per_dimension' or 'scalar'")
+    if horizon < 1:
+        raise ValueError(f"horizon is {horizon}, expected at least 1")
+    if nu is not None and not 0 < nu < np.inf:
+        raise ValueError(f"nu is {nu}, expected degrees of freedom above 0, or None for a Gaussian")
+    if library is not None and noise is not None:
+        raise ValueError(
+            "library and noise are given; a library takes start states as exact: drop noise"
+        )
+    longest = int(history.dataset["n_rows"].max()) - 1
+    if horizon > longest:
+        raise HistoryError(
+            f"horizon is {horizon} intervals, and the longest trajectory has {longest}; use a"
+            " shorter horizon"
+        )
+    problem = Problem.of(
+        scene,
+        history,
+        attach(scene, effects),
+        horizon=horizon,
+        substeps=substeps,
+        threads=threads,
+        noise=Noise(scalar=sigma == "scalar", start=noise, nu=nu),
+        library=library,
+    )
+    return build_model(problem)
+
+
+def build_model(problem: Problem) -> pm.Model:
+    """Declare the pm.Model of a problem; see :func:`physics_model`."""
+    observations, segments, layout = problem.observations, problem.segments, problem.layout
+    physics, noise = problem.physics, problem.noise
+    simulate = SimulatorOp(
+        physics.scene, layout, physics.effects, physics.substeps, physics.threads, physics.parts
+    )
+    with pm.Model(coords=_coords(problem)) as model:
+        start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
+        actions = pm.Data("actions", problem.inputs, dims=("transition", "step", "body", "wrench"))
+        # Table 1
+        table1: dict[str, Any] = {}
+        if problem.library is not None:
+            table1 = _chosen(problem, problem.library)
+        else:
+            for block in layout.blocks:
+                index = _index(block, layout, table1)
+                table1[block.name] = random_variable(
+                    block.name, block.priors, _dim(problem, block), block.conditional, index
+                )
+        phi = pt.concatenate(list(table1.values())) if table1 else pt.zeros(0)
+        # P(sigma)
+        median, spread = problem.noise_prior
+        if noise.scalar:
+            scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
+            sigma = pt.ones(len(median)) * scalar
+        else:
+            sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
+        # Eq. 7: s' = f(s, a; Phi) + eps, and Eq. 11
+        predicted = simulate(phi, start, actions)[..., list(observations.columns)]
+        pm.CustomDist(
+            "next_state",
+            predicted,
+            sigma,
+            logp=partial(
+                next_state_logp, observations=observations, noise=noise.start, nu=noise.nu
+            ),
+            random=partial(_random, noise=noise.start, nu=noise.nu),
+            signature="(h,k,d),(d)->(h,k,d)",
+            observed=np.nan_to_num(observations.values),
+            dims=("transition", "step", "body", "state"),
+        )
+    model.problem = problem
+    return model
+
+
+def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
+    """Which parameter set each body has, and the parameters that follow from that."""
+    names = [body.name for body in problem.scene.moving]
+    table = library.table(problem.layout, problem.scene)
+    p = np.stack([library.prior(name) for name in names])
+    index = pm.Categorical("library_index", p=p, dims="body")
+    result = {}
+    for block, place in problem.layout.slices():
+        own = index[[names.index(owner) for owner in block.owners]]
+        value = pt.as_tensor(table[place])[np.arange(len(block.owners)), own]
+        result[block.name] = pm.Deterministic(block.name, value, dims=_dim(problem, block))
+    return result
+
+
+def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
+    """Whose bounds hold an anchor: the index variable, 0 where the body is given."""
+    name = f"i_{block.name[0]}"
+    if not block.conditional or name not in variables:
+        return None
+    free = next(each.owners for each in layout.blocks if each.name == name)
+    held = [variables[name][free.index(each)] if each in free else 0 for each in block.owners]
+    return pt.stack(held)
+
+
+def _random(
+    predicted: Any,
+    sigma: Any,
+    noise: StartNoise | None,
+    nu: float | None,
+    rng: np.random.Generator | None = None,
+    size: Any = None,
+) -> Any:
+    return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size, nu)
+
+
+def _coords(problem: Problem) -> dict[str, Any]:
+    """Coordinates by name: every dimension of the model says what it runs over."""
+    segments = problem.segments
+    coords: dict[str, Any] = {
+        "body": [body.name for body in problem.scene.moving],
+        "full_state": list(STATE),
+        "state": list(problem.observations.names),
+        "wrench": list(INPUT[: problem.inputs.shape[-1]]),
+        "transition": np.arange(segments.n),
+        "step": np.arange(1, problem.data.horizon + 1),
+    }
+    for block in problem.layout.blocks:
+        coords.setdefault(_dim(problem, block), list(block.owners))
+    return coords
+
+
+def _dim(problem: Problem, block: Block) -> str:
+    """``body`` where all moving bodies have the parameter, else a dimension of its own."""
+    if block.of == "joint":
+        return "joint" if not block.name.startswith("i_") else "free_joint"
+    if len(block.owners) == len(problem.scene.moving):
+        return "body"
+    return f"{block.effect or block.name}_body"

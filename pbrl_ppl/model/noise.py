@@ -1,0 +1,53 @@
+"""How measurements scatter about predictions: Eq. 11's sigma, its prior and its tails."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import Segments
+from pbrl_ppl.model.likelihood import Observations, StartNoise
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """The noise of a model.
+
+    Parameters
+    ----------
+    scalar : bool
+        One sigma for all state dimensions, as in the paper.
+    start : StartNoise, optional
+        Spread of the start state's noise over the predictions; without it the start is exact.
+    nu : float, optional
+        Degrees of freedom of Student-t noise; Gaussian without it.
+    prior : tuple, optional
+        Medians of sigma's prior, one a measured state dimension, and its log-scale; by default
+        :func:`sigma_prior` takes them from the data.
+    """
+
+    scalar: bool = False
+    start: StartNoise | None = None
+    nu: float | None = None
+    prior: tuple[tuple[float, ...], float] | None = None
+
+
+def sigma_prior(observations: Observations, segments: Segments) -> tuple[Array, float]:
+    """Median and log-scale of the weak prior of sigma: a tenth of how much the state changes.
+
+    Returns
+    -------
+    median : ndarray
+        Shape (state,), in the units of the states.
+    spread : float
+        Standard deviation of the logarithm.
+    """
+    columns = observations.columns
+    change = observations.residual(segments.start[:, None])
+    seen = observations.measured
+    typical = np.sqrt((change**2).sum((0, 1, 2)) / np.maximum(seen.sum((0, 1, 2)), 1))
+    return np.maximum(0.1 * typical, 1e-9) * np.ones(len(columns)), 2.0

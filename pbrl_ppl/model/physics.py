@@ -1,0 +1,74 @@
+"""What a model predicts with: a scene's bodies, their effects and the engine's settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+
+from pbrl_ppl.effects import Attached
+from pbrl_ppl.model.table1 import build_layout
+from pbrl_ppl.parameters import Layout
+from pbrl_ppl.physics import PartedSimulator, Parts
+from pbrl_ppl.scene import Scene
+
+#: Engine steps an interval where a rough answer will do.
+COARSE = 4
+
+
+@dataclass(frozen=True)
+class Physics:
+    """Bodies, effects and the engine's settings, with the engine that follows from them.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry.
+    effects : tuple of Attached
+        All effects of the model, declared and added.
+    parts : tuple of tuple of str, optional
+        Moving bodies that have to do with each other, together; all in one part without it.
+    substeps : int
+        Engine steps an interval.
+    threads : int
+        Engine worlds that run side by side.
+    extrapolate : bool
+        Whether the engine's leading errors are cancelled.
+    """
+
+    scene: Scene
+    effects: tuple[Attached, ...]
+    parts: Parts | None
+    substeps: int
+    threads: int = 1
+    extrapolate: bool = True
+    layout: Layout = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "layout", build_layout(self.scene, self.effects))
+
+    def __getstate__(self) -> dict[str, object]:
+        """Leave the engine's worlds behind when it goes to another process."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+    @cached_property
+    def simulator(self) -> PartedSimulator:
+        """The engine for this scene with these effects."""
+        return PartedSimulator(
+            self.scene,
+            self.layout,
+            self.effects,
+            self.parts,
+            substeps=self.substeps,
+            threads=self.threads,
+            extrapolate=self.extrapolate,
+        )
+
+    @cached_property
+    def coarse(self) -> Physics:
+        """The same with few substeps: it costs little, and its derivative is nearly right."""
+        return self.changed(substeps=min(COARSE, self.substeps), extrapolate=False)
+
+    def changed(self, **fields: object) -> Physics:
+        """The same with other fields; itself, with its worlds, where they are equal."""
+        other = replace(self, **fields)  # type: ignore[arg-type]
+        return self if other == self else other

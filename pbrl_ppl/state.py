@@ -1,0 +1,17 @@
+"""Names, units and order of a body's state and of the wrench on it."""
+
+#: A body's state: pose and velocity of its origin in the world frame.
+STATE = ("x", "y", "theta", "vx", "vy", "omega")
+STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
+#: The part of the state that is a place.
+POSE = STATE[:3]
+#: Where the state holds the angle, whose differences are wrapped.
+THETA = STATE.index("theta")
+
+#: A wrench at the body's origin, in the world frame.
+WRENCH = ("force_x", "force_y", "torque")
+WRENCH_UNITS = ("N", "N", "N m")
+
+#: What acts in an interval: the wrench, the one before (zero before the first), the trajectory's
+#: number, and the time in it at which the interval begins and ends (s).
+INPUT = (*WRENCH, *(f"previous_{name}" for name in WRENCH), "trajectory", "begin", "end")

@@ -1,0 +1,1 @@
+"""What several tests use: scenes, made histories, findings; tests import nothing of each other."""

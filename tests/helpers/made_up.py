@@ -1,0 +1,164 @@
+"""Small findings of each verdict, without a fit."""
+
+from dataclasses import replace
+from typing import Any
+
+import arviz as az
+import numpy as np
+
+from pbrl_ppl.criticism.findings import (
+    Added,
+    Candidate,
+    Errors,
+    Estimate,
+    Findings,
+    Numerical,
+    Rollout,
+    Unexplained,
+)
+from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.state import STATE, STATE_UNITS
+
+DRAG = "a force against the motion that grows with the speed"
+
+
+def idata(posterior: dict[str, np.ndarray], dims: dict[str, list[str]]) -> Any:
+    """An InferenceData or a DataTree, as the installed ArviZ has it."""
+    coords = {"body": ["cart"], "linear_drag_body": ["cart"], "state": list(STATE)}
+    if az.__version__.startswith("0."):
+        return az.from_dict(posterior, coords=coords, dims=dims)
+    return az.from_dict({"posterior": posterior}, coords=coords, dims=dims)
+
+
+def made_up_posterior(stuck: bool = False) -> Any:
+    rng = np.random.default_rng(1)
+    draws = {
+        "mass": 6.5 + 0.1 * rng.normal(size=(4, 500, 1)),
+        "w_x": -0.25 + 0.01 * rng.normal(size=(4, 500, 1)),
+        "linear_drag_coefficient": 3.0 + 0.1 * rng.normal(size=(4, 500, 1)),
+        "sigma": np.exp(0.1 * rng.normal(size=(4, 500, 6))),
+    }
+    if stuck:
+        draws["w_x"] += np.arange(4).reshape(4, 1, 1)
+    dims = {"mass": ["body"], "w_x": ["body"], "sigma": ["state"]}
+    return idata(draws, dims | {"linear_drag_coefficient": ["linear_drag_body"]})
+
+
+def made_up_errors(times: float) -> Errors:
+    scales = dict(zip(STATE, (0.002, 0.002, 0.004, 0.01, 0.01, 0.02), strict=True))
+    # drag is seen in the velocities more than in the rest
+    grown = {d: s * (times if d in ("vx", "vy") else times**0.5) for d, s in scales.items()}
+    far = {d: s * times * 4 for d, s in scales.items()}
+    return Errors(grown, far, normalised_rmse=times, elpd=3000.0 - 300.0 * times)
+
+
+def made_up(verdict: str = "effects-added", stuck: bool = False) -> Findings:
+    """Small findings of each verdict, without a fit."""
+    rng = np.random.default_rng(0)
+    scene = Scene(time_step=0.1, bodies=(Body("cart", Shape.box(1.0, 0.6)),))
+    time = 0.1 * np.arange(31)
+    turn = 2.8 + 1.5 * time
+    motion = np.stack(
+        [0.6 * time, np.sin(time), turn, 0.6 + 0 * time, np.cos(time), 1.5 + 0 * time]
+    )
+    wrapped = motion.copy()
+    wrapped[2] = np.angle(np.exp(1j * turn))
+    measured = wrapped + 0.01 * rng.normal(size=motion.shape)
+    measured[1, 10:14] = np.nan
+    off = motion * (1 + 0.05 * time) + 0.02 * time
+    off[2] = np.angle(np.exp(1j * off[2]))
+    noise = {d: rng.normal(size=240) for d in STATE}
+    found = verdict == "effects-added"
+    grown = {d: r * (3.0 if d in ("vx", "vy") else 1.1) for d, r in noise.items()}
+    candidates = tuple(
+        Candidate(effect, "cart", sentence, s, dof, p, estimate, units, share)
+        for effect, sentence, s, dof, p, estimate, units, share in (
+            (
+                "linear_drag",
+                DRAG,
+                419.0,
+                1,
+                1e-80,
+                {"coefficient": 3.01},
+                {"coefficient": "kg/s"},
+                0.48,
+            ),
+            (
+                "quadratic_drag",
+                "a force that grows with its square",
+                401.5,
+                1,
+                1e-75,
+                {"coefficient": 2.2},
+                {"coefficient": "kg/m"},
+                0.4,
+            ),
+            (
+                "constant_force",
+                "the floor slopes",
+                11.0,
+                2,
+                0.04,
+                {"force_x": 0.2, "force_y": -0.1},
+                {"force_x": "N", "force_y": "N"},
+                0.9,
+            ),
+            (
+                "inertia_scale",
+                "mass is not spread evenly",
+                0.0,
+                1,
+                1.0,
+                {"scale": 1.0},
+                {"scale": "1"},
+                0.0004,
+            ),
+        )
+    )
+    if not found:
+        candidates = tuple(
+            replace(c, statistic=c.statistic / 200, p_value=0.37) for c in candidates
+        )
+    added = Added(
+        "linear_drag",
+        "cart",
+        DRAG,
+        419.0,
+        1e-80,
+        {"coefficient": Estimate(3.0, 0.1, (2.81, 3.19), "kg/s")},
+        ("quadratic_drag",),
+        210.0,
+        19.0,
+    )
+    remains = Unexplained(
+        "cart", "omega", "omega", 0.34, 0.002, "its omega is off in a way that depends on omega"
+    )
+    posterior = made_up_posterior(stuck)
+    before = made_up_errors(2.4 if verdict != "adequate" else 1.01)
+    return Findings(
+        scene=scene,
+        verdict=verdict,
+        numerical=Numerical(10, 40, 0.83) if found else Numerical(10, 10, 0.012),
+        candidates=candidates,
+        added=(added,) if found else (),
+        unexplained=remains if verdict == "unexplained" else None,
+        before=before,
+        after=made_up_errors(1.02) if found else before,
+        noise_floor=made_up_errors(1.0),
+        posterior_before=posterior,
+        posterior_after=posterior,
+        residuals_before=noise if verdict == "adequate" else grown,
+        residuals_after=noise if found else grown,
+        rollout=Rollout(
+            "cart",
+            time,
+            STATE,
+            STATE_UNITS,
+            measured.T,
+            off.T if found else wrapped.T,
+            wrapped.T,
+        ),
+        horizon=1,
+        rollout_horizon=20,
+        provenance={"seed": 1, "versions": {"pymc": "5.28"}, "data_sha256": "ab" * 32},
+    )

@@ -1,0 +1,90 @@
+"""Problem: a change of data, physics or noise keeps the others with all that they have made."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.effects import attach, catalogue
+from pbrl_ppl.model import Problem, StartNoise
+from pbrl_ppl.model import data as data_module
+from pbrl_ppl.scene import Body, Scene, Shape
+from tests.helpers.histories import simulated_history
+
+PUCKS = Scene(time_step=0.1, bodies=tuple(Body(name, Shape.circle(0.2)) for name in "ab"))
+TRUTH = {"mass": [2.0, 3.0], "r": [0.2, 0.2], "mu_c": [0.3, 0.3]}
+
+
+@pytest.fixture
+def checks(monkeypatch) -> list[int]:
+    """One entry for each time that start states are checked."""
+    seen: list[int] = []
+    check = data_module.check_history
+
+    def counted(scene, history, segments) -> None:
+        seen.append(segments.n)
+        check(scene, history, segments)
+
+    monkeypatch.setattr(data_module, "check_history", counted)
+    return seen
+
+
+@pytest.fixture
+def problem() -> Problem:
+    return Problem.of(PUCKS, simulated_history(PUCKS, TRUTH, seed=1), substeps=5)
+
+
+def test_other_noise_keeps_the_engine_and_the_checked_data(problem, checks) -> None:
+    engine, rough, segments = problem.simulator, problem.coarse.simulator, problem.segments
+    cells = segments.n, 2 * 6
+    start = StartNoise(np.ones(cells), np.tile(np.eye(12), (segments.n, 1, 1)), np.zeros(cells[0]))
+    for other in (problem.with_noise(start=start), problem.with_noise(nu=4.0, scalar=True)):
+        assert other.simulator is engine
+        assert other.coarse.simulator is rough
+        assert other.segments is segments
+        assert other.observations is problem.observations
+    assert checks == [segments.n]
+
+
+def test_other_physics_keep_the_checked_data(problem, checks) -> None:
+    drag = next(effect for effect in catalogue if effect.name == "linear_drag")
+    segments, engine = problem.segments, problem.simulator
+    fewer = PUCKS.replace(bodies=tuple(Body(n, Shape.circle(0.2), known={"r": 0.1}) for n in "ab"))
+    for other in (
+        problem.with_physics(effects=attach(PUCKS, [drag])),
+        problem.with_physics(scene=fewer),
+        problem.with_physics(substeps=10),
+    ):
+        assert other.segments is segments
+        assert other.noise is problem.noise
+        assert other.simulator is not engine
+    assert problem.with_physics(substeps=5, threads=1).simulator is engine
+    assert checks == [segments.n]
+
+
+def test_other_data_keep_the_engine_where_its_parts_are_the_same(problem) -> None:
+    longer = problem.with_data(horizon=2)
+    assert longer.simulator is problem.simulator
+    assert longer.segments.actions.shape[1] == 2
+    apart = problem.with_data(history=simulated_history(PUCKS, TRUTH, seed=2))
+    assert apart.simulator is problem.simulator
+    poses = np.array([[0.0, 0.0, 0.0], [0.45, 0.0, 0.0]])
+    meeting = problem.with_data(history=simulated_history(PUCKS, TRUTH, seed=3, poses=poses))
+    assert [len(each.bodies) for each in problem.simulator.parts] == [1, 1]
+    assert [len(each.bodies) for each in meeting.simulator.parts] == [2]
+
+
+def test_start_noise_is_of_its_own_segments(problem) -> None:
+    n = problem.segments.n
+    start = StartNoise(np.ones((n, 12)), np.tile(np.eye(12), (n, 1, 1)), np.zeros(n))
+    noisy = problem.with_noise(start=start, nu=4.0)
+    assert noisy.with_data(horizon=2).noise.start is None
+    assert noisy.with_data(horizon=2).noise.nu == 4.0
+
+
+def test_what_was_computed_does_not_travel(problem) -> None:
+    small = len(pickle.dumps(problem))
+    phi = problem.layout.to_vector(TRUTH)
+    here = problem.predict(phi)
+    assert len(pickle.dumps(problem)) == small
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(problem)).predict(phi), here)

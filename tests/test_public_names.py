@@ -1,0 +1,34 @@
+"""The public names: all resolve, each when it is first used."""
+
+import subprocess
+import sys
+
+import pytest
+
+import pbrl_ppl
+
+
+def test_every_name_resolves() -> None:
+    assert {"Scene", "History", "physics_model", "fit", "close_loop", "plan"} <= {*pbrl_ppl.__all__}
+    for name in pbrl_ppl.__all__:
+        assert getattr(pbrl_ppl, name) is not None
+    assert {*pbrl_ppl.__all__} <= {*dir(pbrl_ppl)}
+    with pytest.raises(AttributeError, match="nonsense"):
+        pbrl_ppl.nonsense  # noqa: B018
+
+
+def test_star_import() -> None:
+    names: dict[str, object] = {}
+    exec("from pbrl_ppl import *", names)
+    assert {*pbrl_ppl.__all__} <= {*names}
+
+
+def test_import_is_quick() -> None:
+    """PyMC is loaded with the first name that needs it."""
+    code = "import sys, pbrl_ppl; print(*sys.modules); pbrl_ppl.Scene; print(*sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    at_once, with_scene = (set(line.split()) for line in said.stdout.splitlines())
+    assert "pbrl_ppl" in at_once
+    assert not {"pymc", "arviz", "numpy", "pbrl_ppl.scene"} & at_once
+    assert "pbrl_ppl.scene" in with_scene
+    assert not {"pymc", "arviz"} & with_scene
