@@ -157,7 +157,7 @@ class History:
                 "number": ("trajectory", np.arange(float(len(table.n_rows)))),
                 "before": (
                     ("trajectory", "body", "wrench"),
-                    np.zeros((len(table.n_rows), len(scene.dynamic), len(WRENCH))),
+                    np.zeros((len(table.n_rows), len(scene.moving), len(WRENCH))),
                     wrench_units,
                 ),
             },
@@ -261,7 +261,7 @@ class History:
         )
 
     def numbered(self, first: float) -> History:
-        """Return the same trajectories, numbered on from ``first``: a recording made after others."""
+        """Return the same trajectories, numbered from ``first``: recorded after others."""
         number = self.dataset["number"]
         return History(self.dataset.assign(number=number - number.min() + first))
 

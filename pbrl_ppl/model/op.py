@@ -19,6 +19,7 @@ from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import PartedSimulator, Parts
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import INPUT, WRENCH
 
 Array = NDArray[np.float64]
 
@@ -61,11 +62,13 @@ class _EngineOp(Op):
             If an input has the wrong number of dimensions or a static shape that does not fit.
         """
         k, p = len(self.scene.moving), self.layout.size
+        actions = pt.as_tensor_variable(actions)
+        width = len(INPUT) if actions.type.shape[-1:] == (len(INPUT),) else len(WRENCH)
         inputs = []
         for name, value, shape in (
             ("phi", phi, (p,)),
             ("start", start, (None, k, 6)),
-            ("actions", actions, (None, None, k, None)),
+            ("actions", actions, (None, None, k, width)),
         ):
             tensor = pt.cast(pt.as_tensor_variable(value), "float64")
             static = tensor.type.shape

@@ -157,7 +157,7 @@ class ActionSet:
             If nothing was pushed.
         """
         scene = scene_of(idata)
-        given = group(idata, "constant_data")["actions"].to_numpy()
+        given = group(idata, "constant_data")["actions"].to_numpy()[..., :3]
         actions: list[Action] = []
         for i, body in enumerate(scene.moving):
             if body.kinematic:  # its path was the action, not a push

@@ -10,7 +10,8 @@ from tests.helpers.worlds import G, simulator
 
 BOX = Shape.box(0.9, 0.55)
 ARM = Shape.box(0.03, 0.4)
-PIVOT = [effect for effect in catalogue if effect.name.startswith("pivot")]
+#: Without hinges there is no friction in them, and without obstacles nothing to touch.
+OTHERS = [e for e in catalogue if not e.name.startswith(("pivot", "hidden_obstacle"))]
 
 
 def ring(half: float) -> tuple[Wall, ...]:
@@ -31,7 +32,7 @@ def cart(walls: bool) -> tuple[Simulator, np.ndarray, np.ndarray]:
     if not walls:
         start[..., :2] *= 5.0
     actions = rng.normal(0, [12, 12, 2], (40, 3, 1, 3))
-    return simulator(scene, tuple(e for e in catalogue if e not in PIVOT)), start, actions
+    return simulator(scene, tuple(OTHERS)), start, actions
 
 
 def chain() -> tuple[Simulator, np.ndarray, np.ndarray]:

@@ -296,6 +296,7 @@ def segments_of(observed: np.ndarray) -> Segments:
         observed,
         np.zeros(n, dtype=int),
         np.arange(n),
+        np.zeros((n, h, k, 9)),
     )
 
 

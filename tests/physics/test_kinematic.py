@@ -6,7 +6,7 @@ import pytest
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.model import Transition, build_layout
-from pbrl_ppl.physics import Simulator, compiled, independent_parts
+from pbrl_ppl.physics import Simulator, calls, independent_parts
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.pushes import pushed
 from tests.helpers.worlds import BY_NAME, body, simulator, state
@@ -104,7 +104,7 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
     return sim, phi, start, rng.normal(0, 2.0, (30, 3, 5, 3))
 
 
-@pytest.mark.skipif(not compiled.AVAILABLE, reason="the engine cannot be called on this platform")
+@pytest.mark.skipif(not calls.AVAILABLE, reason="the engine cannot be called on this platform")
 def test_paths_agree_and_order_and_chunks_change_nothing() -> None:
     sim, phi, start, actions = crowd()
     expected = sim(phi, start, actions)
