@@ -1,184 +1,26 @@
-"""Findings in words, as a page, and as the files of the contract."""
+"""Findings in words, and as a page."""
 
 from __future__ import annotations
 
 import base64
-import json
-import os
-import tempfile
 from collections.abc import Iterable
-from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import jinja2
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.criticism import ADEQUATE, UNEXPLAINED, Findings, revise
+from pbrl_ppl.criticism import ADEQUATE, UNEXPLAINED, Findings
 from pbrl_ppl.effects import catalogue
-from pbrl_ppl.errors import OutputError
-from pbrl_ppl.history import History
 from pbrl_ppl.parameters import BODY_PARAMETERS
-from pbrl_ppl.posterior import save_posterior
 from pbrl_ppl.report import plots
 from pbrl_ppl.report.plots import UNITS, plain
-from pbrl_ppl.scene import Scene
 
-#: What :meth:`Loop.save` writes.
-FILES = ("report.html", "report.json", "before.nc", "after.nc")
 #: A chain mix is good enough below this R-hat and above this effective sample size.
 GOOD_R_HAT, GOOD_ESS = 1.01, 400.0
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Loop:
-    """A closed loop: the findings, and how to keep them.
-
-    Everything in ``findings`` can be had directly: ``loop.verdict``, ``loop.added``.
-
-    Parameters
-    ----------
-    findings : Findings
-        What was found.
-    """
-
-    findings: Findings
-
-    def __getattr__(self, name: str) -> Any:
-        # copy and pickle look for dunder names before `findings` is there
-        if name.startswith("__") or name == "findings":
-            raise AttributeError(name)
-        return getattr(self.findings, name)
-
-    def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *dir(self.findings), *vars(self.findings)})
-
-    def __repr__(self) -> str:
-        return f"Loop({verdict_in_words(self.findings)})"
-
-    def report(self, path: str | Path) -> Path:
-        """Write the report as one self-contained page and return its path.
-
-        Raises
-        ------
-        OutputError
-            If the file cannot be written.
-        """
-        path = Path(path)
-        page = render(self.findings)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            temporary.write_text(page, encoding="utf-8")
-            temporary.replace(path)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-        finally:
-            temporary.unlink(missing_ok=True)
-        return path
-
-    def save(self, folder: str | Path, overwrite: bool = False) -> Path:
-        """Write report.html, report.json, before.nc and after.nc, all or nothing.
-
-        Parameters
-        ----------
-        folder : str or pathlib.Path
-            Made if missing; other files in it are left alone.
-        overwrite : bool
-            Whether a folder that has content may be written to.
-
-        Returns
-        -------
-        pathlib.Path
-            The folder.
-
-        Raises
-        ------
-        OutputError
-            If the folder cannot be written, or has content and ``overwrite`` is false.
-        """
-        folder = Path(folder)
-        nearest = check_folder(folder, overwrite)
-        try:
-            # on the same file system as the folder, so that renaming is all that is left to do
-            with tempfile.TemporaryDirectory(prefix=".pbrl-ppl-", dir=nearest) as temporary:
-                made = Path(temporary) / "result"
-                made.mkdir()
-                (made / "report.html").write_text(render(self.findings), encoding="utf-8")
-                text = json.dumps(self.findings.to_dict(), indent=1, allow_nan=False)
-                (made / "report.json").write_text(text + "\n", encoding="utf-8")
-                save_posterior(self.findings.posterior_before, made / "before.nc")
-                save_posterior(self.findings.posterior_after, made / "after.nc")
-                if nearest == folder:
-                    # it may be a mount or somebody's working directory: fill it, do not swap it
-                    for name in FILES:
-                        (made / name).replace(folder / name)
-                else:
-                    folder.parent.mkdir(parents=True, exist_ok=True)
-                    made.rename(folder)
-        except OutputError:
-            raise
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written: {error}") from error
-        return folder
-
-
-def close_loop(scene: Scene, train: History, test: History | None = None, **options: Any) -> Loop:
-    """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
-
-    Parameters
-    ----------
-    scene : Scene
-        The declared scene.
-    train : History
-        What is fitted.
-    test : History, optional
-        What errors are measured on; a seeded quarter of the trajectories of ``train`` without it.
-    **options
-        As :func:`pbrl_ppl.criticism.loop.revise` takes them.
-
-    Examples
-    --------
-    ::
-
-        loop = close_loop(scene, train, test, seed=1)
-        loop.verdict  # 'effects-added'
-    """
-    return Loop(revise(scene, train, test, **options))
-
-
-def check_folder(folder: Path, overwrite: bool) -> Path:
-    """Return the nearest folder that exists, if results can be written to ``folder``.
-
-    Raises
-    ------
-    OutputError
-        If they cannot, or if it has content and ``overwrite`` is false.
-    """
-    nearest = folder
-    # a dangling link counts as there: it cannot be made a folder
-    while not (nearest.exists() or nearest.is_symlink()) and nearest != nearest.parent:
-        nearest = nearest.parent
-    if not nearest.is_dir():
-        raise OutputError(
-            f"output folder {folder}: {nearest} is a file, expected a folder; choose another path"
-        )
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise OutputError(f"output folder {folder}: no permission to write in {nearest}")
-    if nearest != folder:
-        return nearest
-    if not overwrite and any(folder.iterdir()):
-        raise OutputError(
-            f"output folder {folder}: it has content already; choose another, or allow"
-            " overwriting (--overwrite, overwrite=True)"
-        )
-    for name in FILES:
-        if (folder / name).is_dir():
-            raise OutputError(f"output folder {folder}: {name} in it is a folder; remove it")
-    return folder
 
 
 def verdict_in_words(findings: Findings) -> str:

@@ -1,6 +1,7 @@
 """The report: the right words and numbers, a page that needs nothing else, files all or none."""
 
 import copy
+import inspect
 import json
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -23,8 +24,10 @@ from pbrl_ppl.criticism.findings import (
 )
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
-from pbrl_ppl.report import plots, report
-from pbrl_ppl.report.report import FILES, Loop, number, render, verdict_in_words
+from pbrl_ppl.report import loop as loop_module
+from pbrl_ppl.report import plots
+from pbrl_ppl.report.loop import FILES, Loop, close_loop
+from pbrl_ppl.report.report import number, render, verdict_in_words
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE, STATE_UNITS
 
@@ -395,9 +398,11 @@ def test_a_parameter_that_never_moved() -> None:
 def test_loop_stands_for_its_findings() -> None:
     loop = Loop(made_up())
     assert loop.verdict == "effects-added"
-    assert loop.added[0].effect == "linear_drag"
+    for name in ("added", "candidates", "unexplained", "before", "after"):
+        assert getattr(loop, name) is getattr(loop.findings, name)
+    assert loop.posterior_before is loop.findings.posterior_before
+    assert loop.posterior_after is loop.findings.posterior_after
     assert "Something was missing" in repr(loop)
-    assert {"verdict", "save", "report"} <= set(dir(loop))
     assert copy.copy(loop).verdict == "effects-added"
     with pytest.raises(AttributeError, match="vredict"):
         _ = loop.vredict
@@ -405,10 +410,17 @@ def test_loop_stands_for_its_findings() -> None:
 
 def test_close_loop_hands_over_what_it_got(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    monkeypatch.setattr(report, "revise", lambda *args, **kw: calls.append((args, kw)) or made_up())
-    loop = report.close_loop("scene", "train", "test", seed=3)  # type: ignore[arg-type]
+    revise = loop_module.revise
+    monkeypatch.setattr(
+        loop_module, "revise", lambda *args, **kw: calls.append((args, kw)) or made_up()
+    )
+    loop = close_loop("scene", "train", "test", seed=3, horizon=2)  # type: ignore[arg-type]
     assert loop.verdict == "effects-added"
-    assert calls == [(("scene", "train", "test"), {"seed": 3})]
+    ((args, options),) = calls
+    assert args == ("scene", "train", "test")
+    assert (options["seed"], options["horizon"], options["draws"]) == (3, 2, None)
+    ours, theirs = (inspect.signature(each).parameters for each in (close_loop, revise))
+    assert list(ours.values()) == list(theirs.values())
 
 
 def test_save_writes_the_contract(tmp_path: Path) -> None:
@@ -466,8 +478,8 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> None:
         if path.name == "after.nc":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "save_posterior", fail)
-    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "save_posterior", fail)
+    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
 
 
 @pytest.mark.usefixtures("broken")
@@ -487,8 +499,10 @@ def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
 
 
 def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "save_posterior", lambda posterior, path: path.write_bytes(b"nc"))
-    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    monkeypatch.setattr(
+        loop_module, "save_posterior", lambda posterior, path: path.write_bytes(b"nc")
+    )
+    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
     loop = Loop(made_up())
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"has content already.*--overwrite"):
@@ -513,7 +527,7 @@ def test_folder_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
     path = Loop(made_up()).report(tmp_path / "report.html")
     assert path.read_text() == "a page"
     for place in (tmp_path, tmp_path / "none" / "report.html"):
