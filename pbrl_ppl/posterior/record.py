@@ -19,7 +19,7 @@ from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.model import Noise, Observations, ParameterLibrary, Problem, sigma_prior
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws
-from pbrl_ppl.posterior.identification import uninformed
+from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.store import (
     attributes,
     convergence,
