@@ -16,7 +16,8 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.posterior import save_posterior
-from pbrl_ppl.report.report import render, verdict_in_words
+from pbrl_ppl.report.report import render
+from pbrl_ppl.report.words import verdict_in_words
 from pbrl_ppl.scene import Scene
 
 #: What :meth:`Loop.save` writes.

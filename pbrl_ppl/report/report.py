@@ -1,76 +1,62 @@
-"""Findings in words, and as a page."""
+"""Findings as a page."""
 
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable
 from importlib import resources
 from typing import Any
 
 import jinja2
-import numpy as np
 import pandas as pd
 
-from pbrl_ppl.criticism import ADEQUATE, UNEXPLAINED, Findings
+from pbrl_ppl.criticism import Findings
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.parameters import BODY_PARAMETERS
-from pbrl_ppl.report import plots
-from pbrl_ppl.report.plots import UNITS, plain
+from pbrl_ppl.report.effect_plots import HARDLY, MOST_CANDIDATES, plot_added, plot_candidates
+from pbrl_ppl.report.error_plots import plot_errors, plot_residuals, plot_rollout
+from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
+from pbrl_ppl.report.style import UNITS, png
+from pbrl_ppl.report.words import (
+    chance,
+    change,
+    joined,
+    number,
+    odds,
+    plain,
+    quantity,
+    verdict_in_words,
+)
 
 #: A chain mix is good enough below this R-hat and above this effective sample size.
 GOOD_R_HAT, GOOD_ESS = 1.01, 400.0
 
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-def verdict_in_words(findings: Findings) -> str:
-    """Say the verdict in a sentence or two, for a reader who knows no statistics."""
-    found = _joined(
-        f"{one.sentence.rstrip('.')} ({plain(one.effect)}) on the {plain(one.body)}"
-        for one in findings.added
-    )
-    left = findings.unexplained
-    rest = "a pattern remains in the errors" if left is None else left.sentence.rstrip(".")
-    if findings.verdict == ADEQUATE:
-        return "Nothing is missing: the declared model explains the data up to measurement noise."
-    if findings.verdict == UNEXPLAINED and not found:
-        return f"Something is missing that no effect in the catalogue explains: {rest}."
-    if findings.verdict == UNEXPLAINED or left is not None:
-        return (
-            f"Part of what was missing is {found}. Something is still missing that no effect in"
-            f" the catalogue explains: {rest}."
-        )
-    if len(findings.added) > 1:
-        return f"{len(findings.added)} things were missing: {found}."
-    return f"Something was missing: {found}."
-
 
 def render(findings: Findings) -> str:
     """Render the report: one page of HTML that needs nothing else."""
-    table = plots.summary(findings.posterior_after)
-    parameters = plots.most_interesting(findings, table)
+    table = summary(findings.posterior_after)
+    parameters = most_interesting(findings, table)
     pictures = {
-        "rollout": plots.plot_rollout(findings),
-        "errors": plots.plot_errors(findings),
-        "residuals": plots.plot_residuals(findings),
-        "trace": plots.plot_trace(findings, parameters),
-        "rank": plots.plot_rank(findings, parameters),
+        "rollout": plot_rollout(findings),
+        "errors": plot_errors(findings),
+        "residuals": plot_residuals(findings),
+        "trace": plot_trace(findings, parameters),
+        "rank": plot_rank(findings, parameters),
     }
     if findings.candidates:
-        pictures["candidates"] = plots.plot_candidates(findings)
+        pictures["candidates"] = plot_candidates(findings)
     if findings.added:
-        pictures["added"] = plots.plot_added(findings)
+        pictures["added"] = plot_added(findings)
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(
         number=number,
         chance=chance,
-        odds=_odds,
+        odds=odds,
         plain=plain,
-        joined=_joined,
-        change=_change,
-        quantity=_quantity,
+        joined=joined,
+        change=change,
+        quantity=quantity,
     )
     template = resources.files("pbrl_ppl.report").joinpath("report.html.jinja").read_text("utf-8")
     return environment.from_string(template).render(
@@ -82,10 +68,10 @@ def render(findings: Findings) -> str:
         added={(one.effect, one.body) for one in findings.added},
         best=_largest_fall(findings),
         good={"r_hat": GOOD_R_HAT, "ess": GOOD_ESS},
-        hardly=plots.HARDLY,
-        most=plots.MOST_CANDIDATES,
+        hardly=HARDLY,
+        most=MOST_CANDIDATES,
         picture={
-            name: "data:image/png;base64," + base64.b64encode(plots.png(figure)).decode("ascii")
+            name: "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
             for name, figure in pictures.items()
         },
     )
@@ -122,61 +108,3 @@ def _largest_fall(findings: Findings) -> dict[str, Any] | None:
         return None
     best = min(shares, key=lambda dimension: shares[dimension])
     return {"name": best, "before": before[best], "after": after[best]}
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """Write a number for a reader: three significant digits, no exponent below a million.
-
-    Examples
-    --------
-    >>> number(419.04), number(0.00123456), number(2.0), number(float("nan"))
-    ('419', '0.00123', '2.00', '–')
-    """
-    if value is None or not np.isfinite(value):
-        return "–"
-    if value != 0 and not 1e-4 <= abs(value) < 1e6:
-        mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
-        return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}"
-    places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
-    return f"{value:,.{max(places, 0)}f}".replace("-", "−")
-
-
-def _quantity(value: float, unit: str) -> str:
-    """Write a number with its unit, which is "1" where there is none."""
-    return f"{number(value)} {unit.removesuffix('1')}".rstrip()
-
-
-def chance(p_value: float) -> str:
-    """Write a p-value: two digits, and no pretence of exactness where it underflowed.
-
-    Examples
-    --------
-    >>> chance(0.0312), chance(1e-80), chance(0.0)
-    ('0.031', '1.0 × 10⁻⁸⁰', '< 10⁻³⁰⁰')
-    """
-    return "< 10⁻³⁰⁰" if p_value < 1e-300 else number(p_value, 2)
-
-
-def _odds(p_value: float) -> str:
-    """How often chance alone does it."""
-    if p_value < 1e-300:
-        return "less than once in 10³⁰⁰ times"
-    if p_value > 0.1:
-        return f"in {100 * p_value:.0f} % of all cases"
-    if p_value > 1e-6:
-        return f"once in {1 / p_value:,.0f} times"
-    power = int(np.floor(-np.log10(p_value)))
-    return f"less than once in 10{str(power).translate(_RAISED)} times"
-
-
-def _change(before: float, after: float) -> str:
-    """Say by how much an error fell."""
-    share = 1 - after / before if before > 0 else float("nan")
-    if not np.isfinite(share) or abs(share) < 0.005:
-        return "did not change"
-    return f"{'fell' if share > 0 else 'rose'} by {abs(share) * 100:.0f} %"
-
-
-def _joined(parts: Iterable[str], word: str = "and") -> str:
-    *most, last = [str(part) for part in parts] or [""]
-    return f"{'; '.join(most)}, {word} {last}" if most else last

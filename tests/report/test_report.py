@@ -25,9 +25,11 @@ from pbrl_ppl.criticism.findings import (
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.report import loop as loop_module
-from pbrl_ppl.report import plots
+from pbrl_ppl.report.error_plots import plot_rollout, unwrap
 from pbrl_ppl.report.loop import FILES, Loop, close_loop
-from pbrl_ppl.report.report import number, render, verdict_in_words
+from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
+from pbrl_ppl.report.report import render
+from pbrl_ppl.report.words import number, verdict_in_words
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE, STATE_UNITS
 
@@ -362,10 +364,10 @@ def test_numbers(value: float | None, written: str) -> None:
 
 def test_rollout_angles_have_no_jumps() -> None:
     jumping = np.array([3.0, 3.1, np.nan, -3.1, -3.0])
-    smooth = plots.unwrap(jumping)
+    smooth = unwrap(jumping)
     assert np.isnan(smooth[2])
     assert np.allclose(np.delete(smooth, 2), [3.0, 3.1, 2 * np.pi - 3.1, 2 * np.pi - 3.0])
-    figure = plots.plot_rollout(made_up())
+    figure = plot_rollout(made_up())
     theta = figure.axes[2]
     assert theta.get_ylabel() == "theta (rad)"
     for line in theta.lines:
@@ -375,13 +377,13 @@ def test_rollout_angles_have_no_jumps() -> None:
 
 
 def test_parameters_of_most_interest() -> None:
-    shown = plots.most_interesting(made_up(stuck=True))
+    shown = most_interesting(made_up(stuck=True))
     assert shown[:2] == ["linear_drag_coefficient[cart]", "w_x[cart]"]
-    assert len(shown) == plots.MOST_PARAMETERS
+    assert len(shown) == MOST_PARAMETERS
 
 
 def test_summary_has_the_same_columns_everywhere() -> None:
-    table = plots.summary(made_up_posterior())
+    table = summary(made_up_posterior())
     assert list(table.columns) == ["mean", "sd", "lower", "upper", "ess_bulk", "ess_tail", "r_hat"]
     drag = table.loc["linear_drag_coefficient[cart]"]
     assert drag["mean"] == pytest.approx(3.0, abs=0.01)
