@@ -7,14 +7,13 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.calibration.ranks import MOST_DRAWS, rank
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.model import Problem, build_model, prior_predictive_draws
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws
 from pbrl_ppl.sampling import fit
@@ -76,17 +75,10 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
     names = [block.name for block in design.layout.blocks] + ["sigma", "next_state"]
     total = n
     while total <= _MOST_REDRAWN * n:
-        # compiling would take longer than drawing
-        drawn = pm.draw(
-            [model[name] for name in names], draws=total, random_seed=seed, mode="FAST_COMPILE"
-        )
-        prior = {
-            name: (("chain", "draw", *(f"{name}_{d}" for d in range(value.ndim - 1))), value[None])
-            for name, value in zip(names[:-1], drawn[:-1], strict=True)
-        }
-        trace = from_groups({"posterior": xr.Dataset(prior)}, {})
-        phi, sigma = parameter_draws(design, trace)
-        values = drawn[-1]
+        drawn = prior_predictive_draws(model, names, total, seed)
+        phi, values = design.layout.to_vectors(drawn, total), drawn["next_state"]
+        shape = total, len(design.observations.columns)
+        sigma = np.broadcast_to(drawn["sigma"].reshape(total, -1), shape)
         possible = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
         chosen = np.flatnonzero(possible)[:n]
         if len(chosen) == n:

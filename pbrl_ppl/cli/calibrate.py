@@ -38,9 +38,9 @@ def calibrate(
     with interruptible(f"finished replications are in {output}; the same command goes on"):
         declared, design = load_files(scene, history, estimate_velocities)
         os.environ.setdefault("MPLBACKEND", "Agg")
+        from pbrl_ppl import report
         from pbrl_ppl.calibration import calibration
         from pbrl_ppl.history import write_atomically
-        from pbrl_ppl.report import plots
 
         with _pool(jobs) as executor:
             result = calibration.calibrate(
@@ -49,7 +49,7 @@ def calibrate(
             )  # fmt: skip
         result.save(output / "ranks.nc")
         write_atomically(output / "table.csv", result.table().to_csv)
-        picture = plots.png(plots.plot_calibration(result))
+        picture = report.png(report.plot_calibration(result))
         write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
     typer.echo(_calibrated(result))
     typer.echo(f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}")

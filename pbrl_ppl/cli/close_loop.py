@@ -54,13 +54,19 @@ def close_loop(
         progress("loading the sampler")
         # nobody is there to see a window
         os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl.report import report
+        from pbrl_ppl import report
 
         # before the long work, which would be lost
         report.check_folder(output, overwrite)
-        options = {"draws": draws, "horizon": horizon}
-        given = {name: value for name, value in options.items() if value is not None}
-        loop = report.close_loop(declared, history, held_out, seed=seed, progress=progress, **given)
+        loop = report.close_loop(
+            declared,
+            history,
+            held_out,
+            seed=seed,
+            horizon=horizon,
+            draws=draws,
+            progress=progress,
+        )
         progress("writing the report")
         loop.save(output, overwrite=overwrite)
     typer.echo(report.verdict_in_words(loop.findings))

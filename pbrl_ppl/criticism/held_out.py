@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from scipy.special import logsumexp
 from pbrl_ppl.criticism.findings import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, StartNoise
+from pbrl_ppl.model import Data, Problem, StartNoise
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
 from pbrl_ppl.state import STATE_UNITS
@@ -38,35 +39,52 @@ class HeldOut:
 
     history: History
     seed: int
+    _data: dict[int, Data] = field(default_factory=dict, init=False, repr=False)
+    _noisy: WeakKeyDictionary[Mode, dict[int, Problem]] = field(
+        default_factory=WeakKeyDictionary, init=False, repr=False
+    )
 
     def problem(self, mode: Mode, horizon: int | None = None) -> Problem:
-        """A mode's problem on the held-out history, with its start noise linearised there."""
-        length = mode.problem.data.horizon if horizon is None else horizon
-        problem = mode.problem.with_data(history=self.history, horizon=length)
-        if problem.observations.columns != mode.problem.observations.columns:
-            raise HistoryError(
-                f"test history measures {', '.join(problem.observations.names)}, the training"
-                f" history {', '.join(mode.problem.observations.names)}; they must be the same"
-            )
-        measured = problem.observations.measured.reshape(problem.segments.n, -1)
-        sensitivity = problem.sensitivity(mode.phi, mode.sigma)
-        return problem.with_noise(start=StartNoise.of(sensitivity, measured, mode.sigma))
+        """A mode's problem on the held-out history, its start states taken as exact."""
+        horizon = mode.problem.data.horizon if horizon is None else horizon
+        if horizon not in self._data:
+            data = replace(mode.problem.data, history=self.history, horizon=horizon)
+            measured, trained = data.observations, mode.problem.observations
+            if measured.columns != trained.columns:
+                raise HistoryError(
+                    f"test history measures {', '.join(measured.names)}, the training history"
+                    f" {', '.join(trained.names)}; they must be the same"
+                )
+            self._data[horizon] = data
+        return mode.problem.on(self._data[horizon])
+
+    def noisy(self, mode: Mode, horizon: int | None = None) -> Problem:
+        """The same with the start states' noise, linearised at the mode once."""
+        horizon = mode.problem.data.horizon if horizon is None else horizon
+        known = self._noisy.setdefault(mode, {})
+        if horizon not in known:
+            problem = self.problem(mode, horizon)
+            measured = problem.observations.measured.reshape(problem.segments.n, -1)
+            sensitivity = problem.sensitivity(mode.phi, mode.sigma)
+            start = StartNoise.of(sensitivity, measured, mode.sigma)
+            known[horizon] = problem.with_noise(start=start)
+        return known[horizon]
 
     def gains(self, before: Mode, after: Mode) -> Array:
         """Held-out log predictive density gained, shape (transition,)."""
         rng = np.random.default_rng(self.seed)
-        return _elpd(self.problem(after), *_laplace_draws(after, rng)) - _elpd(
-            self.problem(before), *_laplace_draws(before, rng)
+        return _elpd(self.noisy(after), *_laplace_draws(after, rng)) - _elpd(
+            self.noisy(before), *_laplace_draws(before, rng)
         )
 
     def fall(self, before: Mode, after: Mode) -> float:
         """Share by which the residual falls, in units of the later model's noise."""
-        scale = self.problem(after)
+        scale = self.noisy(after)
         return 1.0 - _normalised(scale, after, after) / _normalised(scale, before, after)
 
     def residuals(self, mode: Mode, unit: Mode) -> dict[str, Array]:
         """Residuals of a mode in units of another's noise, by state dimension."""
-        scale = self.problem(unit)
+        scale = self.noisy(unit)
         observations = scale.observations
         z = _whitened(scale, mode, unit).reshape(observations.values.shape)
         return {
@@ -81,14 +99,14 @@ class HeldOut:
 
     def errors(self, mode: Mode, scale: Mode, posterior: Any, rollout: int) -> Errors:
         """Errors of a model; ``scale`` is the model whose noise is the unit."""
-        problem = self.problem(mode)
+        problem = self.noisy(mode)
         pick = np.random.default_rng(self.seed)
         phi, sigma = parameter_draws(mode.problem, posterior)
         chosen = pick.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
         return Errors(
-            one_step_rmse=_rmse(problem.with_data(horizon=1), mode),
-            rollout_rmse=_rmse(problem.with_data(horizon=rollout), mode),
-            normalised_rmse=_normalised(self.problem(scale), mode, scale),
+            one_step_rmse=_rmse(self.problem(mode, 1), mode),
+            rollout_rmse=_rmse(self.problem(mode, rollout), mode),
+            normalised_rmse=_normalised(self.noisy(scale), mode, scale),
             elpd=float(_elpd(problem, phi[chosen], sigma[chosen]).sum()),
         )
 
@@ -105,12 +123,12 @@ class HeldOut:
             square = ((gain * mode.sigma) ** 2 * seen).sum((0, 1)) / np.maximum(seen.sum((0, 1)), 1)
             return dict(zip(names, np.sqrt(square).tolist(), strict=True))
 
-        problem = self.problem(mode)
+        problem = self.noisy(mode)
         measured = problem.observations.measured
         at_mode = problem.log_density(np.zeros_like(problem.observations.values), mode.sigma)
         return Errors(
-            one_step_rmse=expected(self.problem(mode, 1)),
-            rollout_rmse=expected(self.problem(mode, rollout)),
+            one_step_rmse=expected(self.noisy(mode, 1)),
+            rollout_rmse=expected(self.noisy(mode, rollout)),
             normalised_rmse=1.0,
             elpd=float(at_mode.sum() - 0.5 * measured.sum()),
         )
@@ -119,7 +137,7 @@ class HeldOut:
         """Follow the body that moves most over the first held-out trajectory."""
         scene = revised.problem.scene
         length = int(self.history.dataset["n_rows"].min()) - 1
-        problem = revised.problem.with_data(history=self.history, horizon=length)
+        problem = self.problem(revised, length)
         first = slice(0, 1)
         start, actions = problem.segments.start[first], problem.segments.inputs[first]
         measured = problem.observations.values[0]

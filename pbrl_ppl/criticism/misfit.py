@@ -62,7 +62,7 @@ def find_remainder(mode: Mode, *, seed: int = 0) -> Unexplained | None:
     chosen = np.sort(rng.permutation(n)[:_MOST])
     columns = problem.observations.columns
     # a segment's residual in one number a dimension: independent cells, so their scaled sum
-    target = mode.whitened.reshape(n, problem.data.horizon, k, len(columns)).sum(1)
+    target = mode.whitened_residual().reshape(n, problem.data.horizon, k, len(columns)).sum(1)
     target = target[chosen] / np.sqrt(problem.data.horizon)
     groups = problem.segments.trajectory[chosen]
     best: Unexplained | None = None

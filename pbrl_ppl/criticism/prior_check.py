@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import logging
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import Problem
-from pbrl_ppl.posterior import HDI_PROB, group
+from pbrl_ppl.model import Problem, prior_predictive_draws
+from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.state import STATE, STATE_UNITS
 
 Array = NDArray[np.float64]
@@ -83,7 +79,7 @@ class PriorCheck:
         return tuple(found)
 
 
-def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) -> PriorCheck:
+def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> PriorCheck:
     """Compare measured changes over a segment with what the prior predicts for them.
 
     The noise added to the predictions is the median of sigma's prior. All of that prior would not
@@ -129,7 +125,9 @@ def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) 
     noise = problem.noise_prior[0]
     first = segments.start[..., columns]
     measured = observations.wrapped(observations.values[:, -1] - first)
-    phi = _prior_draws(model, problem, draws, rng)
+    names = [block.name for block in problem.layout.blocks]
+    drawn = prior_predictive_draws(model, names, draws, int(rng.integers(2**31)))
+    phi = problem.layout.to_vectors(drawn, draws)
     ends = np.concatenate(
         [
             problem.predict(phi[i : i + _CHUNK])[..., -1, :, :][..., columns]
@@ -156,33 +154,6 @@ def prior_predictive_check(model: pm.Model, *, draws: int = 200, seed: int = 0) 
         draws,
         int(draws - good.sum()),
     )
-
-
-def _prior_draws(model: pm.Model, problem: Problem, draws: int, rng: np.random.Generator) -> Array:
-    """Phi from the model's prior, shape (draw, p)."""
-    names = [block.name for block in problem.layout.blocks]
-    if not names:
-        return np.zeros((draws, 0))
-    with _quiet():
-        idata = pm.sample_prior_predictive(
-            draws, model=model, var_names=names, random_seed=int(rng.integers(2**31))
-        )
-    prior = group(idata, "prior")
-    return problem.layout.to_vectors({name: prior[name].to_numpy() for name in names}, draws)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Without PyMC's line that it samples, and PyMC 6's that truncated normals run in Python."""
-    logger = logging.getLogger("pymc")
-    level = logger.level
-    logger.setLevel(logging.WARNING)
-    try:
-        with warnings.catch_warnings():
-            warnings.filterwarnings("ignore", "Numba will use object mode", UserWarning)
-            yield
-    finally:
-        logger.setLevel(level)
 
 
 def _compare(predicted: Array, measured: Array) -> xr.Dataset:

@@ -126,7 +126,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
 
     derivative, _ = posterior_steps(predict, null[new], lower, upper, begin)
     derivative = np.vstack([derivative, np.zeros((p, len(new)))])
-    residual = np.concatenate([mode.whitened.ravel(), -prior_residual(priors, mode.phi)])
+    residual = np.concatenate([mode.whitened_residual().ravel(), -prior_residual(priors, mode.phi)])
     slopes = _prior_slopes(problem, mode.phi)
     jacobian = np.vstack([-mode.jacobian, np.diag(slopes)])
     edges = np.cumsum([0, *map(len, columns)])

@@ -1,7 +1,7 @@
 """Table 1, Eqs. 11 and 12, the engine as a pytensor Op, and the `pm.Model` made of them."""
 
 from pbrl_ppl.model.data import Data
-from pbrl_ppl.model.declaration import build_model, physics_model
+from pbrl_ppl.model.declaration import build_model, physics_model, prior_predictive_draws
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
     Observations,
@@ -35,6 +35,7 @@ __all__ = [
     "log_density",
     "next_state_random",
     "physics_model",
+    "prior_predictive_draws",
     "robust",
     "sigma_prior",
     "whiten",

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
+from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
@@ -169,6 +170,35 @@ def build_model(problem: Problem) -> pm.Model:
         )
     model.problem = problem
     return model
+
+
+def prior_predictive_draws(
+    model: pm.Model, names: Sequence[str], draws: int, seed: int
+) -> dict[str, NDArray[Any]]:
+    """Draws from the prior of a model, by PyMC.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        As made by :func:`physics_model`.
+    names : sequence of str
+        Variables to draw, ``next_state`` among them if wanted (Eq. 13).
+    draws : int
+        How many; the first of more are the same.
+    seed : int
+        Of the draws.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Shape (draw, ...) each.
+    """
+    if not names:
+        return {}
+    variables = [model[name] for name in names]
+    # compiling would take longer than drawing
+    drawn = pm.draw(variables, draws=draws, random_seed=seed, mode="FAST_COMPILE")
+    return dict(zip(names, drawn, strict=True))
 
 
 def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:

@@ -79,12 +79,16 @@ class Problem:
         )
 
     def with_data(self, **changes: Any) -> Problem:
-        """The same problem of other data; arguments are fields of :class:`Data`.
+        """The same problem of other data; arguments are fields of :class:`Data`."""
+        return self.on(replace(self.data, **changes))
+
+    def on(self, data: Data) -> Problem:
+        """The same problem of other data.
 
         The start state's noise, which is of each segment, is left out. Bodies that have to do with
         each other in another history are found anew; where they are the same, the physics stay.
         """
-        data, physics = replace(self.data, **changes), self.physics
+        physics = self.physics
         if data.history is not self.data.history:
             physics = physics.changed(parts=independent_parts(physics.scene, data.history))
         return replace(self, data=data, physics=physics, noise=replace(self.noise, start=None))

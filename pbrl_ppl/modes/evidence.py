@@ -107,7 +107,7 @@ class Coordinates:
         precision[own, own] += 2.0 * self._counts * self._spread**2
         covariance = np.linalg.inv(precision)
         # a density's mode moves with its coordinates: where the data are silent, to the origin
-        residual = np.nan_to_num(robust(mode.whitened, self.problem.noise.nu)).ravel()
+        residual = np.nan_to_num(robust(mode.whitened_residual(), self.problem.noise.nu)).ravel()
         pull = np.concatenate([-jacobian.T @ residual, np.zeros(len(own))])
         whole = covariance @ (pull - self.origin)
         tried = self.origin + np.array([0.0, 0.25, 0.5, 1.0])[:, None] * whole

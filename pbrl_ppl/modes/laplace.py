@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
@@ -54,6 +54,7 @@ class Mode:
     covariance: Array
     log_posterior: float
     others: tuple[Mode, ...] = ()
+    _residual: list[Array] = field(default_factory=list, init=False, repr=False)
 
     @property
     def values(self) -> dict[str, Array]:
@@ -71,10 +72,13 @@ class Mode:
         moved = self.phi + rng.standard_normal((n, len(self.phi))) @ self.factor.T
         return inside(self.problem.layout.priors, moved)
 
-    @property
-    def whitened(self) -> Array:
-        """Residuals in units of noise, shape (transition, cell)."""
-        return self.problem.whitened(self.phi, self.sigma)
+    def whitened_residual(self) -> Array:
+        """Residuals in units of noise, shape (transition, cell); the engine runs once for it."""
+        if not self._residual:
+            residual = self.problem.whitened(self.phi, self.sigma)
+            residual.setflags(write=False)
+            self._residual.append(residual)
+        return self._residual[0]
 
 
 def posterior_steps(

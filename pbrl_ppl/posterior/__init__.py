@@ -1,7 +1,6 @@
 """Posterior files: save, load, draws, what the data inform, the next prior."""
 
-from pbrl_ppl.posterior.identifiability import Identifiability
-from pbrl_ppl.posterior.identification import identify, uninformed
+from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
 from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
 from pbrl_ppl.posterior.record import (
     MIN_ESS,

@@ -19,7 +19,7 @@ from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.model import Noise, Observations, ParameterLibrary, Problem, sigma_prior
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws
-from pbrl_ppl.posterior.identification import uninformed
+from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.store import (
     attributes,
     convergence,
@@ -288,9 +288,9 @@ def _trouble(
     problem: Problem, idata: Any, asked: int | None
 ) -> Iterator[tuple[type[Warning], str]]:
     """What is wrong, and the cure."""
-    on = "go on with start= this posterior"
+    on = "go on with resume= this posterior"
     if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
-        on = "name the bodies that were found in the scene, fit that and go on with start="
+        on = "name the bodies that were found in the scene, fit that and go on with resume="
     more = f"raise draws= or thin=, or {on}"
     if "updates" in idata.attrs:  # resampled draws are no chain that could go on
         more = "these draws were reweighted by update; fit all data anew"

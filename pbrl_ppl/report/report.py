@@ -1,234 +1,62 @@
-"""Findings in words, as a page, and as the files of the contract."""
+"""Findings as a page."""
 
 from __future__ import annotations
 
 import base64
-import json
-import os
-import tempfile
-from collections.abc import Iterable
-from dataclasses import dataclass
 from importlib import resources
-from pathlib import Path
 from typing import Any
 
 import jinja2
-import numpy as np
 import pandas as pd
 
-from pbrl_ppl.criticism import ADEQUATE, UNEXPLAINED, Findings, revise
+from pbrl_ppl.criticism import Findings
 from pbrl_ppl.effects import catalogue
-from pbrl_ppl.errors import OutputError
-from pbrl_ppl.history import History
 from pbrl_ppl.parameters import BODY_PARAMETERS
-from pbrl_ppl.posterior import save_posterior
-from pbrl_ppl.report import plots
-from pbrl_ppl.report.plots import UNITS, plain
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.report.effect_plots import HARDLY, MOST_CANDIDATES, plot_added, plot_candidates
+from pbrl_ppl.report.error_plots import plot_errors, plot_residuals, plot_rollout
+from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
+from pbrl_ppl.report.style import UNITS, png
+from pbrl_ppl.report.words import (
+    chance,
+    change,
+    joined,
+    number,
+    odds,
+    plain,
+    quantity,
+    verdict_in_words,
+)
 
-#: What :meth:`Loop.save` writes.
-FILES = ("report.html", "report.json", "before.nc", "after.nc")
 #: A chain mix is good enough below this R-hat and above this effective sample size.
 GOOD_R_HAT, GOOD_ESS = 1.01, 400.0
-
-_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Loop:
-    """A closed loop: the findings, and how to keep them.
-
-    Everything in ``findings`` can be had directly: ``loop.verdict``, ``loop.added``.
-
-    Parameters
-    ----------
-    findings : Findings
-        What was found.
-    """
-
-    findings: Findings
-
-    def __getattr__(self, name: str) -> Any:
-        # copy and pickle look for dunder names before `findings` is there
-        if name.startswith("__") or name == "findings":
-            raise AttributeError(name)
-        return getattr(self.findings, name)
-
-    def __dir__(self) -> list[str]:
-        return sorted({*super().__dir__(), *dir(self.findings), *vars(self.findings)})
-
-    def __repr__(self) -> str:
-        return f"Loop({verdict_in_words(self.findings)})"
-
-    def report(self, path: str | Path) -> Path:
-        """Write the report as one self-contained page and return its path.
-
-        Raises
-        ------
-        OutputError
-            If the file cannot be written.
-        """
-        path = Path(path)
-        page = render(self.findings)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            temporary.write_text(page, encoding="utf-8")
-            temporary.replace(path)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-        finally:
-            temporary.unlink(missing_ok=True)
-        return path
-
-    def save(self, folder: str | Path, overwrite: bool = False) -> Path:
-        """Write report.html, report.json, before.nc and after.nc, all or nothing.
-
-        Parameters
-        ----------
-        folder : str or pathlib.Path
-            Made if missing; other files in it are left alone.
-        overwrite : bool
-            Whether a folder that has content may be written to.
-
-        Returns
-        -------
-        pathlib.Path
-            The folder.
-
-        Raises
-        ------
-        OutputError
-            If the folder cannot be written, or has content and ``overwrite`` is false.
-        """
-        folder = Path(folder)
-        nearest = check_folder(folder, overwrite)
-        try:
-            # on the same file system as the folder, so that renaming is all that is left to do
-            with tempfile.TemporaryDirectory(prefix=".pbrl-ppl-", dir=nearest) as temporary:
-                made = Path(temporary) / "result"
-                made.mkdir()
-                (made / "report.html").write_text(render(self.findings), encoding="utf-8")
-                text = json.dumps(self.findings.to_dict(), indent=1, allow_nan=False)
-                (made / "report.json").write_text(text + "\n", encoding="utf-8")
-                save_posterior(self.findings.posterior_before, made / "before.nc")
-                save_posterior(self.findings.posterior_after, made / "after.nc")
-                if nearest == folder:
-                    # it may be a mount or somebody's working directory: fill it, do not swap it
-                    for name in FILES:
-                        (made / name).replace(folder / name)
-                else:
-                    folder.parent.mkdir(parents=True, exist_ok=True)
-                    made.rename(folder)
-        except OutputError:
-            raise
-        except OSError as error:
-            raise OutputError(f"{folder}: cannot be written: {error}") from error
-        return folder
-
-
-def close_loop(scene: Scene, train: History, test: History | None = None, **options: Any) -> Loop:
-    """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
-
-    Parameters
-    ----------
-    scene : Scene
-        The declared scene.
-    train : History
-        What is fitted.
-    test : History, optional
-        What errors are measured on; a seeded quarter of the trajectories of ``train`` without it.
-    **options
-        As :func:`pbrl_ppl.criticism.loop.revise` takes them.
-
-    Examples
-    --------
-    ::
-
-        loop = close_loop(scene, train, test, seed=1)
-        loop.verdict  # 'effects-added'
-    """
-    return Loop(revise(scene, train, test, **options))
-
-
-def check_folder(folder: Path, overwrite: bool) -> Path:
-    """Return the nearest folder that exists, if results can be written to ``folder``.
-
-    Raises
-    ------
-    OutputError
-        If they cannot, or if it has content and ``overwrite`` is false.
-    """
-    nearest = folder
-    # a dangling link counts as there: it cannot be made a folder
-    while not (nearest.exists() or nearest.is_symlink()) and nearest != nearest.parent:
-        nearest = nearest.parent
-    if not nearest.is_dir():
-        raise OutputError(
-            f"output folder {folder}: {nearest} is a file, expected a folder; choose another path"
-        )
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise OutputError(f"output folder {folder}: no permission to write in {nearest}")
-    if nearest != folder:
-        return nearest
-    if not overwrite and any(folder.iterdir()):
-        raise OutputError(
-            f"output folder {folder}: it has content already; choose another, or allow"
-            " overwriting (--overwrite, overwrite=True)"
-        )
-    for name in FILES:
-        if (folder / name).is_dir():
-            raise OutputError(f"output folder {folder}: {name} in it is a folder; remove it")
-    return folder
-
-
-def verdict_in_words(findings: Findings) -> str:
-    """Say the verdict in a sentence or two, for a reader who knows no statistics."""
-    found = _joined(
-        f"{one.sentence.rstrip('.')} ({plain(one.effect)}) on the {plain(one.body)}"
-        for one in findings.added
-    )
-    left = findings.unexplained
-    rest = "a pattern remains in the errors" if left is None else left.sentence.rstrip(".")
-    if findings.verdict == ADEQUATE:
-        return "Nothing is missing: the declared model explains the data up to measurement noise."
-    if findings.verdict == UNEXPLAINED and not found:
-        return f"Something is missing that no effect in the catalogue explains: {rest}."
-    if findings.verdict == UNEXPLAINED or left is not None:
-        return (
-            f"Part of what was missing is {found}. Something is still missing that no effect in"
-            f" the catalogue explains: {rest}."
-        )
-    if len(findings.added) > 1:
-        return f"{len(findings.added)} things were missing: {found}."
-    return f"Something was missing: {found}."
 
 
 def render(findings: Findings) -> str:
     """Render the report: one page of HTML that needs nothing else."""
-    table = plots.summary(findings.posterior_after)
-    parameters = plots.most_interesting(findings, table)
+    table = summary(findings.posterior_after)
+    parameters = most_interesting(findings, table)
     pictures = {
-        "rollout": plots.plot_rollout(findings),
-        "errors": plots.plot_errors(findings),
-        "residuals": plots.plot_residuals(findings),
-        "trace": plots.plot_trace(findings, parameters),
-        "rank": plots.plot_rank(findings, parameters),
+        "rollout": plot_rollout(findings),
+        "errors": plot_errors(findings),
+        "residuals": plot_residuals(findings),
+        "trace": plot_trace(findings, parameters),
+        "rank": plot_rank(findings, parameters),
     }
     if findings.candidates:
-        pictures["candidates"] = plots.plot_candidates(findings)
+        pictures["candidates"] = plot_candidates(findings)
     if findings.added:
-        pictures["added"] = plots.plot_added(findings)
+        pictures["added"] = plot_added(findings)
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     environment.filters.update(
         number=number,
         chance=chance,
-        odds=_odds,
+        odds=odds,
         plain=plain,
-        joined=_joined,
-        change=_change,
-        quantity=_quantity,
+        joined=joined,
+        change=change,
+        quantity=quantity,
     )
     template = resources.files("pbrl_ppl.report").joinpath("report.html.jinja").read_text("utf-8")
     return environment.from_string(template).render(
@@ -240,10 +68,10 @@ def render(findings: Findings) -> str:
         added={(one.effect, one.body) for one in findings.added},
         best=_largest_fall(findings),
         good={"r_hat": GOOD_R_HAT, "ess": GOOD_ESS},
-        hardly=plots.HARDLY,
-        most=plots.MOST_CANDIDATES,
+        hardly=HARDLY,
+        most=MOST_CANDIDATES,
         picture={
-            name: "data:image/png;base64," + base64.b64encode(plots.png(figure)).decode("ascii")
+            name: "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
             for name, figure in pictures.items()
         },
     )
@@ -280,61 +108,3 @@ def _largest_fall(findings: Findings) -> dict[str, Any] | None:
         return None
     best = min(shares, key=lambda dimension: shares[dimension])
     return {"name": best, "before": before[best], "after": after[best]}
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """Write a number for a reader: three significant digits, no exponent below a million.
-
-    Examples
-    --------
-    >>> number(419.04), number(0.00123456), number(2.0), number(float("nan"))
-    ('419', '0.00123', '2.00', '–')
-    """
-    if value is None or not np.isfinite(value):
-        return "–"
-    if value != 0 and not 1e-4 <= abs(value) < 1e6:
-        mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
-        return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}"
-    places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
-    return f"{value:,.{max(places, 0)}f}".replace("-", "−")
-
-
-def _quantity(value: float, unit: str) -> str:
-    """Write a number with its unit, which is "1" where there is none."""
-    return f"{number(value)} {unit.removesuffix('1')}".rstrip()
-
-
-def chance(p_value: float) -> str:
-    """Write a p-value: two digits, and no pretence of exactness where it underflowed.
-
-    Examples
-    --------
-    >>> chance(0.0312), chance(1e-80), chance(0.0)
-    ('0.031', '1.0 × 10⁻⁸⁰', '< 10⁻³⁰⁰')
-    """
-    return "< 10⁻³⁰⁰" if p_value < 1e-300 else number(p_value, 2)
-
-
-def _odds(p_value: float) -> str:
-    """How often chance alone does it."""
-    if p_value < 1e-300:
-        return "less than once in 10³⁰⁰ times"
-    if p_value > 0.1:
-        return f"in {100 * p_value:.0f} % of all cases"
-    if p_value > 1e-6:
-        return f"once in {1 / p_value:,.0f} times"
-    power = int(np.floor(-np.log10(p_value)))
-    return f"less than once in 10{str(power).translate(_RAISED)} times"
-
-
-def _change(before: float, after: float) -> str:
-    """Say by how much an error fell."""
-    share = 1 - after / before if before > 0 else float("nan")
-    if not np.isfinite(share) or abs(share) < 0.005:
-        return "did not change"
-    return f"{'fell' if share > 0 else 'rose'} by {abs(share) * 100:.0f} %"
-
-
-def _joined(parts: Iterable[str], word: str = "and") -> str:
-    *most, last = [str(part) for part in parts] or [""]
-    return f"{'; '.join(most)}, {word} {last}" if most else last

@@ -12,13 +12,12 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, choose_from_library, find_mode, weigh
 from pbrl_ppl.posterior import complete, from_groups, group, groups
 from pbrl_ppl.sampling.emulator import emulate
+from pbrl_ppl.sampling.fit_checks import DEFAULT, checked_problem
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
-from pbrl_ppl.sampling.mixture import check_joint_fit, labelled, mix, posterior_dataset
+from pbrl_ppl.sampling.mixture import labelled, mix, posterior_dataset
 from pbrl_ppl.sampling.starts import blank_point, dispersed, from_posterior, gaussian_blocks
 from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
 
@@ -185,7 +184,6 @@ def _thinned(trace: Any, thin: int) -> Any:
     return from_groups(data, {})
 
 
-_DEFAULT = "metropolis"
 #: The samplers by name. Of the paper's schedule only the kind is known to us; its lengths are ours.
 METHODS: Mapping[str, Method] = {
     "metropolis": Method(_metropolis, draws=800, tune=500, thin=1),
@@ -200,14 +198,15 @@ METHODS: Mapping[str, Method] = {
 def fit(
     model: pm.Model,
     *,
-    method: str = _DEFAULT,
+    method: str = DEFAULT,
     seed: int = 0,
     draws: int | None = None,
     tune: int | None = None,
     chains: int = 4,
     thin: int | None = None,
     cores: int | None = None,
-    start: Any = None,
+    start: Mode | None = None,
+    resume: Any = None,
     progress: bool = True,
 ) -> Any:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
@@ -236,9 +235,11 @@ def fit(
         Steps a draw; rounds over the blocks for ``metropolis``.
     cores : int, optional
         Processes; as many as there are processors by default, at most one a chain.
-    start : Mode, InferenceData or DataTree, optional
-        A mode found before; or a posterior of the same model, whose chains go on where they ended,
-        with the new draws after the old.
+    start : Mode, optional
+        A mode found before, in place of the search for one.
+    resume : InferenceData or DataTree, optional
+        A posterior of the same model, whose chains go on where they ended, with the new draws after
+        the old.
     progress : bool
         Whether to show PyMC's progress bar.
 
@@ -252,8 +253,9 @@ def fit(
     Raises
     ------
     FitError
-        If the model was not made by ``physics_model``, or there is no such method; for joints of
-        unknown bodies, if there are too many choices, or with ``smc`` or ``start``.
+        If the model was not made by ``physics_model``, there is no such method, ``start`` is no
+        mode, or both ``start`` and ``resume`` are given; for joints of unknown bodies, if there are
+        too many choices, or with ``smc``, ``start`` or ``resume``.
 
     Warns
     -----
@@ -265,16 +267,8 @@ def fit(
     UninformedWarning
         If the data say nothing about a parameter.
     """
-    problem = getattr(model, "problem", None)
-    if not isinstance(problem, Problem):
-        raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
-    if method not in METHODS:
-        raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
+    problem = checked_problem(model, method, METHODS, start, resume)
     if problem.library is not None:
-        if method != _DEFAULT or start is not None:
-            raise FitError(
-                "fit: a model with a library is summed over exactly; leave out method= and start="
-            )
         trace = _summed(model, METHODS[method].draws if draws is None else draws, chains, seed)
         return complete(problem, trace, seed=seed, method="exact sum over the library")
     chosen = METHODS[method]
@@ -304,18 +298,16 @@ def fit(
             warnings.filterwarnings("ignore", message="Numba will use object mode")
             return chosen.run(job)
 
-    earlier = None if start is None or isinstance(start, Mode) else start
     if problem.layout.discrete.any():
-        check_joint_fit(method, start)
         found = weigh(problem, seed=seed, progress=progress)
         trace = mix(model, problem, found, sampled, draws=draws, chains=chains, seed=seed)
-    elif earlier is not None:
-        trace = sampled(model, *from_posterior(problem, earlier))
+    elif resume is not None:
+        trace = sampled(model, *from_posterior(problem, resume))
     else:
         trace = sampled(model, find_mode(problem, seed=seed) if start is None else start)
     done = group(trace, "posterior").sizes["draw"]
-    if earlier is not None:
-        trace = _appended(earlier, trace)
+    if resume is not None:
+        trace = _appended(resume, trace)
     # PyMC ends an interrupted run quietly, with the draws so far
     asked = draws if done < draws else None
     return complete(problem, trace, seed=seed, method=method, asked=asked)

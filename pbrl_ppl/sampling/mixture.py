@@ -10,7 +10,6 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.errors import FitError
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import ATTRIBUTE, Mode, Weighed, stored
 from pbrl_ppl.parameters import JOINT_INDICES
@@ -21,32 +20,6 @@ Labels = NDArray[np.int64]
 
 #: Configurations less probable than this share of the best get no draws: they would be a handful.
 NEGLIGIBLE = 1e-3
-
-
-def check_joint_fit(method: str, start: Any) -> None:
-    """Refuse what there is no way to do for joints of unknown bodies.
-
-    Parameters
-    ----------
-    method, start
-        As for :func:`pbrl_ppl.fit`.
-
-    Raises
-    ------
-    FitError
-        If the method is ``smc``, or there is a start.
-    """
-    if method == "smc":
-        raise FitError(
-            "fit: method is 'smc' and which bodies a joint joins is unknown; each choice of bodies"
-            " is sampled by itself, which tempering from the prior is not made for; use"
-            " 'metropolis', or name the bodies in the scene"
-        )
-    if start is not None:
-        raise FitError(
-            "fit: start= was given and which bodies a joint joins is unknown; a fit cannot go on"
-            " from one choice of bodies to all of them; leave start out and raise draws="
-        )
 
 
 def mix(

@@ -18,7 +18,7 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Noise, Problem, build_model, physics_model
-from pbrl_ppl.report import plots
+from pbrl_ppl.report import plot_calibration, png
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -441,11 +441,11 @@ def test_bad_arguments(puck: tuple[Scene, History]) -> None:
 
 
 def test_picture() -> None:
-    figure = plots.plot_calibration(toy(200, width=0.5))
+    figure = plot_calibration(toy(200, width=0.5))
     panels = [axes for axes in figure.axes if axes.axison]
     assert [axes.get_title().split(":")[0] for axes in panels] == ["mu", "log_likelihood"]
     assert panels[0].get_title().endswith("failed")
-    assert plots.png(figure).startswith(b"\x89PNG")
+    assert png(figure).startswith(b"\x89PNG")
 
 
 # the command

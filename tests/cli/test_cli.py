@@ -9,10 +9,11 @@ from typing import Any
 
 import pytest
 
+from pbrl_ppl import report
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
-from pbrl_ppl.report import report
-from pbrl_ppl.report.report import FILES, Loop
+from pbrl_ppl.report import loop as loop_module
+from pbrl_ppl.report.loop import FILES, Loop
 from tests.helpers.made_up import made_up
 from tests.helpers.places import ROOT
 
@@ -55,7 +56,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any, Any, dict[str
         return Loop(made_up())
 
     monkeypatch.setattr(report, "close_loop", close_loop)
-    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
     return seen
 
 
@@ -87,7 +88,7 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     scene, train, test, options = calls[0]
     assert scene.substeps == 4
     assert train.n_transitions == test.n_transitions == 4
-    assert options == {"seed": 1}
+    assert options == {"seed": 1, "horizon": None, "draws": None}
 
 
 @pytest.mark.usefixtures("files")
@@ -196,7 +197,7 @@ def test_warnings_are_one_line(
         return Loop(made_up())
 
     monkeypatch.setattr(report, "close_loop", close_loop)
-    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 0
     assert capsys.readouterr().err.strip() == "warning: w_y did not converge"
 

@@ -11,7 +11,7 @@ from pbrl_ppl.criticism.prior_check import QUANTILES, prior_predictive_check
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
-from pbrl_ppl.report import plots
+from pbrl_ppl.report import plot_prior_check, png
 from pbrl_ppl.state import STATE
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -144,9 +144,9 @@ def test_refusals(scene, history) -> None:
 
 def test_picture(scene, history) -> None:
     check = prior_predictive_check(physics_model(scene, history), draws=50)
-    figure = plots.plot_prior_check(check)
+    figure = plot_prior_check(check)
     titles = [axes.get_title() for axes in figure.axes if axes.get_visible()]
     assert [title.split(":")[0] for title in titles] == [f"{name} of cart" for name in STATE]
     share = float(check.dataset["share_inside"].sel(state="vx").item())
     assert f"{100 * share:.0f} % as expected" in titles[STATE.index("vx")]
-    assert len(plots.png(figure)) > 10_000
+    assert len(png(figure)) > 10_000

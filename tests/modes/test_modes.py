@@ -1,5 +1,6 @@
 """Modes: recovery from a wrong start, the wheel's symmetry, start noise and derivatives."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -86,8 +87,11 @@ def test_modes_are_sorted_and_describe_themselves(problem, modes) -> None:
     assert np.linalg.eigvalsh(mode.covariance).min() > 0
     assert mode.values["mass"] == pytest.approx(mode.phi[:1])
     # sigma is the maximum likelihood, so the whitened residual has unit mean square
-    z = mode.whitened.reshape(problem.observations.values.shape)
+    z = mode.whitened_residual().reshape(problem.observations.values.shape)
     np.testing.assert_allclose((z**2).mean(axis=(0, 1, 2)), 1.0, rtol=1e-6)
+    assert mode.whitened_residual() is mode.whitened_residual()
+    other = replace(mode, problem=problem.with_physics(substeps=2))
+    assert not np.array_equal(other.whitened_residual(), mode.whitened_residual())
 
 
 def test_same_seed_same_modes(problem, modes) -> None:

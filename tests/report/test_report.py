@@ -1,6 +1,7 @@
 """The report: the right words and numbers, a page that needs nothing else, files all or none."""
 
 import copy
+import inspect
 import json
 from dataclasses import replace
 from html.parser import HTMLParser
@@ -15,8 +16,12 @@ from pbrl_ppl.criticism.findings import (
 )
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
-from pbrl_ppl.report import plots, report
-from pbrl_ppl.report.report import FILES, Loop, number, render, verdict_in_words
+from pbrl_ppl.report import loop as loop_module
+from pbrl_ppl.report.error_plots import plot_rollout, unwrap
+from pbrl_ppl.report.loop import FILES, Loop, close_loop
+from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
+from pbrl_ppl.report.report import render
+from pbrl_ppl.report.words import number, verdict_in_words
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 
 
@@ -206,10 +211,10 @@ def test_numbers(value: float | None, written: str) -> None:
 
 def test_rollout_angles_have_no_jumps() -> None:
     jumping = np.array([3.0, 3.1, np.nan, -3.1, -3.0])
-    smooth = plots.unwrap(jumping)
+    smooth = unwrap(jumping)
     assert np.isnan(smooth[2])
     assert np.allclose(np.delete(smooth, 2), [3.0, 3.1, 2 * np.pi - 3.1, 2 * np.pi - 3.0])
-    figure = plots.plot_rollout(made_up())
+    figure = plot_rollout(made_up())
     theta = figure.axes[2]
     assert theta.get_ylabel() == "theta (rad)"
     for line in theta.lines:
@@ -219,13 +224,13 @@ def test_rollout_angles_have_no_jumps() -> None:
 
 
 def test_parameters_of_most_interest() -> None:
-    shown = plots.most_interesting(made_up(stuck=True))
+    shown = most_interesting(made_up(stuck=True))
     assert shown[:2] == ["linear_drag_coefficient[cart]", "w_x[cart]"]
-    assert len(shown) == plots.MOST_PARAMETERS
+    assert len(shown) == MOST_PARAMETERS
 
 
 def test_summary_has_the_same_columns_everywhere() -> None:
-    table = plots.summary(made_up_posterior())
+    table = summary(made_up_posterior())
     assert list(table.columns) == ["mean", "sd", "lower", "upper", "ess_bulk", "ess_tail", "r_hat"]
     drag = table.loc["linear_drag_coefficient[cart]"]
     assert drag["mean"] == pytest.approx(3.0, abs=0.01)
@@ -242,9 +247,11 @@ def test_a_parameter_that_never_moved() -> None:
 def test_loop_stands_for_its_findings() -> None:
     loop = Loop(made_up())
     assert loop.verdict == "effects-added"
-    assert loop.added[0].effect == "linear_drag"
+    for name in ("added", "candidates", "unexplained", "before", "after"):
+        assert getattr(loop, name) is getattr(loop.findings, name)
+    assert loop.posterior_before is loop.findings.posterior_before
+    assert loop.posterior_after is loop.findings.posterior_after
     assert "Something was missing" in repr(loop)
-    assert {"verdict", "save", "report"} <= set(dir(loop))
     assert copy.copy(loop).verdict == "effects-added"
     with pytest.raises(AttributeError, match="vredict"):
         _ = loop.vredict
@@ -252,10 +259,17 @@ def test_loop_stands_for_its_findings() -> None:
 
 def test_close_loop_hands_over_what_it_got(monkeypatch: pytest.MonkeyPatch) -> None:
     calls = []
-    monkeypatch.setattr(report, "revise", lambda *args, **kw: calls.append((args, kw)) or made_up())
-    loop = report.close_loop("scene", "train", "test", seed=3)  # type: ignore[arg-type]
+    revise = loop_module.revise
+    monkeypatch.setattr(
+        loop_module, "revise", lambda *args, **kw: calls.append((args, kw)) or made_up()
+    )
+    loop = close_loop("scene", "train", "test", seed=3, horizon=2)  # type: ignore[arg-type]
     assert loop.verdict == "effects-added"
-    assert calls == [(("scene", "train", "test"), {"seed": 3})]
+    ((args, options),) = calls
+    assert args == ("scene", "train", "test")
+    assert (options["seed"], options["horizon"], options["draws"]) == (3, 2, None)
+    ours, theirs = (inspect.signature(each).parameters for each in (close_loop, revise))
+    assert list(ours.values()) == list(theirs.values())
 
 
 def test_save_writes_the_contract(tmp_path: Path) -> None:
@@ -313,8 +327,8 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> None:
         if path.name == "after.nc":
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "save_posterior", fail)
-    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "save_posterior", fail)
+    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
 
 
 @pytest.mark.usefixtures("broken")
@@ -334,8 +348,10 @@ def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
 
 
 def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "save_posterior", lambda posterior, path: path.write_bytes(b"nc"))
-    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    monkeypatch.setattr(
+        loop_module, "save_posterior", lambda posterior, path: path.write_bytes(b"nc")
+    )
+    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
     loop = Loop(made_up())
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"has content already.*--overwrite"):
@@ -360,7 +376,7 @@ def test_folder_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(report, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
     path = Loop(made_up()).report(tmp_path / "report.html")
     assert path.read_text() == "a page"
     for place in (tmp_path, tmp_path / "none" / "report.html"):

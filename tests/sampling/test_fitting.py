@@ -321,7 +321,7 @@ def interrupted(model, mode):
         )
         with (
             pytest.warns(ConvergenceWarning, match="have not converged"),
-            pytest.warns(ConvergenceWarning, match="after 30 of 50 draws.*start="),
+            pytest.warns(ConvergenceWarning, match="after 30 of 50 draws.*resume="),
         ):
             return fit(model, seed=4, start=mode, **(QUICK | {"draws": 50}))
 
@@ -336,7 +336,7 @@ def test_an_interrupt_keeps_the_draws(interrupted) -> None:
 def test_an_interrupted_fit_goes_on(model, interrupted) -> None:
     """New draws follow the old ones, which stay."""
     with pytest.warns(ConvergenceWarning, match="not converged"):
-        whole = fit(model, seed=5, start=interrupted, **(QUICK | {"draws": 170, "tune": 0}))
+        whole = fit(model, seed=5, resume=interrupted, **(QUICK | {"draws": 170, "tune": 0}))
     assert "interrupted" not in whole.attrs
     posterior = group(whole, "posterior")
     assert dict(posterior.sizes) == {"chain": 2, "draw": 200, "body": 1, "state": 6}
@@ -349,7 +349,14 @@ def test_a_start_of_another_model_is_refused(model, interrupted) -> None:
     scene = cart_scene()  # r and mu_c are unknown here
     other = physics_model(scene, model.problem.data.history)
     with pytest.raises(PosteriorError, match="has no r, mu_c"):
-        fit(other, start=interrupted, progress=False)
+        fit(other, resume=interrupted, progress=False)
+
+
+def test_a_mode_starts_and_a_posterior_is_resumed(model, mode, interrupted) -> None:
+    with pytest.raises(FitError, match=r"expected a Mode; pass a posterior .* as resume="):
+        fit(model, start=interrupted, progress=False)
+    with pytest.raises(FitError, match="leave one out"):
+        fit(model, start=mode, resume=interrupted, progress=False)
 
 
 def test_chains_in_equal_descriptions_of_a_wheel_agree(model, fitted) -> None:

@@ -1,0 +1,158 @@
+"""Pictures of held-out errors: residuals, error bars, and one trajectory."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from pbrl_ppl.criticism import Findings
+from pbrl_ppl.posterior import HDI_PROB
+from pbrl_ppl.report.style import AFTER, BAND, BEFORE, UNITS, blank_figure
+
+Array = NDArray[np.float64]
+
+
+def plot_residuals(findings: Findings) -> Figure:
+    """Held-out residuals of each state dimension before and after, in units of noise."""
+    names = list(findings.residuals_before)
+    figure, (axes,) = blank_figure(8.0, 3.6, 1, 1)
+    edge = float(norm.ppf(0.5 + HDI_PROB / 2))
+    axes.axhspan(-edge, edge, color=BAND, zorder=0)
+    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
+    shown = [(findings.residuals_before, BEFORE, "before", -0.18)]
+    if findings.added:
+        shown.append((findings.residuals_after, AFTER, "after", 0.18))
+    else:
+        shown = [(findings.residuals_before, AFTER, "declared model", 0.0)]
+    largest = 0.0
+    for residuals, colour, _, shift in shown:
+        for place, name in enumerate(names):
+            values = np.asarray(residuals[name], dtype=float)
+            values = values[np.isfinite(values)]
+            if not values.size:
+                continue
+            largest = max(largest, float(np.abs(values).max()))
+            some = values[:: max(1, values.size // 300)]
+            # spread sideways by a sequence that is even and the same on every run
+            aside = (np.arange(some.size) * 0.618 % 1 - 0.5) * 0.24
+            axes.plot(place + shift + aside, some, ".", color=colour, alpha=0.25, markersize=3)
+            low, high = np.quantile(values, [0.5 - HDI_PROB / 2, 0.5 + HDI_PROB / 2])
+            axes.plot([place + shift] * 2, [low, high], color=colour, linewidth=3)
+    if largest > 12:
+        axes.set_yscale("asinh", linear_width=4.0)
+        ticks = [tick for tick in (3, 10, 30, 100, 300, 1000) if tick <= largest]
+        ticks = [*(-tick for tick in reversed(ticks)), 0, *ticks]
+        axes.set_yticks(ticks, [f"{tick:g}" for tick in ticks])
+        axes.set_yticks([], minor=True)
+    axes.set_xticks(range(len(names)), names)
+    axes.set_ylabel("residual / noise")
+    handles: list[Any] = [Line2D([], [], color=c, linewidth=3, label=n) for _, c, n, _ in shown]
+    handles.append(Patch(color=BAND, label=f"noise alone, {100 * HDI_PROB:.0f} %"))
+    figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def plot_errors(findings: Findings) -> Figure:
+    """Held-out errors before and after, one step ahead and at the end of a rollout."""
+    kinds = [
+        ("one_step_rmse", "one step ahead"),
+        ("rollout_rmse", f"{findings.rollout_horizon} steps ahead"),
+    ]
+    kinds = [(kind, title) for kind, title in kinds if getattr(findings.before, kind)]
+    names = [list(getattr(findings.before, kind)) for kind, _ in kinds]
+    height = 1.2 + 0.42 * max((len(each) for each in names), default=1)
+    figure, panels = blank_figure(8.0, height, 1, max(len(kinds), 1), grid="x")
+    for axes, (kind, title), dims in zip(panels, kinds, names, strict=False):
+        before, after, floor = (
+            getattr(e, kind) for e in (findings.before, findings.after, findings.noise_floor)
+        )
+        has_floor = all(np.isfinite(floor.get(d, np.nan)) and floor[d] > 0 for d in dims)
+        scale = floor if has_floor else before
+        bars = [(before, BEFORE, -0.19), (after, AFTER, 0.19)]
+        if not findings.added:
+            bars = [(before, AFTER, 0.0)]
+        for values, colour, shift in bars:
+            for place, dim in enumerate(dims):
+                value = values.get(dim, np.nan)
+                if not np.isfinite(value) or not scale[dim] > 0:
+                    continue
+                axes.barh(place + shift, value / scale[dim], height=0.36, color=colour)
+                axes.annotate(
+                    f"{value:.3g} {UNITS.get(dim, '')}",
+                    (value / scale[dim], place + shift),
+                    xytext=(3, 0),
+                    textcoords="offset points",
+                    va="center",
+                    fontsize=7.5,
+                )
+        axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
+        axes.set_yticks(range(len(dims)), dims)
+        axes.invert_yaxis()
+        axes.margins(x=0.3)
+        axes.set_xlim(left=0.0)
+        axes.set_title(title, fontsize=10)
+        axes.set_xlabel("error / noise floor" if has_floor else "error / error before")
+    labels = ["before", "after"] if findings.added else ["declared model"]
+    colours = [BEFORE, AFTER] if findings.added else [AFTER]
+    handles = [Patch(color=c, label=n) for c, n in zip(colours, labels, strict=True)]
+    figure.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False)
+    return figure
+
+
+def plot_rollout(findings: Findings) -> Figure:
+    """One held-out trajectory: measured, and predicted before and after."""
+    rollout = findings.rollout
+    count = len(rollout.names)
+    columns = 1 if count == 1 else 2
+    rows = -(-count // columns)
+    figure, panels = blank_figure(8.0, 0.8 + 1.9 * rows, rows, columns)
+    lines: list[tuple[Array, str, Literal["-", "--"], str]] = [
+        (rollout.before, BEFORE, "--", "before"),
+        (rollout.after, AFTER, "-", "after"),
+    ]
+    if not findings.added:
+        lines = [(rollout.before, AFTER, "-", "predicted by the declared model")]
+    for place, (name, unit) in enumerate(zip(rollout.names, rollout.units, strict=True)):
+        axes = panels[place]
+        measured = rollout.measured[:, place]
+        if unit == "rad":
+            measured = unwrap(measured)
+        axes.plot(rollout.time, measured, "o", color="black", markersize=2.5)
+        for values, colour, style, _ in lines:
+            line = values[:, place]
+            if unit == "rad":
+                line = _beside(unwrap(line), measured)
+            axes.plot(rollout.time, line, style, color=colour, linewidth=1.6)
+        axes.set_ylabel(f"{name} ({unit})")
+        if place >= count - columns:
+            axes.set_xlabel("time (s)")
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    handles = [Line2D([], [], color="black", marker="o", linestyle="", markersize=3)]
+    handles += [Line2D([], [], color=c, linestyle=s) for _, c, s, _ in lines]
+    names = ["measured", *(name for *_, name in lines)]
+    figure.legend(handles, names, loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def unwrap(angle: Array) -> Array:
+    """Angles (rad) without jumps of a turn, shape (time,); NaN stays NaN."""
+    result = np.array(angle, dtype=float)
+    seen = np.isfinite(result)
+    result[seen] = np.unwrap(result[seen])
+    return result
+
+
+def _beside(line: Array, measured: Array) -> Array:
+    """Shift a line by whole turns so that it starts beside the measurement."""
+    both = np.flatnonzero(np.isfinite(line) & np.isfinite(measured))
+    if not both.size:
+        return line
+    turns = np.round((measured[both[0]] - line[both[0]]) / (2 * np.pi))
+    return np.asarray(line + 2 * np.pi * turns)

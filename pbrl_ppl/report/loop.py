@@ -1,0 +1,248 @@
+"""The loop as people use it: closed by one call, and kept as a report and posterior files."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pbrl_ppl.criticism import Added, Candidate, Errors, Findings, Unexplained, revise
+from pbrl_ppl.effects import Effect
+from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.errors import OutputError
+from pbrl_ppl.history import History
+from pbrl_ppl.posterior import save_posterior
+from pbrl_ppl.report.report import render
+from pbrl_ppl.report.words import verdict_in_words
+from pbrl_ppl.scene import Scene
+
+#: What :meth:`Loop.save` writes.
+FILES = ("report.html", "report.json", "before.nc", "after.nc")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Loop:
+    """A closed loop: the findings, and how to keep them.
+
+    What is asked for most can be had directly: ``loop.verdict``, ``loop.added``; everything is in
+    ``findings``.
+
+    Parameters
+    ----------
+    findings : Findings
+        What was found.
+    """
+
+    findings: Findings
+
+    @property
+    def verdict(self) -> str:
+        """``adequate``, ``effects-added`` or ``unexplained``."""
+        return self.findings.verdict
+
+    @property
+    def added(self) -> tuple[Added, ...]:
+        """Effects added, in order."""
+        return self.findings.added
+
+    @property
+    def candidates(self) -> tuple[Candidate, ...]:
+        """All candidates of the first round, best first."""
+        return self.findings.candidates
+
+    @property
+    def unexplained(self) -> Unexplained | None:
+        """What remains that no effect in the catalogue explains."""
+        return self.findings.unexplained
+
+    @property
+    def before(self) -> Errors:
+        """Held-out errors of the declared model."""
+        return self.findings.before
+
+    @property
+    def after(self) -> Errors:
+        """Held-out errors of the revised model."""
+        return self.findings.after
+
+    @property
+    def posterior_before(self) -> Any:
+        """Posterior of the declared model, as ArviZ takes it."""
+        return self.findings.posterior_before
+
+    @property
+    def posterior_after(self) -> Any:
+        """Posterior of the revised model; the same where nothing was added."""
+        return self.findings.posterior_after
+
+    def __repr__(self) -> str:
+        return f"Loop({verdict_in_words(self.findings)})"
+
+    def report(self, path: str | Path) -> Path:
+        """Write the report as one self-contained page and return its path.
+
+        Raises
+        ------
+        OutputError
+            If the file cannot be written.
+        """
+        path = Path(path)
+        page = render(self.findings)
+        temporary = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
+            temporary.write_text(page, encoding="utf-8")
+            temporary.replace(path)
+        except OSError as error:
+            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+        finally:
+            temporary.unlink(missing_ok=True)
+        return path
+
+    def save(self, folder: str | Path, overwrite: bool = False) -> Path:
+        """Write report.html, report.json, before.nc and after.nc, all or nothing.
+
+        Parameters
+        ----------
+        folder : str or pathlib.Path
+            Made if missing; other files in it are left alone.
+        overwrite : bool
+            Whether a folder that has content may be written to.
+
+        Returns
+        -------
+        pathlib.Path
+            The folder.
+
+        Raises
+        ------
+        OutputError
+            If the folder cannot be written, or has content and ``overwrite`` is false.
+        """
+        folder = Path(folder)
+        nearest = check_folder(folder, overwrite)
+        try:
+            # on the same file system as the folder, so that renaming is all that is left to do
+            with tempfile.TemporaryDirectory(prefix=".pbrl-ppl-", dir=nearest) as temporary:
+                made = Path(temporary) / "result"
+                made.mkdir()
+                (made / "report.html").write_text(render(self.findings), encoding="utf-8")
+                text = json.dumps(self.findings.to_dict(), indent=1, allow_nan=False)
+                (made / "report.json").write_text(text + "\n", encoding="utf-8")
+                save_posterior(self.findings.posterior_before, made / "before.nc")
+                save_posterior(self.findings.posterior_after, made / "after.nc")
+                if nearest == folder:
+                    # it may be a mount or somebody's working directory: fill it, do not swap it
+                    for name in FILES:
+                        (made / name).replace(folder / name)
+                else:
+                    folder.parent.mkdir(parents=True, exist_ok=True)
+                    made.rename(folder)
+        except OutputError:
+            raise
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written: {error}") from error
+        return folder
+
+
+def close_loop(
+    scene: Scene,
+    train: History,
+    test: History | None = None,
+    *,
+    catalogue: Iterable[Effect] = full_catalogue,
+    seed: int = 0,
+    horizon: int | None = None,
+    substeps: int | None = None,
+    draws: int | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Loop:
+    """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene.
+    train : History
+        What is fitted.
+    test : History, optional
+        What errors are measured on; a seeded quarter of the trajectories of ``train`` without it.
+    catalogue : iterable of Effect
+        Effects to consider; add your own to the package's.
+    seed : int
+        The same seed gives the same findings.
+    horizon : int, optional
+        Intervals predicted from one measured state; chosen from the data by default.
+    substeps : int, optional
+        Engine steps an interval to begin with; the scene's by default.
+    draws : int, optional
+        Posterior draws kept of each chain; 800 by default, half of that for long recordings.
+    progress : callable, optional
+        Told the name of each stage.
+
+    Returns
+    -------
+    Loop
+        Verdict, effects, errors before and after and both posteriors, and the report of them.
+
+    Raises
+    ------
+    HistoryError
+        If the histories do not fit each other or are too short.
+    EffectError
+        If the scene declares an unknown effect.
+
+    Examples
+    --------
+    ::
+
+        loop = pp.close_loop(scene, train, test, seed=1)
+        loop.verdict  # 'effects-added'
+        loop.report("report.html")
+    """
+    found = revise(
+        scene,
+        train,
+        test,
+        catalogue=catalogue,
+        seed=seed,
+        horizon=horizon,
+        substeps=substeps,
+        draws=draws,
+        progress=progress,
+    )
+    return Loop(found)
+
+
+def check_folder(folder: Path, overwrite: bool) -> Path:
+    """Return the nearest folder that exists, if results can be written to ``folder``.
+
+    Raises
+    ------
+    OutputError
+        If they cannot, or if it has content and ``overwrite`` is false.
+    """
+    nearest = folder
+    # a dangling link counts as there: it cannot be made a folder
+    while not (nearest.exists() or nearest.is_symlink()) and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not nearest.is_dir():
+        raise OutputError(
+            f"output folder {folder}: {nearest} is a file, expected a folder; choose another path"
+        )
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise OutputError(f"output folder {folder}: no permission to write in {nearest}")
+    if nearest != folder:
+        return nearest
+    if not overwrite and any(folder.iterdir()):
+        raise OutputError(
+            f"output folder {folder}: it has content already; choose another, or allow"
+            " overwriting (--overwrite, overwrite=True)"
+        )
+    for name in FILES:
+        if (folder / name).is_dir():
+            raise OutputError(f"output folder {folder}: {name} in it is a folder; remove it")
+    return folder

@@ -1,0 +1,97 @@
+"""Findings in words: the verdict, and numbers as a reader wants them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from pbrl_ppl.criticism import ADEQUATE, UNEXPLAINED, Findings
+
+_RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
+
+
+def verdict_in_words(findings: Findings) -> str:
+    """Say the verdict in a sentence or two, for a reader who knows no statistics."""
+    found = joined(
+        f"{one.sentence.rstrip('.')} ({plain(one.effect)}) on the {plain(one.body)}"
+        for one in findings.added
+    )
+    left = findings.unexplained
+    rest = "a pattern remains in the errors" if left is None else left.sentence.rstrip(".")
+    if findings.verdict == ADEQUATE:
+        return "Nothing is missing: the declared model explains the data up to measurement noise."
+    if findings.verdict == UNEXPLAINED and not found:
+        return f"Something is missing that no effect in the catalogue explains: {rest}."
+    if findings.verdict == UNEXPLAINED or left is not None:
+        return (
+            f"Part of what was missing is {found}. Something is still missing that no effect in"
+            f" the catalogue explains: {rest}."
+        )
+    if len(findings.added) > 1:
+        return f"{len(findings.added)} things were missing: {found}."
+    return f"Something was missing: {found}."
+
+
+def plain(name: str) -> str:
+    """Write a catalogue name as words."""
+    return name.replace("_", " ")
+
+
+def number(value: float | None, digits: int = 3) -> str:
+    """Write a number for a reader: three significant digits, no exponent below a million.
+
+    Examples
+    --------
+    >>> number(419.04), number(0.00123456), number(2.0), number(float("nan"))
+    ('419', '0.00123', '2.00', '–')
+    """
+    if value is None or not np.isfinite(value):
+        return "–"
+    if value != 0 and not 1e-4 <= abs(value) < 1e6:
+        mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
+        return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}"
+    places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
+    return f"{value:,.{max(places, 0)}f}".replace("-", "−")
+
+
+def quantity(value: float, unit: str) -> str:
+    """Write a number with its unit, which is "1" where there is none."""
+    return f"{number(value)} {unit.removesuffix('1')}".rstrip()
+
+
+def chance(p_value: float) -> str:
+    """Write a p-value: two digits, and no pretence of exactness where it underflowed.
+
+    Examples
+    --------
+    >>> chance(0.0312), chance(1e-80), chance(0.0)
+    ('0.031', '1.0 × 10⁻⁸⁰', '< 10⁻³⁰⁰')
+    """
+    return "< 10⁻³⁰⁰" if p_value < 1e-300 else number(p_value, 2)
+
+
+def odds(p_value: float) -> str:
+    """How often chance alone does it."""
+    if p_value < 1e-300:
+        return "less than once in 10³⁰⁰ times"
+    if p_value > 0.1:
+        return f"in {100 * p_value:.0f} % of all cases"
+    if p_value > 1e-6:
+        return f"once in {1 / p_value:,.0f} times"
+    power = int(np.floor(-np.log10(p_value)))
+    return f"less than once in 10{str(power).translate(_RAISED)} times"
+
+
+def change(before: float, after: float) -> str:
+    """Say by how much an error fell."""
+    share = 1 - after / before if before > 0 else float("nan")
+    if not np.isfinite(share) or abs(share) < 0.005:
+        return "did not change"
+    return f"{'fell' if share > 0 else 'rose'} by {abs(share) * 100:.0f} %"
+
+
+def joined(parts: Iterable[str], word: str = "and") -> str:
+    """Write a list as words: ``a; b, and c``."""
+    *most, last = [str(part) for part in parts] or [""]
+    return f"{'; '.join(most)}, {word} {last}" if most else last
