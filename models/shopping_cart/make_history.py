@@ -88,6 +88,12 @@ class Effects:
     inertia_scale: float = 1.0
     pivot_friction: float = 0.0  # N m, Coulomb torque in the hinge
     pivot_damping: float = 0.0  # N m s
+    actuator_delay: float = 0.0  # share of the interval by which the command is late
+    dead_zone: float = 0.0  # N
+    mass_change: tuple[float, float, float] = (1.0, 0.0, 0.0)  # factor, from trajectory, from s
+    hidden_obstacle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # disc: x, y, radius (m)
+    sensor_bias: tuple[float, ...] = (0.0,) * 6  # m, m, rad, m/s, m/s, rad/s
+    heavy_tails: float = 0.0  # reciprocal of the degrees of freedom of the noise
     # Outside pbrl_ppl's catalogue:
     stiction_patch: float = 0.0  # extra isotropic Coulomb friction of the floor where x > 0
     time_varying_gain: tuple[float, float] = (0.0, 1.0)  # force times 1 + a sin(2 pi t / period)
@@ -137,7 +143,11 @@ def cross(a: complex, b: complex) -> float:
 
 
 def rollout(
-    setup: Setup, start: np.ndarray, wrenches: np.ndarray, effects: Effects | None = None
+    setup: Setup,
+    start: np.ndarray,
+    wrenches: np.ndarray,
+    effects: Effects | None = None,
+    trajectory: int = 0,
 ) -> np.ndarray:
     """Return the states (n + 1, 6) at the samples, noise-free, from start (6,) and wrenches (n, 3).
 
@@ -151,7 +161,7 @@ def rollout(
         position = -setup.hinge * cmath.exp(1j * theta)
         velocity = 1j * omega * position
         x, y, vx, vy = position.real, position.imag, velocity.real, velocity.imag
-    inertia = setup.inertia * effects.inertia_scale
+    factor, loaded_from, loaded_at = effects.mass_change
 
     world = Box2D.b2World(gravity=(0, -setup.gravity * CM), doSleep=False, continuousPhysics=False)
     ground = world.CreateStaticBody()
@@ -164,6 +174,10 @@ def rollout(
             ground.CreateEdgeFixture(
                 vertices=[corners[i - 1], corners[i]], friction=setup.mu_c, restitution=0.0
             )
+    disc_x, disc_y, disc_radius = effects.hidden_obstacle
+    if disc_radius:
+        disc = Box2D.b2CircleShape(pos=(disc_x * CM, disc_y * CM), radius=disc_radius * CM)
+        ground.CreateFixture(shape=disc, friction=setup.mu_c, restitution=0.0)
     body = world.CreateDynamicBody(
         position=(x * CM, y * CM),
         angle=theta,
@@ -172,7 +186,6 @@ def rollout(
     )
     half = (setup.size[0] * CM / 2, setup.size[1] * CM / 2)
     body.CreatePolygonFixture(box=half, density=1.0, friction=setup.mu_c, restitution=setup.r)
-    body.massData = Box2D.b2MassData(mass=setup.mass, center=(0, 0), I=inertia * CM**2)
     if setup.hinge is not None:
         world.CreateRevoluteJoint(
             bodyA=ground,
@@ -190,17 +203,23 @@ def rollout(
 
     states = [state()]
     steps = round(setup.time_step / STEP)
-    for i, wrench in enumerate(wrenches):
+    before = np.vstack([np.zeros(3), wrenches])
+    for i in range(len(wrenches)):
         for j in range(steps):
+            loaded = trajectory >= loaded_from and (i * steps + j) * STEP >= loaded_at
+            mass = setup.mass * (factor if loaded else 1.0)
+            inertia = setup.inertia * effects.inertia_scale * mass / setup.mass
+            body.massData = Box2D.b2MassData(mass=mass, center=(0, 0), I=inertia * CM**2)
+            wrench = before[i if j < effects.actuator_delay * steps else i + 1]
             x, _, theta, vx, vy, omega = state()
             v, turn = complex(vx, vy), cmath.exp(1j * theta)
             force, torque = total_wrench(effects, wrench, turn, v, omega, (i * steps + j) * STEP)
-            v += force / setup.mass * STEP
+            v += force / mass * STEP
             omega += torque / inertia * STEP
             if effects.stiction_patch and x > 0:
                 v *= 1 - min(1.0, effects.stiction_patch * NORMAL_GRAVITY * STEP / (abs(v) or 1.0))
             if setup.wheel is not None:
-                v, omega = roll(setup.wheel, setup.mass, inertia, turn, v, omega)
+                v, omega = roll(setup.wheel, mass, inertia, turn, v, omega)
             body.linearVelocity = (v.real * CM, v.imag * CM)
             body.angularVelocity = omega
             world.Step(STEP, 20, 10)
@@ -220,6 +239,7 @@ def total_wrench(
     """Return the force (N) and the torque (N m) on the body: the commanded ones and the effects."""
     amplitude, period = effects.time_varying_gain
     force = complex(wrench[0], wrench[1]) * cmath.exp(1j * effects.actuator_rotation)
+    force *= abs(force) >= effects.dead_zone
     force *= 1 + amplitude * math.sin(2 * math.pi * time / period)
     torque = float(wrench[2]) + cross(turn * complex(*effects.push_offset), force)
     force -= (effects.linear_drag + effects.quadratic_drag * abs(v)) * v
@@ -275,8 +295,12 @@ def _trajectory(
     n = setup.n_intervals
     held = rng.normal(0.0, setup.wrench_sd, size=(math.ceil(n / setup.hold), 3))
     wrenches = np.repeat(held, setup.hold, axis=0)[:n].round(6)
-    states = rollout(setup, start, wrenches, effects)
-    measured = states + rng.standard_normal(states.shape) * np.array(setup.noise)
+    states = rollout(setup, start, wrenches, effects, number)
+    if effects.heavy_tails:
+        noise = rng.standard_t(1 / effects.heavy_tails, states.shape)
+    else:
+        noise = rng.standard_normal(states.shape)
+    measured = states + np.array(effects.sensor_bias) + noise * np.array(setup.noise)
     frame = pd.DataFrame({"trajectory": number, "step": range(n + 1)})
     frame["time"] = (frame["step"] * setup.time_step).round(6)
     frame["body"] = setup.name

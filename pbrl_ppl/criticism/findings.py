@@ -41,6 +41,8 @@ class Candidate:
         Unit of each parameter.
     identifiable : float
         Share of the signature (0 to 1) that the declared parameters cannot absorb.
+    looks : int
+        At how many places, thresholds or times it was tried; the p-value pays for them.
     """
 
     effect: str
@@ -52,6 +54,7 @@ class Candidate:
     estimate: Mapping[str, float]
     units: Mapping[str, str]
     identifiable: float
+    looks: int = 1
 
 
 @dataclass(frozen=True)

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism.findings import Candidate
-from pbrl_ppl.effects import Attached
+from pbrl_ppl.criticism.scan import Look, looks
+from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import prior_residual
@@ -75,16 +76,24 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
     """
     if not candidates:
         return []
-    residual, jacobian, signatures = _signatures(mode, candidates)
+    smooth = [one for one in candidates if one.effect.scan is None and not _of_noise(one)]
+    residual, jacobian, signatures = _signatures(mode, smooth)
     q, r = np.linalg.qr(jacobian)
     # a parameter that the data and the prior say nothing about has no direction
     q = q[:, np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)]
     left = residual - q @ (q.T @ residual)
-    scored = []
-    for one, signature in zip(candidates, signatures, strict=True):
-        projected = signature - q @ (q.T @ signature)
-        scored.append(_score(one, signature, projected, left, len(candidates)))
-    return sorted(scored, key=lambda each: each.log_p)
+    derived = dict(zip(smooth, signatures, strict=True))
+
+    def score(one: Attached) -> Signature:
+        if _of_noise(one):
+            return _tail_score(mode, one, left, len(candidates))
+        if one in derived:
+            evidence = _evidence(derived[one], q, left, _side(one))
+            values = np.array(one.effect.null) + evidence.size
+            return _signature(one, evidence, values, 1, len(candidates))
+        return _best_look(one, looks(mode, one), q, left, len(candidates))
+
+    return sorted(map(score, candidates), key=lambda signature: signature.log_p)
 
 
 def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Array, list[Array]]:
@@ -141,46 +150,122 @@ def _prior_slopes(problem: Problem, phi: Array) -> Array:
     return (prior_residual(priors, phi + step) - prior_residual(priors, phi - step)) / (2 * step)
 
 
-def _score(
-    one: Attached, signature: Array, projected: Array, residual: Array, n_candidates: int
-) -> Signature:
-    effect = one.effect
-    dof = len(effect.parameters)
-    size = (signature**2).sum()
-    share = float((projected**2).sum() / size) if size > 0 else 0.0
-    estimate, statistic, log_p = np.zeros(dof), 0.0, 0.0
-    basis, direction = np.zeros((len(residual), 0)), np.zeros(len(residual))
+@dataclass(frozen=True, eq=False)
+class _Evidence:
+    """What the residual says of a signature's columns."""
+
+    statistic: float
+    log_p: float
+    share: float
+    size: Array
+    basis: Array
+    direction: Array
+
+
+def _evidence(signature: Array, q: Array, residual: Array, side: int = 0) -> _Evidence:
+    """The score statistic of a signature, projected off the declared parameters' directions ``q``.
+
+    ``side`` is 1 (or -1) where a single column can only have a positive (or negative) size.
+    """
+    projected = signature - q @ (q.T @ signature)
+    total = (signature**2).sum()
+    share = float((projected**2).sum() / total) if total > 0 else 0.0
+    n, columns = signature.shape
+    size, statistic, log_p = np.zeros(columns), 0.0, 0.0
+    basis, direction = np.zeros((n, 0)), np.zeros(n)
     if share > ABSORBED:
         u, s, vt = np.linalg.svd(projected, full_matrices=False)
         keep = s > 1e-6 * s.max()
         basis = u[:, keep]
         coordinates = basis.T @ residual
-        estimate = vt[keep].T @ (coordinates / s[keep])
+        size = vt[keep].T @ (coordinates / s[keep])
         statistic = float(coordinates @ coordinates)
         log_p = float(chi2.logsf(statistic, int(keep.sum())))
-        if dof == 1:
-            lower, upper = effect.parameters[0].prior.support
-            if effect.parameters[0].null in (lower, upper):
-                # it can only be on one side of nothing: half the chance, and none on the other side
-                allowed = (estimate[0] > 0) == (effect.parameters[0].null == lower)
-                statistic = statistic if allowed else 0.0
-                log_p = log_p + np.log(0.5) if allowed else 0.0
+        if side and columns == 1:
+            # it can only be on one side of nothing: half the chance, and none on the other side
+            allowed = side * size[0] > 0
+            statistic = statistic if allowed else 0.0
+            log_p = log_p + np.log(0.5) if allowed else 0.0
         if statistic > 0:
             direction = basis @ coordinates / np.sqrt(statistic)
+    return _Evidence(statistic, log_p, share, size, basis, direction)
+
+
+def _side(one: Attached) -> int:
+    """On which side of its null value a single parameter must be; 0 if on any."""
+    if len(one.effect.parameters) > 1:
+        return 0
+    (parameter,) = one.effect.parameters
+    lower, upper = parameter.prior.support
+    return int(parameter.null == lower) - int(parameter.null == upper)
+
+
+def _signature(
+    one: Attached, evidence: _Evidence, values: Array, n_looks: int, n_candidates: int
+) -> Signature:
+    """A candidate's signature, its p-value corrected for the looks and for the candidates."""
+    effect = one.effect
+    log_p = min(0.0, evidence.log_p + np.log(max(1, n_looks)))
     names = [parameter.name for parameter in effect.parameters]
-    values = np.array(effect.null) + estimate
     candidate = Candidate(
         effect=effect.name,
         body=one.body,
         sentence=effect.sentence,
-        statistic=statistic,
-        dof=dof,
+        statistic=evidence.statistic,
+        dof=len(names),
         p_value=float(min(1.0, np.exp(log_p) * n_candidates)),
         estimate=dict(zip(names, values.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
-        identifiable=share,
+        identifiable=evidence.share,
+        looks=n_looks,
     )
-    return Signature(one, candidate, log_p, basis, direction)
+    return Signature(one, candidate, log_p, evidence.basis, evidence.direction)
+
+
+def _best_look(
+    one: Attached, tried: Sequence[Look], q: Array, residual: Array, n_candidates: int
+) -> Signature:
+    """The look of a scan that explains most; of a whole change, only its own sign counts."""
+    best = _evidence(np.zeros((len(residual), 1)), q, residual)
+    values = np.array(one.effect.null)
+    for look in tried:
+        rows = np.pad(look.signature, ((0, len(residual) - len(look.signature)), (0, 0)))
+        found = _evidence(rows, q, residual, 0 if look.columns else 1)
+        if found.log_p < best.log_p:
+            best, values = found, look.values.copy()
+            for column, size in zip(look.columns, found.size, strict=False):
+                values[column] += size
+    return _signature(one, best, values, len(tried), n_candidates)
+
+
+def _of_noise(one: Attached) -> bool:
+    return isinstance(one.effect.stage, Noise)
+
+
+def _tail_score(mode: Mode, one: Attached, left: Array, n_candidates: int) -> Signature:
+    """Score of the noise's tail: the kurtosis, with what sigma can absorb projected out.
+
+    The derivative of Student-t's log-density by the reciprocal of its degrees of freedom at zero is
+    (z^4 - 2 z^2 - 1) / 4; without its projection on sigma's score it is the fourth Hermite
+    polynomial over 4, of variance 3/2.
+    """
+    measured = mode.problem.observations.measured
+    cells = np.flatnonzero(measured.ravel()) if mode.problem.noise.nu is None else np.zeros(0, int)
+    z = left[cells]
+    z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
+    score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
+    heavier = score > 0
+    nothing = _evidence(np.zeros((len(left), 1)), np.zeros((len(left), 0)), left)
+    evidence = replace(
+        nothing,
+        statistic=score**2 / variance if heavier else 0.0,
+        log_p=float(norm.logsf(score / np.sqrt(variance))) if heavier else 0.0,
+        share=1.0,
+    )
+    values = np.array(one.effect.null)
+    if heavier and len(values) == 1:
+        values = values + score / variance
+    return _signature(one, evidence, values, 1, n_candidates)
 
 
 def twins(one: Signature, other: Signature) -> bool:

@@ -25,7 +25,7 @@ def _scan(scene: Scene, history: History, body: Body) -> Any:
     numbers = data["number"].to_numpy()
     last = float(np.nanmax(data["clock"].to_numpy()))
     begins = (
-        np.unique(np.quantile(numbers[1:] - 0.5, np.linspace(0, 1, _LOOKS)))
+        np.unique(np.quantile(numbers[1:] - 0.5, np.linspace(0, 1, _LOOKS), method="nearest"))
         if len(numbers) > 1
         else np.zeros(0)
     )

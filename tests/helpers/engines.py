@@ -10,6 +10,8 @@ from tests.helpers.worlds import G, simulator
 
 BOX = Shape.box(0.9, 0.55)
 ARM = Shape.box(0.03, 0.4)
+#: Friction in hinges.
+PIVOT = [e for e in catalogue if e.name.startswith("pivot")]
 #: Without hinges there is no friction in them, and without obstacles nothing to touch.
 OTHERS = [e for e in catalogue if not e.name.startswith(("pivot", "hidden_obstacle"))]
 
