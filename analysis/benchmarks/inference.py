@@ -224,7 +224,7 @@ def measure_map() -> Iterator[Row]:
     try:
         from mujoco_sysid import sysid_seconds
     except ImportError as error:
-        print(f"map_over_mujoco is left out: {error}; pip install 'mujoco[sysid]'", file=sys.stderr)
+        print(f"map_over_mujoco is left out: {error}; pip install -e '.[bench]'", file=sys.stderr)
         return
     theirs = sysid_seconds()
     what = "the same / MuJoCo's sysid, seven parameters of one body, as many steps"
