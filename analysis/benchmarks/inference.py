@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 import warnings
@@ -35,6 +36,7 @@ from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
 from pbrl_ppl.physics import PartedSimulator
 from pbrl_ppl.posterior.store import az, convergence, group
+from pbrl_ppl.sampling.fitting import METHODS
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import ROUNDS, machine, naive
@@ -222,7 +224,7 @@ def measure_map() -> Iterator[Row]:
     try:
         from mujoco_sysid import sysid_seconds
     except ImportError as error:
-        print(f"map_over_mujoco is left out: {error}; pip install 'mujoco[sysid]'", file=sys.stderr)
+        print(f"map_over_mujoco is left out: {error}; pip install -e '.[bench]'", file=sys.stderr)
         return
     theirs = sysid_seconds()
     what = "the same / MuJoCo's sysid, seven parameters of one body, as many steps"
@@ -319,26 +321,37 @@ def measure_ratio() -> Iterator[Row]:
     )
 
 
-#: Draws, tuning draws and steps a draw of each method: what it needs, as far as patience goes.
-LENGTHS = {
-    "metropolis": {},
-    "paper": {"draws": 200, "tune": 1000},
-    "demetropolisz": {"draws": 500, "tune": 1000},
-    "smc": {"draws": 100, "chains": 2},
-    "nuts": {"draws": 50, "tune": 50, "chains": 2},
-}
+#: Wall-clock seconds that each method is given, the mode apart: the effort is the same for all.
+EFFORT = 120.0
+#: Draws a chain of a first run, and twice as many of a second: their difference is a draw's cost.
+PILOT = {"metropolis": 400, "paper": 20, "demetropolisz": 60, "smc": 30, "nuts": 4}
+_CHAINS, _MOST_DRAWS = 4, 200_000
 
 
 def measure_methods() -> Iterator[Row]:
-    """Effective draws a second of every method: which should be the default."""
+    """Effective draws a second of every method with the same seconds: which should be the default.
+
+    Tuning draws are in the proportion to draws that each method has by default.
+    """
     scene, history = cart(30)
     model = pp.physics_model(scene, history)
     mode = find_mode(model.problem, seed=1)
-    for method, lengths in LENGTHS.items():
-        run = partial(pp.fit, model, method=method, seed=1, start=mode, progress=False, **lengths)
-        took, r_hat, ess = judged(*seconds(run))
-        what = f"cart, 30 transitions, {method}: least ESS a second ({took:.0f} s, ESS {ess:.0f}"
-        yield f"ess_per_second_{method}", f"{what}, R-hat {r_hat:.2f})", "", ess / took
+    options = {"seed": 1, "start": mode, "progress": False, "chains": _CHAINS}
+    for method, few in PILOT.items():
+        share = METHODS[method].tune / METHODS[method].draws
+
+        def run(draws: int, method: str = method, share: float = share) -> tuple[float, object]:
+            tune = math.ceil(share * draws)
+            return seconds(lambda: pp.fit(model, method=method, draws=draws, tune=tune, **options))
+
+        run(few)  # compiled code is there
+        (less, _), (more, _) = run(few), run(2 * few)
+        a_draw = max((more - less) / few, EFFORT / _MOST_DRAWS)
+        draws = max(few, int(few + (EFFORT - less) / a_draw))
+        took, r_hat, ess = judged(*run(draws))
+        what = f"cart, 30 transitions, {_CHAINS} chains, {method}: least ESS a second"
+        how = f"{took:.0f} s, {draws} draws a chain, ESS {ess:.0f}, R-hat {r_hat:.2f}"
+        yield f"ess_per_second_{method}", f"{what} ({how})", "", ess / took
 
 
 def measure_joint() -> Iterator[Row]:

@@ -16,6 +16,9 @@ import mujoco
 import numpy as np
 from mujoco import rollout, sysid
 
+if not hasattr(sysid, "optimize"):  # mujoco keeps quiet about what its toolbox lacks
+    raise ImportError("mujoco.sysid is there without what it needs")
+
 COMMANDS, STEPS, ROUNDS = 360, 20, 3
 NOISE = np.array([0.002, 0.002, 0.004, 0.01, 0.01, 0.02])
 JOINTS = ("x", "y", "yaw")

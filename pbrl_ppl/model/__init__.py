@@ -12,6 +12,7 @@ from pbrl_ppl.model.likelihood import (
     robust,
     whiten,
 )
+from pbrl_ppl.model.log_posterior import log_noise_prior, log_posterior, log_prior, noise_law
 from pbrl_ppl.model.noise import Noise, sigma_prior
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
@@ -33,7 +34,11 @@ __all__ = [
     "build_model",
     "estimate_sigma",
     "log_density",
+    "log_noise_prior",
+    "log_posterior",
+    "log_prior",
     "next_state_random",
+    "noise_law",
     "physics_model",
     "prior_predictive_draws",
     "robust",

@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln, ndtr, ndtri
 from scipy.stats import truncnorm
 
-from pbrl_ppl.model import robust
+from pbrl_ppl.model import noise_law, robust
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior
 
@@ -61,13 +61,11 @@ class Coordinates:
         self.problem = mode.problem
         priors = self.problem.layout.priors
         self._laws = [_Law(prior, x) for prior, x in zip(priors, mode.phi, strict=True)]
-        median, self._spread = self.problem.noise_prior
-        self._centre = np.log(median)
+        self._centre, self._spread = noise_law(self.problem)
         sigma = np.log(mode.sigma)
         self._counts = self.problem.observations.measured.sum((0, 1, 2))
         if self.problem.noise.scalar:
-            self._centre, sigma = self._centre.mean(keepdims=True), sigma[:1]
-            self._counts = self._counts.sum(keepdims=True)
+            sigma, self._counts = sigma[:1], self._counts.sum(keepdims=True)
         z = [float(law.standard(x)) for law, x in zip(self._laws, mode.phi, strict=True)]
         #: The mode, shape (d,).
         self.origin = np.concatenate([z, (sigma - self._centre) / self._spread])
@@ -82,7 +80,7 @@ class Coordinates:
         return phi, np.broadcast_to(sigma, (len(z), states))
 
     def log_density(self, z: Array) -> Array:
-        """Log-likelihood plus log-prior, normalised, shape (n,)."""
+        """Log-posterior with the coordinates' volume, normalised by the prior, shape (n,)."""
         phi, sigma = self.values(z)
         problem = self.problem
         parts = [

@@ -8,9 +8,10 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import least_squares
 
-from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, robust, whiten
+from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, log_posterior, robust
+from pbrl_ppl.modes.noise import FAR_OFF, profile_sigma
 from pbrl_ppl.numerics import differentiate
 from pbrl_ppl.parameters import box, fold_wheels, inside, prior_residual
 from pbrl_ppl.physics import PartedSimulator
@@ -19,8 +20,6 @@ Array = NDArray[np.float64]
 #: Where a climb ended: phi, sigma and the log-posterior there.
 Peak = tuple[Array, Array, float]
 
-#: A residual beyond this many noise units says no more about where the mode is.
-FAR_OFF = 1e3
 #: Gain in log-posterior that is not worth another round.
 STALLED = 0.02
 
@@ -42,7 +41,7 @@ class Mode:
     covariance : ndarray
         Laplace covariance of phi, shape (p, p).
     log_posterior : float
-        Log-likelihood plus log-prior of phi, up to a constant of the priors.
+        As of :func:`pbrl_ppl.model.log_posterior`.
     others : tuple of Mode
         Lower ones, that may yet hold a share of the posterior.
     """
@@ -100,7 +99,7 @@ def posterior_steps(
 def climb(
     problem: Problem, phi: Array, slope: PartedSimulator, rounds: int = 40, tries: int = 4
 ) -> Peak:
-    """Alternate between phi by least squares and sigma by maximum likelihood.
+    """Alternate between phi by least squares and the most probable sigma there.
 
     Derivatives are taken through the engine ``slope``.
     """
@@ -144,43 +143,11 @@ def climb(
 
 
 def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
-    """The most likely sigma at phi, and the log-posterior there."""
+    """The most probable sigma at phi, and the log-posterior there."""
     residual = problem.residual(phi)
     sigma = profile_sigma(problem, residual)
     likelihood = problem.log_density(residual, sigma).sum()
-    return sigma, float(likelihood - 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum())
-
-
-def profile_sigma(problem: Problem, residual: Array) -> Array:
-    """Maximum-likelihood sigma at given residuals, shape (state,).
-
-    Parameters
-    ----------
-    problem : Problem
-        Says which cells were measured, and how the start state's noise spreads.
-    residual : ndarray
-        Shape (transition, H, body, state).
-    """
-    measured, noise = problem.observations.measured, problem.noise.start
-    residual = np.nan_to_num(residual, nan=FAR_OFF)
-    sigma = estimate_sigma(residual, measured, None)
-    gaussian = problem.noise.nu is None
-    if problem.noise.scalar and gaussian:
-        z = whiten(residual, np.ones_like(sigma), noise)
-        return np.full_like(sigma, max(np.sqrt((z**2).sum() / measured.sum()), 1e-9))
-    if noise is None and gaussian:
-        return sigma
-    begin = np.log(sigma if noise is None else sigma / np.median(noise.gain))
-    every = np.ones_like(sigma)
-    if problem.noise.scalar:
-        begin = begin.mean(keepdims=True)
-
-    def cost(log_sigma: Array) -> float:
-        return -float(problem.log_density(residual, np.exp(log_sigma) * every).sum())
-
-    bounds = [(b - 6, b + 6) for b in begin]
-    found = minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x
-    return np.asarray(np.exp(found) * every)
+    return sigma, float(log_posterior(problem, phi, sigma, log_likelihood=likelihood))
 
 
 def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> Mode:

@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import Observations, Problem, estimate_sigma, log_density
+from pbrl_ppl.model import Observations, Problem, estimate_sigma, log_density, log_noise_prior
 from pbrl_ppl.physics import Part
 
 Array = NDArray[np.float64]
@@ -111,17 +111,15 @@ def choose_from_library(
     table = problem.library.table(problem.layout, problem.scene)
     parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
     median, spread = problem.noise_prior
-    typical = np.log(median)
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
-    every = np.ones(len(typical))
+    every = np.ones(len(median))
     if problem.noise.scalar:
-        typical, counts = typical.mean(keepdims=True), counts.sum(keepdims=True)
+        counts = counts.sum(keepdims=True)
 
     def density(log_sigma: Array) -> Array:
         sigma = np.exp(log_sigma) * every
         each = [logsumexp(part.log_joint(sigma, problem.noise.nu), axis=1) for part in parts]
-        prior = -0.5 * (((log_sigma - typical) / spread) ** 2).sum(axis=1)
-        return np.asarray(np.sum(each, axis=0) + prior)
+        return np.asarray(np.sum(each, axis=0) + log_noise_prior(problem, log_sigma))
 
     begin = np.log(_rough_sigma(problem, parts, median))
     begin = begin.mean(keepdims=True) if problem.noise.scalar else begin

@@ -11,8 +11,9 @@ from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.model import Problem, estimate_sigma
-from pbrl_ppl.modes.laplace import FAR_OFF, STALLED, Mode, Peak, climb, finish
-from pbrl_ppl.parameters import box, fold_wheels, inside, prior_draws, prior_residual
+from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, finish
+from pbrl_ppl.modes.noise import FAR_OFF, gaussian_profile
+from pbrl_ppl.parameters import box, fold_wheels, inside, prior_draws
 
 Array = NDArray[np.float64]
 
@@ -32,8 +33,6 @@ _SAME = 10.0
 _FAR = 100.0
 #: Log-posterior by which a mode is too low to hold a share of the posterior, however wide it is.
 _LOWER = 20.0
-#: How small the noise may seem beside its typical size while basins are compared.
-_EXACT = 1e-3
 
 
 def find_modes(
@@ -124,16 +123,12 @@ def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
     priors = problem.layout.priors
     draws = prior_draws(priors, rng, _POPULATION)
     measured = problem.observations.measured
-    counts = measured.sum((0, 1, 2))
-    # without a floor, an exact fit of one dimension would outweigh all others
-    floor = (_EXACT * problem.noise_prior[0]) ** 2
 
     def cost(points: Array) -> Array:
         phi = inside(priors, points.T)
         residual = np.where(measured, np.nan_to_num(problem.residual(phi), nan=FAR_OFF), 0.0)
-        variance = np.maximum((residual**2).sum((1, 2, 3)) / counts, floor)
-        fit = (counts * np.log(variance)).sum(axis=-1)
-        return np.asarray(0.5 * (fit + (prior_residual(priors, phi) ** 2).sum(axis=-1)))
+        fit = gaussian_profile(problem, (residual**2).sum((1, 2, 3)))
+        return np.asarray(-fit - problem.layout.log_prior(phi).sum(axis=-1))
 
     lower, upper = box(priors)
     lower = np.where(np.isfinite(lower), lower, draws.min(axis=0))

@@ -121,16 +121,41 @@ class Layout:
             Shape (n, p).
         """
         lower, upper = (np.tile(end, (len(phi), 1)) for end in self.bounds)
+        for place, index, conditional in self._conditional():
+            support = np.array([prior.support for prior in conditional])
+            held = support[phi[:, index].astype(int)]
+            lower[:, place], upper[:, place] = held.T
+        return lower, upper
+
+    def log_prior(self, phi: Array) -> Array:
+        """Log-density of each entry under its prior; an anchor's prior depends on its index.
+
+        Parameters
+        ----------
+        phi : ndarray
+            Shape (..., p).
+
+        Returns
+        -------
+        ndarray
+            Shape (..., p): sums over it, or over some entries, are joint log-densities.
+        """
+        result = np.empty(np.shape(phi))
+        for i, prior in enumerate(self.priors):
+            result[..., i] = prior.log_density(phi[..., i])
+        for place, index, conditional in self._conditional():
+            for number, prior in enumerate(conditional):
+                held = phi[..., index] == number
+                result[held, place] = prior.log_density(phi[held, place])
+        return result
+
+    def _conditional(self) -> Iterator[tuple[int, int, tuple[Prior, ...]]]:
+        """Place of each anchor of unknown bodies, place of its index, and its alternatives."""
         for block in self.blocks:
             side = f"i_{block.name[0]}"
             for owner, conditional in zip(block.owners, block.conditional, strict=False):
-                if f"{side}[{owner}]" not in self.labels:
-                    continue
-                place, index = self.index(block.name, owner), self.index(side, owner)
-                support = np.array([prior.support for prior in conditional])
-                held = support[phi[:, index].astype(int)]
-                lower[:, place], upper[:, place] = held.T
-        return lower, upper
+                if f"{side}[{owner}]" in self.labels:
+                    yield self.index(block.name, owner), self.index(side, owner), conditional
 
     def scale(self, phi: Array) -> Array:
         """What is a large change of each entry of phi, shape (p,); zero of a discrete one."""

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import i0e
 from scipy.stats import truncnorm
 
 from pbrl_ppl.errors import ParameterError
@@ -130,6 +132,47 @@ class Prior:
         if self.family == "von_mises":
             return np.asarray(2.0 * np.sqrt(self.kappa) * np.sin((x - self.mu) / 2.0))
         return np.asarray((x - self.mu) / self.sigma)
+
+    def log_density(self, x: Array) -> Array:
+        """Logarithm of the normalised density, minus infinity outside the support.
+
+        Parameters
+        ----------
+        x : ndarray
+            Values, any shape.
+
+        Returns
+        -------
+        ndarray
+            Same shape; of a discrete prior the log-probability.
+
+        Examples
+        --------
+        >>> float(Prior("normal", sigma=2.0).log_density(np.array(0.0)).round(3))
+        -1.612
+        """
+        x = np.asarray(x, dtype=float)
+        lower, upper = self.support
+        there = (x >= lower) & (x <= upper) & ((x > 0) | (self.family != "log_normal"))
+        density = self._log_norm - 0.5 * self.residual(x) ** 2
+        return np.asarray(np.where(there, density, -np.inf))
+
+    @cached_property
+    def _log_norm(self) -> float:
+        """Log-density where the residual is zero."""
+        if self.discrete:
+            return -float(np.log(self.upper - self.lower + 1.0))
+        if self.family == "von_mises":
+            return -float(np.log(2.0 * np.pi * i0e(self.kappa)))
+        normal = -0.5 * float(np.log(2.0 * np.pi)) - float(np.log(self.sigma))
+        if self.family == "log_normal":
+            return normal - self.mu + 0.5 * self.sigma**2
+        if self.family in ("truncated_normal", "half_normal"):
+            ends = (np.array(self.support) - self.mu) / self.sigma
+            centre = self.centre
+            law = truncnorm(*ends, self.mu, self.sigma)
+            return float(law.logpdf(centre) + 0.5 * self.residual(np.array(centre)) ** 2)
+        return normal
 
     def sample(self, rng: np.random.Generator, size: int) -> Array:
         """Draw values; ``size`` of them."""

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import build_layout, next_state_random
-from pbrl_ppl.parameters import prior_residual
+from pbrl_ppl.model import build_layout, log_posterior, next_state_random
 from pbrl_ppl.physics import Simulator
+from pbrl_ppl.posterior import draws as all_draws
 from pbrl_ppl.posterior import group, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
 
@@ -85,7 +85,7 @@ class Dynamics:
             As made by :func:`pbrl_ppl.fit`, or loaded.
         draws : int, optional
             Chosen at random without replacement; without it, the single one of highest posterior
-            density (MAP).
+            density (MAP), by :func:`pbrl_ppl.model.log_posterior`.
         seed : int
             Of the choice.
         effects : iterable of Effect
@@ -102,8 +102,12 @@ class Dynamics:
         problem = problem_of(idata, effects)  # all of its effects are declared in its scene
         phi, sigma = parameter_draws(problem, idata)
         if draws is None:
-            density = group(idata, "log_likelihood")["next_state"].sum("transition").values.ravel()
-            density = density - 0.5 * (prior_residual(problem.layout.priors, phi) ** 2).sum(axis=-1)
+            likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
+            known = likelihood.transpose("chain", "draw").to_numpy().ravel()
+            choice = None
+            if problem.library is not None:
+                choice = all_draws(idata)["library_index"].astype(np.intp)
+            density = log_posterior(problem, phi, sigma, choice, log_likelihood=known)
             chosen = np.array([np.argmax(density)])
         elif not 1 <= draws <= len(phi):
             raise PosteriorError(

@@ -310,7 +310,13 @@ def _trouble(
     r_hat, ess = convergence(idata)
     worst_hat, worst_ess = max(r_hat, key=lambda k: r_hat[k]), min(ess, key=lambda k: ess[k])
     idata.attrs["max_rhat"], idata.attrs["min_ess"] = r_hat[worst_hat], ess[worst_ess]
-    if not (r_hat[worst_hat] <= MAX_RHAT and ess[worst_ess] >= MIN_ESS):
+    if sizes["chain"] == 1:
+        yield (
+            ConvergenceWarning,
+            "one chain alone cannot show whether it has converged: R-hat compares chains; raise"
+            " chains= to 4",
+        )
+    elif not (r_hat[worst_hat] <= MAX_RHAT and ess[worst_ess] >= MIN_ESS):
         yield (
             ConvergenceWarning,
             f"the chains have not converged: R-hat is {r_hat[worst_hat]:.3f} for {worst_hat}"

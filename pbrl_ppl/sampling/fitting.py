@@ -10,16 +10,16 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-import xarray as xr
 
 from pbrl_ppl.modes import Mode, choose_from_library, find_mode, weigh
-from pbrl_ppl.posterior import complete, from_groups, group, groups
+from pbrl_ppl.posterior import complete, group
 from pbrl_ppl.sampling.emulator import emulate
 from pbrl_ppl.sampling.fit_checks import DEFAULT, checked_problem
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
-from pbrl_ppl.sampling.mixture import labelled, mix, posterior_dataset
+from pbrl_ppl.sampling.mixture import mix
 from pbrl_ppl.sampling.starts import blank_point, dispersed, from_posterior, gaussian_blocks
 from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+from pbrl_ppl.sampling.traces import appended, as_trace, thinned
 
 #: Engine steps that cost no more than what samplers do beside them.
 _LITTLE = 2000
@@ -35,12 +35,15 @@ class Method:
         ``run(job) -> trace``.
     draws, tune, thin : int
         Draws kept and tuning draws of each chain; steps a draw.
+    chains : int
+        Chains.
     """
 
     run: Callable[[Job], Any]
     draws: int
     tune: int
     thin: int
+    chains: int = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +81,7 @@ class Job:
             if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
                 raise KeyboardInterrupt from error
             raise
-        return _thinned(trace, steps_a_draw)
+        return thinned(trace, steps_a_draw)
 
 
 def _metropolis(job: Job) -> Any:
@@ -138,56 +141,12 @@ def _map(job: Job) -> Any:
     return as_trace(job.model, draws, {"lp": np.array([[job.mode.log_posterior]])})
 
 
-def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
-    """Draws as PyMC gives them, made by other means.
-
-    Parameters
-    ----------
-    model : pymc.Model
-        Of ``physics_model``; says what each variable runs over.
-    draws : mapping of str to ndarray
-        By the variables' names, shape (chain, draw, ...).
-    stats : mapping of str to ndarray
-        What the sampler says of each draw, shape (chain, draw).
-    """
-    problem, posterior = model.problem, posterior_dataset(model, draws)
-    segments = problem.segments
-
-    per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
-    given = {
-        "start": (("transition", "body", "full_state"), segments.start),
-        "actions": (("transition", "step", "body", "wrench"), problem.inputs),
-    }
-    observed = {
-        "next_state": (("transition", "step", "body", "state"), problem.observations.values)
-    }
-    return from_groups(
-        {
-            "posterior": posterior,
-            "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
-            "observed_data": labelled(model, observed),
-            "constant_data": labelled(model, given),
-        },
-        {},
-    )
-
-
-def _thinned(trace: Any, thin: int) -> Any:
-    """Keep each ``thin``-th draw."""
-    if thin == 1:
-        return trace
-    per_draw = ("posterior", "sample_stats")
-    data = {
-        name: each.isel(draw=slice(thin - 1, None, thin)) if name in per_draw else each
-        for name, each in groups(trace).items()
-    }
-    return from_groups(data, {})
-
-
-#: The samplers by name. Of the paper's schedule only the kind is known to us; its lengths are ours.
+#: The samplers by name. The paper's schedule is that of Table 2 for the cart: 30 chains of 20,000
+#: iterations, of which the first 1,000 are burnt in and each tenth of the others is kept. (PyMC 2
+#: counted the burn-in among the iterations.)
 METHODS: Mapping[str, Method] = {
     "metropolis": Method(_metropolis, draws=800, tune=500, thin=1),
-    "paper": Method(_paper, draws=1000, tune=5000, thin=10),
+    "paper": Method(_paper, draws=1900, tune=1000, thin=10, chains=30),
     "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),
     "smc": Method(_smc, draws=1000, tune=0, thin=1),
     "nuts": Method(_nuts, draws=500, tune=500, thin=1),
@@ -202,7 +161,7 @@ def fit(
     seed: int = 0,
     draws: int | None = None,
     tune: int | None = None,
-    chains: int = 4,
+    chains: int | None = None,
     thin: int | None = None,
     cores: int | None = None,
     start: Mode | None = None,
@@ -222,15 +181,17 @@ def fit(
         As made by ``physics_model``.
     method : str
         ``metropolis``: adaptive blocks that follow the scene's independent parts and look ahead
-        with polynomials where engine runs are dear; ``paper``: one random walk a variable, burnt
-        in and thinned; ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient;
-        ``map``: the mode alone, as one draw.
+        with polynomials where engine runs are dear; ``paper``: one random walk a variable, by
+        default on the schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations,
+        1,000 of them burn-in, each tenth kept), that for the apartment being ``draws=400,
+        tune=1000, thin=10, chains=1``; ``demetropolisz``; ``smc``; ``nuts``, on the
+        finite-difference gradient; ``map``: the mode alone, as one draw.
     seed : int
         The same seed gives the same posterior.
     draws, tune : int, optional
         Draws kept and tuning draws of each chain; each method has its own default.
-    chains : int
-        Chains.
+    chains : int, optional
+        Chains; 4 by default, 30 for ``paper``.
     thin : int, optional
         Steps a draw; rounds over the blocks for ``metropolis``.
     cores : int, optional
@@ -269,10 +230,17 @@ def fit(
     """
     problem = checked_problem(model, method, METHODS, start, resume)
     if problem.library is not None:
-        trace = _summed(model, METHODS[method].draws if draws is None else draws, chains, seed)
+        default = METHODS[method]
+        trace = _summed(
+            model,
+            default.draws if draws is None else draws,
+            default.chains if chains is None else chains,
+            seed,
+        )
         return complete(problem, trace, seed=seed, method="exact sum over the library")
     chosen = METHODS[method]
     draws = chosen.draws if draws is None else draws
+    chains = chosen.chains if chains is None else chains
     if method == "map":
         draws = chains = 1
 
@@ -307,7 +275,7 @@ def fit(
         trace = sampled(model, find_mode(problem, seed=seed) if start is None else start)
     done = group(trace, "posterior").sizes["draw"]
     if resume is not None:
-        trace = _appended(resume, trace)
+        trace = appended(resume, trace)
     # PyMC ends an interrupted run quietly, with the draws so far
     asked = draws if done < draws else None
     return complete(problem, trace, seed=seed, method=method, asked=asked)
@@ -320,14 +288,3 @@ def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:
     values: dict[str, Any] = problem.layout.to_dict(phi)
     values |= {"library_index": index, "sigma": sigma[..., 0] if problem.noise.scalar else sigma}
     return as_trace(model, values, {"accept": accepted})
-
-
-def _appended(earlier: Any, trace: Any) -> Any:
-    """The draws of two runs, one after the other."""
-    data = groups(trace)
-    for name in ("posterior", "sample_stats"):
-        old, new = group(earlier, name), data[name]
-        shared = [str(each) for each in new.data_vars if each in old]
-        both = xr.concat([old[shared], new[shared]], dim="draw")
-        data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
-    return from_groups(data, {})

@@ -14,6 +14,7 @@ from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import ATTRIBUTE, Mode, Weighed, stored
 from pbrl_ppl.parameters import JOINT_INDICES
 from pbrl_ppl.posterior import from_groups, group, groups
+from pbrl_ppl.sampling.traces import posterior_dataset
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
@@ -98,22 +99,6 @@ def allocate(probability: Array, n: int) -> Labels:
     left = n - int(counts.sum())
     counts[np.argsort(counts - ideal, kind="stable")[:left]] += 1
     return np.asarray(counts)
-
-
-def posterior_dataset(model: pm.Model, values: Mapping[str, Array]) -> xr.Dataset:
-    """Draws by variable, shape (chain, draw, ...), with the model's dimensions and coordinates."""
-    data = {
-        name: (("chain", "draw", *(model.named_vars_to_dims.get(name) or ())), value)
-        for name, value in values.items()
-    }
-    chains, draws = next(iter(values.values())).shape[:2]
-    return labelled(model, data).assign_coords(chain=np.arange(chains), draw=np.arange(draws))
-
-
-def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
-    """Variables (dims, values) with the model's coordinates of their dimensions."""
-    used = {dim for dims, _ in variables.values() for dim in dims if dim in model.coords}
-    return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})
 
 
 def _values(

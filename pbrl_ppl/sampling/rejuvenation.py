@@ -7,8 +7,8 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem, log_density
-from pbrl_ppl.parameters import inside, prior_residual
+from pbrl_ppl.model import Problem, log_density, log_noise_prior
+from pbrl_ppl.parameters import inside
 from pbrl_ppl.sampling.metropolis import TARGET_ACCEPTANCE, Gaussian
 from pbrl_ppl.sampling.starts import constrain, unconstrain
 
@@ -88,11 +88,8 @@ class _Mover:
         phi = inside(self.priors, phi)
         pairs = [unconstrain(prior, x) for prior, x in zip(self.priors, phi.T, strict=True)]
         self.u = np.array([u for u, _ in pairs]).reshape(-1, len(phi)).T.copy()
-        median, self.spread = problem.noise_prior
-        self.typical = np.log(median)
         self.noise = np.log(sigma)
         if problem.noise.scalar:
-            self.typical = self.typical.mean(keepdims=True)
             self.noise = self.noise[:, :1].copy()
         self.parts = problem.simulator.parts
         if problem.noise.start is not None:  # it mixes the bodies' residuals
@@ -122,7 +119,7 @@ class _Mover:
     def prior(self, u: Array) -> Array:
         """Log-density of each part's parameters with the transform's, shape (particle, part)."""
         phi = self.phi(u)
-        each = -0.5 * prior_residual(self.priors, phi) ** 2
+        each = self.problem.layout.log_prior(phi)
         for i, prior in enumerate(self.priors):
             each[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
         return np.stack([each[:, part.places].sum(axis=1) for part in self.parts], axis=1)
@@ -218,8 +215,8 @@ class _Mover:
         """Steps of the noise, shape (particle, state), at given residuals."""
 
         def density(at: Array) -> Array:
-            prior = -0.5 * (((at - self.typical) / self.spread) ** 2).sum(axis=1)
-            return np.asarray(prior + self.likelihood(residual, at).sum(axis=1))
+            likelihood = self.likelihood(residual, at).sum(axis=1)
+            return np.asarray(log_noise_prior(self.problem, at) + likelihood)
 
         here = density(noise)
         for _ in range(_NOISE_STEPS):

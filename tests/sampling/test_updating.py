@@ -404,7 +404,7 @@ def test_start_noise_is_refused(parts) -> None:
     problem = physics_model(scene, a.select(range(5))).problem
     mode = find_mode(problem, seed=1)
     noisy = with_start_noise(problem, mode)
-    assert isinstance(noisy.noise, StartNoise)
+    assert isinstance(noisy.noise.start, StartNoise)
     idata = quiet(fit, build_model(noisy), seed=1, start=mode, **(QUICK | {"draws": 60, "tune": 9}))
     with pytest.raises(PosteriorError, match="noise in the measured start states"):
         update(idata, b.select([0]))
@@ -412,6 +412,18 @@ def test_start_noise_is_refused(parts) -> None:
     attrs = {k: v for k, v in idata.attrs.items() if k != "start_noise"}
     with pytest.raises(PosteriorError, match="start noise, other effects or another version"):
         update(from_groups(groups(idata), attrs), b.select([0]))
+
+
+def test_start_noise_joins_the_parts_that_are_moved(parts) -> None:
+    """It mixes the bodies' residuals: all parameters are one block, none is left where it was."""
+    scene, a, _, _ = parts
+    problem = physics_model(scene, a.select(range(5))).problem
+    mode = find_mode(problem, seed=1)
+    noisy = with_start_noise(problem, mode)
+    phi, sigma = mode.draws(np.random.default_rng(1), 40), np.tile(mode.sigma, (40, 1))
+    assert len(problem.simulator.parts) == 2
+    (whole,) = _Mover(noisy, phi, sigma).parts
+    np.testing.assert_array_equal(whole.places, np.arange(problem.layout.size))
 
 
 def test_weights_are_smoothed_alike_on_both_stacks() -> None:

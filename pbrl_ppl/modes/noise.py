@@ -1,0 +1,82 @@
+"""The most probable sigma at given residuals, under its prior."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.special import wrightomega
+
+from pbrl_ppl.model import Problem, log_noise_prior, noise_law, whiten
+
+Array = NDArray[np.float64]
+
+#: A residual beyond this many noise units says no more about where the mode is.
+FAR_OFF = 1e3
+#: Sigma of a recording without noise still needs a scale.
+_LEAST = 1e-9
+
+
+def profile_sigma(problem: Problem, residual: Array) -> Array:
+    """Sigma of highest posterior density at given residuals, shape (state,).
+
+    Parameters
+    ----------
+    problem : Problem
+        Says which cells were measured, how the start state's noise spreads, and P(sigma).
+    residual : ndarray
+        Shape (transition, H, body, state).
+    """
+    noise = problem.noise.start
+    residual = np.nan_to_num(residual, nan=FAR_OFF)
+    every = np.ones(residual.shape[-1])
+    if problem.noise.nu is None and (noise is None or problem.noise.scalar):
+        z = whiten(residual, every, noise).reshape(residual.shape)
+        return np.asarray(np.exp(gaussian_log_sigma(problem, (z**2).sum((0, 1, 2)))) * every)
+    begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
+    if noise is not None:
+        begin = begin - np.log(np.median(noise.gain))
+
+    def cost(log_sigma: Array) -> float:
+        likelihood = problem.log_density(residual, np.exp(log_sigma) * every).sum()
+        return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
+
+    bounds = [(b - 6, b + 6) for b in begin]
+    return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x) * every)
+
+
+def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
+    """The same for independent Gaussian residuals, in closed form.
+
+    The density ``-(n + 1) t - S exp(-2 t) / 2 - (t - m)^2 / 2 s^2`` of t = log sigma has its only
+    maximum where ``y exp(2 y) = s^2 S exp(2 (a - m))``, with ``a = s^2 (n + 1)`` and
+    ``t = y - a + m``: Wright's omega function.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says how many cells were measured, and P(sigma).
+    square : ndarray
+        Sum of squared residuals of each state dimension, shape (..., state).
+
+    Returns
+    -------
+    ndarray
+        Log sigma, shape (..., state), or (..., 1) for a scalar sigma.
+    """
+    centre, spread = noise_law(problem)
+    count = problem.observations.measured.sum((0, 1, 2))
+    if problem.noise.scalar:
+        square, count = square.sum(axis=-1, keepdims=True), count.sum(keepdims=True)
+    a = spread**2 * (count + 1)
+    with np.errstate(divide="ignore"):  # an exact fit
+        y = 0.5 * wrightomega(np.log(2 * spread**2 * square) + 2 * (a - centre))
+    return np.asarray(np.maximum(y - a + centre, np.log(_LEAST)))
+
+
+def gaussian_profile(problem: Problem, square: Array) -> Array:
+    """Log-density of data and sigma at that sigma, up to a constant, shape (...)."""
+    t = gaussian_log_sigma(problem, square)
+    count = problem.observations.measured.sum((0, 1, 2))
+    likelihood = -(count * t + 0.5 * square * np.exp(-2 * t)).sum(axis=-1)
+    return np.asarray(likelihood + log_noise_prior(problem, t) - t.sum(axis=-1))

@@ -1,0 +1,88 @@
+"""Draws in PyMC's form, made by other means, thinned or joined."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pymc as pm
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.posterior import from_groups, group, groups
+
+Array = NDArray[np.float64]
+
+
+def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
+    """Draws as PyMC gives them, made by other means.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        Of ``physics_model``; says what each variable runs over.
+    draws : mapping of str to ndarray
+        By the variables' names, shape (chain, draw, ...).
+    stats : mapping of str to ndarray
+        What the sampler says of each draw, shape (chain, draw).
+    """
+    problem, posterior = model.problem, posterior_dataset(model, draws)
+    segments = problem.segments
+
+    per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
+    given = {
+        "start": (("transition", "body", "full_state"), segments.start),
+        "actions": (("transition", "step", "body", "wrench"), problem.inputs),
+    }
+    observed = {
+        "next_state": (("transition", "step", "body", "state"), problem.observations.values)
+    }
+    return from_groups(
+        {
+            "posterior": posterior,
+            "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
+            "observed_data": labelled(model, observed),
+            "constant_data": labelled(model, given),
+        },
+        {},
+    )
+
+
+def thinned(trace: Any, thin: int) -> Any:
+    """Keep each ``thin``-th draw."""
+    if thin == 1:
+        return trace
+    per_draw = ("posterior", "sample_stats")
+    data = {
+        name: each.isel(draw=slice(thin - 1, None, thin)) if name in per_draw else each
+        for name, each in groups(trace).items()
+    }
+    return from_groups(data, {})
+
+
+def appended(earlier: Any, trace: Any) -> Any:
+    """The draws of two runs, one after the other."""
+    data = groups(trace)
+    for name in ("posterior", "sample_stats"):
+        old, new = group(earlier, name), data[name]
+        shared = [str(each) for each in new.data_vars if each in old]
+        both = xr.concat([old[shared], new[shared]], dim="draw")
+        data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
+    return from_groups(data, {})
+
+
+def posterior_dataset(model: pm.Model, values: Mapping[str, Array]) -> xr.Dataset:
+    """Draws by variable, shape (chain, draw, ...), with the model's dimensions and coordinates."""
+    data = {
+        name: (("chain", "draw", *(model.named_vars_to_dims.get(name) or ())), value)
+        for name, value in values.items()
+    }
+    chains, draws = next(iter(values.values())).shape[:2]
+    return labelled(model, data).assign_coords(chain=np.arange(chains), draw=np.arange(draws))
+
+
+def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
+    """Variables (dims, values) with the model's coordinates of their dimensions."""
+    used = {dim for dims, _ in variables.values() for dim in dims if dim in model.coords}
+    return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})
