@@ -154,7 +154,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
             break
         settings |= {key: _LONGER * settings[key] for key in ("draws", "tune")}
     residual = problem.residual(truth.phi)
-    of_truth = problem.log_density(residual, truth.sigma).sum(keepdims=True)
+    of_truth = problem.log_density(residual, truth.sigma, truth.phi).sum(keepdims=True)
     true = _quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
     ranks = [
         rank(column, value, each)

@@ -125,7 +125,9 @@ class HeldOut:
 
         problem = self.noisy(mode)
         measured = problem.observations.measured
-        at_mode = problem.log_density(np.zeros_like(problem.observations.values), mode.sigma)
+        at_mode = problem.log_density(
+            np.zeros_like(problem.observations.values), mode.sigma, mode.phi
+        )
         return Errors(
             one_step_rmse=expected(self.noisy(mode, 1)),
             rollout_rmse=expected(self.noisy(mode, rollout)),
@@ -176,7 +178,7 @@ def _laplace_draws(mode: Mode, rng: np.random.Generator) -> tuple[Array, Array]:
 
 def _elpd(problem: Problem, phi: Array, sigma: Array) -> Array:
     """Log predictive density of each held-out transition, shape (transition,)."""
-    density = problem.log_density(problem.residual(phi), sigma)
+    density = problem.log_density(problem.residual(phi), sigma, phi)
     return np.asarray(logsumexp(density, axis=0) - np.log(len(phi)))
 
 

@@ -15,7 +15,7 @@ from pbrl_ppl.criticism.held_out import HeldOut, standard_error
 from pbrl_ppl.criticism.misfit import find_remainder
 from pbrl_ppl.criticism.resolution import choose_horizon, noisy, shift, with_enough_substeps
 from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
-from pbrl_ppl.effects import Attached, Effect, attach, candidates
+from pbrl_ppl.effects import Attached, Effect, Noise, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_model
@@ -332,9 +332,14 @@ def _added(step: _Step, revised: Mode, posterior: Any) -> Added:
 
 
 def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
-    """Significant candidates, best first; of twins, the one that the catalogue names first."""
+    """Significant candidates, best first; of twins, the one that the catalogue names first.
+
+    The noise's shape is scored and never added: misfit would pass for noise. A scene declares it.
+    """
     kept: list[Signature] = []
     for each in sorted(ranked, key=lambda each: order.index(each.attached.effect.name)):
+        if isinstance(each.attached.effect.stage, Noise):
+            continue
         significant = each.candidate.p_value < TRY_P
         if significant and not any(twins(each, other) for other in kept):
             kept.append(each)
@@ -344,4 +349,4 @@ def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
 def _log_likelihood(mode: Mode) -> float:
     problem = mode.problem
     residual = problem.residual(mode.phi)
-    return float(problem.log_density(residual, mode.sigma).sum())
+    return float(problem.log_density(residual, mode.sigma, mode.phi).sum())

@@ -250,7 +250,9 @@ def _tail_score(mode: Mode, one: Attached, left: Array, n_candidates: int) -> Si
     polynomial over 4, of variance 3/2.
     """
     measured = mode.problem.observations.measured
-    cells = np.flatnonzero(measured.ravel()) if mode.problem.noise.nu is None else np.zeros(0, int)
+    cells = (
+        np.flatnonzero(measured.ravel()) if mode.problem.nu(mode.phi) is None else np.zeros(0, int)
+    )
     z = left[cells]
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)

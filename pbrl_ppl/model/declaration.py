@@ -15,11 +15,17 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.model.library import ParameterLibrary
-from pbrl_ppl.model.likelihood import StartNoise, next_state_logp, next_state_random
+from pbrl_ppl.model.likelihood import (
+    Observations,
+    StartNoise,
+    next_state_logp,
+    next_state_random,
+)
 from pbrl_ppl.model.noise import Noise
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.table1 import random_variable
+from pbrl_ppl.model.tails import tail_tensor
 from pbrl_ppl.parameters import Block, Layout
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE
@@ -156,15 +162,20 @@ def build_model(problem: Problem) -> pm.Model:
             sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
         # Eq. 7: s' = f(s, a; Phi) + eps, and Eq. 11
         predicted = simulate(phi, start, actions)[..., list(observations.columns)]
+        logp = partial(next_state_logp, observations=observations, noise=noise.start, nu=noise.nu)
+        random, of = partial(_random, noise=noise.start, nu=noise.nu), [predicted, sigma]
+        signature = "(h,k,d),(d)->(h,k,d)"
+        if problem.tails:
+            of.append(tail_tensor(physics, table1, noise.nu))
+            logp = partial(_tailed_logp, observations=observations, noise=noise.start)
+            random = partial(_tailed_random, noise=noise.start)
+            signature = "(h,k,d),(d),(k)->(h,k,d)"
         pm.CustomDist(
             "next_state",
-            predicted,
-            sigma,
-            logp=partial(
-                next_state_logp, observations=observations, noise=noise.start, nu=noise.nu
-            ),
-            random=partial(_random, noise=noise.start, nu=noise.nu),
-            signature="(h,k,d),(d)->(h,k,d)",
+            *of,
+            logp=logp,
+            random=random,
+            signature=signature,
             observed=np.nan_to_num(observations.values),
             dims=("transition", "step", "body", "state"),
         )
@@ -233,6 +244,30 @@ def _random(
     rng: np.random.Generator | None = None,
     size: Any = None,
 ) -> Any:
+    return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size, nu)
+
+
+def _tailed_logp(
+    value: Any,
+    predicted: Any,
+    sigma: Any,
+    tail: Any,
+    observations: Observations,
+    noise: StartNoise | None,
+) -> Any:
+    return next_state_logp(value, predicted, sigma, observations, noise, tail=tail)
+
+
+def _tailed_random(
+    predicted: Any,
+    sigma: Any,
+    tail: Any,
+    noise: StartNoise | None,
+    rng: np.random.Generator | None = None,
+    size: Any = None,
+) -> Any:
+    with np.errstate(divide="ignore"):
+        nu = 1.0 / np.asarray(tail, dtype=float)[..., :, None]
     return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size, nu)
 
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 from scipy.optimize import minimize
+from scipy.special import gammaln
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import Segments
@@ -17,6 +18,9 @@ from pbrl_ppl.state import STATE, THETA
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+
+#: Degrees of freedom from which on a Student-t counts as Gaussian.
+_GAUSSIAN = 1e7
 
 
 @dataclass(frozen=True)
@@ -177,7 +181,7 @@ def log_density(
     sigma: Array,
     noise: StartNoise | None,
     measured: Bools,
-    nu: float | None = None,
+    nu: float | Array | None = None,
 ) -> Array:
     """Log-likelihood of each transition (Eq. 11), in numpy.
 
@@ -191,8 +195,9 @@ def log_density(
         Spread of the start state's noise.
     measured : ndarray
         Shape (transition, H, body, state).
-    nu : float, optional
-        Degrees of freedom of a Student-t distribution; without it, Gaussian.
+    nu : float or ndarray, optional
+        Degrees of freedom of a Student-t distribution, broadcasting against the residual; without
+        it, or where it is infinite, Gaussian.
 
     Returns
     -------
@@ -201,22 +206,29 @@ def log_density(
     """
     z = whiten(residual, sigma, noise)
     log_sigma = np.where(measured, np.log(sigma)[..., None, None, None, :], 0.0).sum((-1, -2, -3))
-    count = measured.sum((-1, -2, -3))
-    result = -0.5 * (robust(z, nu) ** 2).sum(-1) - log_sigma + count * log_norm(nu)
+    norm = np.where(measured, log_norm(nu), 0.0).sum((-1, -2, -3))
+    result = -0.5 * (robust(z, cells(nu, residual.shape)) ** 2).sum(-1) - log_sigma + norm
     if noise is not None:
         result = result - noise.log_det
     return np.where(np.isnan(result), -np.inf, result)
 
 
-def robust(z: Array, nu: float | None) -> Array:
+def cells(nu: float | Array | None, shape: tuple[int, ...]) -> float | Array | None:
+    """Degrees of freedom of whitened residuals (..., transition, cell), for this shape."""
+    if not isinstance(nu, np.ndarray) or nu.ndim == 0:
+        return nu
+    return np.broadcast_to(nu, shape).reshape(*shape[:-3], -1)
+
+
+def robust(z: Array, nu: float | Array | None) -> Array:
     """Whitened residuals of which half the squares are the negative log-density, up to a constant.
 
     Parameters
     ----------
     z : ndarray
         Residuals in units of their noise, any shape.
-    nu : float or None
-        Degrees of freedom; None for a Gaussian, whose residuals stay as they are.
+    nu : float, ndarray or None
+        Degrees of freedom; None or infinite for a Gaussian, whose residuals stay as they are.
 
     Examples
     --------
@@ -225,14 +237,20 @@ def robust(z: Array, nu: float | None) -> Array:
     """
     if nu is None:
         return z
-    return np.asarray(np.sign(z) * np.sqrt((nu + 1) * np.log1p(z**2 / nu)))
+    heavy = np.less(nu, _GAUSSIAN)
+    nu = np.where(heavy, nu, 1.0)
+    return np.asarray(np.where(heavy, np.sign(z) * np.sqrt((nu + 1) * np.log1p(z**2 / nu)), z))
 
 
-def log_norm(nu: float | None) -> float:
+def log_norm(nu: float | Array | None) -> Array:
     """Logarithm of a standard Student-t's (or normal's) density at zero."""
+    normal = np.asarray(-0.5 * math.log(2 * math.pi))
     if nu is None:
-        return -0.5 * math.log(2 * math.pi)
-    return math.lgamma((nu + 1) / 2) - math.lgamma(nu / 2) - 0.5 * math.log(nu * math.pi)
+        return normal
+    heavy = np.less(nu, _GAUSSIAN)
+    nu = np.where(heavy, nu, 1.0)
+    norm = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * np.log(nu * np.pi)
+    return np.asarray(np.where(heavy, norm, normal))
 
 
 def estimate_sigma(residual: Array, measured: Bools, sensitivity: Array | None) -> Array:
@@ -281,6 +299,7 @@ def next_state_logp(
     observations: Observations,
     noise: StartNoise | None,
     nu: float | None = None,
+    tail: Any = None,
 ) -> Any:
     """Eq. 11 as a pytensor expression, one log-density a transition.
 
@@ -296,6 +315,8 @@ def next_state_logp(
         Spread of the start state's noise.
     nu : float, optional
         Degrees of freedom of a Student-t distribution; without it, Gaussian.
+    tail : tensor, optional
+        The reciprocal for each body, shape (body,), in place of ``nu``.
     """
     measured = observations.measured
     n = len(measured)
@@ -309,8 +330,17 @@ def next_state_logp(
         z = (pt.as_tensor(noise.unmix) @ (z / noise.gain)[:, :, None])[:, :, 0]
     log_sigma = (pt.log(sigma) * measured).sum(axis=(1, 2, 3))
     count = measured.sum(axis=(1, 2, 3))
-    square = z**2 if nu is None else (nu + 1) * pt.log1p(z**2 / nu)
-    logp = -0.5 * square.sum(axis=1) - log_sigma + count * log_norm(nu)
+    if tail is None:
+        square = z**2 if nu is None else (nu + 1) * pt.log1p(z**2 / nu)
+        norm = count * log_norm(nu)
+    else:
+        every = (tail[None, :, None] * np.ones(measured.shape[1:])).reshape((1, -1))
+        heavy = pt.gt(every, 1.0 / _GAUSSIAN)
+        nus = 1.0 / pt.switch(heavy, every, 1.0)
+        square = pt.switch(heavy, (nus + 1) * pt.log1p(z**2 / nus), z**2)
+        at_zero = pt.gammaln((nus + 1) / 2) - pt.gammaln(nus / 2) - 0.5 * pt.log(nus * np.pi)
+        norm = (pt.switch(heavy, at_zero, log_norm(None)) * measured.reshape((n, -1))).sum(axis=1)
+    logp = -0.5 * square.sum(axis=1) - log_sigma + norm
     if noise is not None:
         logp = logp - noise.log_det
     return pt.switch(pt.isnan(logp), -np.inf, logp)
@@ -322,12 +352,19 @@ def next_state_random(
     noise: StartNoise | None,
     rng: np.random.Generator,
     size: Any = None,
-    nu: float | None = None,
+    nu: float | Array | None = None,
 ) -> Array:
     """Draw next states by Eq. 13, shape as ``predicted``: (..., transition, H, body, state)."""
     predicted = np.asarray(predicted)
     shape = predicted.shape
-    z = rng.standard_normal(shape) if nu is None else rng.standard_t(nu, shape)
+    if nu is None:
+        z = rng.standard_normal(shape)
+    elif np.ndim(nu) == 0:
+        z = rng.standard_t(nu, shape)
+    else:
+        heavy = np.less(nu, _GAUSSIAN)
+        heavy_z = rng.standard_t(np.where(heavy, nu, 1.0), shape)
+        z = np.where(heavy, heavy_z, rng.standard_normal(shape))
     if noise is not None:
         flat = z.reshape(*z.shape[:-3], -1)
         mixed = np.linalg.solve(noise.unmix, flat[..., None])[..., 0] * noise.gain

@@ -95,5 +95,5 @@ def log_posterior(
         Shape (...).
     """
     if log_likelihood is None:
-        log_likelihood = problem.log_density(problem.residual(phi), sigma).sum(axis=-1)
+        log_likelihood = problem.log_density(problem.residual(phi), sigma, phi).sum(axis=-1)
     return np.asarray(log_likelihood + log_prior(problem, phi, sigma, choice))

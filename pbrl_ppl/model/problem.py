@@ -10,12 +10,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, needs_inputs
+from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments, fill_hinges
 from pbrl_ppl.model.data import Data
 from pbrl_ppl.model.library import ParameterLibrary
-from pbrl_ppl.model.likelihood import Observations, log_density, next_state_random, whiten
+from pbrl_ppl.model.likelihood import (
+    Observations,
+    cells,
+    log_density,
+    next_state_random,
+    robust,
+    whiten,
+)
 from pbrl_ppl.model.noise import Noise, sigma_prior
 from pbrl_ppl.model.physics import Physics
+from pbrl_ppl.model.tails import degrees_of_freedom, tail_places
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import PartedSimulator, independent_parts
 from pbrl_ppl.scene import Scene
@@ -168,7 +177,37 @@ class Problem:
         """Residuals in units of their noise, shape (..., transition, cell)."""
         return whiten(self.residual(phi, engine), sigma, self.noise.start)
 
-    def log_density(self, residual: Array, sigma: Array) -> Array:
+    @cached_property
+    def tails(self) -> tuple[int, ...]:
+        """Where phi holds parameters of the noise's tails."""
+        return tuple(tail_places(self.physics))
+
+    def nu(self, phi: Array | None = None) -> float | Array | None:
+        """Degrees of freedom of the noise at phi; None for a Gaussian.
+
+        Shape (..., 1, 1, body, 1) where an effect of the noise stage says so.
+
+        Raises
+        ------
+        ParameterError
+            If they depend on phi, and there is none.
+        """
+        if not self.tails:
+            return self.noise.nu
+        if phi is None:
+            raise ParameterError("the noise's tails depend on the parameters; give phi")
+        return degrees_of_freedom(self.physics, phi, self.noise.nu)
+
+    def robust(self, phi: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
+        """Whitened residuals whose half squares are the negative log-density, up to a constant.
+
+        Shape (..., transition, cell).
+        """
+        residual = self.residual(phi, engine)
+        z = whiten(residual, sigma, self.noise.start)
+        return robust(z, cells(self.nu(phi), residual.shape))
+
+    def log_density(self, residual: Array, sigma: Array, phi: Array | None = None) -> Array:
         """Log-likelihood of each transition, shape (..., transition); see `likelihood`.
 
         Parameters
@@ -177,15 +216,18 @@ class Problem:
             Shape (..., transition, H, body, state).
         sigma : ndarray
             Shape (..., state).
+        phi : ndarray, optional
+            Shape (..., p); needed where the noise's tails are inferred.
         """
-        return log_density(
-            residual, sigma, self.noise.start, self.observations.measured, self.noise.nu
-        )
+        seen = self.observations.measured
+        return log_density(residual, sigma, self.noise.start, seen, self.nu(phi))
 
-    def next_states(self, states: Array, sigma: Array, rng: np.random.Generator) -> Array:
+    def next_states(
+        self, states: Array, sigma: Array, rng: np.random.Generator, phi: Array | None = None
+    ) -> Array:
         """Draw measured next states by Eq. 13 about predictions (..., transition, H, body, 6)."""
         predicted = states[..., self.observations.columns]
-        return next_state_random(predicted, sigma, self.noise.start, rng, nu=self.noise.nu)
+        return next_state_random(predicted, sigma, self.noise.start, rng, nu=self.nu(phi))
 
     def sensitivity(self, phi: Array, steps: Array) -> Array:
         """Derivative of the predictions by the measured start state, F.

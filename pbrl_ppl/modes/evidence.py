@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln, ndtr, ndtri
 from scipy.stats import truncnorm
 
-from pbrl_ppl.model import noise_law, robust
+from pbrl_ppl.model import noise_law
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior
 
@@ -84,8 +84,8 @@ class Coordinates:
         phi, sigma = self.values(z)
         problem = self.problem
         parts = [
-            problem.log_density(problem.residual(phi[i : i + _CHUNK]), sigma[i : i + _CHUNK])
-            for i in range(0, len(z), _CHUNK)
+            problem.log_density(problem.residual(phi[i:j]), sigma[i:j], phi[i:j])
+            for i, j in ((i, i + _CHUNK) for i in range(0, len(z), _CHUNK))
         ]
         return np.asarray(np.concatenate(parts).sum(axis=-1) + _log_normal(z))
 
@@ -105,7 +105,7 @@ class Coordinates:
         precision[own, own] += 2.0 * self._counts * self._spread**2
         covariance = np.linalg.inv(precision)
         # a density's mode moves with its coordinates: where the data are silent, to the origin
-        residual = np.nan_to_num(robust(mode.whitened_residual(), self.problem.noise.nu)).ravel()
+        residual = np.nan_to_num(self.problem.robust(mode.phi, mode.sigma)).ravel()
         pull = np.concatenate([-jacobian.T @ residual, np.zeros(len(own))])
         whole = covariance @ (pull - self.origin)
         tried = self.origin + np.array([0.0, 0.25, 0.5, 1.0])[:, None] * whole

@@ -8,9 +8,9 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
+from scipy.optimize import least_squares, minimize
 
-from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, log_posterior, robust
+from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, profile_sigma
 from pbrl_ppl.numerics import differentiate
 from pbrl_ppl.parameters import box, fold_wheels, inside, prior_residual
@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 #: Where a climb ended: phi, sigma and the log-posterior there.
 Peak = tuple[Array, Array, float]
 
+#: Step of a second difference in the noise's tails, and the least curvature.
+_TAIL_STEP, _LEAST_CURVATURE = 0.02, 1.0
 #: Gain in log-posterior that is not worth another round.
 STALLED = 0.02
 
@@ -109,10 +111,12 @@ def climb(
     if not priors:
         return phi, sigma, value
     steps = 1e-3 * problem.layout.scale(phi)
+    tails = list(problem.tails)
 
     def whole(points: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
-        z = problem.whitened(points, sigma, engine).reshape(*points.shape[:-1], -1)
-        z = robust(z, problem.noise.nu)
+        points = points.copy()
+        points[..., tails] = phi[tails]  # no least squares: see `_best_tails`
+        z = problem.robust(points, sigma, engine).reshape(*points.shape[:-1], -1)
         z = np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
         return np.concatenate([z, prior_residual(priors, points)], axis=-1)
 
@@ -131,10 +135,11 @@ def climb(
             residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=tries,
             ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
-        better, improved = _at(problem, result.x)
+        reached = _best_tails(problem, result.x, sigma)
+        better, improved = _at(problem, reached)
         if improved < value:
             break
-        phi, sigma, gain, value = result.x, better, improved - value, improved
+        phi, sigma, gain, value = reached, better, improved - value, improved
         if gain < STALLED:
             break
         size = np.sqrt((result.jac**2).sum(axis=0))
@@ -145,9 +150,52 @@ def climb(
 def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
     """The most probable sigma at phi, and the log-posterior there."""
     residual = problem.residual(phi)
-    sigma = profile_sigma(problem, residual)
-    likelihood = problem.log_density(residual, sigma).sum()
+    sigma = profile_sigma(problem, residual, phi)
+    likelihood = problem.log_density(residual, sigma, phi).sum()
     return sigma, float(log_posterior(problem, phi, sigma, log_likelihood=likelihood))
+
+
+def _tail_cost(problem: Problem, phi: Array, sigma: Array) -> Callable[[Array], float]:
+    """Negative log-posterior as a function of the noise's tails alone."""
+    residual, tails = np.nan_to_num(problem.residual(phi), nan=FAR_OFF), list(problem.tails)
+
+    def cost(values: Array) -> float:
+        point = phi.copy()
+        point[tails] = values
+        likelihood = problem.log_density(residual, sigma, point).sum()
+        return -float(likelihood + problem.layout.log_prior(point)[tails].sum())
+
+    return cost
+
+
+def _best_tails(problem: Problem, phi: Array, sigma: Array) -> Array:
+    """Phi with the most probable tails; a density's constant depends on them."""
+    if not problem.tails:
+        return phi
+    tails = list(problem.tails)
+    lower, upper = (end[tails] for end in box(problem.layout.priors))
+    bounds = list(zip(lower, upper, strict=True))
+    found = minimize(_tail_cost(problem, phi, sigma), phi[tails], method="L-BFGS-B", bounds=bounds)
+    result = phi.copy()
+    result[tails] = found.x
+    return result
+
+
+def _tail_precision(problem: Problem, phi: Array, sigma: Array) -> Array:
+    """Curvature of the negative log-posterior in each of the noise's tails."""
+    tails = list(problem.tails)
+    lower, upper = (end[tails] for end in box(problem.layout.priors))
+    cost = _tail_cost(problem, phi, sigma)
+    curvature = np.empty(len(tails))
+    for i, step in enumerate(np.minimum(_TAIL_STEP, 0.25 * (upper - lower))):
+        middle = phi[tails].copy()
+        middle[i] = np.clip(middle[i], lower[i] + step, upper[i] - step)
+        ends = [middle.copy(), middle, middle.copy()]
+        ends[0][i] -= step
+        ends[2][i] += step
+        below, at, above = (cost(end) for end in ends)
+        curvature[i] = max((below - 2 * at + above) / step**2, _LEAST_CURVATURE)
+    return curvature
 
 
 def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> Mode:
@@ -158,11 +206,12 @@ def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> 
         cells = problem.observations.values.size
         return Mode(problem, phi, sigma, np.zeros((cells, 0)), np.zeros((0, 0)), log_posterior)
     lower, upper = box(priors)
+    tails = list(problem.tails)
 
     def residual(points: Array, engine: PartedSimulator | None = None) -> Array:
-        z = robust(problem.whitened(points, sigma, engine), problem.noise.nu).reshape(
-            len(points), -1
-        )
+        points = points.copy()
+        points[..., tails] = phi[tails]
+        z = problem.robust(points, sigma, engine).reshape(len(points), -1)
         return np.concatenate([np.nan_to_num(z), prior_residual(priors, points)], axis=-1)
 
     begin = 1e-3 * problem.layout.scale(phi)
@@ -170,6 +219,8 @@ def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> 
     _, steps = posterior_steps(rough, phi, lower, upper, begin)
     jacobian = differentiate(residual, phi, steps, lower, upper)
     precision = jacobian.T @ jacobian
+    if tails:
+        precision[tails, tails] = _tail_precision(problem, phi, sigma)
     covariance = np.linalg.pinv(precision, hermitian=True)
     n_cells = len(jacobian) - len(phi)
     return Mode(

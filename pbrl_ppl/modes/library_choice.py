@@ -59,7 +59,7 @@ class _Combinations:
         )
         self.residual = self.observations.residual(states)
 
-    def log_joint(self, sigma: Array, nu: float | None) -> Array:
+    def log_joint(self, sigma: Array, nu: float | Array | None) -> Array:
         """Of data and combination given sigma (draw, state), shape (draw, combination)."""
         seen = self.observations.measured
         result = np.empty((len(sigma), len(self.indices)))
@@ -118,7 +118,7 @@ def choose_from_library(
 
     def density(log_sigma: Array) -> Array:
         sigma = np.exp(log_sigma) * every
-        each = [logsumexp(part.log_joint(sigma, problem.noise.nu), axis=1) for part in parts]
+        each = [logsumexp(part.log_joint(sigma, problem.nu()), axis=1) for part in parts]
         return np.asarray(np.sum(each, axis=0) + log_noise_prior(problem, log_sigma))
 
     begin = np.log(_rough_sigma(problem, parts, median))
@@ -144,7 +144,7 @@ def choose_from_library(
         sigmas.append(np.exp(log_sigma))
         index = np.zeros((draws, len(problem.scene.moving)), dtype=np.intp)
         for own, part in zip(parts, problem.simulator.parts, strict=True):
-            joint = own.log_joint(np.exp(log_sigma) * every, problem.noise.nu)
+            joint = own.log_joint(np.exp(log_sigma) * every, problem.nu())
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
             index[:, part.bodies] = own.indices[which]

@@ -17,7 +17,7 @@ FAR_OFF = 1e3
 _LEAST = 1e-9
 
 
-def profile_sigma(problem: Problem, residual: Array) -> Array:
+def profile_sigma(problem: Problem, residual: Array, phi: Array | None = None) -> Array:
     """Sigma of highest posterior density at given residuals, shape (state,).
 
     Parameters
@@ -26,11 +26,13 @@ def profile_sigma(problem: Problem, residual: Array) -> Array:
         Says which cells were measured, how the start state's noise spreads, and P(sigma).
     residual : ndarray
         Shape (transition, H, body, state).
+    phi : ndarray, optional
+        Parameters, shape (p,); needed where the noise's tails are inferred.
     """
     noise = problem.noise.start
     residual = np.nan_to_num(residual, nan=FAR_OFF)
     every = np.ones(residual.shape[-1])
-    if problem.noise.nu is None and (noise is None or problem.noise.scalar):
+    if problem.nu(phi) is None and (noise is None or problem.noise.scalar):
         z = whiten(residual, every, noise).reshape(residual.shape)
         return np.asarray(np.exp(gaussian_log_sigma(problem, (z**2).sum((0, 1, 2)))) * every)
     begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
@@ -38,7 +40,7 @@ def profile_sigma(problem: Problem, residual: Array) -> Array:
         begin = begin - np.log(np.median(noise.gain))
 
     def cost(log_sigma: Array) -> float:
-        likelihood = problem.log_density(residual, np.exp(log_sigma) * every).sum()
+        likelihood = problem.log_density(residual, np.exp(log_sigma) * every, phi).sum()
         return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
 
     bounds = [(b - 6, b + 6) for b in begin]

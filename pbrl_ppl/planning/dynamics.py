@@ -35,8 +35,8 @@ class Dynamics:
     effects : iterable of Effect or Attached
         Effects beside those that the scene declares.
     noise : tuple of ndarray, int and float, optional
-        Sigma (draw, state), the columns it is of, and the degrees of freedom or None: then
-        :meth:`noisy` works.
+        Sigma (draw, state), the columns it is of, and the degrees of freedom or None, or (draw,
+        1, 1, body, 1): then :meth:`noisy` works.
     substeps, threads : int
         Of the engine.
     declared : iterable of Effect
@@ -49,7 +49,7 @@ class Dynamics:
         phi: Array,
         effects: Iterable[Effect | Attached] = (),
         *,
-        noise: tuple[Array, tuple[int, ...], float | None] | None = None,
+        noise: tuple[Array, tuple[int, ...], float | Array | None] | None = None,
         substeps: int | None = None,
         threads: int = 2,
         declared: Iterable[Effect] = catalogue,
@@ -118,7 +118,7 @@ class Dynamics:
         return cls(
             problem.scene,
             phi[chosen],
-            noise=(sigma[chosen], problem.observations.columns, problem.noise.nu),
+            noise=(sigma[chosen], problem.observations.columns, problem.nu(phi[chosen])),
             substeps=problem.physics.substeps,
             threads=threads,
             declared=effects,
@@ -136,7 +136,9 @@ class Dynamics:
         one = copy(self)
         one.phi = self.phi[i : i + 1]
         if self._noise is not None:
-            one._noise = (self._noise[0][i : i + 1], *self._noise[1:])
+            sigma, columns, nu = self._noise
+            own = nu[i : i + 1] if isinstance(nu, np.ndarray) else nu
+            one._noise = (sigma[i : i + 1], columns, own)
         return one
 
     def mass(self, body: str) -> Array:
@@ -183,9 +185,10 @@ class Dynamics:
             raise PosteriorError("noise: these parameters are known, and have no sigma; leave it")
         sigma, columns, nu = self._noise
         out = states.copy()
-        for i, each in enumerate(sigma):
+        for i, scale in enumerate(sigma):
+            own = nu[i][0] if isinstance(nu, np.ndarray) else nu
             out[i][..., columns] = next_state_random(
-                states[i][..., columns], each, None, rng, nu=nu
+                states[i][..., columns], scale, None, rng, nu=own
             )
         return out
 

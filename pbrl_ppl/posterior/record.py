@@ -141,9 +141,10 @@ def evaluate(
         part = slice(begin, begin + size)
         own, which = np.unique(phi[part], axis=0, return_inverse=True)  # a chain stays put at times
         states = wide.predict(own)[which.ravel()]
-        likelihood[part] = problem.log_density(problem.observations.residual(states), sigma[part])
+        residual = problem.observations.residual(states)
+        likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
         predictive += [
-            problem.next_states(states[i - begin], sigma[i], rng)
+            problem.next_states(states[i - begin], sigma[i], rng, phi[i])
             for i in rows
             if begin <= i < begin + size
         ]

@@ -117,8 +117,8 @@ def emulate(
             phi, sigma = (np.array(each) for each in zip(*drawn, strict=True))
             residual = problem.residual(phi)
             told = np.array([emulator(each).copy() for each in phi])
-            exact = problem.log_density(residual, sigma).sum(axis=-1)
-            off = problem.log_density(told, sigma).sum(axis=-1) - exact
+            exact = problem.log_density(residual, sigma, phi).sum(axis=-1)
+            off = problem.log_density(told, sigma, phi).sum(axis=-1) - exact
             if np.isfinite(off).all() and off.std() < close:
                 return Emulator(problem, phi, residual, degree)
     return None

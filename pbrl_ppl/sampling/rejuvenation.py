@@ -124,29 +124,32 @@ class _Mover:
             each[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
         return np.stack([each[:, part.places].sum(axis=1) for part in self.parts], axis=1)
 
-    def likelihood(self, residual: Array, noise: Array) -> Array:
+    def likelihood(self, residual: Array, noise: Array, u: Array) -> Array:
         """Of each part, shape (particle, part), for log sigma (particle, state)."""
         problem, sigma = self.problem, np.exp(noise) * np.ones(residual.shape[-1])
-        measured = problem.observations.measured
+        measured, phi = problem.observations.measured, self.phi(u)
+        nu = problem.nu(phi)
         if len(self.parts) == 1:
-            return np.asarray(problem.log_density(residual, sigma).sum(axis=-1)[:, None])
+            return np.asarray(problem.log_density(residual, sigma, phi).sum(axis=-1)[:, None])
         result = np.empty((len(residual), len(self.parts)))
         for j, part in enumerate(self.parts):
             own = residual[..., part.bodies, :]
             seen = measured[..., part.bodies, :]
-            result[:, j] = log_density(own, sigma, None, seen, problem.noise.nu).sum(axis=-1)
+            result[:, j] = log_density(own, sigma, None, seen, _of_bodies(nu, part.bodies)).sum(
+                axis=-1
+            )
         return result
 
     def exact(self, u: Array, noise: Array) -> tuple[Array, Array]:
         """Log-density of each part, and the residuals."""
         residual = self.problem.residual(self.phi(u))
-        return self.prior(u) + self.likelihood(residual, noise), residual
+        return self.prior(u) + self.likelihood(residual, noise, u), residual
 
     def rough(self, u: Array, noise: Array) -> Array:
         """The same with the coarse engine."""
         states = self.problem.predict(self.phi(u), self.coarse) + self.correction
         residual = self.problem.observations.residual(states)
-        return self.prior(u) + self.likelihood(residual, noise)
+        return self.prior(u) + self.likelihood(residual, noise, u)
 
     def move(self, group: slice, rng: np.random.Generator) -> float:
         """One round of one group of particles; the share of its moves that was accepted."""
@@ -167,7 +170,7 @@ class _Mover:
             for j, part in enumerate(self.parts):
                 which = np.flatnonzero(accepted[:, j])[:, None]
                 residual[which, ..., part.bodies] = moved[which, ..., part.bodies]
-        self.u[group], self.noise[group] = u, self._noisy(residual, noise, rng)
+        self.u[group], self.noise[group] = u, self._noisy(residual, noise, u, rng)
         return float(np.mean(rates))
 
     def _chosen(self, accepted: Bools, y: Array, u: Array) -> Array:
@@ -211,11 +214,11 @@ class _Mover:
                 self._learn(np.mean(each, axis=0), walk)
         return u, begin - here
 
-    def _noisy(self, residual: Array, noise: Array, rng: np.random.Generator) -> Array:
+    def _noisy(self, residual: Array, noise: Array, u: Array, rng: np.random.Generator) -> Array:
         """Steps of the noise, shape (particle, state), at given residuals."""
 
         def density(at: Array) -> Array:
-            likelihood = self.likelihood(residual, at).sum(axis=1)
+            likelihood = self.likelihood(residual, at, u).sum(axis=1)
             return np.asarray(log_noise_prior(self.problem, at) + likelihood)
 
         here = density(noise)
@@ -243,3 +246,8 @@ def _spread(points: Array, columns: NDArray[np.intp]) -> Array:
         return np.zeros((0, 0))
     covariance = np.cov(points[:, columns], rowvar=False).reshape(2 * (len(columns),))
     return covariance + 1e-9 * np.diag(np.diag(covariance)) + 1e-12 * np.eye(len(columns))
+
+
+def _of_bodies(nu: float | Array | None, bodies: NDArray[np.intp]) -> float | Array | None:
+    """Degrees of freedom of some bodies."""
+    return nu[..., bodies, :] if isinstance(nu, np.ndarray) else nu

@@ -74,5 +74,5 @@ class Surrogate:
         phi, sigma, prior = self.unpack(q)
         if not np.isfinite(prior):
             return -np.inf
-        density = self.problem.log_density(self.residual(phi), sigma)
+        density = self.problem.log_density(self.residual(phi), sigma, phi)
         return prior + _FLATTER * float(density.sum())

@@ -89,7 +89,7 @@ def check_engine(idata: Any, problem: Problem) -> None:
     held = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
     first = problem_of(held, {one.effect for one in problem.physics.effects})
     phi, sigma = parameter_draws(problem, idata)
-    now = first.log_density(first.residual(phi[0]), sigma[0])
+    now = first.log_density(first.residual(phi[0]), sigma[0], phi[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()
     off = float(np.median(np.abs(now - then[:_CHECKED])))
     if not off < _SAME:

@@ -1,0 +1,80 @@
+"""The noise stage: tails of the noise that depend on the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pytensor.tensor as pt
+from numpy.typing import NDArray
+
+from pbrl_ppl.effects import Attached, Noise, at_stage
+from pbrl_ppl.model.physics import Physics
+
+Array = NDArray[np.float64]
+
+
+def tail_places(physics: Physics) -> list[int]:
+    """Where phi holds parameters of the noise stage."""
+    labels = physics.layout.labels
+    return [
+        labels.index(f"{variable}[{one.body}]")
+        for one in at_stage(physics.effects, Noise)
+        for variable in one.variables
+    ]
+
+
+def degrees_of_freedom(physics: Physics, phi: Array, nu: float | None) -> Array:
+    """Degrees of freedom of each body's noise.
+
+    Parameters
+    ----------
+    physics : Physics
+        Has the effects of the noise stage.
+    phi : ndarray
+        Parameters, shape (..., p).
+    nu : float or None
+        Those of the noise without the effects; None for a Gaussian.
+
+    Returns
+    -------
+    ndarray
+        Shape (..., 1, 1, body, 1), to go with (..., transition, H, body, state); infinite for a
+        Gaussian.
+    """
+    labels = physics.layout.labels
+
+    def value(one: Attached, variable: str) -> Array:
+        return np.asarray(phi[..., labels.index(f"{variable}[{one.body}]")])
+
+    zero = np.full(phi.shape[:-1], 0.0 if nu is None else 1.0 / nu)
+    tails = np.stack(_tails(physics, value, zero), axis=-1)[..., None, None, :, None]
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / np.maximum(tails, 0.0))
+
+
+def tail_tensor(physics: Physics, variables: Mapping[str, Any], nu: float | None) -> Any:
+    """Reciprocal degrees of freedom of each body's noise, a tensor of shape (body,)."""
+    owners = {block.name: block.owners for block in physics.layout.blocks}
+
+    def value(one: Attached, variable: str) -> Any:
+        return variables[variable][owners[variable].index(one.body)]
+
+    zero = pt.constant(0.0 if nu is None else 1.0 / nu)
+    return pt.stack(_tails(physics, value, zero))
+
+
+def _tails(physics: Physics, value: Any, zero: Any) -> list[Any]:
+    """Of each body, the sum of its effects' tails; ``value`` gives a parameter."""
+    acting = at_stage(physics.effects, Noise)
+    result = []
+    for body in physics.scene.moving:
+        tail = zero
+        for one in acting:
+            if one.body == body.name and isinstance(one.effect.stage, Noise):
+                names = [parameter.name for parameter in one.effect.parameters]
+                values = [value(one, variable) for variable in one.variables]
+                tail = tail + one.effect.stage.tail(dict(zip(names, values, strict=True)))
+        result.append(tail)
+    return result
