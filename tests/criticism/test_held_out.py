@@ -46,6 +46,6 @@ def test_other_dimensions_are_refused(histories) -> None:
     train, test = histories
     mode = find_mode(Problem.of(PUCK, train, substeps=5), seed=1)
     frame = test.to_dataframe().drop(columns="omega")
-    blind = History.from_dataframe(frame, PUCK)
+    blind = History.from_dataframe(frame, PUCK, estimate_velocities=True)
     with pytest.raises(HistoryError, match=r"test history measures x, y, theta, vx, vy, the"):
         HeldOut(blind, seed=1).gains(mode, mode)
