@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.posterior.store import DATATREE, az, group
+from pbrl_ppl.posterior.store import DATATREE, group
 
 #: With fewer draws, the tail that Pareto's law is fitted to has fewer than twenty.
 _LEAST_DRAWS = 100
@@ -80,12 +80,14 @@ def compare(before: Any, after: Any) -> Comparison | None:
         if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
             return None
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # of Pareto k, which the result says
+        # of ArviZ 0.23 about 1.0, and of Pareto k, which the result says
         warnings.simplefilter("ignore")
+        import arviz as az
+
         try:
             first = az.loo(before, pointwise=True)
             second = first if after is before else az.loo(after, pointwise=True)
-            difference, error = (0.0, 0.0) if after is before else _gain(first, second)
+            difference, error = (0.0, 0.0) if after is before else _gain(az, first, second)
         except Exception:  # whatever it is, a report can do without
             return None
     found = Comparison(_summary(first), _summary(second), difference, error, _n(first))
@@ -93,7 +95,7 @@ def compare(before: Any, after: Any) -> Comparison | None:
     return found if np.isfinite(numbers).all() else None
 
 
-def _gain(first: Any, second: Any) -> tuple[float, float]:
+def _gain(az: Any, first: Any, second: Any) -> tuple[float, float]:
     """What the second model gains, from the table that has the better one first."""
     exact = {"round_to": "none"} if DATATREE else {}
     table = az.compare({"before": first, "after": second}, **exact)
