@@ -17,7 +17,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import StartNoise, next_state_logp, next_state_random
 from pbrl_ppl.model.noise import Noise
-from pbrl_ppl.model.op import SimulatorOp
+from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
 from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.parameters import Block, Layout
@@ -130,9 +130,8 @@ def build_model(problem: Problem) -> pm.Model:
     """Declare the pm.Model of a problem; see :func:`physics_model`."""
     observations, segments, layout = problem.observations, problem.segments, problem.layout
     physics, noise = problem.physics, problem.noise
-    simulate = SimulatorOp(
-        physics.scene, layout, physics.effects, physics.substeps, physics.threads, physics.parts
-    )
+    settings = physics.scene, layout, physics.effects, physics.substeps, physics.threads
+    simulate = SimulatorOp(*settings, physics.parts)
     with pm.Model(coords=_coords(problem)) as model:
         start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
         actions = pm.Data(
@@ -157,16 +156,20 @@ def build_model(problem: Problem) -> pm.Model:
         else:
             sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
         # Eq. 7: s' = f(s, a; Phi) + eps, and Eq. 11
-        predicted = simulate(phi, start, actions)[..., list(observations.columns)]
+        columns = list(observations.columns)
+        predicted = simulate(phi, start, actions)[..., columns]
+        # the likelihood takes bodies apart that were apart in the data; in draws they may meet
+        whole = predicted
+        if len(problem.simulator.parts) > 1:
+            whole = OneWorldOp(*settings, physics.parts)(phi, start, actions)[..., columns]
         pm.CustomDist(
             "next_state",
             predicted,
+            whole,
             sigma,
-            logp=partial(
-                next_state_logp, observations=observations, noise=noise.start, nu=noise.nu
-            ),
+            logp=partial(_log_density, observations=observations, noise=noise.start, nu=noise.nu),
             random=partial(_random, noise=noise.start, nu=noise.nu),
-            signature="(h,k,d),(d)->(h,k,d)",
+            signature="(h,k,d),(h,k,d),(d)->(h,k,d)",
             observed=np.nan_to_num(observations.values),
             dims=("transition", "step", "body", "state"),
         )
@@ -227,15 +230,21 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
     return pt.stack(held)
 
 
+def _log_density(value: Any, predicted: Any, whole: Any, sigma: Any, **fixed: Any) -> Any:
+    """Of what was measured, whose bodies met or not: parts of the scene will do."""
+    return next_state_logp(value, predicted, sigma, **fixed)
+
+
 def _random(
     predicted: Any,
+    whole: Any,
     sigma: Any,
     noise: StartNoise | None,
     nu: float | None,
     rng: np.random.Generator | None = None,
     size: Any = None,
 ) -> Any:
-    return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size, nu)
+    return next_state_random(whole, sigma, noise, rng or np.random.default_rng(), size, nu)
 
 
 def _coords(problem: Problem) -> dict[str, Any]:
