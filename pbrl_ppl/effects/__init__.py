@@ -17,6 +17,7 @@ from pbrl_ppl.effects.pivot_damping import pivot_damping
 from pbrl_ppl.effects.pivot_friction import pivot_friction
 from pbrl_ppl.effects.push_offset import push_offset
 from pbrl_ppl.effects.quadratic_drag import quadratic_drag
+from pbrl_ppl.effects.sliding_friction import sliding_friction
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.scene import Scene
 
@@ -35,6 +36,7 @@ catalogue: tuple[Effect, ...] = (
     push_offset,
     actuator_rotation,
     inertia_scale,
+    sliding_friction,
 )
 
 

@@ -23,7 +23,16 @@ from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.effects.base import Force
 from pbrl_ppl.physics.properties import COLUMNS, JOINT_COLUMNS
-from pbrl_ppl.physics.world import DIVERGED, FAR, ITERATIONS_A_RATIO, MOST_ITERATIONS, TINY, World
+from pbrl_ppl.physics.world import (
+    DIVERGED,
+    FAR,
+    ITERATIONS_A_RATIO,
+    MOST_ITERATIONS,
+    RING,
+    STICKING,
+    TINY,
+    World,
+)
 
 #: The engine's functions in use, each by the name of its address.
 Functions = namedtuple(
@@ -56,9 +65,8 @@ Functions = namedtuple(
         "cpDampedRotarySpringSetDamping",
     ],
 )
-_MASS, _R, _MU_C, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(
-    len(COLUMNS)
-)
+_MASS, _R, _MU_C, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(11)
+_PATCH_MU, _PATCH_RADIUS = range(11, len(COLUMNS))
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
@@ -202,6 +210,9 @@ class Pointers(NamedTuple):
     link_rod: NDArray[np.bool_]
     pivots: NDArray[np.int64]  # (2, pivot): the motor, the damper
     pivot_body: NDArray[np.int64]
+    patches: NDArray[np.int64]  # (2, patch, point of the ring): what holds it, the rod
+    patch_body: NDArray[np.int64]
+    ring: NDArray[np.float64]
     radii: NDArray[np.float64]
     obstacles: NDArray[np.float64]
     can_touch: NDArray[np.bool_]
@@ -244,6 +255,12 @@ def pointers(world: World) -> Pointers:
             ]
         ),
         pivot_body=whole([pivot.body for pivot in pivots]),
+        patches=at(
+            [hold._constraint for patch in world.patches for hold in patch.holds]
+            + [rod._constraint for patch in world.patches for rod in patch.rods]
+        ).reshape(2, -1, len(RING)),
+        patch_body=whole([patch.body for patch in world.patches]),
+        ring=np.array(RING),
         radii=world.radii,
         obstacles=world.obstacles,
         can_touch=world.can_touch,
@@ -289,6 +306,12 @@ def _set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     for j in range(len(world.pivot_body)):
         damping = bodies[world.pivot_body[j], _DAMPING]
         _call1(fn.cpDampedRotarySpringSetDamping, world.pivots[1, j], damping)
+    for j in range(len(world.patch_body)):
+        radius = bodies[world.patch_body[j], _PATCH_RADIUS]
+        for point in range(len(world.ring)):
+            x, y = world.ring[point] * radius
+            _call2(fn.cpPivotJointSetAnchorA, world.patches[0, j, point], x, y)
+            _call2(fn.cpPinJointSetAnchorA, world.patches[1, j, point], x, y)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -305,6 +328,8 @@ def _set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-un
         torque = on * bodies[world.pivot_body[j], _TORQUE]
         _call1(fn.cpConstraintSetMaxForce, world.pivots[0, j], torque)
         _call1(fn.cpConstraintSetMaxForce, world.pivots[1, j], np.inf if on else 0.0)
+    for joint in world.patches.ravel():  # on again in every substep
+        _call1(fn.cpConstraintSetMaxForce, joint, 0.0)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -315,7 +340,7 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
     other, and numbered alike. Where nothing has touched, and nothing will, that is left out. A
     joint's stored impulse is clipped to its greatest force, here zero.
     """
-    if touched == _FREE and len(world.wheel_body) == 0 and len(world.links) == 0:
+    if touched == _FREE and len(world.wheel_body) + len(world.links) + len(world.patch_body) == 0:
         return  # nothing to forget
     if touched:
         for i in range(len(world.bodies)):
@@ -335,6 +360,31 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
     _call1(fn.cpSpaceStep, world.space, TINY)
     _call_int(fn.cpSpaceSetIterations, world.space, _iterations(world, bodies))
     _set_strengths(fn, world, bodies, normal_gravity, 1.0)
+
+
+@numba.njit(nogil=True, cache=True)
+def _place_patches(fn, world, bodies, state, step, normal_gravity):  # type: ignore[no-untyped-def]
+    """Put each point's rod along its velocity, and share its friction: as in plain.py."""
+    for j in range(len(world.patch_body)):
+        i = world.patch_body[j]
+        radius, slowing = bodies[i, _PATCH_RADIUS], bodies[i, _PATCH_MU] * normal_gravity
+        most = slowing * bodies[i, _MASS] / len(world.ring)
+        theta = state[i, 2] + state[i, 5] * step
+        c, s = math.cos(theta), math.sin(theta)
+        for point in range(len(world.ring)):
+            x, y = world.ring[point, 0] * radius, world.ring[point, 1] * radius
+            x, y = c * x - s * y, s * x + c * y
+            along_x, along_y = state[i, 3] - state[i, 5] * y, state[i, 4] + state[i, 5] * x
+            speed = math.sqrt(along_x * along_x + along_y * along_y)
+            slow = STICKING * slowing * step
+            share = 1.0 if speed >= slow else speed / slow
+            if speed == 0.0:
+                along_x, speed = 1.0, 1.0
+            x = state[i, 0] + state[i, 3] * step + x + along_x / speed
+            y = state[i, 1] + state[i, 4] * step + y + along_y / speed
+            _call2(fn.cpPinJointSetAnchorB, world.patches[1, j, point], x, y)
+            _call1(fn.cpConstraintSetMaxForce, world.patches[0, j, point], (1.0 - share) * most)
+            _call1(fn.cpConstraintSetMaxForce, world.patches[1, j, point], share * most)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -374,7 +424,19 @@ def _drive(fn, world, state, action):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def _transition(  # type: ignore[no-untyped-def]
-    fn, world, bodies, forces, force_body, force_offset, laws, start, actions, step, substeps, out
+    fn,
+    world,
+    bodies,
+    forces,
+    force_body,
+    force_offset,
+    laws,
+    start,
+    actions,
+    step,
+    substeps,
+    normal_gravity,
+    out,
 ):
     """One transition of horizon H into ``out`` (H, body, 6); says what became of it."""
     k = len(world.bodies)
@@ -427,6 +489,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 c, s = c * axes[j, 0] - s * axes[j, 1], s * axes[j, 0] + c * axes[j, 1]
                 _call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x + c, y + s)
                 _call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x - s, y + c)
+            _place_patches(fn, world, bodies, state, step, normal_gravity)
             _call1(fn.cpSpaceStep, world.space, step)
             for i in range(k):
                 body = world.bodies[i]
@@ -490,7 +553,8 @@ def rollout(  # type: ignore[no-untyped-def]
                 _forget(fn, world, bodies[p], normal_gravity, before)
                 state = _transition(
                     fn, world, bodies[p], forces, force_body, force_offset, laws[p],
-                    start[t], actions[t], time_step / counts[level], counts[level], scratch,
+                    start[t], actions[t], time_step / counts[level], counts[level],
+                    normal_gravity, scratch,
                 )  # fmt: skip
                 if state != _TOUCHED or before == _TOUCHED:
                     break

@@ -15,8 +15,16 @@ from pbrl_ppl.scene import WORLD, Scene
 Array = NDArray[np.float64]
 
 #: Columns of a body's properties. ``moment`` is about the centroid (kg m^2); ``pivot_torque`` (N m)
-#: and ``pivot_damping`` (N m s) act in the body's hinge.
-COLUMNS = (*BODY_PARAMETERS, "moment", "pivot_torque", "pivot_damping")
+#: and ``pivot_damping`` (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m)
+#: are of the friction under it.
+COLUMNS = (
+    *BODY_PARAMETERS,
+    "moment",
+    "pivot_torque",
+    "pivot_damping",
+    "patch_mu",
+    "patch_radius",
+)
 COLUMN = {name: i for i, name in enumerate(COLUMNS)}
 #: Columns of a joint's properties: its anchors and its length (m).
 JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
@@ -55,6 +63,15 @@ class EngineInput(NamedTuple):
     indices: NDArray[np.int64]
 
 
+def _is_patch(one: Attached) -> bool:
+    """Whether an effect puts friction under its body: it is tried."""
+    if one.effect.modify is None:
+        return False
+    row = {name: np.ones(1) for name in COLUMNS}
+    one.effect.modify(row, {p.name: np.array([p.prior.centre]) for p in one.effect.parameters})
+    return bool((row["patch_mu"] != 1.0).any())
+
+
 class EngineProperties:
     """Translates parameter vectors for the engine.
 
@@ -90,6 +107,8 @@ class EngineProperties:
             for one in effects
             if one.effect.modify is not None
         ]
+        #: Which bodies have friction under them.
+        self.patches = tuple(sorted({bodies.index(one.body) for one in effects if _is_patch(one)}))
         self._laws = [
             value
             for one in effects
