@@ -48,3 +48,10 @@ from .scene import Wall as Wall
 
 __version__: str
 __all__: list[str]
+from .effects import Command as Command
+from .effects import Disc as Disc
+from .effects import Force as Force
+from .effects import Noise as Noise
+from .effects import Properties as Properties
+from .effects import Sensor as Sensor
+from .effects import Structure as Structure

@@ -49,6 +49,10 @@ class RefitWarning(UserWarning):
     """An update for which the earlier draws were no use, so that all data were fitted anew."""
 
 
+class MeetingWarning(UserWarning):
+    """A fit in which bodies meet that were thought apart: it was made again with them together."""
+
+
 class FitError(PbrlError, ValueError):
     """A model that cannot be fitted as asked."""
 

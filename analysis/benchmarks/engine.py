@@ -27,6 +27,7 @@ import pytensor
 import pytensor.tensor as pt
 
 from pbrl_ppl import Body, Scene, Shape, Simulator, SimulatorOp
+from pbrl_ppl.history import fill_hinges
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import calls, pointers
@@ -88,6 +89,16 @@ def cart_data(n: int) -> tuple[np.ndarray, np.ndarray]:
     return start, rng.normal(0, [40.0, 40.0, 5.0], (n, 1, 1, 3))
 
 
+def hung(scene: Scene, start: np.ndarray) -> np.ndarray:
+    """Start states (n, body, 6) with hinged bodies where their hinges hold them."""
+    start = start.copy()
+    for i, body in enumerate(scene.dynamic):
+        if any(body.name in (joint.bodies or ()) for joint in scene.joints):
+            start[:, i, [0, 1, 3, 4]] = np.nan  # they follow from theta and omega
+    fill_hinges(start[:, None], scene)
+    return start
+
+
 def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Furniture about its reference poses, moving; pushes on all of it; parameters."""
     rng = np.random.default_rng(2)
@@ -96,7 +107,7 @@ def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.nda
     start[..., :3] += [body.pose for body in scene.dynamic]
     layout = build_layout(scene)
     phi = np.array([prior.centre for prior in layout.priors])
-    return phi, start, rng.normal(0, [60.0, 60.0, 10.0], (n, 1, k, 3))
+    return phi, hung(scene, start), rng.normal(0, [60.0, 60.0, 10.0], (n, 1, k, 3))
 
 
 def naive(

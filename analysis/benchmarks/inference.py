@@ -39,7 +39,7 @@ from pbrl_ppl.posterior.store import az, convergence, group
 from pbrl_ppl.sampling.fitting import METHODS
 
 sys.path.insert(0, str(Path(__file__).parent))
-from engine import ROUNDS, machine, naive
+from engine import ROUNDS, hung, machine, naive
 
 MODELS = Path(__file__).parents[2] / "models"
 NOISE = np.array([0.002, 0.002, 0.004, 0.01, 0.01, 0.02])  # of motion capture
@@ -102,7 +102,7 @@ def apartment(n: int) -> tuple[pp.Scene, pp.History]:
     start[..., :3] += [body.pose for body in scene.dynamic]
     mass = phi[[layout.index("mass", body.name) for body in scene.dynamic]]
     actions = rng.normal(0, [3.0, 3.0, 0.8], (n, k, 3)) * mass[:, None]
-    return scene, simulate(scene, phi, start, actions, NOISE, 4)
+    return scene, simulate(scene, phi, hung(scene, start), actions, NOISE, 4)
 
 
 def furniture(n: int, joined: bool) -> tuple[pp.Scene, pp.History]:

@@ -31,9 +31,9 @@ DRAWS, STARTS, SEED = 16, 20, 0
 WHEEL, TAIL = -0.25, 0.25
 #: How far off its heading the goal may then be (rad).
 AHEAD = np.radians(20.0)
-#: Nodes of a plan under all draws, whose guide under one may have as many for each draw; a plan
-#: with the mode may have both numbers together, which is as much of the engine's work.
-NODES = 5_000
+#: States that a plan may generate, each draw's own: as much of the engine's work with the mode as
+#: with draws.
+NODES = 160_000
 #: Intervals that are played of a plan, and in all.
 EVERY, INTERVALS = 20, 120
 PUSHES = pp.ActionSet.box(
@@ -89,13 +89,12 @@ def success(idata: object, starts: np.ndarray, draws: int | None) -> tuple[float
     """
     truth = Dynamics.known(walled(), CART)
     goal = pp.Goal.of({"cart": (3.0, 0.0, 0.0)})  # 0.1 m, 0.1 rad
-    nodes = NODES if draws else 2 * NODES * DRAWS
     reached, begin = [], time.perf_counter()
     for start in starts:
         world = World(truth, start)
         done = pp.act(
             world, idata, world.state, goal, PUSHES, every=EVERY, intervals=INTERVALS, draws=draws,
-            nodes=nodes, seconds=600.0, weight=5.0,
+            nodes=NODES, weight=5.0,
         )  # fmt: skip
         reached.append(done.reached)
     return float(np.mean(reached)), (time.perf_counter() - begin) / len(starts)
@@ -151,7 +150,7 @@ def open_loop(idata: object, starts: np.ndarray, draws: int | None, nodes: int) 
     for i, start in enumerate(starts):
         plan = pp.plan(
             idata, {"cart": start}, goal, PUSHES, draws=draws, tail=TAIL if draws else 1.0,
-            nodes=nodes if draws else 2 * nodes * DRAWS, seconds=600.0, weight=1.5,
+            nodes=nodes, weight=1.5,
         )  # fmt: skip
         for j, truth in enumerate(truths):
             end = truth.rollout(plan.start, plan.wrenches)[0, -1]
@@ -160,7 +159,7 @@ def open_loop(idata: object, starts: np.ndarray, draws: int | None, nodes: int) 
 
 
 def compared(
-    idata: object, count: int, nodes: int = 20_000
+    idata: object, count: int, nodes: int = 640_000
 ) -> tuple[np.ndarray, np.ndarray, float]:
     """Which plays reach with the mode and with draws, and how likely by chance so many more.
 

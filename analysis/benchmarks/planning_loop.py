@@ -68,7 +68,7 @@ def final_distances(posterior: Path, starts: np.ndarray) -> np.ndarray:
     found = []
     for start in starts:
         state = np.concatenate([start, np.zeros(3)])
-        plan = pp.plan(idata, state[None], GOAL, PUSHES, nodes=NODES, seconds=600.0)
+        plan = pp.plan(idata, state[None], GOAL, PUSHES, nodes=NODES)
         end = world.rollout(world.CART, state, plan.wrenches[:, 0], effects)[-1]
         found.append(float(GOAL.distance(plan.scene, end[None])))
     return np.array(found)

@@ -11,7 +11,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.calibration.ranks import MOST_DRAWS, rank
-from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError, UninformedWarning
+from pbrl_ppl.errors import (
+    BoundWarning,
+    ConvergenceWarning,
+    FitError,
+    MeetingWarning,
+    UninformedWarning,
+)
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.model import Problem, build_model, prior_predictive_draws
 from pbrl_ppl.parameters import fold_wheels
@@ -135,7 +141,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     for again in range(_AGAIN + 1):
         with warnings.catch_warnings():
             # convergence is in the result; the others are of made-up data
-            for kind in (ConvergenceWarning, BoundWarning, UninformedWarning):
+            for kind in (ConvergenceWarning, BoundWarning, MeetingWarning, UninformedWarning):
                 warnings.simplefilter("ignore", kind)
             idata = fit(model, seed=seed, progress=False, **settings)
         if "interrupted" in idata.attrs:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -51,7 +51,13 @@ def plan(
     contact_penalty: Annotated[
         float | None, typer.Option(help="Cost of a second in contact (s); inf forbids it.")
     ] = None,
-    seconds: Annotated[float, typer.Option(help="Limit of the search (s).")] = 60.0,
+    nodes: Annotated[
+        int | None, typer.Option(min=1, help="States that the search generates at most.")
+    ] = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(help="Another limit (s); the plan then depends on the machine's load."),
+    ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
     animate: Annotated[
         Path | None,
@@ -90,10 +96,11 @@ def plan(
             wanted = Goal.of(dict(_pose(text, only, "--goal") for text in goal or ()), **given)
         places = dict(_pose(text, only, "--start") for text in start or ())
         allowed = None if actions is None else ActionSet.load(actions)
+        limit: dict[str, Any] = {} if nodes is None else {"nodes": nodes}
         progress("planning")
         result = make_plan(
             idata, places, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,
-            seconds=seconds, seed=seed, progress=progress,
+            seconds=seconds, seed=seed, progress=progress, **limit,
         )  # fmt: skip
         if output is not None:
             result.save(output)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.posterior import Identifiability
+from pbrl_ppl.posterior import Comparison, Identifiability
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
@@ -212,6 +212,8 @@ class Findings:
         Seed, versions, hash of the data, number of transitions, horizons.
     identifiability : Identifiability or None
         Which parameters of the model after revision the data inform.
+    loo : Comparison or None
+        Leave-one-out cross-validation of both models on the data they were fitted to.
     """
 
     scene: Scene
@@ -232,6 +234,7 @@ class Findings:
     rollout_horizon: int
     provenance: Mapping[str, Any]
     identifiability: Identifiability | None = None
+    loo: Comparison | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of ``report.json``; numbers that are not finite become null."""
@@ -271,6 +274,7 @@ class Findings:
                     "noise_floor": vars(self.noise_floor),
                 },
                 "identifiability": self.identifiability and self.identifiability.to_dict(),
+                "loo": self.loo and self.loo.to_dict(),
                 "provenance": self.provenance,
             }
         )

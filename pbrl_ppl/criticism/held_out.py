@@ -65,7 +65,7 @@ class HeldOut:
         if horizon not in known:
             problem = self.problem(mode, horizon)
             measured = problem.observations.measured.reshape(problem.segments.n, -1)
-            sensitivity = problem.sensitivity(mode.phi, mode.sigma)
+            sensitivity = problem.sensitivity(mode.phi, mode.sigma, problem.one_world)
             start = StartNoise.of(sensitivity, measured, mode.sigma)
             known[horizon] = problem.with_noise(start=start)
         return known[horizon]
@@ -147,7 +147,7 @@ class HeldOut:
         spread = np.nanstd(measured, axis=0)
         body = int(np.argmax(np.nansum(spread / np.maximum(revised.sigma, 1e-12), axis=1)))
         predictions = [
-            np.concatenate([start, mode.problem.simulator(mode.phi, start, actions)[0]])
+            np.concatenate([start, mode.problem.one_world(mode.phi, start, actions)[0]])
             for mode in (declared, revised)
         ]
         origin = np.where(np.isfinite(start[0, body]), start[0, body], np.nan)
@@ -178,13 +178,13 @@ def _laplace_draws(mode: Mode, rng: np.random.Generator) -> tuple[Array, Array]:
 
 def _elpd(problem: Problem, phi: Array, sigma: Array) -> Array:
     """Log predictive density of each held-out transition, shape (transition,)."""
-    density = problem.log_density(problem.residual(phi), sigma, phi)
+    density = problem.log_density(problem.residual(phi, problem.one_world), sigma, phi)
     return np.asarray(logsumexp(density, axis=0) - np.log(len(phi)))
 
 
 def _rmse(problem: Problem, mode: Mode) -> dict[str, float]:
     """Error at the end of the horizon, per state dimension."""
-    residual = problem.residual(mode.phi)[:, -1]
+    residual = problem.residual(mode.phi, problem.one_world)[:, -1]
     seen = problem.observations.measured[:, -1]
     square = (residual**2).sum((0, 1)) / np.maximum(seen.sum((0, 1)), 1)
     return dict(zip(problem.observations.names, np.sqrt(square).tolist(), strict=True))
@@ -199,4 +199,4 @@ def _normalised(scale: Problem, mode: Mode, unit: Mode) -> float:
 def _whitened(scale: Problem, mode: Mode, unit: Mode) -> Array:
     physics = mode.problem.physics
     model = scale.with_physics(effects=physics.effects, substeps=physics.substeps)
-    return model.whitened(mode.phi, unit.sigma)
+    return model.whitened(mode.phi, unit.sigma, model.one_world)

@@ -21,8 +21,8 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.parameters import inside
+from pbrl_ppl.posterior import compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
-from pbrl_ppl.posterior import identify, interval, versions
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Scene
 
@@ -304,6 +304,7 @@ class _Loop:
                 "rollout_seconds": rollout * self.scene.time_step,
             },
             identifiability=identify(after, mode=revised),
+            loo=compare(before, after),
         )
 
 

@@ -130,7 +130,7 @@ def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> Pr
     phi = problem.layout.to_vectors(drawn, draws)
     ends = np.concatenate(
         [
-            problem.predict(phi[i : i + _CHUNK])[..., -1, :, :][..., columns]
+            problem.predict(phi[i : i + _CHUNK], problem.one_world)[..., -1, :, :][..., columns]
             for i in range(0, len(phi), _CHUNK)
         ]
     )

@@ -18,6 +18,7 @@ from pbrl_ppl.effects.pivot_friction import pivot_friction
 from pbrl_ppl.effects.push_offset import push_offset
 from pbrl_ppl.effects.quadratic_drag import quadratic_drag
 from pbrl_ppl.effects.sensor_bias import sensor_bias
+from pbrl_ppl.effects.sliding_friction import sliding_friction
 
 #: Where two effects cannot be told apart, the earlier one is named: a hinge's own friction before
 #: drag on a body, which looks the same on a single pendulum, and the simpler before the richer.
@@ -33,6 +34,7 @@ catalogue: tuple[Effect, ...] = (
     push_offset,
     actuator_rotation,
     inertia_scale,
+    sliding_friction,
     actuator_delay,
     dead_zone,
     mass_change,

@@ -16,13 +16,12 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
-    Observations,
     StartNoise,
     next_state_logp,
     next_state_random,
 )
 from pbrl_ppl.model.noise import Noise
-from pbrl_ppl.model.op import SimulatorOp
+from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
 from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.model.tails import tail_tensor
@@ -136,9 +135,8 @@ def build_model(problem: Problem) -> pm.Model:
     """Declare the pm.Model of a problem; see :func:`physics_model`."""
     observations, segments, layout = problem.observations, problem.segments, problem.layout
     physics, noise = problem.physics, problem.noise
-    simulate = SimulatorOp(
-        physics.scene, layout, physics.effects, physics.substeps, physics.threads, physics.parts
-    )
+    settings = physics.scene, layout, physics.effects, physics.substeps, physics.threads
+    simulate = SimulatorOp(*settings, physics.parts)
     with pm.Model(coords=_coords(problem)) as model:
         start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
         actions = pm.Data("actions", problem.inputs, dims=("transition", "step", "body", "wrench"))
@@ -161,21 +159,23 @@ def build_model(problem: Problem) -> pm.Model:
         else:
             sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
         # Eq. 7: s' = f(s, a; Phi) + eps, and Eq. 11
-        predicted = simulate(phi, start, actions)[..., list(observations.columns)]
-        logp = partial(next_state_logp, observations=observations, noise=noise.start, nu=noise.nu)
-        random, of = partial(_random, noise=noise.start, nu=noise.nu), [predicted, sigma]
-        signature = "(h,k,d),(d)->(h,k,d)"
-        if problem.tails:
-            of.append(tail_tensor(physics, table1, noise.nu))
-            logp = partial(_tailed_logp, observations=observations, noise=noise.start)
-            random = partial(_tailed_random, noise=noise.start)
-            signature = "(h,k,d),(d),(k)->(h,k,d)"
+        columns = list(observations.columns)
+        predicted = simulate(phi, start, actions)[..., columns]
+        # the likelihood takes bodies apart that were apart in the data; in draws they may meet
+        whole = predicted
+        if len(problem.simulator.parts) > 1:
+            whole = OneWorldOp(*settings, physics.parts)(phi, start, actions)[..., columns]
+        shape: dict[str, Any] = {"noise": noise.start, "nu": noise.nu}
+        tail = [tail_tensor(physics, table1, noise.nu)] if problem.tails else []
         pm.CustomDist(
             "next_state",
-            *of,
-            logp=logp,
-            random=random,
-            signature=signature,
+            predicted,
+            whole,
+            sigma,
+            *tail,
+            logp=partial(_log_density, observations=observations, **shape),
+            random=partial(_random, **shape),
+            signature=f"(h,k,d),(h,k,d),(d){',(k)' * len(tail)}->(h,k,d)",
             observed=np.nan_to_num(observations.values),
             dims=("transition", "step", "body", "state"),
         )
@@ -236,39 +236,29 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
     return pt.stack(held)
 
 
+def _log_density(
+    value: Any, predicted: Any, whole: Any, sigma: Any, *tail: Any, **fixed: Any
+) -> Any:
+    """Of what was measured, whose bodies met or not: parts of the scene will do."""
+    return next_state_logp(value, predicted, sigma, tail=tail[0] if tail else None, **fixed)
+
+
 def _random(
     predicted: Any,
+    whole: Any,
     sigma: Any,
+    *tail: Any,
     noise: StartNoise | None,
     nu: float | None,
     rng: np.random.Generator | None = None,
     size: Any = None,
 ) -> Any:
-    return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size, nu)
-
-
-def _tailed_logp(
-    value: Any,
-    predicted: Any,
-    sigma: Any,
-    tail: Any,
-    observations: Observations,
-    noise: StartNoise | None,
-) -> Any:
-    return next_state_logp(value, predicted, sigma, observations, noise, tail=tail)
-
-
-def _tailed_random(
-    predicted: Any,
-    sigma: Any,
-    tail: Any,
-    noise: StartNoise | None,
-    rng: np.random.Generator | None = None,
-    size: Any = None,
-) -> Any:
+    rng = rng or np.random.default_rng()
+    if not tail:
+        return next_state_random(whole, sigma, noise, rng, size, nu)
     with np.errstate(divide="ignore"):
-        nu = 1.0 / np.asarray(tail, dtype=float)[..., :, None]
-    return next_state_random(predicted, sigma, noise, rng or np.random.default_rng(), size, nu)
+        own = 1.0 / np.asarray(tail[0], dtype=float)[..., :, None]
+    return next_state_random(whole, sigma, noise, rng, size, own)
 
 
 def _coords(problem: Problem) -> dict[str, Any]:

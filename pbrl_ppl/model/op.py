@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numba
@@ -17,7 +18,7 @@ from pytensor.link.numba.dispatch.basic import numba_funcify
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import PartedSimulator, Parts
+from pbrl_ppl.physics import OneWorld, PartedSimulator, Parts
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, WRENCH
 
@@ -147,6 +148,28 @@ class SimulatorOp(_EngineOp):
         ]
 
     L_op = pullback  # its name in pytensor 2
+
+
+class OneWorldOp(_EngineOp):
+    """As :class:`SimulatorOp`, but bodies of different parts may meet; without a derivative.
+
+    Draws of next states (prior and posterior predictive) are about its predictions.
+    """
+
+    @property
+    def _last(self) -> tuple[int, ...]:
+        return len(self.scene.moving), 6
+
+    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+        return self.one_world(phi, start, actions)
+
+    @cached_property
+    def one_world(self) -> OneWorld:
+        """The engine."""
+        return OneWorld(
+            self.scene, self.layout, self.effects, self.parts, substeps=self.substeps,
+            threads=self.threads,
+        )  # fmt: skip
 
 
 class JacobianOp(_EngineOp):

@@ -8,7 +8,7 @@ from functools import cached_property
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.model.table1 import build_layout
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import PartedSimulator, Parts
+from pbrl_ppl.physics import OneWorld, PartedSimulator, Parts
 from pbrl_ppl.scene import Scene
 
 #: Engine steps an interval where a rough answer will do.
@@ -33,6 +33,8 @@ class Physics:
         Engine worlds that run side by side.
     extrapolate : bool
         Whether the engine's leading errors are cancelled.
+    together : tuple of str
+        Bodies that are in one part whatever the history says: in predictions they met.
     """
 
     scene: Scene
@@ -41,6 +43,7 @@ class Physics:
     substeps: int
     threads: int = 1
     extrapolate: bool = True
+    together: tuple[str, ...] = ()
     layout: Layout = field(init=False)
 
     def __post_init__(self) -> None:
@@ -54,6 +57,19 @@ class Physics:
     def simulator(self) -> PartedSimulator:
         """The engine for this scene with these effects."""
         return PartedSimulator(
+            self.scene,
+            self.layout,
+            self.effects,
+            self.parts,
+            substeps=self.substeps,
+            threads=self.threads,
+            extrapolate=self.extrapolate,
+        )
+
+    @cached_property
+    def one_world(self) -> OneWorld:
+        """The engine for predictions, in which bodies of different parts may meet."""
+        return OneWorld(
             self.scene,
             self.layout,
             self.effects,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -26,10 +27,15 @@ from pbrl_ppl.model.noise import Noise, sigma_prior
 from pbrl_ppl.model.physics import Physics
 from pbrl_ppl.model.tails import degrees_of_freedom, tail_places
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import PartedSimulator, independent_parts
+from pbrl_ppl.physics import OneWorld, PartedSimulator, Parts, independent_parts, joined_parts
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
+
+#: Phi, start states and wrenches in, next states out.
+Engine = Callable[[Array, Array, Array], Array]
+#: How far predictions may differ and be the same to the likelihood, in units of the noise.
+_SAME = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +74,7 @@ class Problem:
         columns: tuple[int, ...] | None = None,
         noise: Noise | None = None,
         library: ParameterLibrary | None = None,
+        together: tuple[str, ...] = (),
     ) -> Problem:
         """Build one from a scene and a history; by default all is as in the paper.
 
@@ -79,9 +86,10 @@ class Problem:
             Physics(
                 scene,
                 effects,
-                independent_parts(scene, history),
+                _parts(scene, history, together),
                 scene.substeps if substeps is None else substeps,
                 threads,
+                together=together,
             ),
             Noise() if noise is None else noise,
             library,
@@ -99,13 +107,16 @@ class Problem:
         """
         physics = self.physics
         if data.history is not self.data.history:
-            physics = physics.changed(parts=independent_parts(physics.scene, data.history))
+            parts = _parts(physics.scene, data.history, physics.together)
+            physics = physics.changed(parts=parts)
         return replace(self, data=data, physics=physics, noise=replace(self.noise, start=None))
 
     def with_physics(self, **changes: Any) -> Problem:
         """The same problem with other physics; arguments are fields of :class:`Physics`."""
-        if "scene" in changes:
-            changes["parts"] = independent_parts(changes["scene"], self.data.history)
+        if "scene" in changes or "together" in changes:
+            scene = changes.get("scene", self.scene)
+            together = changes.get("together", self.physics.together)
+            changes["parts"] = _parts(scene, self.data.history, together)
         return replace(self, physics=self.physics.changed(**changes))
 
     def with_noise(self, **changes: Any) -> Problem:
@@ -116,6 +127,28 @@ class Problem:
     def coarse(self) -> Problem:
         """The same problem with few engine steps."""
         return replace(self, physics=self.physics.coarse)
+
+    def joined(self, phi: Array, sigma: Array) -> Problem:
+        """The same problem with the bodies in one part that meet in one world; itself if none do.
+
+        Parameters
+        ----------
+        phi, sigma : ndarray
+            Draws at which to look, shapes (n, p) and (n, state).
+        """
+        segments, columns = self.segments, list(self.observations.columns)
+        states, met = self.one_world.told(phi, segments.start, self.inputs)
+        if not met.any():
+            return self
+        off = abs(self.observations.wrapped((states - self.predict(phi))[..., columns]))
+        matters = np.any(~(off <= _SAME * sigma[:, None, None, None]), axis=(2, 3, 4))
+        names = [body.name for body in self.scene.moving]
+        own = [
+            names[i] for i in np.flatnonzero((met & np.expand_dims(matters, -1)).any(axis=(0, 1)))
+        ]
+        if not own:
+            return self
+        return self.with_physics(together=tuple(dict.fromkeys((*self.physics.together, *own))))
 
     @property
     def scene(self) -> Scene:
@@ -129,8 +162,13 @@ class Problem:
 
     @property
     def simulator(self) -> PartedSimulator:
-        """The engine."""
+        """The engine of the likelihood, in parts."""
         return self.physics.simulator
+
+    @property
+    def one_world(self) -> OneWorld:
+        """The engine of predictions, in which bodies that were apart in the data may meet."""
+        return self.physics.one_world
 
     @property
     def segments(self) -> Segments:
@@ -165,15 +203,15 @@ class Problem:
         noise = {"sigma": sigma[0] if self.noise.scalar else sigma}
         return self.layout.to_dict(phi) | noise
 
-    def predict(self, phi: Array, engine: PartedSimulator | None = None) -> Array:
+    def predict(self, phi: Array, engine: Engine | None = None) -> Array:
         """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""
         return (engine or self.simulator)(phi, self.segments.start, self.inputs)
 
-    def residual(self, phi: Array, engine: PartedSimulator | None = None) -> Array:
+    def residual(self, phi: Array, engine: Engine | None = None) -> Array:
         """Measured minus predicted, shape (..., transition, H, body, state)."""
         return self.observations.residual(self.predict(phi, engine))
 
-    def whitened(self, phi: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
+    def whitened(self, phi: Array, sigma: Array, engine: Engine | None = None) -> Array:
         """Residuals in units of their noise, shape (..., transition, cell)."""
         return whiten(self.residual(phi, engine), sigma, self.noise.start)
 
@@ -229,7 +267,7 @@ class Problem:
         predicted = states[..., self.observations.columns]
         return next_state_random(predicted, sigma, self.noise.start, rng, nu=self.nu(phi))
 
-    def sensitivity(self, phi: Array, steps: Array) -> Array:
+    def sensitivity(self, phi: Array, steps: Array, engine: Engine | None = None) -> Array:
         """Derivative of the predictions by the measured start state, F.
 
         Parameters
@@ -264,7 +302,11 @@ class Problem:
                     # what was not measured follows through the hinges, else stays
                     fill_hinges(moved[:, None], self.scene)
                     moved = np.where(np.isfinite(moved), moved, start)
-                    ends.append(self.simulator(phi, moved, self.inputs))
+                    ends.append((engine or self.simulator)(phi, moved, self.inputs))
                 difference = (ends[0] - ends[1])[..., columns] / (2 * h)
                 result.append(difference.reshape(n, -1))
         return np.stack(result, axis=-1)
+
+
+def _parts(scene: Scene, history: History, together: tuple[str, ...]) -> Parts:
+    return joined_parts(independent_parts(scene, history), together)

@@ -1,11 +1,13 @@
 """The engine: world building, wheel, joints and the batched rollout; alone in importing pymunk."""
 
-from pbrl_ppl.physics.coupling import Parts, independent_parts
+from pbrl_ppl.physics.coupling import Parts, independent_parts, joined_parts
+from pbrl_ppl.physics.one_world import OneWorld
 from pbrl_ppl.physics.parts import Part, PartedSimulator
 from pbrl_ppl.physics.placement import check_history, check_placement, overlap
 from pbrl_ppl.physics.simulator import Simulator
 
 __all__ = [
+    "OneWorld",
     "Part",
     "PartedSimulator",
     "Parts",
@@ -13,5 +15,6 @@ __all__ = [
     "check_history",
     "check_placement",
     "independent_parts",
+    "joined_parts",
     "overlap",
 ]

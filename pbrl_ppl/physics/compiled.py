@@ -15,12 +15,12 @@ from pbrl_ppl.physics.world import (
     ITERATIONS_A_RATIO,
     MOST_ITERATIONS,
     NO_SIZE,
+    STICKING,
     TINY,
 )
 
-_MASS, _R, _MU_C, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(
-    len(COLUMNS)
-)
+_MASS, _R, _MU_C, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(11)
+_PATCH_MU, _PATCH_RADIUS = range(11, len(COLUMNS))
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
@@ -64,6 +64,12 @@ def _set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     for j in range(len(world.pivot_body)):
         damping = bodies[world.pivot_body[j], _DAMPING]
         call1(fn.cpDampedRotarySpringSetDamping, world.pivots[1, j], damping)
+    for j in range(len(world.patch_body)):
+        radius = bodies[world.patch_body[j], _PATCH_RADIUS]
+        for point in range(len(world.ring)):
+            x, y = world.ring[point] * radius
+            call2(fn.cpPivotJointSetAnchorA, world.patches[0, j, point], x, y)
+            call2(fn.cpPinJointSetAnchorA, world.patches[1, j, point], x, y)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -97,6 +103,8 @@ def _set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-un
         torque = on * bodies[world.pivot_body[j], _TORQUE]
         call1(fn.cpConstraintSetMaxForce, world.pivots[0, j], torque)
         call1(fn.cpConstraintSetMaxForce, world.pivots[1, j], np.inf if on else 0.0)
+    for joint in world.patches.ravel():  # on again in every substep
+        call1(fn.cpConstraintSetMaxForce, joint, 0.0)
 
 
 @numba.njit(nogil=True, cache=True)
@@ -107,7 +115,7 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
     other, and numbered alike. Where nothing has touched, and nothing will, that is left out. A
     joint's stored impulse is clipped to its greatest force, here zero.
     """
-    if touched == _FREE and len(world.wheel_body) == 0 and len(world.links) == 0:
+    if touched == _FREE and len(world.wheel_body) + len(world.links) + len(world.patch_body) == 0:
         return  # nothing to forget
     if touched:
         for i in range(len(world.bodies)):
@@ -214,6 +222,31 @@ def _place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-unty
 
 
 @numba.njit(nogil=True, cache=True)
+def _place_patches(fn, world, bodies, state, step, normal_gravity):  # type: ignore[no-untyped-def]
+    """Put each point's rod along its velocity, and share its friction: as in plain.py."""
+    for j in range(len(world.patch_body)):
+        i = world.patch_body[j]
+        radius, slowing = bodies[i, _PATCH_RADIUS], bodies[i, _PATCH_MU] * normal_gravity
+        most = slowing * bodies[i, _MASS] / len(world.ring)
+        theta = state[i, 2] + state[i, 5] * step
+        c, s = math.cos(theta), math.sin(theta)
+        for point in range(len(world.ring)):
+            x, y = world.ring[point, 0] * radius, world.ring[point, 1] * radius
+            x, y = c * x - s * y, s * x + c * y
+            along_x, along_y = state[i, 3] - state[i, 5] * y, state[i, 4] + state[i, 5] * x
+            speed = math.sqrt(along_x * along_x + along_y * along_y)
+            slow = STICKING * slowing * step
+            share = 1.0 if speed >= slow else speed / slow
+            if speed == 0.0:
+                along_x, speed = 1.0, 1.0
+            x = state[i, 0] + state[i, 3] * step + x + along_x / speed
+            y = state[i, 1] + state[i, 4] * step + y + along_y / speed
+            call2(fn.cpPinJointSetAnchorB, world.patches[1, j, point], x, y)
+            call1(fn.cpConstraintSetMaxForce, world.patches[0, j, point], (1.0 - share) * most)
+            call1(fn.cpConstraintSetMaxForce, world.patches[1, j, point], share * most)
+
+
+@numba.njit(nogil=True, cache=True)
 def _drive(fn, world, state, action):  # type: ignore[no-untyped-def]
     """Give the kinematic bodies the velocities of the interval that begins."""
     for i in range(len(world.bodies)):
@@ -266,6 +299,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 call2(fn.cpBodySetForce, world.bodies[i], wrench[i, 0], wrench[i, 1])
                 call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
             _place_wheels(fn, world, bodies, state, axes, step)
+            _place_patches(fn, world, bodies, state, step, normal_gravity)
             call1(fn.cpSpaceStep, world.space, step)
             for i in range(k):
                 body = world.bodies[i]

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
 from pbrl_ppl.history import History
@@ -10,9 +13,29 @@ from pbrl_ppl.scene import WORLD, Scene
 
 #: Room that bodies must leave each other: a share of their size, and of how far they move apart or
 #: towards each other in an interval, within which they do not go straight.
-_SHARE = 0.25
+SHARE = 0.25
 
 Parts = tuple[tuple[str, ...], ...]
+Array = NDArray[np.float64]
+
+
+def joined_parts(parts: Parts, together: Collection[str]) -> Parts:
+    """The parts, with those that hold any of these bodies made one.
+
+    Examples
+    --------
+    >>> joined_parts((("a", "b"), ("c",), ("d",)), ["b", "d"])
+    (('a', 'b', 'd'), ('c',))
+    """
+    one = tuple(name for part in parts if set(part) & set(together) for name in part)
+    if not one:
+        return parts
+    first = next(part for part in parts if part[0] == one[0])
+    return tuple(
+        one if part is first else part
+        for part in parts
+        if part is first or not set(part) & set(together)
+    )
 
 
 def independent_parts(scene: Scene, history: History) -> Parts:
@@ -21,7 +44,8 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     A kinematic body counts as any other: bodies that it meets are in one part, for it is in one.
 
     Each part has a likelihood of its own given the noise, so that many bodies cost what each of
-    them costs alone.
+    them costs alone. That is for the likelihood: bodies that were apart in the data may meet in a
+    prediction, which one world with all of them makes.
 
     Parameters
     ----------
@@ -65,8 +89,9 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     reach = [body.shape.bounding_radius for body in scene.moving]
     for i in range(k):
         for j in range(i):
-            least = (1.0 + _SHARE) * (reach[i] + reach[j])
-            together[i, j] |= _meet(begin[:, i] - begin[:, j], end[:, i] - end[:, j], least)
+            least = (1.0 + SHARE) * (reach[i] + reach[j])
+            near = come_near(begin[:, i] - begin[:, j], end[:, i] - end[:, j], least)
+            together[i, j] |= near.any()
     count, part = connected_components(together, directed=False)
     driven = np.array([body.kinematic for body in scene.moving])
     for which in range(count):  # a kinematic body that meets none goes with the first that moves
@@ -78,12 +103,16 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     )
 
 
-def _meet(begin: np.ndarray, end: np.ndarray, least: float) -> bool:
-    """Whether a relative place, shape (interval, 2), comes nearer than ``least``, or is unknown."""
-    if not (np.isfinite(begin).all() and np.isfinite(end).all()):
-        return True
+def come_near(begin: Array, end: Array, least: float) -> NDArray[np.bool_]:
+    """Whether two bodies come nearer than ``least`` (m), or may have, for one's place is unknown.
+
+    Parameters
+    ----------
+    begin, end : ndarray
+        Place of one relative to the other before and after an interval, shape (..., 2), m.
+    """
     way = end - begin
-    length = (way**2).sum(axis=1)
-    share = np.clip(-(begin * way).sum(axis=1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
-    nearest = np.linalg.norm(begin + share[:, None] * way, axis=1)
-    return bool((nearest < least + _SHARE * np.sqrt(length)).any())
+    length = (way**2).sum(axis=-1)
+    share = np.clip(-(begin * way).sum(axis=-1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
+    nearest = np.linalg.norm(begin + share[..., None] * way, axis=-1)
+    return np.asarray(~(nearest >= least + SHARE * np.sqrt(length)))

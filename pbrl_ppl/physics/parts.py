@@ -39,6 +39,7 @@ class PartedSimulator:
 
     Proposals that agree in a part's parameters are simulated once for it: a derivative, or a
     sampler that moves one part at a time, costs for many bodies what it costs for each alone.
+    Bodies of different parts go through each other; predictions are :class:`OneWorld`'s.
 
     Parameters
     ----------

@@ -8,7 +8,7 @@ import numpy as np
 
 from pbrl_ppl.effects import Attached, Command, Force, at_stage
 from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput
-from pbrl_ppl.physics.world import DIVERGED, World
+from pbrl_ppl.physics.world import DIVERGED, RING, STICKING, World
 
 
 def rollout(
@@ -84,6 +84,7 @@ def rollout(
                     continue
                 body.force, body.torque = tuple(wrench[i, :2]), wrench[i, 2]
             _place_wheels(world, bodies, step)
+            _place_patches(world, bodies, step)
             world.space.step(step)
             touched = touched or near_contact(world)
             if not all(np.abs(_state(world, i)[3:]).sum() < DIVERGED for i in range(len(names))):
@@ -150,6 +151,32 @@ def _place_wheels(world: World, bodies: Array, step: float) -> None:
         at_y = body.position.y + body.velocity.y * step + s * x + c * y
         c, s = math.cos(theta + row[COLUMN["w_theta"]]), math.sin(theta + row[COLUMN["w_theta"]])
         wheel.along_x.anchor_b, wheel.along_y.anchor_b = (at_x + c, at_y + s), (at_x - s, at_y + c)
+
+
+def _place_patches(world: World, bodies: Array, step: float) -> None:
+    """Put each point's rod along its velocity, and share its friction with what holds it."""
+    for patch in world.patches:
+        body, row = world.bodies[patch.body], bodies[patch.body]
+        radius = row[COLUMN["patch_radius"]]
+        slowing = row[COLUMN["patch_mu"]] * world.scene.normal_gravity
+        most = slowing * row[COLUMN["mass"]] / len(RING)
+        theta = body.angle + body.angular_velocity * step
+        c, s = math.cos(theta), math.sin(theta)
+        for (x, y), hold, rod in zip(RING, patch.holds, patch.rods, strict=True):
+            x, y = x * radius, y * radius
+            x, y = c * x - s * y, s * x + c * y
+            along_x = body.velocity.x - body.angular_velocity * y
+            along_y = body.velocity.y + body.angular_velocity * x
+            speed = math.sqrt(along_x * along_x + along_y * along_y)
+            slow = STICKING * slowing * step
+            share = 1.0 if speed >= slow else speed / slow
+            if speed == 0.0:  # any direction will do: the point rests
+                along_x, speed = 1.0, 1.0
+            rod.anchor_b = (
+                body.position.x + body.velocity.x * step + x + along_x / speed,
+                body.position.y + body.velocity.y * step + y + along_y / speed,
+            )
+            hold.max_force, rod.max_force = (1.0 - share) * most, share * most
 
 
 def near_contact(world: World) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymunk import _chipmunk_cffi
 
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import RING, World
 
 
 class Pointers(NamedTuple):
@@ -30,6 +30,9 @@ class Pointers(NamedTuple):
     discs: NDArray[np.int64]
     pivots: NDArray[np.int64]  # (2, pivot): the motor, the damper
     pivot_body: NDArray[np.int64]
+    patches: NDArray[np.int64]  # (2, patch, point of the ring): what holds it, the rod
+    patch_body: NDArray[np.int64]
+    ring: NDArray[np.float64]
     radii: NDArray[np.float64]
     obstacles: NDArray[np.float64]
     can_touch: NDArray[np.bool_]
@@ -73,6 +76,12 @@ def pointers(world: World) -> Pointers:
             ]
         ),
         pivot_body=whole([pivot.body for pivot in pivots]),
+        patches=at(
+            [hold._constraint for patch in world.patches for hold in patch.holds]
+            + [rod._constraint for patch in world.patches for rod in patch.rods]
+        ).reshape(2, -1, len(RING)),
+        patch_body=whole([patch.body for patch in world.patches]),
+        ring=np.array(RING),
         radii=world.radii,
         obstacles=world.obstacles,
         can_touch=world.can_touch,

@@ -25,8 +25,16 @@ from pbrl_ppl.scene import WORLD, Scene
 Array = NDArray[np.float64]
 
 #: Columns of a body's properties. ``moment`` is about the centroid (kg m^2); ``pivot_torque`` (N m)
-#: and ``pivot_damping`` (N m s) act in the body's hinge.
-COLUMNS = (*BODY_PARAMETERS, "moment", "pivot_torque", "pivot_damping")
+#: and ``pivot_damping`` (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m)
+#: are of the friction under it.
+COLUMNS = (
+    *BODY_PARAMETERS,
+    "moment",
+    "pivot_torque",
+    "pivot_damping",
+    "patch_mu",
+    "patch_radius",
+)
 COLUMN = {name: i for i, name in enumerate(COLUMNS)}
 #: Columns of a joint's properties: its anchors and its length (m).
 JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
@@ -70,6 +78,18 @@ class EngineInput(NamedTuple):
     indices: NDArray[np.int64]
 
 
+def _is_patch(one: Attached) -> bool:
+    """Whether an effect puts friction under its body: it is tried."""
+    stage = one.effect.stage
+    if not isinstance(stage, Properties):
+        return False
+    row = {name: np.zeros((1, 1)) for name in (*COLUMNS, "moment_per_mass")}
+    centre = {p.name: np.full((1, 1), p.prior.centre) for p in one.effect.parameters}
+    never = np.full((1, 1), np.inf)
+    stage.modify(row, centre, Clock(never, never, never))
+    return bool(row["patch_mu"].any())
+
+
 class EngineProperties:
     """Translates parameter vectors for the engine.
 
@@ -108,6 +128,8 @@ class EngineProperties:
         )
         #: How many discs the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
+        #: Which bodies have friction under them.
+        self.patches = tuple(sorted({bodies.index(one.body) for one in effects if _is_patch(one)}))
         self._bind_joints(scene, places)
 
     def values(self, one: Attached, phi: Array, axes: int = 0) -> dict[str, Array]:

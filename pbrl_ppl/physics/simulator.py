@@ -240,10 +240,10 @@ class Simulator:
         """Numbers of substeps to run, the finest first, and the weights of their results.
 
         The engine's error is a series in the substep (Richardson, 1911): two runs cancel its first
-        term, three its second as well. Friction of a wheel has kinks that a third run amplifies.
+        term, three its second as well. Friction on the floor has kinks that a third run amplifies.
         """
-        wheels = any(body.wheel for body in self.scene.moving)
-        runs = (2 if wheels else 3) if self.extrapolate else 1
+        kinks = any(body.wheel for body in self.scene.moving) or self._properties.patches
+        runs = (2 if kinks else 3) if self.extrapolate else 1
         counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
         powers = np.vander(1.0 / np.array(counts), increasing=True).T
         weights = np.linalg.solve(powers, np.eye(len(counts))[0])
@@ -276,7 +276,8 @@ class Simulator:
         )
 
     def _new_world(self, joined: Joined) -> World:
-        return World(self.scene, self._properties.hinges, joined, self._properties.n_discs)
+        properties = self._properties
+        return World(self.scene, properties.hinges, joined, properties.n_discs, properties.patches)
 
     def _run_plain(
         self, joined: Joined, given: EngineInput, starts: Array, inputs: Array, out: Array

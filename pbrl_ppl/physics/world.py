@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +18,11 @@ from pbrl_ppl.scene import WORLD, Body, Joint, Scene
 #: body is heavier than another (with fewer, a heavy link below a light one gains energy).
 ITERATIONS_ALONE, ITERATIONS, ITERATIONS_CHAINED = 5, 10, 30
 ITERATIONS_A_RATIO, MOST_ITERATIONS = 2, 2000
+#: Points of a ring that carry a body's weight, in units of its radius.
+RING = tuple((math.cos(0.25 * i * math.pi), math.sin(0.25 * i * math.pi)) for i in range(8))
+#: A point slower than so many times what friction takes from a speed in an engine step may stick.
+#: (With a tenth, points that creep are held back across their way now and then: predictions jump.)
+STICKING = 1.0
 #: Allowed overlap of shapes (m); the engine's default is meant for pixels.
 COLLISION_SLOP = 1e-4
 #: Where bodies are parked (m), and for how long (s).
@@ -65,6 +71,21 @@ class Pivot:
     damper: pymunk.DampedRotarySpring
 
 
+@dataclass
+class Patch:
+    """Coulomb friction under a body, at points of a ring that share its weight.
+
+    A point that slides is held back by a rod along its velocity, as strongly as friction can; one
+    that rests, by a joint to the ground whose force is clipped as a vector. (That joint alone would
+    not do: what it does to a sliding point is not against its motion, for it is solved in the
+    metric of the point's inertia.) Both are placed every substep.
+    """
+
+    body: int
+    holds: tuple[pymunk.PivotJoint, ...]
+    rods: tuple[pymunk.PinJoint, ...]
+
+
 class World:
     """One engine world with the scene's geometry in it.
 
@@ -79,6 +100,8 @@ class World:
         of equals is no joint.
     discs : int
         Static discs beside those of the scene; their places and sizes are properties.
+    patches : tuple of int
+        Bodies with friction under them.
     """
 
     def __init__(
@@ -87,6 +110,7 @@ class World:
         hinges: tuple[bool, ...] = (),
         joined: tuple[tuple[int, int], ...] = (),
         discs: int = 0,
+        patches: tuple[int, ...] = (),
     ) -> None:
         self.scene = scene
         self.space = pymunk.Space()
@@ -119,9 +143,10 @@ class World:
         self._add_shapes()
         self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
         self._add_joints(hinges, joined)
+        self.patches = [self._new_patch(i) for i in patches]
         #: Which bodies that forces move are joined to other moving ones.
         self.chained = np.logical_not(self.can_touch.all(axis=1)) & ~self.kinematic
-        alone = len(scene.bodies) == 1 and not scene.walls and not discs
+        alone = len(scene.bodies) == 1 and not scene.walls and not (discs or patches)
         self.iterations = (
             ITERATIONS_CHAINED if self.chained.any() else ITERATIONS_ALONE if alone else ITERATIONS
         )
@@ -180,6 +205,16 @@ class World:
             joint.max_force = 0.0
         self.space.add(along_x, along_y)
         self.wheels.append(Wheel(index, along_x, along_y))
+
+    def _new_patch(self, index: int) -> Patch:
+        body, ground = self.bodies[index], self.space.static_body
+        holds = tuple(pymunk.PivotJoint(body, ground, (0, 0), (0, 0)) for _ in RING)
+        rods = tuple(pymunk.PinJoint(body, ground, (0, 0), (0, 0)) for _ in RING)
+        for joint in (*holds, *rods):
+            joint.max_bias = 0.0  # friction resists motion; it does not pull back
+            joint.max_force = 0.0
+        self.space.add(*holds, *rods)
+        return Patch(index, holds, rods)
 
     def _add_joints(self, hinges: tuple[bool, ...], joined: tuple[tuple[int, int], ...]) -> None:
         """Hinges and rods; their anchors and lengths are properties."""
@@ -246,6 +281,10 @@ class World:
             wheel.along_x.anchor_a = wheel.along_y.anchor_a = place
             wheel.along_x.max_force = row[COLUMN["mu_x"]] * load
             wheel.along_y.max_force = row[COLUMN["mu_y"]] * load
+        for patch in self.patches:
+            radius = bodies[patch.body, COLUMN["patch_radius"]]
+            for (x, y), hold, rod in zip(RING, patch.holds, patch.rods, strict=True):
+                hold.anchor_a = rod.anchor_a = x * radius, y * radius
         for link in self.links:
             a_x, a_y, b_x, b_y, length = joints[link.joint]
             link.constraint.anchor_a, link.constraint.anchor_b = (a_x, a_y), (b_x, b_y)

@@ -16,14 +16,14 @@ from pbrl_ppl.planning.contact import contact_cost
 from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.risk import tail_mean
-from pbrl_ppl.planning.search import Found
+from pbrl_ppl.planning.search import NODES, Found
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: Nodes expanded in one engine call; fewer under many draws, whose calls are large anyway.
 _BATCH = 32
-#: Share of the time for a search under one draw that guides that under all.
+#: Share of the limits for a search under one draw that guides that under all.
 _GUIDE = 0.5
 #: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
 #: second; further away and nearer they grow and shrink in proportion, between these limits.
@@ -45,8 +45,8 @@ def astar(
     *,
     tail: float = 1.0,
     weight: float = 3.0,
-    nodes: int = 5_000_000,
-    seconds: float = 60.0,
+    nodes: int = NODES,
+    seconds: float | None = None,
     improve: bool = False,
     noise: bool = False,
     rng: np.random.Generator | None = None,
@@ -76,8 +76,10 @@ def astar(
         Of the heuristic: 1 is A*; more is quicker, and as far as the heuristic is admissible and
         cells hold one state, the plan costs at most so many times the least. See
         :class:`pbrl_ppl.planning.bound.TimeToGo` for where it is.
-    nodes, seconds : int, float
-        Where to stop; the search under one draw does not count as nodes.
+    nodes : int
+        States to generate at most, each draw's own, the guiding search's among them.
+    seconds : float, optional
+        Where to stop, too; then the plan depends on how busy the machine is.
     improve : bool
         Whether to go on for a cheaper plan until a limit, or until there is none.
     noise : bool
@@ -90,7 +92,8 @@ def astar(
     Returns
     -------
     Found
-        If the goal is not reached, the plan that ends nearest to it in L2 distance.
+        If the goal is not reached, the plan that ends nearest to it in L2 distance. A plan of
+        nothing is one where bodies are at rest: others do not stay where they are.
 
     Raises
     ------
@@ -102,22 +105,22 @@ def astar(
     search = _Search(dynamics, start, goal, actions, tail, weight)
     search.rng = (rng or np.random.default_rng(0)) if noise else None
     begin = told = time.monotonic()
+    limit = np.inf if seconds is None else seconds
     stopped = "exhausted"
     try:
         if dynamics.draws > 1:
             guide = _Search(dynamics.single(), start, goal, actions, tail, weight)
-            # as much of the engine's work as the limit of nodes allows the other
-            most = nodes * dynamics.draws
-            while not guide.best and guide.generated < most and guide.open():
-                if time.monotonic() - begin > _GUIDE * seconds:
+            while not guide.best and guide.generated < _GUIDE * nodes and guide.open():
+                if time.monotonic() - begin > _GUIDE * limit:
                     break
                 guide.expand()
             search.follow(guide.path(guide.best or guide.nearest))
+            search.generated += guide.generated
         while search.open():
             now = time.monotonic()
             if search.best and not improve:
                 break
-            if search.generated >= nodes or now - begin > seconds:
+            if search.generated >= nodes or now - begin > limit:
                 stopped = "nodes" if search.generated >= nodes else "time"
                 break
             search.expand()
@@ -187,6 +190,8 @@ class _Search:
         self.least_distance = np.inf
         root = np.moveaxis(self.states, 0, 1)
         self._look(root, np.zeros(1), np.zeros(1, int), np.zeros(1, int), 0)
+        if self.root[..., 3:].any():
+            self.least_distance = np.inf
 
     def expand(self) -> None:
         """Take the most promising nodes, and try all actions at each, in one engine call each."""
@@ -212,7 +217,7 @@ class _Search:
             states = self.dynamics.step(states, wrenches)
             if self.rng is not None:
                 states = self.dynamics.noisy(states, self.rng)
-            self.generated += len(parents)
+            self.generated += len(parents) * self.dynamics.draws
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
             far = self._look(states, cost, parents, which, interval)
             if interval == only or (only is None and interval in self.counts):

@@ -22,7 +22,7 @@ from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.risk import tail_mean
-from pbrl_ppl.planning.search import Found
+from pbrl_ppl.planning.search import NODES, Found
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE
 
@@ -56,7 +56,7 @@ class Plan:
     distance : float
         L2 distance from the goal at the end (m), as the mean of the worst ``tail`` of draws.
     nodes : int
-        States that were generated.
+        States that were generated, each draw's own.
     seconds : float
         How long the search took.
     """
@@ -127,7 +127,8 @@ def plan(
     tail: float = 1.0,
     noise: bool = False,
     seed: int = 0,
-    seconds: float = 60.0,
+    nodes: int = NODES,
+    seconds: float | None = None,
     effects: Iterable[Effect] = catalogue,
     progress: Callable[[str], None] | None = None,
     **options: Any,
@@ -157,8 +158,11 @@ def plan(
         Whether Eq. 13's noise is added while planning and in the predicted distribution.
     seed : int
         Of the choice of draws and of all else that is random.
-    seconds : float
-        Limit of the search.
+    nodes : int
+        States that the search generates at most, each draw's own. The same start and seed give the
+        same plan, however busy the machine is.
+    seconds : float, optional
+        Another limit of the search; with it, the plan depends on how busy the machine is.
     effects : iterable of Effect
         Where the names of the posterior's effects are looked up.
     progress : callable, optional
@@ -190,7 +194,7 @@ def plan(
         raise GoalError(f'plan: method is "{method}"{nearest(method, METHODS)}')
     if not 0 < tail <= 1:
         raise GoalError(f"plan: tail is {tail}, expected a share above 0 and at most 1")
-    if not seconds > 0:
+    if seconds is not None and not seconds > 0:
         raise GoalError(f"plan: seconds is {seconds}, expected more than 0")
     if isinstance(idata, Dynamics):
         dynamics = idata
@@ -208,8 +212,8 @@ def plan(
     search: Callable[..., Found] = astar if method == "astar" else mppi
     rng = np.random.default_rng(seed)
     found = search(
-        dynamics, first, goal, actions, tail=tail, seconds=seconds, noise=noise, rng=rng,
-        progress=progress, **options,
+        dynamics, first, goal, actions, tail=tail, nodes=nodes, seconds=seconds, noise=noise,
+        rng=rng, progress=progress, **options,
     )  # fmt: skip
     return _described(dynamics, first, goal, found, tail, noise, rng)
 

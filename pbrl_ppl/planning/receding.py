@@ -14,7 +14,7 @@ from pbrl_ppl.planning.contact import contact_cost
 from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.risk import tail_mean
-from pbrl_ppl.planning.search import Found
+from pbrl_ppl.planning.search import NODES, Found
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
@@ -71,7 +71,7 @@ class Horizon:
         noise: bool,
         rng: np.random.Generator,
     ) -> None:
-        self.movings, self.goal, self.rng = dynamics, goal, rng
+        self.dynamics, self.goal, self.rng = dynamics, goal, rng
         self.samples, self.iterations = samples, iterations
         self.tail, self.noise = tail, noise
         self.most = _strongest(dynamics.scene, actions)
@@ -106,14 +106,14 @@ class Horizon:
 
     def _cost(self, start: Array, tried: Array) -> Array:
         """L2 distance from the goal, its mean on the way and at the end, speed there, contacts."""
-        scene, horizon = self.movings.scene, tried.shape[1]
+        scene, horizon = self.dynamics.scene, tried.shape[1]
         states = np.repeat(start[:, None], len(tried), axis=1)
         cost = np.zeros(len(tried))
         for t in range(horizon):
-            states = self.movings.step(states, tried[:, t])
+            states = self.dynamics.step(states, tried[:, t])
             if self.noise:
-                states = self.movings.noisy(states, self.rng)
-            self.generated += len(tried)
+                states = self.dynamics.noisy(states, self.rng)
+            self.generated += len(tried) * self.dynamics.draws
             far = tail_mean(self.goal.distance(scene, states), self.tail)
             cost += far / horizon + scene.time_step * contact_cost(self.goal, scene, states)
         speed = np.sqrt((states[..., self._own, 3:5] ** 2).sum(axis=(-2, -1)))
@@ -131,7 +131,8 @@ def mppi(
     samples: int = 256,
     iterations: int = 3,
     intervals: int = 200,
-    seconds: float = 60.0,
+    nodes: int = NODES,
+    seconds: float | None = None,
     noise: bool = False,
     rng: np.random.Generator | None = None,
     progress: Callable[[str], None] | None = None,
@@ -146,22 +147,27 @@ def mppi(
         As of :class:`Horizon`.
     intervals : int
         The longest plan.
-    seconds : float
-        Where to stop.
+    nodes : int
+        States to generate at most, each draw's own.
+    seconds : float, optional
+        Where to stop, too; then the plan depends on how busy the machine is.
 
     Returns
     -------
     Found
-        If the goal is not reached, up to where it was nearest.
+        If the goal is not reached, up to where it was nearest; a start in motion does not count.
 
     Raises
     ------
     GoalError
         If a number is below 1.
     """
-    if min(horizon, samples, iterations, intervals) < 1:
-        raise GoalError("MPPI: horizon, samples, iterations and intervals must be at least 1")
+    if min(horizon, samples, iterations, intervals, nodes) < 1:
+        raise GoalError(
+            "MPPI: horizon, samples, iterations, intervals and nodes must be at least 1"
+        )
     scene, begin = dynamics.scene, time.monotonic()
+    limit = np.inf if seconds is None else seconds
     ahead = Horizon(
         dynamics, goal, actions, horizon=horizon, samples=samples, iterations=iterations,
         tail=tail, noise=noise, rng=rng or np.random.default_rng(0),
@@ -176,10 +182,12 @@ def mppi(
                 stopped, best = "goal", len(wrenches)
                 break
             far = float(tail_mean(goal.distance(scene, states), tail)[0])
-            if far < nearest:
+            if far < nearest and (wrenches or not start[:, 3:].any()):
                 nearest, best = far, len(wrenches)
-            if len(wrenches) >= intervals or time.monotonic() - begin > seconds:
-                stopped = "exhausted" if len(wrenches) >= intervals else "time"
+            if len(wrenches) >= intervals:
+                break
+            if ahead.generated >= nodes or time.monotonic() - begin > limit:
+                stopped = "nodes" if ahead.generated >= nodes else "time"
                 break
             if progress is not None:
                 progress(f"interval {len(wrenches)}, {far:.2f} m from the goal")

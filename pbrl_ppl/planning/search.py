@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+#: States that a search generates at most, unless it is told otherwise: 15 s or so for one body.
+NODES = 2_000_000
+
 
 @dataclass(frozen=True, eq=False)
 class Found:
@@ -23,7 +26,7 @@ class Found:
     stopped : str
         ``goal``, ``nodes``, ``time``, ``exhausted`` or ``interrupted``.
     nodes : int
-        States that were generated.
+        States that were generated, each draw's own.
     seconds : float
         How long it took.
     """

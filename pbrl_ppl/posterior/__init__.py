@@ -1,5 +1,6 @@
 """Posterior files: save, load, draws, what the data inform, the next prior."""
 
+from pbrl_ppl.posterior.comparison import Comparison, compare
 from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
 from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
 from pbrl_ppl.posterior.record import (
@@ -33,8 +34,10 @@ __all__ = [
     "DATATREE",
     "HDI_PROB",
     "MIN_ESS",
+    "Comparison",
     "Identifiability",
     "checked",
+    "compare",
     "complete",
     "convergence",
     "draws",

@@ -136,6 +136,7 @@ def evaluate(
     likelihood = np.empty((len(phi), problem.segments.n))
     predictive = []
     wide = problem.with_physics(threads=max(problem.physics.threads, 2))
+    rows = np.asarray(rows, dtype=int)
     size = max(_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE // problem.segments.n)
     for begin in range(0, len(phi), size):
         part = slice(begin, begin + size)
@@ -143,11 +144,9 @@ def evaluate(
         states = wide.predict(own)[which.ravel()]
         residual = problem.observations.residual(states)
         likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
-        predictive += [
-            problem.next_states(states[i - begin], sigma[i], rng, phi[i])
-            for i in rows
-            if begin <= i < begin + size
-        ]
+        for i in rows[(begin <= rows) & (rows < begin + size)]:
+            foreseen = wide.predict(phi[i], wide.one_world)
+            predictive.append(problem.next_states(foreseen, sigma[i], rng, phi[i]))
     return likelihood, np.stack(predictive)
 
 
@@ -205,6 +204,7 @@ def problem_of(
         columns=columns,
         noise=noise,
         library=ParameterLibrary.from_json(str(attrs["library"])) if "library" in attrs else None,
+        together=tuple(json.loads(str(attrs.get("together", "[]")))),
     )
 
 
@@ -258,6 +258,7 @@ def _origin(problem: Problem, seed: int) -> dict[str, Any]:
         **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
         **({} if problem.library is None else {"library": problem.library.to_json()}),
         substeps=problem.physics.substeps,
+        together=list(problem.physics.together),
         sigma_prior=[[float(each) for each in median], float(spread)],
         start_noise=int(problem.noise.start is not None),
         data_sha256=problem.data.history.data_sha256,

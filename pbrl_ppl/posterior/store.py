@@ -1,4 +1,10 @@
-"""Posteriors as files and draws; the one place that knows ArviZ 0.x from 1.x."""
+"""Posteriors as files and draws; the one place that knows ArviZ 0.x from 1.x.
+
+Files are written by xarray through h5netcdf, one NetCDF group a dataset, and not by ArviZ: its
+generations have a writer each (``InferenceData.to_netcdf``, ``DataTree.to_netcdf``), with an
+engine, compression and coordinates of its own. Written here, a file is laid out the same by both
+and needs no netCDF4. ``arviz.from_netcdf`` of either and ``xarray.open_datatree`` read it.
+"""
 
 from __future__ import annotations
 

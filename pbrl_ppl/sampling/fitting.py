@@ -6,6 +6,7 @@ import os
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from pbrl_ppl.modes import Mode, choose_from_library, find_mode, weigh
 from pbrl_ppl.posterior import complete, group
 from pbrl_ppl.sampling.emulator import emulate
 from pbrl_ppl.sampling.fit_checks import DEFAULT, checked_problem
+from pbrl_ppl.sampling.meeting import as_in, joined_model, model_of_draws
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
 from pbrl_ppl.sampling.mixture import mix
 from pbrl_ppl.sampling.starts import blank_point, dispersed, from_posterior, gaussian_blocks
@@ -223,12 +225,18 @@ def fit(
     ConvergenceWarning
         If an R-hat is over 1.01 or an effective sample size under 400, if sampling was
         interrupted, or if an evidence is too rough for the probability of a joint.
+    MeetingWarning
+        If bodies that were apart in the data meet under the parameters found.
     BoundWarning
         If a parameter is pressed against the end of its support.
     UninformedWarning
         If the data say nothing about a parameter.
     """
     problem = checked_problem(model, method, METHODS, start, resume)
+    again = partial(
+        fit, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
+        cores=cores, progress=progress,
+    )  # fmt: skip
     if problem.library is not None:
         default = METHODS[method]
         trace = _summed(
@@ -237,6 +245,8 @@ def fit(
             default.chains if chains is None else chains,
             seed,
         )
+        if joined := model_of_draws(problem, trace):
+            return again(joined)
         return complete(problem, trace, seed=seed, method="exact sum over the library")
     chosen = METHODS[method]
     draws = chosen.draws if draws is None else draws
@@ -266,14 +276,21 @@ def fit(
             warnings.filterwarnings("ignore", message="Numba will use object mode")
             return chosen.run(job)
 
+    model = as_in(model, resume)
+    problem = model.problem
     if problem.layout.discrete.any():
         found = weigh(problem, seed=seed, progress=progress)
         trace = mix(model, problem, found, sampled, draws=draws, chains=chains, seed=seed)
     elif resume is not None:
         trace = sampled(model, *from_posterior(problem, resume))
     else:
-        trace = sampled(model, find_mode(problem, seed=seed) if start is None else start)
+        mode = find_mode(problem, seed=seed) if start is None else start
+        if joined := joined_model(problem, mode.phi[None], mode.sigma[None]):
+            return again(joined)
+        trace = sampled(model, mode)
     done = group(trace, "posterior").sizes["draw"]
+    if done == draws and (joined := model_of_draws(problem, trace)):
+        return again(joined)
     if resume is not None:
         trace = appended(resume, trace)
     # PyMC ends an interrupted run quietly, with the draws so far

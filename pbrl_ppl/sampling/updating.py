@@ -146,6 +146,8 @@ def _updated(
     names = [*(block.name for block in problem.layout.blocks), "sigma"]
     phi, sigma = parameter_draws(problem, from_groups({"posterior": base[names]}, {}))
     rows = base["row"].to_numpy()
+    problem = problem.joined(phi[rows], sigma[rows])
+    together = {"together": json.dumps(list(problem.physics.together))}
     likelihood, predictive = evaluate(problem, phi, sigma, rows, rng)
     data = _with_data(idata, problem)
     base = _with_new(base, likelihood, predictive).assign_coords(data["observed_data"].coords)
@@ -159,11 +161,11 @@ def _updated(
     # a chain that the data speak against sits where the others do not: then they must mix
     of_chains = weights.reshape(base.sizes["chain"], -1).sum(axis=1) * base.sizes["chain"]
     if min(share, of_chains.min()) >= _MOVE and not heavy:
-        result = _reweighted(base, weights, data, idata.attrs, rng)
+        result = _reweighted(base, weights, data, idata.attrs | together, rng)
         if not _worn(base, result):
             return checked(problem, result), how | {"did": "reweighted"}
     # from here on all data are needed
-    whole = problem_of(from_groups(groups(idata) | data, idata.attrs), effects)
+    whole = problem_of(from_groups(groups(idata) | data, idata.attrs | together), effects)
     if share < _REFIT or heavy or whole.library is not None:  # sets cannot be moved by steps
         why = f"their tail has a shape k of {k:.2g}" if heavy else f"worth {share:.1%} of the draws"
         warnings.warn(

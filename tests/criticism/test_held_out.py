@@ -9,7 +9,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.model.test_model import simulated_history
+from tests.helpers.histories import simulated_history
 
 PUCK = Scene(
     time_step=0.1, bodies=(Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}),)
@@ -46,6 +46,6 @@ def test_other_dimensions_are_refused(histories) -> None:
     train, test = histories
     mode = find_mode(Problem.of(PUCK, train, substeps=5), seed=1)
     frame = test.to_dataframe().drop(columns="omega")
-    blind = History.from_dataframe(frame, PUCK)
+    blind = History.from_dataframe(frame, PUCK, estimate_velocities=True)
     with pytest.raises(HistoryError, match=r"test history measures x, y, theta, vx, vy, the"):
         HeldOut(blind, seed=1).gains(mode, mode)

@@ -131,7 +131,7 @@ def furnished(apartment):
 
 
 def test_the_apartment_s_bodies_are_recognised(apartment, furnished) -> None:
-    """Wheels turned are no matter to the two bodies that have none: there the prior decides."""
+    """Wheels turned are no matter to the three bodies that have none: there the prior decides."""
     scene, _, library, true = apartment
     table = library_probabilities(furnished)
     assert list(table.columns) == list(library.names)

@@ -1,5 +1,7 @@
 """Searches for plans: closed forms, symmetry, limits, uncertainty, and acting on plans."""
 
+from itertools import count
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from pbrl_ppl.errors import GoalError, PosteriorError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Transition
 from pbrl_ppl.physics import overlap
-from pbrl_ppl.planning import ActionSet, Dynamics, Goal, plan
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal, astar, plan, receding
 from pbrl_ppl.planning.bound import TimeToGo
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
 from tests.helpers.pucks import ACROSS, FORCE, FREE, MASS, PUSHES, ROOM, known
@@ -178,6 +180,37 @@ def test_time_is_a_limit_too() -> None:
     found = plan(known(ROOM), *ACROSS, PUSHES, seconds=1e-3)
     assert not found.reached
     assert found.stopped == "time"
+    assert "limit of time" in found.in_words()
+
+
+@pytest.mark.parametrize(
+    ("module", "options"),
+    [
+        (astar, {}),
+        (astar, {"draws": 3, "nodes": 20_000}),
+        (receding, {"method": "mppi", "intervals": 10, "samples": 20}),
+    ],
+)
+def test_a_busy_machine_gives_the_same_plan(module, options, monkeypatch) -> None:
+    """The clock goes on by an hour between two looks at it."""
+    masses = (1.9, MASS, 2.1)[: options.pop("draws", 1)]
+    idle = plan(known(ROOM, *masses), *ACROSS, PUSHES, seed=3, **options)
+    hours = SimpleNamespace(monotonic=count(step=3600.0).__next__)
+    monkeypatch.setattr(module, "time", hours)
+    busy = plan(known(ROOM, *masses), *ACROSS, PUSHES, seed=3, **options)
+    assert (busy.nodes, busy.stopped) == (idle.nodes, idle.stopped)
+    np.testing.assert_array_equal(busy.wrenches, idle.wrenches)
+
+
+def test_nodes_are_counted_under_each_draw() -> None:
+    """The limit bounds the engine's work: eight draws may have as much as one."""
+    closed = ROOM.replace(walls=(*ROOM.walls, Wall((0.0, 1.0), (0.0, 3.0))))
+    for masses in ((MASS,), (MASS,) * 8):
+        found = plan(known(closed, *masses), *ACROSS, PUSHES, nodes=20_000)
+        assert found.stopped == "nodes"
+        assert 20_000 <= found.nodes < 24_000
+    shown = plan(known(closed), *ACROSS, PUSHES, method="mppi", nodes=20_000)
+    assert shown.stopped == "nodes"
 
 
 def test_an_interrupt_keeps_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -287,6 +320,20 @@ def test_planning_again_makes_up_for_a_wrong_mass() -> None:
     assert looking.history().n_transitions == len(looking.wrenches)
 
 
+def test_who_flies_past_the_goal_comes_back() -> None:
+    """The start is nearest to the goal of all that is found, but no place to stay at: it moves."""
+    unsure = known(FREE, 1.2, MASS, 3.0)
+    start, goal = state(x=0.3, vx=4.0)[None], Goal.of({"puck": (0.0, 0.0, None)}, speed=0.5)
+    for method, options in (("astar", {"nodes": 2_000}), ("mppi", {"intervals": 5, "samples": 50})):
+        one = plan(unsure, start, goal, PUSHES, method=method, **options)
+        assert not one.reached
+        assert len(one.wrenches)
+        still = plan(unsure, state(x=0.3)[None], goal, PUSHES, method=method, **options)
+        assert still.distance <= 0.3 + 1e-9
+    done = act(world(FREE, 2.2, start), unsure, start, goal, PUSHES, every=6, nodes=5_000)
+    assert done.reached
+
+
 def test_acting_stops_at_its_limit_and_refuses_nonsense() -> None:
     start, goal = ACROSS
     first = state(*start["puck"])[None]
@@ -315,6 +362,7 @@ def test_acting_stops_at_its_limit_and_refuses_nonsense() -> None:
         ({"method": "a*"}, 'did you mean "astar"'),
         ({"tail": 0.0}, "tail is 0.0"),
         ({"seconds": 0.0}, "seconds is 0.0"),
+        ({"nodes": 0}, "nodes 0"),
         ({"weight": 0.5}, "weight is 0.5"),
         ({"method": "mppi", "horizon": 0}, "at least 1"),
     ],

@@ -102,7 +102,7 @@ def test_an_unreachable_goal_ends_with_code_1_and_the_best(tmp_path, capsys) -> 
     path, out = tmp_path / "actions.toml", tmp_path / "plan.csv"
     path.write_text('[[action]]\nbody = "puck"\nforce = [4, 0]\nframe = "world"\n')
     backwards = ["--start", "0,0,0", "--goal", "-2,0,-", "--actions", str(path), "--quiet"]
-    command = ["plan", str(file("5")), *backwards, "-o", str(out), "--seconds", "2"]
+    command = ["plan", str(file("5")), *backwards, "-o", str(out), "--nodes", "20000"]
     assert main(command) == 1
     assert "the goal is not reached" in capsys.readouterr().out
     assert out.exists()

@@ -59,7 +59,7 @@ def test_one_draws_plan_leads_all_around_a_wall() -> None:
     way = (-4.0, 0.0, 4.0)
     pushes = pp.ActionSet.box("puck", forces=way, lateral=way, frame="world", durations=(0.2, 0.5))
     goal = pp.Goal.of({"puck": (1.5, 0.0, None)}, tolerance=0.2)
-    plan = pp.plan(dynamics, {"puck": (-1.5, 0.0, 0.0)}, goal, pushes, nodes=500)
+    plan = pp.plan(dynamics, {"puck": (-1.5, 0.0, 0.0)}, goal, pushes, nodes=8_000)
     assert plan.reached
-    again = pp.plan(dynamics, {"puck": (-1.5, 0.0, 0.0)}, goal, pushes, nodes=500)
+    again = pp.plan(dynamics, {"puck": (-1.5, 0.0, 0.0)}, goal, pushes, nodes=8_000)
     np.testing.assert_array_equal(plan.wrenches, again.wrenches)

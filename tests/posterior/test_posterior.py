@@ -69,6 +69,24 @@ def made(seed: int = 0, **more):
     return from_groups(datasets(seed), attrs)
 
 
+@pytest.mark.parametrize("reader", ["arviz", "xarray"])
+def test_arviz_reads_the_file(reader, tmp_path) -> None:
+    """By its own reader, which the two generations call the same, and as a tree of datasets."""
+    path = tmp_path / "cart.nc"
+    save_posterior(made(), path)
+    if reader == "arviz":
+        found = az.from_netcdf(str(path))
+    else:
+        found = xr.open_datatree(path, engine="h5netcdf")
+    for name, data in datasets().items():
+        read = found[name] if reader == "arviz" and not DATATREE else found[name].to_dataset()
+        xr.testing.assert_identical(read.load().drop_attrs(deep=False), data)
+    if reader == "arviz":
+        assert "mass[cart]" in az.summary(found).index
+        assert scene_of(found) == SCENE
+    (found.close if hasattr(found, "close") else list)()
+
+
 def test_a_type_that_arviz_takes() -> None:
     idata = made()
     if DATATREE:

@@ -15,6 +15,7 @@ from pbrl_ppl.criticism.findings import (
     Errors,
 )
 from pbrl_ppl.errors import OutputError
+from pbrl_ppl.posterior.comparison import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.report import loop as loop_module
 from pbrl_ppl.report.error_plots import plot_rollout, unwrap
@@ -145,6 +146,34 @@ def test_page_says_what_the_data_do_not() -> None:
     without = made_up()
     assert "What the data say" not in render(without)
     assert without.to_dict()["identifiability"] is None
+
+
+def test_page_compares_by_leave_one_out() -> None:
+    """Of an added effect, both models and the gain; of none, the declared model alone."""
+    one = LeaveOneOut(4000.0, 30.0, 11.5, 2, 0.7)
+    two = replace(one, elpd_loo=4210.0, high_pareto_k=0)
+    findings = replace(made_up(), loo=Comparison(one, two, 210.0, 19.0, 360))
+    text = Page(render(findings)).text
+    assert "Leave-one-out cross-validation on the 360 transitions of the fit" in text
+    assert "elpd_loo (more is better) 4,000 4,210" in text
+    assert "Transitions with a Pareto k above 0.70 2 0" in text
+    assert "the revised model gains 210 ± 19.0" in text
+    assert "make elpd_loo unreliable" in text
+    assert findings.to_dict()["loo"] == {
+        "before": vars(one),
+        "after": vars(two),
+        "elpd_difference": 210.0,
+        "elpd_difference_se": 19.0,
+        "transitions": 360,
+    }
+    same = replace(made_up("adequate"), loo=Comparison(two, two, 0.0, 0.0, 360))
+    text = Page(render(same)).text
+    assert "Transitions with a Pareto k above 0.70 0 " in text
+    assert "the revised model gains" not in text
+    assert "unreliable" not in text
+    # where it cannot be computed, the report does without
+    assert made_up().to_dict()["loo"] is None
+    assert "Leave-one-out" not in page("effects-added").text
 
 
 def test_page_says_what_did_not_converge() -> None:
@@ -286,6 +315,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "unexplained",
         "error",
         "identifiability",
+        "loo",
         "provenance",
     ]
     assert list(got["added"][0]) == [

@@ -1,0 +1,57 @@
+"""Bodies that were apart in the data, and meet under the parameters that a fit has found."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from typing import Any
+
+import numpy as np
+import pymc as pm
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import MeetingWarning
+from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.posterior import parameter_draws, predictive_rows
+
+Array = NDArray[np.float64]
+
+
+def joined_model(problem: Problem, phi: Array, sigma: Array) -> pm.Model | None:
+    """A model with those bodies in one part that meet at draws (n, p) and (n, state); None if none.
+
+    The likelihood simulates bodies apart that were apart in the data. Here it is looked whether
+    that changes anything where the posterior is.
+
+    Warns
+    -----
+    MeetingWarning
+        If bodies meet.
+    """
+    joined = problem.joined(phi, sigma)
+    if joined is problem:
+        return None
+    warnings.warn(
+        f"fit: {', '.join(joined.physics.together)} meet under the parameters that were found, and"
+        " were thought apart by where they are in the data; all is fitted again with them in one"
+        " world",
+        MeetingWarning,
+        stacklevel=3,
+    )
+    return build_model(joined)
+
+
+def model_of_draws(problem: Problem, trace: Any) -> pm.Model | None:
+    """As :func:`joined_model`, at some of a trace's draws."""
+    phi, sigma = parameter_draws(problem, trace)
+    rows = predictive_rows(len(phi))
+    return joined_model(problem, phi[rows], sigma[rows])
+
+
+def as_in(model: pm.Model, idata: Any) -> pm.Model:
+    """The model with those bodies together that a posterior has together."""
+    problem, attrs = model.problem, {} if idata is None else idata.attrs
+    known = tuple(json.loads(str(attrs.get("together", "[]"))))
+    if set(known) <= set(problem.physics.together):
+        return model
+    return build_model(problem.with_physics(together=known))
