@@ -5,7 +5,9 @@ import pytest
 
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import EffectError
-from pbrl_ppl.model import build_layout
+from pbrl_ppl.history import from_segments
+from pbrl_ppl.model import build_layout, physics_model
+from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Simulator, calls
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
@@ -188,3 +190,21 @@ def test_only_it_puts_a_patch_under_a_body() -> None:
     for effect in others:
         sim = simulator(scene, (effect,))
         assert bool(sim._properties.patches) == (effect.name == "sliding_friction")
+
+
+@pytest.mark.slow
+def test_friction_and_radius_are_recovered() -> None:
+    """Within 3.3 standard deviations: false alarms in 1 of 500."""
+    scene = floor(substeps=20).with_effects("block", "sliding_friction")
+    rng = np.random.default_rng(7)
+    start = rng.normal(0, [1, 1, 1, 0.8, 0.8, 2], (40, 1, 6))
+    actions = rng.normal(0, [6, 6, 1], (40, 2, 1, 3))
+    truth = np.array([MU, RADIUS])
+    states = simulator(scene)(truth, start, actions)
+    noise = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3, 1e-2])
+    history = from_segments(scene, start, actions, states + noise * rng.normal(size=states.shape))
+    problem = physics_model(scene, history, horizon=2).problem
+    mode = find_mode(problem, initial=np.array([0.05, 0.6]))  # from far off
+    sd = np.sqrt(np.diag(mode.covariance))
+    assert (np.abs(mode.phi - truth) < 3.3 * sd).all()
+    assert (sd < 0.02 * truth).all()
