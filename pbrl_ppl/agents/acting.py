@@ -106,7 +106,8 @@ def act(
     states, plans = [start_state(scene, start)], 0
     played: list[Array] = []
     while len(played) < intervals and not _there(scene, goal, states[-1]):
-        ahead = plan(idata, states[-1], goal, actions, **options)
+        last = played[-1] if played else None
+        ahead = plan(idata, states[-1], goal, actions, before=last, **options)
         plans += 1
         for wrench in ahead.wrenches[: intervals - len(played)][:every]:
             state = np.asarray(world(wrench), dtype=float)

@@ -220,7 +220,7 @@ class History:
         rows = np.where(after, 0, rows)
         inputs = self._inputs(action)[trajectory[:, None], rows]
         observed = self.dataset["observed"].to_numpy()[trajectory[:, None], rows + 1]
-        inputs[after, :, :6] = 0.0
+        inputs[after, :, :6], inputs[after, :, 6:] = 0.0, np.inf
         observed[after] = np.nan
         observed[:, :, follows] = np.nan
         actions = inputs[..., : len(WRENCH)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 from functools import cached_property
 
-from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.model.likelihood import Observations
 from pbrl_ppl.physics import check_history
@@ -44,16 +43,11 @@ class Data:
         Raises
         ------
         HistoryError
-            If no trajectory is long enough.
+            If no segment starts from a complete state.
         SimulationError
             If bodies start deep inside each other or a wall, or a hinge's bodies apart.
         """
         segments = self.history.segments(self.horizon)
-        if not segments.n:
-            raise HistoryError(
-                f"history: no trajectory is long enough for a horizon of {self.horizon} intervals;"
-                " choose a shorter one"
-            )
         check_history(self.scene, self.history, segments)
         return segments
 

@@ -179,6 +179,7 @@ class _Search:
         """Begin at the root."""
         # the tree; it has room for more nodes than there are
         self.states, self.cost = self.root.copy(), np.zeros(1)
+        self.last = self.dynamics.before[None].copy()  # what acted on the way to each node
         self.edges = np.array([[-1, -1, 0]])
         self.size = 1
         self.queue: list[tuple[float, int]] = [(0.0, 0)]
@@ -211,17 +212,18 @@ class _Search:
     def _try(self, parents: Ints, which: Ints, only: int | None = None) -> None:
         """Play an action from each of some nodes, for every duration or one alone (intervals)."""
         states = np.moveaxis(self.states[parents], 0, 1)
-        cost = self.cost[parents]
+        cost, last = self.cost[parents], self.last[parents]
         for interval in range(1, (only or self.counts[-1]) + 1):
             wrenches = self.actions.wrenches(self.scene, which, mean_angle(states[..., 2]))
-            states = self.dynamics.step(states, wrenches)
+            states = self.dynamics.step(states, wrenches, last)
+            last = wrenches
             if self.rng is not None:
                 states = self.dynamics.noisy(states, self.rng)
             self.generated += len(parents) * self.dynamics.draws
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
             far = self._look(states, cost, parents, which, interval)
             if interval == only or (only is None and interval in self.counts):
-                self._add(states, cost, far, parents, which, interval)
+                self._add(states, wrenches, cost, far, parents, which, interval)
 
     def _look(self, states: Array, cost: Array, parents: Ints, which: Ints, interval: int) -> Array:
         """Note what reaches the goal, or comes nearer than anything before; L2 distances."""
@@ -243,7 +245,14 @@ class _Search:
         return far
 
     def _add(
-        self, states: Array, cost: Array, far: Array, parents: Ints, which: Ints, interval: int
+        self,
+        states: Array,
+        wrenches: Array,
+        cost: Array,
+        far: Array,
+        parents: Ints,
+        which: Ints,
+        interval: int,
     ) -> None:
         """Put on the tree what is in a new cell, or got there more cheaply."""
         ahead = tail_mean(self.to_go(states), self.tail)
@@ -259,7 +268,8 @@ class _Search:
         first, self.size = self.size, self.size + len(chosen)
         edges = np.stack([parents, which, np.full_like(parents, interval)], axis=1)
         for name, new in (
-            ("states", np.moveaxis(states, 0, 1)), ("cost", cost), ("edges", edges)
+            ("states", np.moveaxis(states, 0, 1)), ("last", wrenches), ("cost", cost),
+            ("edges", edges),
         ):  # fmt: skip
             old = getattr(self, name)
             if len(old) < self.size:
@@ -303,5 +313,6 @@ def played(
     each = [action for action, intervals in steps for _ in range(intervals)]
     for i, action in enumerate(each):
         wrenches[i] = actions.wrenches(scene, np.array([action]), mean_angle(states[..., 2]))[0]
-        states = dynamics.step(states, wrenches[i : i + 1])
+        last = wrenches[i - 1] if i else dynamics.before
+        states = dynamics.step(states, wrenches[i : i + 1], last[None])
     return wrenches

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Attached, Effect, attach, catalogue
+from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.model import build_layout, log_posterior, next_state_random
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.posterior import draws as all_draws
 from pbrl_ppl.posterior import group, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import WRENCH
 
 Array = NDArray[np.float64]
 
@@ -57,6 +58,9 @@ class Dynamics:
         attached = attach(scene, effects, declared)
         self.scene, self.layout, self._noise = scene, build_layout(scene, attached), noise
         self.phi = np.atleast_2d(np.asarray(phi, dtype=float))
+        self._whole = needs_inputs(attached)
+        #: Wrenches that acted before the start, shape (body, 3); an actuator may remember them.
+        self.before = np.zeros((len(scene.moving), len(WRENCH)))
         self._engine = Simulator(scene, self.layout, attached, substeps=substeps, threads=threads)
 
     @classmethod
@@ -141,6 +145,12 @@ class Dynamics:
             one._noise = (sigma[i : i + 1], columns, own)
         return one
 
+    def after(self, before: Array) -> Dynamics:
+        """The same after these wrenches, shape (body, 3), N and N m."""
+        other = copy(self)
+        other.before = np.asarray(before, dtype=float).reshape(self.before.shape)
+        return other
+
     def mass(self, body: str) -> Array:
         """A body's mass under each draw, shape (draw,), kg."""
         known = dict(self.scene.body(body).known)
@@ -148,7 +158,7 @@ class Dynamics:
             return np.full(self.draws, float(known["mass"]))
         return self.phi[:, self.layout.index("mass", body)]
 
-    def step(self, states: Array, wrenches: Array) -> Array:
+    def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
         """States after one sampling interval.
 
         Parameters
@@ -157,6 +167,8 @@ class Dynamics:
             Shape (draw, n, body, 6), SI units.
         wrenches : ndarray
             Shape (n, body, 3), world frame, N and N m; the same under each draw.
+        previous : ndarray, optional
+            Those of the interval before, same shape; :attr:`before` without them.
 
         Returns
         -------
@@ -164,6 +176,10 @@ class Dynamics:
             Shape (draw, n, body, 6); NaN where the engine diverged.
         """
         actions = wrenches[:, None]
+        if self._whole:  # the time is after the recording
+            last = np.broadcast_to(self.before if previous is None else previous, wrenches.shape)
+            later = np.full_like(wrenches, np.inf)
+            actions = np.concatenate([wrenches, last, later], axis=-1)[:, None]
         # what had diverged stays so; the engine refuses it
         lost = np.asarray(~np.isfinite(states).all(axis=(-2, -1)))
         given = np.where(lost[..., None, None], 0.0, states) if lost.any() else states
@@ -201,8 +217,9 @@ class Dynamics:
         """
         states = np.broadcast_to(start, (self.draws, 1, *start.shape))
         every = [states]
+        last = self.before
         for wrench in wrenches:
-            states = self.step(states, wrench[None])
+            states, last = self.step(states, wrench[None], last[None]), wrench
             if rng is not None:
                 states = self.noisy(states, rng)
             every.append(states)

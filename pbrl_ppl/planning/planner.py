@@ -129,6 +129,7 @@ def plan(
     seed: int = 0,
     nodes: int = NODES,
     seconds: float | None = None,
+    before: ArrayLike | None = None,
     effects: Iterable[Effect] = catalogue,
     progress: Callable[[str], None] | None = None,
     **options: Any,
@@ -163,6 +164,9 @@ def plan(
         same plan, however busy the machine is.
     seconds : float, optional
         Another limit of the search; with it, the plan depends on how busy the machine is.
+    before : array_like, optional
+        Wrenches in the interval before the start, shape (body, 3), N and N m, for an actuator that
+        is late; none by default.
     effects : iterable of Effect
         Where the names of the posterior's effects are looked up.
     progress : callable, optional
@@ -208,6 +212,8 @@ def plan(
     goal.check(scene)
     actions.check(scene)
     first = start_state(scene, start)
+    if before is not None:
+        dynamics = dynamics.after(np.asarray(before, dtype=float))
     _check_room(scene, goal)
     search: Callable[..., Found] = astar if method == "astar" else mppi
     rng = np.random.default_rng(seed)

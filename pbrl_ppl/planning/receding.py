@@ -79,8 +79,16 @@ class Horizon:
         self._own = goal.places(dynamics.scene)
         self.generated = 0
 
-    def improve(self, start: Array) -> None:
-        """Draw sequences about the mean; weigh them by their cost from states (draw, body, 6)."""
+    def improve(self, start: Array, before: Array) -> None:
+        """Draw sequences about the mean; weigh them by their cost.
+
+        Parameters
+        ----------
+        start : ndarray
+            States that they begin from, shape (draw, body, 6).
+        before : ndarray
+            Wrenches in the interval before, shape (body, 3).
+        """
         size = (self.samples, *self.mean.shape)
         for iteration in range(self.iterations):
             spread = _SPREAD * self.most * 0.7**iteration
@@ -91,7 +99,7 @@ class Horizon:
                 )
             tried = np.clip(self.mean + spread * noise, -self.most, self.most)
             tried[0] = self.mean
-            cost = self._cost(start, tried)
+            cost = self._cost(start, tried, before)
             worst = np.max(cost[np.isfinite(cost)], initial=0.0)
             cost = np.where(np.isfinite(cost), cost, worst + 1e3)
             few = np.sort(cost)[: max(2, int(_ELITE * self.samples))]
@@ -104,13 +112,14 @@ class Horizon:
         self.mean = np.concatenate([self.mean[1:], self.mean[-1:]])
         return first
 
-    def _cost(self, start: Array, tried: Array) -> Array:
+    def _cost(self, start: Array, tried: Array, before: Array) -> Array:
         """L2 distance from the goal, its mean on the way and at the end, speed there, contacts."""
         scene, horizon = self.dynamics.scene, tried.shape[1]
         states = np.repeat(start[:, None], len(tried), axis=1)
         cost = np.zeros(len(tried))
         for t in range(horizon):
-            states = self.dynamics.step(states, tried[:, t])
+            last = tried[:, t - 1] if t else np.broadcast_to(before, tried[:, 0].shape)
+            states = self.dynamics.step(states, tried[:, t], last)
             if self.noise:
                 states = self.dynamics.noisy(states, self.rng)
             self.generated += len(tried) * self.dynamics.draws
@@ -191,9 +200,10 @@ def mppi(
                 break
             if progress is not None:
                 progress(f"interval {len(wrenches)}, {far:.2f} m from the goal")
-            ahead.improve(states[:, 0])
+            last = wrenches[-1] if wrenches else dynamics.before
+            ahead.improve(states[:, 0], last)
             wrenches.append(ahead.advance())
-            states = dynamics.step(states, wrenches[-1][None])
+            states = dynamics.step(states, wrenches[-1][None], last[None])
     except KeyboardInterrupt:
         stopped = "interrupted"
     chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)

@@ -46,7 +46,14 @@ def simulated_history(
     if poses is not None:
         start[..., :3], start[..., 3:] = poses, 0.0
     actions = rng.normal(0.0, wrench_sd, (trajectories, intervals, k, 3))
-    states = simulator(layout.to_vector(truth), start, actions)
+    # as in state.INPUT: the wrench, the one before, and when
+    previous = np.concatenate([np.zeros_like(actions[:, :1]), actions[:, :-1]], axis=1)
+    when = np.empty_like(actions)
+    when[..., 0] = np.arange(trajectories)[:, None, None]
+    when[..., 1] = scene.time_step * np.arange(intervals)[:, None]
+    when[..., 2] = when[..., 1] + scene.time_step
+    inputs = np.concatenate([actions, previous, when], axis=-1)
+    states = simulator(layout.to_vector(truth), start, inputs)
     states = np.concatenate([start[:, None], states], axis=1)
     states += rng.standard_normal(states.shape) * noise
     rows = [
