@@ -9,7 +9,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.model.test_model import simulated_history
+from tests.helpers.histories import simulated_history
 
 PUCK = Scene(
     time_step=0.1, bodies=(Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}),)
