@@ -1,10 +1,18 @@
-"""CONTRIBUTING.md lists the rooms as they are: in the order of imports, in their own words."""
+"""CONTRIBUTING.md lists the rooms as they are, and no test imports another."""
 
 import ast
 import re
 import tomllib
 
 from tests.helpers.places import ROOT
+
+
+def test_no_test_imports_another() -> None:
+    """What several need is in tests/helpers."""
+    files = sorted((ROOT / "tests").rglob("*.py"))
+    others = re.compile(r"^\s*(?:from|import) tests(?!\.helpers\b).*", re.M)
+    assert [(each.name, others.findall(each.read_text())) for each in files
+            if others.search(each.read_text())] == []  # fmt: skip
 
 
 def test_contributing_lists_the_rooms() -> None:

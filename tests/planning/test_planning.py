@@ -71,16 +71,23 @@ def test_bound_is_the_double_integrators_least_time() -> None:
     np.testing.assert_allclose(bound(at[None, :, None])[0], expected, rtol=1e-12)
 
 
-def test_bound_goes_around_walls() -> None:
-    """The shortest way over the wall's end, to the grid's 5 %, and never more than it."""
-    goal = Goal.of({"puck": (1.5, -1.0, None)})
-    start = state(x=-1.5, y=-1.0)[None]
+@pytest.mark.parametrize("at", [(-1.5, -1.0), (-1.5, 0.0), (-2.0, -2.0), (-1.0, -1.0), (-0.5, 0.5)])
+def test_bound_goes_around_walls(at) -> None:
+    """The shortest way of the puck's centre over the wall's end, to the grid's 1 %.
+
+    Two tangents of the circle about the wall's end that the puck's rim leaves free, and its arc.
+    """
+    end, rim = np.array([0.0, 1.0]), 0.2
+    arms = np.array([at, (1.5, -1.0)]) - end
+    far = np.hypot(*arms.T)
+    around = 2 * np.pi - np.arccos(arms[0] @ arms[1] / far.prod()) - np.arccos(rim / far).sum()
+    shortest = np.sqrt(far**2 - rim**2).sum() + rim * around
+    goal = Goal.of({"puck": (1.5, -1.0, None)}, tolerance=0.1)
+    start = state(*at)[None]
     bound = TimeToGo(known(ROOM), goal, PUSHES, start)
     a = np.hypot(FORCE, FORCE) / MASS
-    shortest = 2 * np.hypot(1.5, 2.0)  # for the origin of a point; the puck's circle goes wider
-    wide = 2 * np.hypot(1.5 + 0.2, 2.0 + 0.2)
     found = a / 2 * float(bound(start[None, None])[0, 0]) ** 2 + 0.1
-    assert 0.95 * shortest < found < wide
+    assert found == pytest.approx(shortest, rel=0.01)
 
 
 def test_bound_is_below_what_plans_take() -> None:

@@ -140,24 +140,30 @@ def test_posterior_predictive_is_like_the_data(fitted) -> None:
     assert ((mean_square > 0.25) & (mean_square < 2.0)).all(), mean_square
 
 
-def test_truth_is_inside(fitted) -> None:
+def test_truth_is_inside(model, fitted) -> None:
     """Each parameter within 4 posterior sd: false alarm 4e-4, and more for the sd's own error."""
     for name in PARAMETERS:
         values = draws(fitted)[name]
         assert abs(values.mean() - CART[name]) < 4 * values.std(), name
-    # Eq. 11's sigma holds the start state's noise as well: at least the sensor's, at most thrice
+    # Eq. 11's sigma is the residual's, to 10 %; it holds the start state's noise beside the
+    # sensor's, and so lies between that and thrice it
     sigma = draws(fitted)["sigma"].mean(axis=0)
-    assert (sigma > 0.6 * np.array(NOISE)).all()
-    assert (sigma < 5.0 * np.array(NOISE)).all()
+    residual = model.problem.residual(model.problem.layout.to_vector(CART))
+    np.testing.assert_allclose(sigma, np.sqrt((residual**2).mean(axis=(0, 1, 2))), rtol=0.1)
+    assert (sigma > np.array(NOISE)).all()
+    assert (sigma < 3.0 * np.array(NOISE)).all()
 
 
 def test_agrees_with_the_laplace_approximation(mode, fitted) -> None:
-    """A cart without contacts: near Gaussian. Two routes, one answer, to half a sd."""
+    """A cart without contacts: near Gaussian. Means to half a sd, widths to a factor of two.
+
+    Of 200 draws and of 10 times as many, means were within 0.1 sd, widths 0.69 (w_y) to 1.04.
+    """
     deviation = np.sqrt(np.diag(mode.covariance))
     for i, name in enumerate(PARAMETERS):
         values = draws(fitted)[name].ravel()
-        assert values.mean() == pytest.approx(mode.phi[i], abs=1.5 * deviation[i]), name
-        assert 0.3 < values.std() / deviation[i] < 3.0, name
+        assert values.mean() == pytest.approx(mode.phi[i], abs=0.5 * deviation[i]), name
+        assert 0.5 < values.std() / deviation[i] < 2.0, name
 
 
 @FORK
