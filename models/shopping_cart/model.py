@@ -30,7 +30,7 @@ def cart_model(scene: pp.Scene, history: pp.History) -> pm.Model:
         # Table 1, the wheel's pose within the bounds of the body
         w_x = pm.TruncatedNormal("w_x", mu=0, sigma=x_max - x_min, lower=x_min, upper=x_max)
         w_y = pm.TruncatedNormal("w_y", mu=0, sigma=y_max - y_min, lower=y_min, upper=y_max)
-        w_theta = pm.VonMises("w_theta", mu=0, kappa=0.5)
+        w_theta = pm.VonMises("w_theta", mu=0, kappa=1e-12)  # uniform
         # Eq. 11: s' ~ Normal(f(s, a; Phi), sigma^2), with one sigma for all dimensions
         sigma = pm.HalfNormal("sigma", sigma=1.0)
         phi = pt.stack([mass, r, mu_c, w_x, w_y, w_theta, mu_x, mu_y])

@@ -28,8 +28,9 @@ Array = NDArray[np.float64]
 #: Half the side of the square in which a joint's anchor in the world is sought where the scene has
 #: neither walls nor poses (m).
 _UNBOUNDED = 10.0
-#: Above this concentration PyMC 5's von Mises density overflows.
-_SHARP = 500.0
+#: Above this concentration PyMC 5's von Mises density overflows; and PyMC wants more than 0, of
+#: which this little is uniform to the last digit.
+_SHARP, _LEVEL = 500.0, 1e-12
 
 
 def table1(body: Body) -> dict[str, Prior]:
@@ -64,7 +65,7 @@ def table1(body: Body) -> dict[str, Prior]:
         "mu_c": share,
         "w_x": Prior("truncated_normal", sigma=x_max - x_min, lower=x_min, upper=x_max),
         "w_y": Prior("truncated_normal", sigma=y_max - y_min, lower=y_min, upper=y_max),
-        "w_theta": Prior("von_mises", mu=0.0, kappa=0.5),
+        "w_theta": Prior("von_mises", mu=0.0, kappa=0.0),  # uniform, as the wheel's symmetry is
         "mu_x": share,
         "mu_y": share,
     }
@@ -272,6 +273,7 @@ def random_variable(
 
 def _von_mises(name: str, mu: Array, kappa: Array, dims: str) -> Any:
     """PyMC's von Mises, or the same density written so that a sharp one does not overflow."""
+    kappa = np.maximum(kappa, _LEVEL)
     if kappa.max() <= _SHARP:
         return pm.VonMises(name, mu=mu, kappa=kappa, dims=dims)
     log_norm = np.log(2 * np.pi * i0e(kappa))
@@ -281,5 +283,6 @@ def _von_mises(name: str, mu: Array, kappa: Array, dims: str) -> Any:
         kappa,
         logp=lambda value, mu, kappa: kappa * (pm.math.cos(value - mu) - 1.0) - log_norm,
         dist=lambda mu, kappa, size: pm.VonMises.dist(mu, kappa, size=size),
+        transform=pm.distributions.transforms.circular,
         dims=dims,
     )

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, log_posterior, robust
 from pbrl_ppl.modes.noise import FAR_OFF, profile_sigma
 from pbrl_ppl.numerics import differentiate
-from pbrl_ppl.parameters import box, fold_wheels, inside, prior_residual
+from pbrl_ppl.parameters import box, inside, likeliest, prior_residual
 from pbrl_ppl.physics import PartedSimulator
 
 Array = NDArray[np.float64]
@@ -22,6 +22,8 @@ Peak = tuple[Array, Array, float]
 
 #: Gain in log-posterior that is not worth another round.
 STALLED = 0.02
+#: Precision of an angle of which nothing is known, as if it were normal: 1 / variance (1/rad^2).
+_CIRCLE = 3.0 / np.pi**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,9 +152,17 @@ def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
     return sigma, float(log_posterior(problem, phi, sigma, log_likelihood=likelihood))
 
 
+def described(problem: Problem, peak: Peak) -> Peak:
+    """A peak with each wheel in its most probable description; the predictions are the same."""
+    phi, sigma, value = peak
+    better = likeliest(problem.layout, phi)
+    gain = problem.layout.log_prior(better) - problem.layout.log_prior(phi)
+    return better, sigma, value + float(gain.sum())
+
+
 def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> Mode:
-    """Fold the wheel's symmetry, and take the Jacobian at the posterior's own scale."""
-    phi = fold_wheels(problem.layout, phi)
+    """Take the Jacobian at the posterior's own scale, wheels in their likeliest description."""
+    phi, sigma, log_posterior = described(problem, (phi, sigma, log_posterior))
     priors = problem.layout.priors
     if not priors:
         cells = problem.observations.values.size
@@ -170,6 +180,8 @@ def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> 
     _, steps = posterior_steps(rough, phi, lower, upper, begin)
     jacobian = differentiate(residual, phi, steps, lower, upper)
     precision = jacobian.T @ jacobian
+    angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
+    precision[angles, angles] += _CIRCLE  # no angle is wider than its circle
     covariance = np.linalg.pinv(precision, hermitian=True)
     n_cells = len(jacobian) - len(phi)
     return Mode(

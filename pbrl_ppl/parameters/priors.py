@@ -33,11 +33,11 @@ class Prior:
     mu, sigma : float
         Location and scale; of the logarithm for ``log_normal``. A ``half_normal`` is a normal cut
         off at zero, about zero unless ``mu`` says otherwise. For ``von_mises``, ``mu`` is the mean
-        direction and ``kappa`` the concentration.
+        direction and ``kappa`` the concentration; without any it is uniform on the circle.
     lower, upper : float
         Support of a truncated normal or a categorical distribution.
     kappa : float
-        Concentration of a von Mises distribution.
+        Concentration of a von Mises distribution, 0 or more.
 
     Raises
     ------
@@ -63,8 +63,10 @@ class Prior:
             value = getattr(self, key)
             if not np.isfinite(value):
                 raise ParameterError(f"{self.family}: {key} is {value}, expected a finite number")
-            if key != "mu" and value <= 0:
+            if key == "sigma" and value <= 0:
                 raise ParameterError(f"{self.family}: {key} is {value}, expected more than 0")
+            if key == "kappa" and value < 0:
+                raise ParameterError(f"{self.family}: {key} is {value}, expected 0 or more")
         if self.family not in ("truncated_normal", "half_normal"):
             return
         lower, upper = self.support
@@ -98,6 +100,11 @@ class Prior:
     def discrete(self) -> bool:
         """Whether the values are whole numbers that stand for names."""
         return self.family == "categorical"
+
+    @property
+    def uniform(self) -> bool:
+        """Whether it is an angle of which nothing is known."""
+        return self.family == "von_mises" and self.kappa == 0
 
     @property
     def centre(self) -> float:

@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 #: Limits of a truncated normal: mu this many sigmas outside the support is an exponential's slope,
 #: and sigma this many times the width of what it covers is level.
 _OUTSIDE, _LEVEL = 5.0, 5.0
-#: Limits of a von Mises concentration: level, and 0.001 rad.
+#: Limits of a von Mises concentration: as good as uniform, and 0.001 rad.
 _KAPPA = (1e-3, 1e6)
 
 
@@ -126,7 +126,7 @@ def _concentration(resultant: float) -> float:
         return float(i1e(kappa) / i0e(kappa)) - resultant
 
     if excess(low) >= 0 or excess(high) <= 0:
-        return _KAPPA[0] if excess(low) >= 0 else _KAPPA[1]
+        return 0.0 if excess(low) >= 0 else _KAPPA[1]
     return float(np.exp(brentq(excess, low, high)))
 
 

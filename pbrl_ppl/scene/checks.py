@@ -59,6 +59,14 @@ def positive(value: object, where: str) -> float:
     return number
 
 
+def not_negative(value: object, where: str) -> float:
+    """Return a number from zero up as a float."""
+    number = finite(value, where)
+    if number < 0:
+        raise SceneError(f"{where} is {number}, expected 0 or more")
+    return number
+
+
 def flag(value: object, where: str) -> None:
     """Refuse what is not a boolean."""
     if not isinstance(value, bool):
@@ -136,7 +144,7 @@ def hyper_parameters(
                 raise SceneError(
                     f'unknown key "{key}" in prior {name} of {where}{nearest(key, HYPER_NAMES)}'
                 )
-            check = finite if key == "mu" else positive
+            check = {"mu": finite, "sigma": positive, "kappa": not_negative}[key]
             hyper[key] = check(item, f"{where}: prior {name} {key}")
         prior[name] = tuple((key, hyper[key]) for key in HYPER_NAMES if key in hyper)
     order = (*PARAMETER_NAMES, *sorted(prior.keys() - set(PARAMETER_NAMES)))

@@ -156,6 +156,7 @@ def test_too_many_configurations_are_refused() -> None:
         Prior("half_normal", mu=1.0, sigma=3.0),
         Prior("truncated_normal", mu=0.5, sigma=1.0, lower=0.0, upper=1.0),
         Prior("truncated_normal", mu=9.0, sigma=1.0, lower=0.0, upper=1.0),
+        Prior("von_mises", mu=0.0, kappa=0.0),
         Prior("von_mises", mu=1.0, kappa=0.5),
         Prior("von_mises", mu=3.0, kappa=2000.0),
     ],
@@ -196,7 +197,7 @@ def test_evidence_is_that_of_a_fine_grid() -> None:
     prior = sum(
         pm.logp(law, values).eval()
         for law, values in (
-            (pm.VonMises.dist(mu=0.0, kappa=0.5), grid[:, 0]),
+            (pm.Uniform.dist(-np.pi, np.pi), grid[:, 0]),
             (pm.TruncatedNormal.dist(mu=0.5, sigma=1.0, lower=0.0, upper=1.0), grid[:, 1]),
         )
     )
