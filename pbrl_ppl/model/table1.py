@@ -21,7 +21,7 @@ from pbrl_ppl.parameters import (
     Layout,
     Prior,
 )
-from pbrl_ppl.scene import CONTACT_NAMES, WORLD, Body, Scene, nearest
+from pbrl_ppl.scene import CONTACT_NAMES, WORLD, Body, Joint, Scene, nearest
 
 Array = NDArray[np.float64]
 
@@ -124,6 +124,32 @@ def anchor_prior(scene: Scene, holder: str, axis: int, centre: float | None = No
     return Prior("truncated_normal", mu=mu, sigma=upper - lower, lower=lower, upper=upper)
 
 
+def index_priors(scene: Scene, joint: Joint) -> tuple[Prior, Prior]:
+    """Table 1 for ``i_a`` and ``i_b`` of a joint of unknown bodies.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its ``joinable`` are what the indices count.
+    joint : Joint
+        Its ``prior`` says how probable each is.
+    """
+    declared = {index: dict(table) for index, table in joint.prior}
+    upper = float(len(scene.joinable) - 1)
+    one, other = (
+        Prior(
+            "categorical",
+            lower=0.0,
+            upper=upper,
+            weights=tuple(declared[index].get(name, 0.0) for name in scene.joinable)
+            if index in declared
+            else (),
+        )
+        for index in JOINT_INDICES
+    )
+    return one, other
+
+
 def _joint_blocks(scene: Scene) -> list[Block]:
     """Table 1's parameters of the joints that are to be inferred."""
     joints = [
@@ -134,8 +160,11 @@ def _joint_blocks(scene: Scene) -> list[Block]:
     if not joints:
         return []
     free = tuple(name for name, joint in joints if joint.bodies is None)
-    index = Prior("categorical", lower=0.0, upper=float(len(scene.joinable) - 1))
-    blocks = [Block(i, free, "1", (index,) * len(free), of="joint") for i in JOINT_INDICES if free]
+    indices = [index_priors(scene, joint) for _, joint in joints if joint.bodies is None]
+    blocks = [
+        Block(name, free, "1", priors, of="joint")
+        for name, priors in zip(JOINT_INDICES, zip(*indices, strict=True), strict=False)
+    ]
     for column, (name, unit) in enumerate(JOINT_ANCHORS.items()):
         side, axis = divmod(column, 2)
         conditional = []
@@ -263,8 +292,8 @@ def random_variable(
             return pm.TruncatedNormal(name, mu=mu, sigma=sigma, lower=0.0, dims=dims)
         return pm.HalfNormal(name, sigma=sigma, dims=dims)
     if family == "categorical":
-        n = int(priors[0].upper) + 1
-        return pm.Categorical(name, p=np.full((len(priors), n), 1.0 / n), dims=dims)
+        p = np.stack([prior.probabilities for prior in priors])
+        return pm.Categorical(name, p=p, dims=dims)
     raise ParameterError(
         f"prior of {name}: family {family!r} is unknown; use log_normal, truncated_normal, normal,"
         " half_normal, von_mises or categorical"

@@ -20,6 +20,8 @@ CONTACT_NAMES = ("r", "mu_c")
 """Those of them that a contact needs: all that a kinematic body has."""
 
 HYPER_NAMES = ("mu", "sigma", "kappa")
+INDEX_NAMES = ("i_a", "i_b")
+"""The indices of a joint of unknown bodies."""
 
 
 def nearest(name: object, known: Iterable[str]) -> str:
@@ -122,6 +124,24 @@ def known_parameters(value: object, where: str) -> tuple[tuple[str, float], ...]
             raise SceneError(f"{where}: known {name} is {number}, expected between 0 and 1")
         known[name] = number
     return tuple((name, known[name]) for name in PARAMETER_NAMES if name in known)
+
+
+def index_probabilities(
+    value: object, where: str
+) -> tuple[tuple[str, tuple[tuple[str, float], ...]], ...]:
+    """Return what a joint's first and second index may be: a probability each name."""
+    prior: dict[str, tuple[tuple[str, float], ...]] = {}
+    for index, table in _items(value, f"{where}: prior"):
+        if index not in INDEX_NAMES:
+            raise SceneError(
+                f'unknown index "{index}" in prior of {where}{nearest(index, INDEX_NAMES)}'
+            )
+        here = f"{where}: prior {index}"
+        given = {label(n, here): not_negative(p, f"{here} {n}") for n, p in _items(table, here)}
+        if not sum(given.values()) > 0:
+            raise SceneError(f"{here} has no name of a probability above 0; add one")
+        prior[index] = tuple(given.items())
+    return tuple((index, prior[index]) for index in INDEX_NAMES if index in prior)
 
 
 def hyper_parameters(

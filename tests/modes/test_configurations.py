@@ -19,7 +19,6 @@ from pbrl_ppl.model import Problem, build_layout, physics_model
 from pbrl_ppl.modes import Mode, find_mode, weigh
 from pbrl_ppl.modes.configurations import (
     ATTRIBUTE,
-    MOST,
     Configuration,
     Weighed,
     configurations,
@@ -136,12 +135,6 @@ def test_named_joints_keep_their_names_without_the_free_ones() -> None:
         scene(Joint("hinge", known=False), held)
     )
     assert left.joint_names == ("joint2",)
-
-
-def test_too_many_configurations_are_refused() -> None:
-    kinds = ("hinge", "distance", "hinge")
-    with pytest.raises(FitError, match=rf"joint1, joint3, joint2.*make 726 .*at most {MOST};"):
-        configurations(scene(*(Joint(kind, known=False) for kind in kinds)))
 
 
 # -- evidence --------------------------------------------------------------------------------------
