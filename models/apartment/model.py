@@ -50,7 +50,7 @@ def apartment_model(scene: pp.Scene, history: pp.History) -> pm.Model:
         w_y = pm.TruncatedNormal(
             "w_y", mu=0, sigma=y_max - y_min, lower=y_min, upper=y_max, dims="wheel"
         )
-        w_theta = pm.VonMises("w_theta", mu=0, kappa=0.5, dims="wheel")
+        w_theta = pm.VonMises("w_theta", mu=0, kappa=1e-12, dims="wheel")  # uniform
         # P(sigma): weak, about a tenth of how much each state dimension changes
         typical = np.sqrt(np.mean(short_way(measured - start[:, None]) ** 2, axis=(0, 1, 2)))
         sigma = pm.LogNormal("sigma", mu=np.log(0.1 * typical), sigma=2.0, shape=6)

@@ -34,7 +34,7 @@ def cart_model(scene: pp.Scene, history: pp.History) -> pm.Model:
         # Table 1, the wheel's pose within the bounds of the body
         w_x = pm.TruncatedNormal("w_x", mu=0, sigma=x_max - x_min, lower=x_min, upper=x_max)
         w_y = pm.TruncatedNormal("w_y", mu=0, sigma=y_max - y_min, lower=y_min, upper=y_max)
-        w_theta = pm.VonMises("w_theta", mu=0, kappa=0.5)
+        w_theta = pm.VonMises("w_theta", mu=0, kappa=1e-12)  # uniform
         # P(sigma): weak, about a tenth of how much each state dimension changes
         typical = np.sqrt(np.mean(short_way(measured - start[:, None]) ** 2, axis=(0, 1, 2)))
         sigma = pm.LogNormal("sigma", mu=np.log(0.1 * typical), sigma=2.0, shape=6)

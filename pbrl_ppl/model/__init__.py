@@ -17,7 +17,7 @@ from pbrl_ppl.model.noise import Noise, sigma_prior
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
 from pbrl_ppl.model.problem import Problem
-from pbrl_ppl.model.table1 import build_layout
+from pbrl_ppl.model.table1 import build_layout, index_priors
 from pbrl_ppl.model.transition import Transition
 
 __all__ = [
@@ -33,6 +33,7 @@ __all__ = [
     "build_layout",
     "build_model",
     "estimate_sigma",
+    "index_priors",
     "log_density",
     "log_noise_prior",
     "log_posterior",

@@ -21,15 +21,16 @@ from pbrl_ppl.parameters import (
     Layout,
     Prior,
 )
-from pbrl_ppl.scene import CONTACT_NAMES, WORLD, Body, Scene, nearest
+from pbrl_ppl.scene import CONTACT_NAMES, WORLD, Body, Joint, Scene, nearest
 
 Array = NDArray[np.float64]
 
 #: Half the side of the square in which a joint's anchor in the world is sought where the scene has
 #: neither walls nor poses (m).
 _UNBOUNDED = 10.0
-#: Above this concentration PyMC 5's von Mises density overflows.
-_SHARP = 500.0
+#: Above this concentration PyMC 5's von Mises density overflows; and PyMC wants more than 0, of
+#: which this little is uniform to the last digit.
+_SHARP, _LEVEL = 500.0, 1e-12
 
 
 def table1(body: Body) -> dict[str, Prior]:
@@ -64,7 +65,7 @@ def table1(body: Body) -> dict[str, Prior]:
         "mu_c": share,
         "w_x": Prior("truncated_normal", sigma=x_max - x_min, lower=x_min, upper=x_max),
         "w_y": Prior("truncated_normal", sigma=y_max - y_min, lower=y_min, upper=y_max),
-        "w_theta": Prior("von_mises", mu=0.0, kappa=0.5),
+        "w_theta": Prior("von_mises", mu=0.0, kappa=0.0),  # uniform, as the wheel's symmetry is
         "mu_x": share,
         "mu_y": share,
     }
@@ -123,6 +124,32 @@ def anchor_prior(scene: Scene, holder: str, axis: int, centre: float | None = No
     return Prior("truncated_normal", mu=mu, sigma=upper - lower, lower=lower, upper=upper)
 
 
+def index_priors(scene: Scene, joint: Joint) -> tuple[Prior, Prior]:
+    """Table 1 for ``i_a`` and ``i_b`` of a joint of unknown bodies.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its ``joinable`` are what the indices count.
+    joint : Joint
+        Its ``prior`` says how probable each is.
+    """
+    declared = {index: dict(table) for index, table in joint.prior}
+    upper = float(len(scene.joinable) - 1)
+    one, other = (
+        Prior(
+            "categorical",
+            lower=0.0,
+            upper=upper,
+            weights=tuple(declared[index].get(name, 0.0) for name in scene.joinable)
+            if index in declared
+            else (),
+        )
+        for index in JOINT_INDICES
+    )
+    return one, other
+
+
 def _joint_blocks(scene: Scene) -> list[Block]:
     """Table 1's parameters of the joints that are to be inferred."""
     joints = [
@@ -133,8 +160,11 @@ def _joint_blocks(scene: Scene) -> list[Block]:
     if not joints:
         return []
     free = tuple(name for name, joint in joints if joint.bodies is None)
-    index = Prior("categorical", lower=0.0, upper=float(len(scene.joinable) - 1))
-    blocks = [Block(i, free, "1", (index,) * len(free), of="joint") for i in JOINT_INDICES if free]
+    indices = [index_priors(scene, joint) for _, joint in joints if joint.bodies is None]
+    blocks = [
+        Block(name, free, "1", priors, of="joint")
+        for name, priors in zip(JOINT_INDICES, zip(*indices, strict=True), strict=False)
+    ]
     for column, (name, unit) in enumerate(JOINT_ANCHORS.items()):
         side, axis = divmod(column, 2)
         conditional = []
@@ -262,8 +292,8 @@ def random_variable(
             return pm.TruncatedNormal(name, mu=mu, sigma=sigma, lower=0.0, dims=dims)
         return pm.HalfNormal(name, sigma=sigma, dims=dims)
     if family == "categorical":
-        n = int(priors[0].upper) + 1
-        return pm.Categorical(name, p=np.full((len(priors), n), 1.0 / n), dims=dims)
+        p = np.stack([prior.probabilities for prior in priors])
+        return pm.Categorical(name, p=p, dims=dims)
     raise ParameterError(
         f"prior of {name}: family {family!r} is unknown; use log_normal, truncated_normal, normal,"
         " half_normal, von_mises or categorical"
@@ -272,6 +302,7 @@ def random_variable(
 
 def _von_mises(name: str, mu: Array, kappa: Array, dims: str) -> Any:
     """PyMC's von Mises, or the same density written so that a sharp one does not overflow."""
+    kappa = np.maximum(kappa, _LEVEL)
     if kappa.max() <= _SHARP:
         return pm.VonMises(name, mu=mu, kappa=kappa, dims=dims)
     log_norm = np.log(2 * np.pi * i0e(kappa))
@@ -281,5 +312,6 @@ def _von_mises(name: str, mu: Array, kappa: Array, dims: str) -> Any:
         kappa,
         logp=lambda value, mu, kappa: kappa * (pm.math.cos(value - mu) - 1.0) - log_norm,
         dist=lambda mu, kappa, size: pm.VonMises.dist(mu, kappa, size=size),
+        transform=pm.distributions.transforms.circular,
         dims=dims,
     )

@@ -1,6 +1,14 @@
 """Peaks of the posterior: the climb, the search, their evidence, joints of unknown bodies."""
 
-from pbrl_ppl.modes.configurations import ATTRIBUTE, Weighed, doubts, joint_probabilities, stored
+from pbrl_ppl.modes.configurations import (
+    ATTRIBUTE,
+    Pair,
+    Weighed,
+    doubts,
+    index_law,
+    joint_probabilities,
+    stored,
+)
 from pbrl_ppl.modes.joint_search import weigh
 from pbrl_ppl.modes.laplace import Mode, posterior_steps, with_start_noise
 from pbrl_ppl.modes.library_choice import choose_from_library
@@ -9,10 +17,12 @@ from pbrl_ppl.modes.search import find_mode
 __all__ = [
     "ATTRIBUTE",
     "Mode",
+    "Pair",
     "Weighed",
     "choose_from_library",
     "doubts",
     "find_mode",
+    "index_law",
     "joint_probabilities",
     "posterior_steps",
     "stored",

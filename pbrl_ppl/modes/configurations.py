@@ -10,16 +10,21 @@ from dataclasses import dataclass, replace
 from itertools import combinations, combinations_with_replacement, product
 from typing import Any
 
-from pbrl_ppl.errors import FitError, PosteriorError
-from pbrl_ppl.model import Problem
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.model import Problem, index_priors
 from pbrl_ppl.modes.evidence import Evidence
 from pbrl_ppl.modes.laplace import Mode
+from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Scene
 
+Array = NDArray[np.float64]
 #: Two names in the order of ``scene.joinable``, or None where there is no joint.
 Pair = tuple[str, str] | None
 
-#: Beyond so many configurations a fit is refused: each takes about a second.
+#: So many configurations are tried at most: each takes about a second.
 MOST = 300
 #: A joint that joins nothing, in the tables that people read.
 NONE = "none"
@@ -57,7 +62,7 @@ class Configuration:
         """The scene with these joints' bodies named, and without those that join nothing."""
         chosen = dict(self.pairs)
         joints = [
-            replace(joint, name=name, bodies=joint.bodies or chosen[name])
+            replace(joint, name=name, bodies=joint.bodies or chosen[name], prior=())
             for name, joint in zip(scene.joint_names, scene.joints, strict=True)
             if joint.bodies is not None or chosen[name] is not None
         ]
@@ -94,21 +99,86 @@ class Weighed:
     probability: float
 
 
+@dataclass(frozen=True)
+class Alike:
+    """Joints of unknown bodies of one kind and one prior: which is called the first is no matter.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The joints.
+    weights : tuple of (tuple of (str, str) or None, float)
+        What each may join, and the probability of that; no joint last, and always among them.
+    """
+
+    names: tuple[str, ...]
+    weights: tuple[tuple[Pair, float], ...]
+
+
+def alike(scene: Scene) -> tuple[Alike, ...]:
+    """The joints whose bodies the scene does not name, those together that may be exchanged."""
+    groups: dict[tuple[str, Prior, Prior], list[str]] = {}
+    for name, joint in zip(scene.joint_names, scene.joints, strict=True):
+        if joint.bodies is None:
+            groups.setdefault((joint.kind, *index_priors(scene, joint)), []).append(name)
+    found = []
+    for (_, *priors), names in groups.items():
+        p_a, p_b = (prior.probabilities for prior in priors)
+        both = np.outer(p_a, p_b)
+        pairs = combinations(range(len(p_a)), 2)
+        weighed: list[tuple[Pair, float]] = [
+            ((scene.joinable[i], scene.joinable[j]), float(both[i, j] + both[j, i]))
+            for i, j in pairs
+        ]
+        possible = [each for each in weighed if each[1] > 0]
+        found.append(Alike(tuple(names), (*possible, (None, float(both.trace())))))
+    return tuple(found)
+
+
+def index_law(pair: Pair, scene: Scene, p_a: Array, p_b: Array) -> Array:
+    """Probabilities of (i_a, i_b), shape (n, n), given what is joined.
+
+    The two orders of a pair are the same joint. Where the indices have one prior, it is given in
+    the order of ``scene.joinable``; else each order has the probability that the priors give it.
+
+    Parameters
+    ----------
+    pair : tuple of (str, str) or None
+        What is joined.
+    scene : Scene
+        Its ``joinable`` are what the indices count.
+    p_a, p_b : ndarray
+        Prior probabilities of the indices, shape (n,).
+    """
+    both = np.outer(p_a, p_b)
+    law = np.zeros_like(both)
+    if pair is None:
+        np.fill_diagonal(law, np.diag(both))
+    else:
+        i, j = sorted(scene.joinable.index(name) for name in pair)
+        law[i, j], law[j, i] = both[i, j], both[j, i]
+        if np.array_equal(p_a, p_b):
+            law[j, i] = 0.0
+    return np.asarray(law / law.sum())
+
+
+def number(scene: Scene) -> int:
+    """How many configurations there are."""
+    return math.prod(
+        math.comb(len(each.weights) + len(each.names) - 1, len(each.names)) for each in alike(scene)
+    )
+
+
 def configurations(scene: Scene) -> tuple[Configuration, ...]:
     """Every choice for the joints whose bodies the scene does not name, no joint at all first.
 
-    Joints of one kind are exchangeable: of the ways to share pairs out among them, the one in
+    Joints that are alike are exchangeable: of the ways to share pairs out among them, the one in
     order counts for all.
 
     Parameters
     ----------
     scene : Scene
         Its ``joinable`` are what a joint may join.
-
-    Raises
-    ------
-    FitError
-        If there are more than can be tried.
 
     Examples
     --------
@@ -118,34 +188,49 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
     >>> [each.pairs[0][1] for each in configurations(scene)]
     [None, ('a', 'b'), ('a', 'world'), ('b', 'world')]
     """
-    names = scene.joinable
-    n = len(names)
-    choices: list[Pair] = [*combinations(names, 2), None]
-    free: dict[str, list[str]] = {}
-    for name, joint in zip(scene.joint_names, scene.joints, strict=True):
-        if joint.bodies is None:
-            free.setdefault(joint.kind, []).append(name)
-    count = math.prod(math.comb(len(choices) + len(own) - 1, len(own)) for own in free.values())
-    if count > MOST:
-        joints = [name for own in free.values() for name in own]
-        raise FitError(
-            f"fit: {len(joints)} joints of unknown bodies ({', '.join(joints)}) and {n} that they"
-            f" may join ({', '.join(names)}) make {count} configurations, expected at most {MOST};"
-            " name the bodies of some joints in the scene, or leave out bodies that cannot be"
-            " joined"
-        )
-    found = []
-    for each in product(*(combinations_with_replacement(choices, len(o)) for o in free.values())):
-        chosen: dict[str, Pair] = {}
-        weight = 1.0
-        for own, pairs in zip(free.values(), each, strict=True):
-            chosen |= zip(own, pairs, strict=True)
-            weight *= math.factorial(len(pairs))  # whichever of them is called the first
-            for times in Counter(pairs).values():
-                weight /= math.factorial(times)
-            weight *= math.prod((n if pair is None else 2) / n**2 for pair in pairs)
-        found.append(Configuration(tuple(chosen.items()), math.log(weight)))
-    return tuple(sorted(found, key=lambda one: not one.empty))
+    groups = alike(scene)
+    ways = (
+        combinations_with_replacement([pair for pair, _ in own.weights], len(own.names))
+        for own in groups
+    )
+    found = [_configuration(groups, each) for each in product(*ways)]
+    possible = [each for each in found if each.empty or np.isfinite(each.log_prior)]
+    return tuple(sorted(possible, key=lambda one: not one.empty))
+
+
+def nothing(scene: Scene) -> Configuration:
+    """The configuration in which nothing is joined, whether or not the prior allows it."""
+    groups = alike(scene)
+    return _configuration(groups, [[None] * len(own.names) for own in groups])
+
+
+def one_more(scene: Scene, configuration: Configuration) -> tuple[Configuration, ...]:
+    """The configurations with one more joint than this one has."""
+    groups, chosen, found = alike(scene), dict(configuration.pairs), []
+    for i, own in enumerate(groups):
+        order = [pair for pair, _ in own.weights]
+        held = [[chosen[name] for name in each.names] for each in groups]
+        if None not in held[i]:
+            continue
+        for pair in order[:-1]:
+            grown = sorted([*held[i][: held[i].index(None)], pair], key=order.index)
+            held_now = [*grown, *[None] * (len(own.names) - len(grown))]
+            found.append(_configuration(groups, [*held[:i], held_now, *held[i + 1 :]]))
+    return tuple(found)
+
+
+def _configuration(groups: Sequence[Alike], held: Sequence[Sequence[Pair]]) -> Configuration:
+    """What the joints of each group join, in the group's order, and its prior."""
+    chosen: dict[str, Pair] = {}
+    weight = 1.0
+    for own, pairs in zip(groups, held, strict=True):
+        chosen |= zip(own.names, pairs, strict=True)
+        weight *= math.factorial(len(pairs))  # whichever of them is called the first
+        for times in Counter(pairs).values():
+            weight /= math.factorial(times)
+        law = dict(own.weights)
+        weight *= math.prod(law[pair] for pair in pairs)
+    return Configuration(tuple(chosen.items()), math.log(weight) if weight else -math.inf)
 
 
 def stored(found: Sequence[Weighed]) -> str:

@@ -12,7 +12,7 @@ from scipy.stats import truncnorm
 
 from pbrl_ppl.model import noise_law
 from pbrl_ppl.modes.laplace import Mode
-from pbrl_ppl.parameters import Prior
+from pbrl_ppl.parameters import Prior, evened
 
 Array = NDArray[np.float64]
 
@@ -87,7 +87,8 @@ class Coordinates:
             problem.log_density(problem.residual(phi[i:j]), sigma[i:j], phi[i:j])
             for i, j in ((i, i + _CHUNK) for i in range(0, len(z), _CHUNK))
         ]
-        return np.asarray(np.concatenate(parts).sum(axis=-1) + _log_normal(z))
+        even = evened(problem.layout, phi).sum(axis=-1)  # it sees one description of a wheel
+        return np.asarray(np.concatenate(parts).sum(axis=-1) + _log_normal(z) + even)
 
     def gauss_newton(self, mode: Mode) -> tuple[Array, Array]:
         """The mode in these coordinates, shape (d,), and the Laplace covariance, shape (d, d)."""

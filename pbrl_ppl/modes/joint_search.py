@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,14 +11,23 @@ from rich.progress import track
 from scipy.optimize import least_squares
 from scipy.special import logsumexp
 
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import lever
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes.configurations import Configuration, Weighed, configurations
+from pbrl_ppl.modes.configurations import (
+    MOST,
+    Configuration,
+    Weighed,
+    configurations,
+    nothing,
+    number,
+    one_more,
+)
 from pbrl_ppl.modes.evidence import Evidence, importance, laplace
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import JOINT_ANCHORS, inside, prior_draws
-from pbrl_ppl.scene import WORLD, Joint
+from pbrl_ppl.scene import WORLD, Joint, Scene
 
 Array = NDArray[np.float64]
 
@@ -45,6 +54,11 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
     geometry puts the anchors. The evidence is Laplace's, and for those that it cannot rule out an
     importance sampler's.
 
+    All configurations are tried where there are at most 300. Where there are more, each joint is
+    tried by itself first, and further ones are added to the best so far (beam search), 300 in all.
+    Then the probabilities are among what was tried, and joints that explain the recording only
+    together may be missed.
+
     Parameters
     ----------
     problem : Problem
@@ -57,26 +71,18 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
     Returns
     -------
     tuple of Weighed
-        As :func:`pbrl_ppl.modes.configurations.configurations` orders them.
+        No joint at all first; then as :func:`pbrl_ppl.modes.configurations.configurations` orders
+        them, or in the order in which they were tried.
 
     Raises
     ------
     FitError
-        If there are too many configurations.
+        If a single joint may join more pairs than can be tried.
     """
-    every = configurations(problem.scene)
     problem.segments  # noqa: B018  # checks the start states, once for all
     console = Console(stderr=True)
-    modes: dict[Configuration, Mode] = {}
-    for each in track(every, "trying joints", console=console, disable=not progress):
-        own = each.problem(problem)
-        if each.empty:
-            modes[each] = _apart(own, seed)
-            continue
-        worth = max(mode.log_posterior for mode in modes.values()) - _HOPELESS
-        modes[each] = _joint(own, each, modes[every[0]], worth)
-    worth = max(mode.log_posterior for mode in modes.values()) - _HOPELESS
-    evidence = {each: laplace(mode) for each, mode in modes.items()}
+    modes, evidence = _tried(problem, seed, console, progress)
+    every, worth = tuple(modes), _worth(modes)
     leading = _leading(evidence, _CONTENDERS, at_least=_BEST)
     for each in track(leading, "looking again", console=console, disable=not progress):
         if each.empty:
@@ -98,6 +104,63 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
     )
 
 
+def _tried(
+    problem: Problem, seed: int, console: Console, progress: bool
+) -> tuple[dict[Configuration, Mode], dict[Configuration, Evidence]]:
+    """Modes of all configurations, or of those that a search comes to; no joint at all first.
+
+    And their evidence by the Laplace method.
+    """
+    scene = problem.scene
+    apart = nothing(scene)
+    modes = {apart: _apart(apart.problem(problem), seed)}
+    evidence = {apart: laplace(modes[apart])}
+
+    def extend(parents: Mapping[Configuration, Configuration], what: str) -> None:
+        for each, parent in track(
+            list(parents.items()), what, console=console, disable=not progress
+        ):
+            own = each.problem(problem)
+            modes[each] = _joint(own, each, modes[parent], _worth(modes))
+            evidence[each] = laplace(modes[each])
+
+    if number(scene) <= MOST:
+        others = [each for each in configurations(scene) if not each.empty]
+        extend(dict.fromkeys(others, apart), "trying joints")
+        return modes, evidence
+    best, levels = [apart], len(apart.pairs)
+    for level in range(levels):
+        grown = {
+            each: parent for parent in best for each in one_more(scene, parent) if each not in modes
+        }
+        if len(modes) + len(grown) > MOST:
+            raise FitError(_too_many(scene, len(grown)))
+        extend(grown, f"trying joint {level + 1} of {levels}")
+        # one that is impossible by the prior may lead to what is not: if each joint joins something
+        score = {e: evidence[e].log_z + max(e.log_prior, -_CONTENDERS) for e in evidence}
+        least = max(score.values()) - 2 * _CONTENDERS
+        best = sorted((e for e in grown if score[e] > least), key=lambda e: -score[e])
+        room = (MOST - len(modes)) // max(levels - level - 1, 1)
+        most = max((len(one_more(scene, each)) for each in best[:1]), default=1)
+        best = best[: max(room // max(most, 1), 1)]
+    return modes, evidence
+
+
+def _too_many(scene: Scene, count: int) -> str:
+    names = scene.joinable
+    return (
+        f"fit: the joints of unknown bodies have {count} configurations to be tried at once, of"
+        f" {len(names)} that they may join ({', '.join(names)}), expected at most {MOST}; name the"
+        " bodies of some joints in the scene, leave out bodies that cannot be joined, or give the"
+        " joints a prior that leaves them out (prior = { i_a = { ... } })"
+    )
+
+
+def _worth(modes: Mapping[Configuration, Mode]) -> float:
+    """Log-posterior below which a mode is hopeless."""
+    return max(mode.log_posterior for mode in modes.values()) - _HOPELESS
+
+
 def _score(configuration: Configuration, evidence: Evidence) -> float:
     return configuration.log_prior + evidence.log_z
 
@@ -116,15 +179,15 @@ def _apart(problem: Problem, seed: int) -> Mode:
     return _best(problem, find_modes(problem.coarse, seed=seed), -np.inf)
 
 
-def _joint(problem: Problem, configuration: Configuration, apart: Mode, worth: float) -> Mode:
-    """The mode, from where geometry puts the anchors, with bodies as without joints or as before.
+def _joint(problem: Problem, configuration: Configuration, fewer: Mode, worth: float) -> Mode:
+    """The mode, from where geometry puts the anchors, bodies as the prior or fewer joints have.
 
     The hills are told apart with few engine steps; the best is climbed with the exact engine.
     """
     starts = []
     for anchors in _placed(problem, configuration):
         centre = np.array([prior.centre for prior in problem.layout.priors])
-        for start in (centre, _carried(apart, problem, centre)):
+        for start in (centre, _carried(fewer, problem, centre)):
             start[_anchor_places(problem, configuration)] = anchors
             starts.append(start)
     return _best(problem, _climbed(problem, starts), worth)

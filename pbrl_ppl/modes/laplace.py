@@ -8,22 +8,23 @@ from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares, minimize
+from scipy.optimize import least_squares
 
 from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, profile_sigma
+from pbrl_ppl.modes.tails import best_tails, tail_precision
 from pbrl_ppl.numerics import differentiate
-from pbrl_ppl.parameters import box, fold_wheels, inside, prior_residual
+from pbrl_ppl.parameters import box, inside, likeliest, prior_residual
 from pbrl_ppl.physics import PartedSimulator
 
 Array = NDArray[np.float64]
 #: Where a climb ended: phi, sigma and the log-posterior there.
 Peak = tuple[Array, Array, float]
 
-#: Step of a second difference in the noise's tails, and the least curvature.
-_TAIL_STEP, _LEAST_CURVATURE = 0.02, 1.0
 #: Gain in log-posterior that is not worth another round.
 STALLED = 0.02
+#: Precision of an angle of which nothing is known, as if it were normal: 1 / variance (1/rad^2).
+_CIRCLE = 3.0 / np.pi**2
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ def climb(
 
     def whole(points: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
         points = points.copy()
-        points[..., tails] = phi[tails]  # no least squares: see `_best_tails`
+        points[..., tails] = phi[tails]  # no least squares: see `best_tails`
         z = problem.robust(points, sigma, engine).reshape(*points.shape[:-1], -1)
         z = np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
         return np.concatenate([z, prior_residual(priors, points)], axis=-1)
@@ -135,7 +136,7 @@ def climb(
             residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=tries,
             ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
-        reached = _best_tails(problem, result.x, sigma)
+        reached = best_tails(problem, result.x, sigma)
         better, improved = _at(problem, reached)
         if improved < value:
             break
@@ -155,52 +156,17 @@ def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
     return sigma, float(log_posterior(problem, phi, sigma, log_likelihood=likelihood))
 
 
-def _tail_cost(problem: Problem, phi: Array, sigma: Array) -> Callable[[Array], float]:
-    """Negative log-posterior as a function of the noise's tails alone."""
-    residual, tails = np.nan_to_num(problem.residual(phi), nan=FAR_OFF), list(problem.tails)
-
-    def cost(values: Array) -> float:
-        point = phi.copy()
-        point[tails] = values
-        likelihood = problem.log_density(residual, sigma, point).sum()
-        return -float(likelihood + problem.layout.log_prior(point)[tails].sum())
-
-    return cost
-
-
-def _best_tails(problem: Problem, phi: Array, sigma: Array) -> Array:
-    """Phi with the most probable tails; a density's constant depends on them."""
-    if not problem.tails:
-        return phi
-    tails = list(problem.tails)
-    lower, upper = (end[tails] for end in box(problem.layout.priors))
-    bounds = list(zip(lower, upper, strict=True))
-    found = minimize(_tail_cost(problem, phi, sigma), phi[tails], method="L-BFGS-B", bounds=bounds)
-    result = phi.copy()
-    result[tails] = found.x
-    return result
-
-
-def _tail_precision(problem: Problem, phi: Array, sigma: Array) -> Array:
-    """Curvature of the negative log-posterior in each of the noise's tails."""
-    tails = list(problem.tails)
-    lower, upper = (end[tails] for end in box(problem.layout.priors))
-    cost = _tail_cost(problem, phi, sigma)
-    curvature = np.empty(len(tails))
-    for i, step in enumerate(np.minimum(_TAIL_STEP, 0.25 * (upper - lower))):
-        middle = phi[tails].copy()
-        middle[i] = np.clip(middle[i], lower[i] + step, upper[i] - step)
-        ends = [middle.copy(), middle, middle.copy()]
-        ends[0][i] -= step
-        ends[2][i] += step
-        below, at, above = (cost(end) for end in ends)
-        curvature[i] = max((below - 2 * at + above) / step**2, _LEAST_CURVATURE)
-    return curvature
+def described(problem: Problem, peak: Peak) -> Peak:
+    """A peak with each wheel in its most probable description; the predictions are the same."""
+    phi, sigma, value = peak
+    better = likeliest(problem.layout, phi)
+    gain = problem.layout.log_prior(better) - problem.layout.log_prior(phi)
+    return better, sigma, value + float(gain.sum())
 
 
 def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> Mode:
-    """Fold the wheel's symmetry, and take the Jacobian at the posterior's own scale."""
-    phi = fold_wheels(problem.layout, phi)
+    """Take the Jacobian at the posterior's own scale, wheels in their likeliest description."""
+    phi, sigma, log_posterior = described(problem, (phi, sigma, log_posterior))
     priors = problem.layout.priors
     if not priors:
         cells = problem.observations.values.size
@@ -220,7 +186,9 @@ def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> 
     jacobian = differentiate(residual, phi, steps, lower, upper)
     precision = jacobian.T @ jacobian
     if tails:
-        precision[tails, tails] = _tail_precision(problem, phi, sigma)
+        precision[tails, tails] = tail_precision(problem, phi, sigma)
+    angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
+    precision[angles, angles] += _CIRCLE  # no angle is wider than its circle
     covariance = np.linalg.pinv(precision, hermitian=True)
     n_cells = len(jacobian) - len(phi)
     return Mode(

@@ -11,9 +11,9 @@ from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.model import Problem, estimate_sigma
-from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, finish
+from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, gaussian_profile
-from pbrl_ppl.parameters import box, fold_wheels, inside, prior_draws
+from pbrl_ppl.parameters import box, inside, likeliest, prior_draws
 
 Array = NDArray[np.float64]
 
@@ -104,7 +104,7 @@ def find_modes(
     steps = problem.simulator.steps * problem.segments.n * problem.data.horizon
     if few and len(priors) <= _MOST_EVOLVED and steps * _POPULATION * _GENERATIONS < _AFFORDED:
         begin = np.vstack([begin, _evolve(problem, rng)])
-    rough = [climb(part, phi, part.simulator) for phi in begin]
+    rough = [described(part, climb(part, phi, part.simulator)) for phi in begin]
     rough.sort(key=lambda result: -result[2])
     found = _distinct(part, rough)
     if not few:
@@ -148,7 +148,7 @@ def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
     A wheel's other description is, and so is what differs where the data are silent. A mirror image
     is not: it predicts the same, but what is linear in between would not.
     """
-    folded = fold_wheels(problem.layout, np.array([phi for phi, _, _ in found]))
+    folded = likeliest(problem.layout, np.array([phi for phi, _, _ in found]))
     z = problem.whitened(folded, found[0][1])
     z = np.nan_to_num(z, nan=FAR_OFF)
     kept: dict[int, Array] = {}
@@ -189,6 +189,7 @@ def _polish(problem: Problem, found: Peak) -> Peak:
     """Go on by the exact engine's derivative, as far as that leads."""
     if not problem.layout.size:
         return found
+    found = described(problem, found)
     exact = climb(problem, found[0], problem.simulator, rounds=1, tries=2)
     if exact[2] < found[2] + _WORTHWHILE:
         return max(found, exact, key=lambda result: result[2])

@@ -9,7 +9,17 @@ from pbrl_ppl.parameters.layout import (
     Layout,
 )
 from pbrl_ppl.parameters.priors import Prior, box, inside, prior_draws, prior_residual
-from pbrl_ppl.parameters.wheel_symmetry import MIXED, fold_draws, fold_wheels
+from pbrl_ppl.parameters.wheel_symmetry import (
+    MIXED,
+    Wheel,
+    evened,
+    fold_draws,
+    fold_wheels,
+    gathered,
+    likeliest,
+    redescribed,
+    wheels,
+)
 
 __all__ = [
     "BODY_PARAMETERS",
@@ -20,10 +30,16 @@ __all__ = [
     "Block",
     "Layout",
     "Prior",
+    "Wheel",
     "box",
+    "evened",
     "fold_draws",
     "fold_wheels",
+    "gathered",
     "inside",
+    "likeliest",
     "prior_draws",
     "prior_residual",
+    "redescribed",
+    "wheels",
 ]

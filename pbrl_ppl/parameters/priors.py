@@ -29,15 +29,18 @@ class Prior:
     ----------
     family : str
         ``log_normal``, ``truncated_normal``, ``normal``, ``half_normal``, ``von_mises`` or
-        ``categorical``, which is uniform over the whole numbers from ``lower`` to ``upper``.
+        ``categorical``, over the whole numbers from ``lower`` to ``upper``.
     mu, sigma : float
         Location and scale; of the logarithm for ``log_normal``. A ``half_normal`` is a normal cut
         off at zero, about zero unless ``mu`` says otherwise. For ``von_mises``, ``mu`` is the mean
-        direction and ``kappa`` the concentration.
+        direction and ``kappa`` the concentration; without any it is uniform on the circle.
     lower, upper : float
         Support of a truncated normal or a categorical distribution.
     kappa : float
-        Concentration of a von Mises distribution.
+        Concentration of a von Mises distribution, 0 or more.
+    weights : tuple of float
+        Of a categorical distribution's numbers, in proportion to their probabilities; without any
+        all are equally probable.
 
     Raises
     ------
@@ -57,14 +60,17 @@ class Prior:
     lower: float = -np.inf
     upper: float = np.inf
     kappa: float = 1.0
+    weights: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for key in ("mu", "sigma", "kappa"):
             value = getattr(self, key)
             if not np.isfinite(value):
                 raise ParameterError(f"{self.family}: {key} is {value}, expected a finite number")
-            if key != "mu" and value <= 0:
+            if key == "sigma" and value <= 0:
                 raise ParameterError(f"{self.family}: {key} is {value}, expected more than 0")
+            if key == "kappa" and value < 0:
+                raise ParameterError(f"{self.family}: {key} is {value}, expected 0 or more")
         if self.family not in ("truncated_normal", "half_normal"):
             return
         lower, upper = self.support
@@ -98,6 +104,18 @@ class Prior:
     def discrete(self) -> bool:
         """Whether the values are whole numbers that stand for names."""
         return self.family == "categorical"
+
+    @property
+    def probabilities(self) -> Array:
+        """Of a discrete prior's numbers from ``lower`` up, shape (number,)."""
+        n = int(self.upper - self.lower) + 1
+        weights = np.array(self.weights or (1.0,) * n)
+        return np.asarray(weights / weights.sum())
+
+    @property
+    def uniform(self) -> bool:
+        """Whether it is an angle of which nothing is known."""
+        return self.family == "von_mises" and self.kappa == 0
 
     @property
     def centre(self) -> float:
@@ -153,6 +171,11 @@ class Prior:
         """
         x = np.asarray(x, dtype=float)
         lower, upper = self.support
+        if self.discrete:
+            with np.errstate(divide="ignore"):
+                table = np.log(self.probabilities)
+            place = np.clip(np.rint(x - lower), 0, len(table) - 1).astype(int)
+            return np.asarray(np.where(x - lower == place, table[place], -np.inf))
         there = (x >= lower) & (x <= upper) & ((x > 0) | (self.family != "log_normal"))
         density = self._log_norm - 0.5 * self.residual(x) ** 2
         return np.asarray(np.where(there, density, -np.inf))
@@ -160,8 +183,6 @@ class Prior:
     @cached_property
     def _log_norm(self) -> float:
         """Log-density where the residual is zero."""
-        if self.discrete:
-            return -float(np.log(self.upper - self.lower + 1.0))
         if self.family == "von_mises":
             return -float(np.log(2.0 * np.pi * i0e(self.kappa)))
         normal = -0.5 * float(np.log(2.0 * np.pi)) - float(np.log(self.sigma))
@@ -181,7 +202,8 @@ class Prior:
         if self.family == "von_mises":
             return rng.vonmises(self.mu, self.kappa, size)
         if self.discrete:
-            return rng.integers(int(self.lower), int(self.upper) + 1, size).astype(float)
+            p = self.probabilities
+            return self.lower + rng.choice(len(p), size=size, p=p).astype(float)
         if self.family == "half_normal" and not self.mu:
             return np.abs(rng.normal(0.0, self.sigma, size))
         if self.family in ("truncated_normal", "half_normal"):

@@ -1,28 +1,104 @@
-"""A wheel's four equal descriptions: draws brought to the one that is nearest to most of them."""
+"""A wheel's four equal descriptions, which of them the prior can tell apart, and the choice of one.
+
+``w_theta`` and ``w_theta + pi/2`` with ``mu_x`` and ``mu_y`` swapped are the same wheel, so the
+likelihood is the same for both. The prior is the same only where it is uniform in the angle and
+equal in both frictions: there, which description a draw has means nothing, and draws are folded
+onto one. Elsewhere each description keeps the probability that the prior gives it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from pbrl_ppl.parameters.layout import Layout
+from pbrl_ppl.parameters.priors import Prior
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.intp]
 
 #: The parameters that the symmetry mixes: w_theta and w_theta + pi/2 with mu_x, mu_y swapped.
 MIXED = ("w_theta", "mu_x", "mu_y")
 _ROUNDS = 20
 
 
+@dataclass(frozen=True)
+class Wheel:
+    """A wheel of which angle and both frictions are unknown; with one known there is no symmetry.
+
+    Parameters
+    ----------
+    owner : str
+        Its body.
+    places : tuple of int
+        Of the angle and the two frictions in phi.
+    priors : tuple of Prior
+        Of the same.
+    """
+
+    owner: str
+    places: tuple[int, int, int]
+    priors: tuple[Prior, Prior, Prior]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Of the angle and the two frictions."""
+        return tuple(f"{name}[{self.owner}]" for name in MIXED)
+
+    @property
+    def period(self) -> int:
+        """Quarter turns that the prior does not notice: 1, 2 (half a turn), or 4, a whole one."""
+        angle, mu_x, mu_y = self.priors
+        if not angle.uniform:
+            return 4
+        return 1 if mu_x == mu_y else 2
+
+    def turned(self, phi: Array, turns: Ints | int) -> Array:
+        """Phi, shape (..., p), with this wheel described so many quarter turns on, shape (...)."""
+        phi, (angle, x, y) = phi.copy(), self.places
+        odd = np.asarray(turns) % 2 == 1
+        phi[..., angle] = _wrapped(phi[..., angle] + np.asarray(turns) * np.pi / 2)
+        mu_x, mu_y = phi[..., x].copy(), phi[..., y].copy()
+        phi[..., x], phi[..., y] = np.where(odd, mu_y, mu_x), np.where(odd, mu_x, mu_y)
+        return phi
+
+    def log_priors(self, phi: Array, count: int = 4) -> Array:
+        """Log-prior of the wheel described 0, 1, ... quarter turns on, shape (count, ...)."""
+        return np.array(
+            [
+                sum(
+                    prior.log_density(turned[..., place])
+                    for place, prior in zip(self.places, self.priors, strict=True)
+                )
+                for turned in (self.turned(phi, turns) for turns in range(count))
+            ]
+        )
+
+
+def wheels(layout: Layout) -> tuple[Wheel, ...]:
+    """Wheels that have four equal descriptions, whatever the prior makes of them."""
+    places = {label: i for i, label in enumerate(layout.labels)}
+    priors, found = layout.priors, []
+    owners = {owner: None for b in layout.blocks if b.of == "body" for owner in b.owners}
+    for owner in owners:
+        at = [places.get(f"{name}[{owner}]", -1) for name in MIXED]
+        if min(at) >= 0:
+            angle, x, y = at
+            found.append(Wheel(owner, (angle, x, y), (priors[angle], priors[x], priors[y])))
+    return tuple(found)
+
+
 def fold_draws(layout: Layout, draws: Mapping[str, Array]) -> dict[str, Array]:
-    """Fold the draws of every wheel onto one description.
+    """Fold the draws of every wheel onto one of the descriptions that its prior cannot tell apart.
 
     Parameters
     ----------
     layout : Layout
-        Says which bodies' wheels are unknown.
+        Says which bodies' wheels are unknown, and their prior.
     draws : mapping of str to ndarray
         By label, such as ``w_theta[cart]``, shape (draw,) each; rad and 1.
 
@@ -43,23 +119,33 @@ def fold_draws(layout: Layout, draws: Mapping[str, Array]) -> dict[str, Array]:
     array([0.1, 0.1])
     """
     folded = dict(draws)
-    for owner in _owners(layout):
-        labels = [f"{name}[{owner}]" for name in MIXED]
-        # with one of them known there is no symmetry left
-        if all(label in draws and label in layout.labels for label in labels):
-            folded |= dict(zip(labels, _fold(*(draws[label] for label in labels)), strict=True))
+    for wheel in wheels(layout):
+        if wheel.period < 4 and all(label in draws for label in wheel.labels):
+            angle, x, y = (draws[label] for label in wheel.labels)
+            folded |= dict(zip(wheel.labels, _fold(angle, x, y, wheel.period), strict=True))
     return folded
 
 
-def fold_wheels(layout: Layout, phi: Array) -> Array:
-    """Choose one of each wheel's four equal descriptions, whatever other draws there are.
+def gathered(layout: Layout, phi: Array) -> Array:
+    """Draws (draw, p) with all wheels on one hill of the likelihood, whatever the prior."""
+    phi = phi.copy()
+    for wheel in wheels(layout):
+        places = list(wheel.places)
+        angle, x, y = phi[:, places].T
+        phi[:, places] = np.stack(_fold(angle, x, y, 1), axis=1)
+    return phi
 
-    Namely mu_x <= mu_y and w_theta in (-pi/2, pi/2].
+
+def fold_wheels(layout: Layout, phi: Array) -> Array:
+    """Choose one of the descriptions that a wheel's prior cannot tell apart, for each draw alone.
+
+    Namely the one with mu_x <= mu_y and w_theta in (-pi/2, pi/2]; the latter alone where the
+    frictions' priors differ; none where that of w_theta is not uniform.
 
     Parameters
     ----------
     layout : Layout
-        Says which bodies' wheels are unknown.
+        Says which bodies' wheels are unknown, and their prior.
     phi : ndarray
         Parameters in the layout's order, shape (..., p), SI units.
 
@@ -69,46 +155,119 @@ def fold_wheels(layout: Layout, phi: Array) -> Array:
         The same shape.
     """
     phi = phi.copy()
-    for owner in _owners(layout):
-        labels = [f"{name}[{owner}]" for name in MIXED]
-        if not all(label in layout.labels for label in labels):
-            continue
-        angle, x, y = (layout.labels.index(label) for label in labels)
-        phi[..., angle] += np.where(phi[..., x] > phi[..., y], np.pi / 2, 0.0)
-        phi[..., [x, y]] = np.sort(phi[..., [x, y]], axis=-1)
-        phi[..., angle] = np.pi / 2 - np.mod(np.pi / 2 - phi[..., angle], np.pi)
+    for wheel in wheels(layout):
+        angle, x, y = wheel.places
+        if wheel.period == 1:
+            phi[..., angle] += np.where(phi[..., x] > phi[..., y], np.pi / 2, 0.0)
+            phi[..., [x, y]] = np.sort(phi[..., [x, y]], axis=-1)
+        if wheel.period < 4:
+            phi[..., angle] = np.pi / 2 - np.mod(np.pi / 2 - phi[..., angle], np.pi)
     return phi
 
 
-def _owners(layout: Layout) -> set[str]:
-    """Bodies that have unknown parameters."""
-    return {owner for block in layout.blocks if block.of == "body" for owner in block.owners}
+def likeliest(layout: Layout, phi: Array) -> Array:
+    """Each wheel's most probable description; of equally probable ones as by `fold_wheels`.
+
+    Parameters
+    ----------
+    layout : Layout
+        Says which bodies' wheels are unknown, and their prior.
+    phi : ndarray
+        Shape (..., p).
+    """
+    for wheel in wheels(layout):
+        if wheel.period > 1:
+            phi = wheel.turned(phi, wheel.log_priors(phi, wheel.period).argmax(axis=0))
+    return fold_wheels(layout, phi)
 
 
-def _fold(angle: Array, mu_x: Array, mu_y: Array) -> tuple[Array, Array, Array]:
-    """Each draw's description that is nearest to the mean of them all; mu_x <= mu_y on average."""
+def redescribed(layout: Layout, phi: Array, rng: np.random.Generator) -> Array:
+    """Draw each wheel's description anew from the prior, given which wheel it is.
+
+    The likelihood being the same for all, that is a Gibbs step of the posterior: draws of it stay
+    draws of it, and chains need not cross from one description to another by themselves. Where
+    the prior cannot tell any apart, nothing is changed.
+
+    Parameters
+    ----------
+    layout : Layout
+        Says which bodies' wheels are unknown, and their prior.
+    phi : ndarray
+        Shape (draw, p).
+    rng : Generator
+        Of the choices.
+    """
+    for wheel in wheels(layout):
+        if wheel.period > 1:
+            each = wheel.log_priors(phi, wheel.period)
+            # the largest of log-probabilities with Gumbel noise is a draw
+            phi = wheel.turned(phi, (each + rng.gumbel(size=each.shape)).argmax(axis=0))
+    return phi
+
+
+def evened(layout: Layout, phi: Array) -> Array:
+    """What to add to the log-prior so that a wheel's four descriptions share their prior evenly.
+
+    A chain then needs to see one of them only; `redescribed` gives each its own share.
+
+    Parameters
+    ----------
+    layout : Layout
+        Says which bodies' wheels are unknown, and their prior.
+    phi : ndarray
+        Shape (..., p).
+
+    Returns
+    -------
+    ndarray
+        Shape (..., p), at the place of each wheel's angle; zero where the prior is even.
+    """
+    result = np.zeros(np.shape(phi))
+    for wheel in wheels(layout):
+        if wheel.period > 1:
+            each = wheel.log_priors(phi)
+            with np.errstate(invalid="ignore"):  # outside the support, where there is no prior
+                change = logsumexp(each, axis=0) - np.log(4.0) - each[0]
+            result[..., wheel.places[0]] = np.nan_to_num(change)
+    return result
+
+
+def _fold(angle: Array, mu_x: Array, mu_y: Array, period: int) -> tuple[Array, Array, Array]:
+    """Each draw's description that is nearest to the mean of them all, of those ``period`` apart.
+
+    Where all four may be chosen, mu_x <= mu_y on average.
+    """
     turns = np.arange(4)[:, None]
     odd = turns % 2 == 1
     theta = angle + turns * np.pi / 2
     points = np.stack(
         [np.cos(theta), np.sin(theta), np.where(odd, mu_y, mu_x), np.where(odd, mu_x, mu_y)]
     )
+    barred = np.where(turns % period == 0, 0.0, np.inf)
     every = np.arange(len(angle))
-    chosen = np.where(mu_x <= mu_y, 0, 1)
+    chosen = np.where((mu_x <= mu_y) | (period > 1), 0, 1)
     # half a turn changes nothing else: begin on the first draw's side
     chosen = chosen + np.where(np.cos(theta[chosen, every] - theta[chosen[0], 0]) < 0, 2, 0)
     for _ in range(_ROUNDS):
         centre = points[:, chosen, every].mean(axis=1)
-        nearest = ((points - centre[:, None, None]) ** 2).sum(axis=0).argmin(axis=0)
+        off = ((points - centre[:, None, None]) ** 2).sum(axis=0) + barred
+        nearest = off.argmin(axis=0)
         if (nearest == chosen).all():
             break
         chosen = nearest
     centre = points[:, chosen, every].mean(axis=1)
-    if centre[2] > centre[3]:
+    if period == 1 and centre[2] > centre[3]:
         chosen = (chosen + 1) % 4
     if np.mean(np.cos(theta[chosen, every])) < 0:  # in (-pi/2, pi/2]
         chosen = (chosen + 2) % 4
-    turned = theta[chosen, every]
     swapped = chosen % 2 == 1
-    wrapped = np.pi - np.mod(np.pi - turned, 2 * np.pi)
-    return wrapped, np.where(swapped, mu_y, mu_x), np.where(swapped, mu_x, mu_y)
+    return (
+        _wrapped(theta[chosen, every]),
+        np.where(swapped, mu_y, mu_x),
+        np.where(swapped, mu_x, mu_y),
+    )
+
+
+def _wrapped(angle: Array) -> Array:
+    """In (-pi, pi]."""
+    return np.asarray(np.pi - np.mod(np.pi - angle, 2 * np.pi))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.model import Observations, build_layout, whiten
 from pbrl_ppl.modes import Mode, posterior_steps
-from pbrl_ppl.parameters import JOINT_INDICES, MIXED, Layout, Prior, fold_draws, inside
+from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.posterior.store import group, scalars, scene_of
 from pbrl_ppl.state import STATE
@@ -272,12 +272,13 @@ def _widths(
 ) -> tuple[Width, ...]:
     """Widths of every parameter that takes part, from draws."""
     folded = fold_draws(layout, posterior)
+    turned = {x for wheel in wheels(layout) if wheel.period == 1 for x in wheel.labels}
     widths = []
     for label, law in zip(layout.labels, layout.priors, strict=True):
         if label not in prior:
             continue
         before, after, moved = _spread(law, prior[label]), _spread(law, folded[label]), 0.0
-        if not label.startswith(MIXED):  # which of equal descriptions a fold chose says nothing
+        if label not in turned and not law.uniform:  # where a fold put it says nothing
             mean = _natural(law, folded[label]).mean() - _natural(law, prior[label]).mean()
             moved = float(abs(mean)) / before
         widths.append(_width(label, before, after, moved))

@@ -18,7 +18,7 @@ from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.model import Noise, Observations, ParameterLibrary, Problem, sigma_prior
 from pbrl_ppl.modes import ATTRIBUTE, doubts
-from pbrl_ppl.parameters import fold_draws
+from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.store import (
     attributes,
@@ -68,7 +68,7 @@ def complete(
     InferenceData or DataTree
         The posterior.
     """
-    posterior = _folded(problem, trace)
+    posterior = _folded(problem, trace, None if method == "map" else seed)
     phi, sigma = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
     chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
     rng = np.random.default_rng(seed)
@@ -217,13 +217,18 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
     return phi, np.broadcast_to(sigma, (len(phi), len(problem.observations.columns)))
 
 
-def _folded(problem: Problem, trace: Any) -> xr.Dataset:
-    """The posterior with each wheel in one of its equal descriptions, the same in all chains."""
+def _folded(problem: Problem, trace: Any, seed: int | None) -> xr.Dataset:
+    """The posterior with each wheel in one of the descriptions that its prior cannot tell apart.
+
+    The same in all chains. Between those that it can, each draw is shared out by the prior.
+    """
     posterior = group(trace, "posterior").copy(deep=True)
     if problem.library is not None:  # the draws are the library's own
         return posterior
     layout = problem.layout
     phi, _ = parameter_draws(problem, trace)
+    if seed is not None:
+        phi = redescribed(layout, phi, np.random.default_rng([seed, len(phi)]))
     folded = fold_draws(layout, dict(zip(layout.labels, phi.T, strict=True)))
     for block in layout.blocks:
         for i, owner in enumerate(block.owners):

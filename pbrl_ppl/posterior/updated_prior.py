@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -14,17 +15,18 @@ from scipy.stats import truncnorm
 
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.parameters import Prior, fold_draws
+from pbrl_ppl.model import build_layout, index_priors
+from pbrl_ppl.modes import ATTRIBUTE, index_law
+from pbrl_ppl.parameters import JOINT_INDICES, Prior, fold_draws
 from pbrl_ppl.posterior.store import scalars, scene_of
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Joint, Scene
 
 Array = NDArray[np.float64]
 
 #: Limits of a truncated normal: mu this many sigmas outside the support is an exponential's slope,
 #: and sigma this many times the width of what it covers is level.
 _OUTSIDE, _LEVEL = 5.0, 5.0
-#: Limits of a von Mises concentration: level, and 0.001 rad.
+#: Limits of a von Mises concentration: as good as uniform, and 0.001 rad.
 _KAPPA = (1e-3, 1e6)
 
 
@@ -32,8 +34,9 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
     """The posterior's scene with a prior that knows what the posterior knows.
 
     The next fit of new data starts from it. It keeps each parameter's own distribution, in Table
-    1's family, and forgets how parameters depend on each other. Joints' anchors have no prior in a
-    scene and sigma's is taken from the data: both start afresh.
+    1's family, and forgets how parameters depend on each other. A joint of unknown bodies gets the
+    posterior probabilities of its indices. Joints' anchors have no prior in a scene and sigma's is
+    taken from the data: both start afresh.
 
     Parameters
     ----------
@@ -45,7 +48,8 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
     Returns
     -------
     Scene
-        Its bodies' ``prior`` holds the new hyper-parameters, the effects' among them.
+        Its bodies' ``prior`` holds the new hyper-parameters, the effects' among them, and that of a
+        joint of unknown bodies the new probabilities.
 
     Raises
     ------
@@ -82,7 +86,32 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
     for body in scene.bodies:
         new = {name: tuple(hyper.items()) for name, hyper in found[body.name].items()}
         bodies.append(replace(body, prior=tuple((dict(body.prior) | new).items())))
-    return scene.replace(bodies=tuple(bodies))
+    return scene.replace(bodies=tuple(bodies), joints=_joints(idata, scene))
+
+
+def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
+    """The joints, those of unknown bodies with their indices' posterior probabilities."""
+    rows = json.loads(str(idata.attrs.get(ATTRIBUTE, "[]")))
+    joints = []
+    for name, joint in zip(scene.joint_names, scene.joints, strict=True):
+        if joint.bodies is None:
+            p_a, p_b = (prior.probabilities for prior in index_priors(scene, joint))
+            laws = [
+                row["probability"] * index_law(row["joints"][name], scene, p_a, p_b)
+                for row in rows
+                if row["probability"] > 0
+            ]
+            if not laws:
+                raise PosteriorError(
+                    f"posterior: it does not say what {name} may join; make it with pbrl_ppl.fit"
+                )
+            law = np.sum(laws, axis=0)
+            both = zip(JOINT_INDICES, (law.sum(axis=1), law.sum(axis=0)), strict=True)
+            named = [(index, zip(scene.joinable, p.tolist(), strict=True)) for index, p in both]
+            found = tuple((index, tuple((n, p) for n, p in each if p)) for index, each in named)
+            joint = replace(joint, prior=found)
+        joints.append(joint)
+    return tuple(joints)
 
 
 def moment_matched(prior: Prior, draws: Array) -> Prior:
@@ -126,7 +155,7 @@ def _concentration(resultant: float) -> float:
         return float(i1e(kappa) / i0e(kappa)) - resultant
 
     if excess(low) >= 0 or excess(high) <= 0:
-        return _KAPPA[0] if excess(low) >= 0 else _KAPPA[1]
+        return 0.0 if excess(low) >= 0 else _KAPPA[1]
     return float(np.exp(brentq(excess, low, high)))
 
 

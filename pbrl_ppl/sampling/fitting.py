@@ -15,6 +15,7 @@ import pymc as pm
 from pbrl_ppl.modes import Mode, choose_from_library, find_mode, weigh
 from pbrl_ppl.posterior import complete, group
 from pbrl_ppl.sampling.emulator import emulate
+from pbrl_ppl.sampling.equal_wheels import evened_logp
 from pbrl_ppl.sampling.fit_checks import DEFAULT, checked_problem
 from pbrl_ppl.sampling.meeting import as_in, joined_model, model_of_draws
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
@@ -91,6 +92,7 @@ def _metropolis(job: Job) -> Any:
     problem, model = job.mode.problem, job.model
     blocks = gaussian_blocks(model, job.mode)
     options: dict[str, Any] = {"inner": 10, "initial_point": blank_point(model, problem)}
+    options["extra"] = evened_logp(model, problem)
     if job.mode.others and len(blocks) == 1:
         hills = [gaussian_blocks(model, other)[0] for other in job.mode.others]
         jumps = Jumps((gaussian_blocks(model, job.mode)[0], *hills))

@@ -204,6 +204,8 @@ class AdaptiveMetropolis(ArrayStepShared):
         Rounds over the blocks a draw.
     jumps : Jumps, optional
         Between hills, one a round; of one block that is not cheap, whose own hill is the first.
+    extra : tensor, optional
+        Added to the model's log-density, in terms of its value variables.
     model : pymc.Model, optional
         The context's by default.
     initial_point : dict, optional
@@ -233,6 +235,7 @@ class AdaptiveMetropolis(ArrayStepShared):
         plain: float = 0.0,
         thin: int = 1,
         jumps: Jumps | None = None,
+        extra: Any = 0.0,
         model: pm.Model | None = None,
         initial_point: dict[str, Array] | None = None,
         rng: Any = None,
@@ -245,7 +248,7 @@ class AdaptiveMetropolis(ArrayStepShared):
         self.blocks, self.rough, self.inner, self.plain = blocks, rough, inner, plain
         self.thin, self.jumps = thin, jumps
         (logp,), joined = join_nonshared_inputs(
-            point=point, outputs=[model.logp()], inputs=values, shared_inputs={}
+            point=point, outputs=[model.logp() + extra], inputs=values, shared_inputs={}
         )
         self.logp = compile_function([joined], logp)
         self.logp.trust_input = True

@@ -11,8 +11,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.model import Problem, build_model
-from pbrl_ppl.modes import ATTRIBUTE, Mode, Weighed, stored
-from pbrl_ppl.parameters import JOINT_INDICES
+from pbrl_ppl.modes import ATTRIBUTE, Mode, Pair, Weighed, index_law, stored
+from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
 from pbrl_ppl.posterior import from_groups, group, groups
 from pbrl_ppl.sampling.traces import posterior_dataset
 
@@ -36,8 +36,9 @@ def mix(
     """Sample each configuration that matters, and mix the draws by their probabilities.
 
     How many draws each has is not left to chance, where they stand in the chains is. A pair's
-    bodies are in the order of ``scene.joinable`` (``i_a < i_b``): the other order is the same
-    joint. A joint that joins nothing has ``i_a = i_b`` and anchors from their prior.
+    bodies are in the order of ``scene.joinable`` (``i_a < i_b``), for the other order is the same
+    joint, unless the two indices have different priors: then each order has its share. A joint that
+    joins nothing has ``i_a = i_b`` and anchors from their prior.
 
     Parameters
     ----------
@@ -109,7 +110,7 @@ def _values(
     rng: np.random.Generator,
 ) -> dict[str, Array]:
     """The whole model's variables, shape (chain, draw, ...), from each configuration's trace."""
-    layout, joinable = problem.layout, problem.scene.joinable
+    layout = problem.layout
     phi = np.full((*label.shape, layout.size), np.nan)
     own = {i: group(t, "posterior").isel(draw=slice(label.shape[1])) for i, t in traces.items()}
     sigma = next(iter(own.values()))["sigma"].to_numpy().copy()
@@ -121,14 +122,31 @@ def _values(
             for j, owner in enumerate(block.owners):
                 phi[here, layout.index(block.name, owner)] = values[here, j]
         for joint, pair in found[i].configuration.pairs:
-            any_one = rng.integers(len(joinable), size=int(here.sum()))  # i_a = i_b: no joint
-            for side, name in enumerate(JOINT_INDICES):
-                held = any_one if pair is None else joinable.index(pair[side])
-                phi[here, layout.index(name, joint)] = held
+            _set_indices(problem, phi, here, joint, pair, rng)
     _fill_anchors(problem, phi, rng)
     named = layout.to_dict(phi)
     indices = {name: named[name].astype(int) for name in JOINT_INDICES}
     return named | indices | {"sigma": sigma}
+
+
+def _set_indices(
+    problem: Problem,
+    phi: Array,
+    here: NDArray[np.bool_],
+    joint: str,
+    pair: Pair,
+    rng: np.random.Generator,
+) -> None:
+    """Draw i_a and i_b of what a joint joins, and turn the anchors round with them, in place."""
+    layout, own = problem.layout, phi[here]
+    a, b = (layout.index(name, joint) for name in JOINT_INDICES)
+    law = index_law(pair, problem.scene, *(layout.priors[place].probabilities for place in (a, b)))
+    drawn = rng.choice(law.size, size=len(own), p=law.ravel())
+    own[:, a], own[:, b] = np.divmod(drawn, len(law))
+    turned = own[:, a] > own[:, b]
+    anchors = np.array([layout.index(name, joint) for name in JOINT_ANCHORS])
+    own[:, anchors] = np.where(turned[:, None], own[:, np.roll(anchors, 2)], own[:, anchors])
+    phi[here] = own
 
 
 def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.model import Problem, log_density, log_noise_prior
-from pbrl_ppl.parameters import inside
+from pbrl_ppl.parameters import evened, gathered, inside
 from pbrl_ppl.sampling.metropolis import TARGET_ACCEPTANCE, Gaussian
 from pbrl_ppl.sampling.starts import constrain, unconstrain
 
@@ -39,6 +39,8 @@ def rejuvenate(
 
     Parts of the scene that have nothing to do with each other are moved and judged each on its own,
     for given the noise they are independent; then the noise, for which the engine is not needed.
+    A wheel's equal descriptions share their prior evenly here; `redescribed` gives each its own.
+
     Where a coarse engine follows the posterior, several steps under it make one proposal, as in
     :class:`pbrl_ppl.sampling.metropolis.AdaptiveMetropolis`.
 
@@ -85,7 +87,7 @@ class _Mover:
 
     def __init__(self, problem: Problem, phi: Array, sigma: Array) -> None:
         self.problem, self.priors = problem, problem.layout.priors
-        phi = inside(self.priors, phi)
+        phi = inside(self.priors, gathered(problem.layout, phi))
         pairs = [unconstrain(prior, x) for prior, x in zip(self.priors, phi.T, strict=True)]
         self.u = np.array([u for u, _ in pairs]).reshape(-1, len(phi)).T.copy()
         self.noise = np.log(sigma)
@@ -119,7 +121,8 @@ class _Mover:
     def prior(self, u: Array) -> Array:
         """Log-density of each part's parameters with the transform's, shape (particle, part)."""
         phi = self.phi(u)
-        each = self.problem.layout.log_prior(phi)
+        layout = self.problem.layout
+        each = layout.log_prior(phi) + evened(layout, phi)
         for i, prior in enumerate(self.priors):
             each[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
         return np.stack([each[:, part.places].sum(axis=1) for part in self.parts], axis=1)

@@ -13,7 +13,7 @@ from scipy.special import expit
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.parameters import Prior, inside
+from pbrl_ppl.parameters import Prior, gathered, inside
 from pbrl_ppl.posterior import group, parameter_draws
 from pbrl_ppl.sampling.metropolis import Gaussian
 
@@ -146,6 +146,7 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
     if missing:
         raise PosteriorError(f"start: the posterior has no {', '.join(missing)}; of another model?")
     phi, sigma = parameter_draws(problem, idata)
+    phi = gathered(problem.layout, phi)
     covariance = np.cov(phi, rowvar=False).reshape(2 * (problem.layout.size,))
     cells = problem.observations.values.size
     mode = Mode(
@@ -156,9 +157,9 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
         covariance,
         np.nan,
     )
-    last = posterior.isel(draw=-1)
-    chains = range(posterior.sizes["chain"])
-    return mode, [{name: last[name].values[chain] for name in names} for chain in chains]
+    chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    last = np.arange(1, chains + 1) * draws - 1
+    return mode, [problem.named(phi[i], sigma[i]) for i in last]
 
 
 def _range(prior: Prior) -> Array:

@@ -11,6 +11,7 @@ from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
 
 from pbrl_ppl.model import Problem
+from pbrl_ppl.sampling.equal_wheels import evened_logp
 from pbrl_ppl.sampling.starts import blank_point
 
 Array = NDArray[np.float64]
@@ -22,6 +23,8 @@ _FLATTER = 0.9
 
 class Unpack:
     """From the sampler's vector to phi, sigma and the log-density of their priors.
+
+    A wheel's equal descriptions share their prior evenly; see `equal_wheels`.
 
     Parameters
     ----------
@@ -37,7 +40,10 @@ class Unpack:
         values = model.continuous_value_vars
         point = blank_point(model, problem)
         joined_outputs, joined = join_nonshared_inputs(
-            point=point, outputs=[model.varlogp, *outputs], inputs=values, shared_inputs={}
+            point=point,
+            outputs=[model.varlogp + evened_logp(model, problem), *outputs],
+            inputs=values,
+            shared_inputs={},
         )
         self._function = compile_function([joined], joined_outputs)
         self._function.trust_input = True

@@ -20,6 +20,8 @@ CONTACT_NAMES = ("r", "mu_c")
 """Those of them that a contact needs: all that a kinematic body has."""
 
 HYPER_NAMES = ("mu", "sigma", "kappa")
+INDEX_NAMES = ("i_a", "i_b")
+"""The indices of a joint of unknown bodies."""
 
 
 def nearest(name: object, known: Iterable[str]) -> str:
@@ -56,6 +58,14 @@ def positive(value: object, where: str) -> float:
     number = finite(value, where)
     if number <= 0:
         raise SceneError(f"{where} is {number}, expected more than 0")
+    return number
+
+
+def not_negative(value: object, where: str) -> float:
+    """Return a number from zero up as a float."""
+    number = finite(value, where)
+    if number < 0:
+        raise SceneError(f"{where} is {number}, expected 0 or more")
     return number
 
 
@@ -116,6 +126,24 @@ def known_parameters(value: object, where: str) -> tuple[tuple[str, float], ...]
     return tuple((name, known[name]) for name in PARAMETER_NAMES if name in known)
 
 
+def index_probabilities(
+    value: object, where: str
+) -> tuple[tuple[str, tuple[tuple[str, float], ...]], ...]:
+    """Return what a joint's first and second index may be: a probability each name."""
+    prior: dict[str, tuple[tuple[str, float], ...]] = {}
+    for index, table in _items(value, f"{where}: prior"):
+        if index not in INDEX_NAMES:
+            raise SceneError(
+                f'unknown index "{index}" in prior of {where}{nearest(index, INDEX_NAMES)}'
+            )
+        here = f"{where}: prior {index}"
+        given = {label(n, here): not_negative(p, f"{here} {n}") for n, p in _items(table, here)}
+        if not sum(given.values()) > 0:
+            raise SceneError(f"{here} has no name of a probability above 0; add one")
+        prior[index] = tuple(given.items())
+    return tuple((index, prior[index]) for index in INDEX_NAMES if index in prior)
+
+
 def hyper_parameters(
     value: object, where: str, effects: tuple[str, ...]
 ) -> tuple[tuple[str, tuple[tuple[str, float], ...]], ...]:
@@ -136,7 +164,7 @@ def hyper_parameters(
                 raise SceneError(
                     f'unknown key "{key}" in prior {name} of {where}{nearest(key, HYPER_NAMES)}'
                 )
-            check = finite if key == "mu" else positive
+            check = {"mu": finite, "sigma": positive, "kappa": not_negative}[key]
             hyper[key] = check(item, f"{where}: prior {name} {key}")
         prior[name] = tuple((key, hyper[key]) for key in HYPER_NAMES if key in hyper)
     order = (*PARAMETER_NAMES, *sorted(prior.keys() - set(PARAMETER_NAMES)))

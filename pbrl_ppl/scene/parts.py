@@ -11,6 +11,7 @@ from pbrl_ppl.scene.checks import (
     Point,
     flag,
     hyper_parameters,
+    index_probabilities,
     known_parameters,
     label,
     nearest,
@@ -150,6 +151,10 @@ class Joint:
         Whether the anchors are given (True) or to be inferred.
     name : str, optional
         What its parameters are labelled with; by default its place in the scene: ``joint1``, ...
+    prior : tuple of (str, tuple of (str, float))
+        Of a joint of unknown bodies: probabilities of the indices by name, such as
+        ``{"i_a": {"cart": 0.7, "world": 0.3}}``, scaled to add up to one; a mapping of mappings is
+        accepted. Names left out have none; all are equally probable for an index left out.
 
     Raises
     ------
@@ -168,6 +173,7 @@ class Joint:
     anchor_b: Point | None = None
     known: bool = True
     name: str | None = None
+    prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
 
     def __post_init__(self) -> None:
         if self.name is not None:
@@ -187,6 +193,11 @@ class Joint:
         if self.bodies is not None:
             bodies = self._check_bodies(self.bodies)
             where = f"joint of {bodies[0]} and {bodies[1]}"
+        object.__setattr__(self, "prior", index_probabilities(self.prior, where))
+        if self.prior and self.bodies is not None:
+            raise SceneError(
+                f"{where}: it has bodies and a prior of which they are; drop one of the two"
+            )
         for key in ("anchor_a", "anchor_b"):
             anchor = getattr(self, key)
             if anchor is not None and self.bodies is None:

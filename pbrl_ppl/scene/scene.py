@@ -111,6 +111,13 @@ class Scene:
             for name in joint.bodies or ():
                 if name not in names:
                     raise SceneError(f'{where}: there is no body "{name}"{nearest(name, names)}')
+            for index, table in joint.prior:
+                for name, _ in table:
+                    if name not in self.joinable:
+                        raise SceneError(
+                            f'{where}: prior {index} names "{name}", which is no moving body or'
+                            f" the world{nearest(name, self.joinable)}"
+                        )
             could = joint.bodies or names
             if not any(body.name in could for body in self.dynamic):
                 raise SceneError(
@@ -176,7 +183,9 @@ class Scene:
             table["prior"] = {name: dict(hyper) for name, hyper in body.prior}
             sections.append(("[[body]]", table))
         sections += [("[[wall]]", {"from": w.start, "to": w.end}) for w in self.walls]
-        sections += [("[[joint]]", vars(joint)) for joint in self.joints]
+        for joint in self.joints:
+            indices = {index: dict(p) for index, p in joint.prior}
+            sections.append(("[[joint]]", dict(vars(joint), prior=indices or None)))
         return scene_toml.write(sections)
 
     @property

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -21,7 +22,7 @@ KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "shape": (("kind",), ("size", "radius", "vertices")),
     "wall": (("from", "to"), ()),
-    "joint": (("kind",), ("bodies", "anchor_a", "anchor_b", "known", "name")),
+    "joint": (("kind",), ("bodies", "anchor_a", "anchor_b", "known", "name", "prior")),
 }
 """Required and optional keys of each table."""
 
@@ -102,5 +103,10 @@ def _value(item: Any) -> str:
 
 def _inline(table: Mapping[str, Any]) -> str:
     """Return an inline table; entries that are None are left out."""
-    pairs = [f"{key} = {_value(item)}" for key, item in table.items() if item is not None]
+    pairs = [f"{_key(key)} = {_value(item)}" for key, item in table.items() if item is not None]
     return "{ " + ", ".join(pairs) + " }" if pairs else "{}"
+
+
+def _key(name: str) -> str:
+    """Return a key, in quotes where it needs them: a body's name may be anything."""
+    return name if re.fullmatch("[A-Za-z0-9_-]+", name) else _value(name)

@@ -266,7 +266,8 @@ def test_sigma_s_prior_is_the_design_s(puck: tuple[Scene, History]) -> None:
 
 
 def test_equal_wheels_have_equal_quantities(cart: tuple[Scene, History]) -> None:
-    design = design_of(cart[1], cart[0])
+    """Where the prior cannot tell them apart; where it can, a wrong choice of one must show."""
+    design = design_of(cart[1], cart_scene())
     phi = design.layout.to_vector(CART)
     turned = design.layout.to_vector(
         CART | {"w_theta": CART["w_theta"] - np.pi / 2, "mu_x": CART["mu_y"], "mu_y": CART["mu_x"]}
@@ -276,6 +277,9 @@ def test_equal_wheels_have_equal_quantities(cart: tuple[Scene, History]) -> None
     )
     np.testing.assert_allclose(rows[0], rows[1])
     np.testing.assert_allclose(rows[0], [*phi, *np.ones(6), 3.0])
+    known = design_of(cart[1], cart_scene(prior=PRIOR))
+    two = replication._quantities(known, np.stack([phi, turned]), np.ones((2, 6)), np.zeros(2))
+    np.testing.assert_array_equal(two[:, : len(phi)], [phi, turned])
     assert len(replication.labels(design)) == rows.shape[1]
 
 

@@ -94,7 +94,7 @@ PRIORS = {
     "mu_c": SHARE,
     "w_x": truncated(0.0, 0.9, -0.45, 0.45),
     "w_y": truncated(0.0, 0.55, -0.275, 0.275),
-    "w_theta": stats.vonmises(0.5),
+    "w_theta": stats.uniform(-np.pi, 2 * np.pi),
     "mu_x": SHARE,
     "mu_y": SHARE,
 }

@@ -26,7 +26,7 @@ TABLE_1 = {
     "mu_c": truncated(0.5, 1.0, 0.0, 1.0),
     "w_x": truncated(0.0, 2.0, -1.0, 1.0),
     "w_y": truncated(0.0, 3.0, -1.0, 2.0),
-    "w_theta": stats.vonmises(0.5),
+    "w_theta": stats.uniform(-np.pi, 2 * np.pi),
     "mu_x": truncated(0.5, 1.0, 0.0, 1.0),
     "mu_y": truncated(0.5, 1.0, 0.0, 1.0),
 }

@@ -121,7 +121,7 @@ priors = st.one_of(
     st.builds(Prior, st.just("log_normal"), location, scale),
     st.builds(Prior, st.just("normal"), location, scale),
     st.builds(Prior, st.just("half_normal"), sigma=scale),
-    st.builds(Prior, st.just("von_mises"), location, kappa=st.floats(0.05, 20.0)),
+    st.builds(Prior, st.just("von_mises"), location, kappa=st.floats(0.0, 20.0)),
     st.builds(
         Prior,
         st.just("truncated_normal"),

@@ -182,11 +182,13 @@ def scenes(draw: st.DrawFn) -> Scene:
     bodies.append(Body("w" + max(movers), draw(shapes), static=True, pose=(*draw(pairs), 1)))
     walls = [Wall(a, b) for a, b in draw(st.lists(st.tuples(pairs, pairs))) if a != b]
     kinds = st.sampled_from(["hinge", "distance"])
+    weights = st.dictionaries(st.sampled_from(["world", *movers]), size, min_size=1)
+    indices = st.fixed_dictionaries({}, optional={"i_a": weights, "i_b": weights})
     two, maybe = st.just(("world", movers[0])), st.none() | pairs
     joint = st.one_of(
         st.builds(Joint, kinds, two, pairs, pairs),
         st.builds(Joint, kinds, two, maybe, maybe, st.just(False)),
-        st.builds(Joint, kinds, known=st.just(False)),
+        st.builds(Joint, kinds, known=st.just(False), prior=indices),
     )
     return Scene(
         gravity=draw(pairs),
