@@ -15,14 +15,11 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.model.library import ParameterLibrary
-from pbrl_ppl.model.likelihood import (
-    StartNoise,
-    next_state_logp,
-    next_state_random,
-)
+from pbrl_ppl.model.likelihood import next_state_logp, next_state_random
 from pbrl_ppl.model.noise import Noise
 from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
 from pbrl_ppl.model.problem import Problem
+from pbrl_ppl.model.start_noise import StartNoise
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.model.tails import tail_tensor
 from pbrl_ppl.parameters import Block, Layout
