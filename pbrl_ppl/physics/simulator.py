@@ -251,8 +251,8 @@ class Simulator:
     def _commands(self) -> tuple[NDArray[Any], ...]:
         """Address, body, first parameter and memory of each command law."""
         memory = [
-            isinstance(one.effect.stage, Command) and one.effect.stage.memory
-            for one in at_stage(self.effects, Command)
+            isinstance(attached.effect.stage, Command) and attached.effect.stage.memory
+            for attached in at_stage(self.effects, Command)
         ]
         return (*self._laws(Command), np.array(memory, dtype=bool))
 
@@ -262,14 +262,14 @@ class Simulator:
         return self._laws(Force)
 
     def _laws(self, kind: type) -> tuple[NDArray[Any], ...]:
-        attached = at_stage(self.effects, kind)
+        acting = at_stage(self.effects, kind)
         names = [body.name for body in self.scene.moving]
-        sizes = [len(one.effect.parameters) for one in attached]
-        stages = [one.effect.stage for one in attached]
+        sizes = [len(attached.effect.parameters) for attached in acting]
+        stages = [attached.effect.stage for attached in acting]
         addresses = [calls.law_address(s.law) for s in stages if isinstance(s, Command | Force)]
         return (
             np.array(addresses, dtype=np.int64),
-            np.array([names.index(one.body) for one in attached], dtype=np.int64),
+            np.array([names.index(attached.body) for attached in acting], dtype=np.int64),
             np.cumsum([0, *sizes])[:-1].astype(np.int64),
         )
 
