@@ -228,8 +228,8 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
     name = f"i_{block.name[0]}"
     if not block.conditional or name not in variables:
         return None
-    free = next(each.owners for each in layout.blocks if each.name == name)
-    held = [variables[name][free.index(each)] if each in free else 0 for each in block.owners]
+    free = next(index_block.owners for index_block in layout.blocks if index_block.name == name)
+    held = [variables[name][free.index(owner)] if owner in free else 0 for owner in block.owners]
     return pt.stack(held)
 
 

@@ -238,9 +238,9 @@ def next_state_logp(
         square = z**2 if nu is None else (nu + 1) * pt.log1p(z**2 / nu)
         norm = count * log_norm(nu)
     else:
-        every = (tail[None, :, None] * np.ones(measured.shape[1:])).reshape((1, -1))
-        heavy = pt.gt(every, 1.0 / _GAUSSIAN)
-        nus = 1.0 / pt.switch(heavy, every, 1.0)
+        tails = (tail[None, :, None] * np.ones(measured.shape[1:])).reshape((1, -1))
+        heavy = pt.gt(tails, 1.0 / _GAUSSIAN)
+        nus = 1.0 / pt.switch(heavy, tails, 1.0)
         square = pt.switch(heavy, (nus + 1) * pt.log1p(z**2 / nus), z**2)
         at_zero = pt.gammaln((nus + 1) / 2) - pt.gammaln(nus / 2) - 0.5 * pt.log(nus * np.pi)
         norm = (pt.switch(heavy, at_zero, log_norm(None)) * measured.reshape((n, -1))).sum(axis=1)
