@@ -25,21 +25,21 @@ def origin(problem: Problem, seed: int) -> dict[str, Any]:
     median, spread = problem.noise_prior
     for body in scene.dynamic:
         new = [
-            one.effect.name
-            for one in problem.physics.effects
-            if one.body == body.name and one.effect.name not in body.effects
+            attached.effect.name
+            for attached in problem.physics.effects
+            if attached.body == body.name and attached.effect.name not in body.effects
         ]
         scene = scene.with_effects(body.name, *new)
     return attributes(
         scene,
-        effects=[[one.effect.name, one.body] for one in problem.physics.effects],
+        effects=[[attached.effect.name, attached.body] for attached in problem.physics.effects],
         seed=seed,
         horizon=problem.data.horizon,
         **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
         **({} if problem.library is None else {"library": problem.library.to_json()}),
         substeps=problem.physics.substeps,
         together=list(problem.physics.together),
-        sigma_prior=[[float(each) for each in median], float(spread)],
+        sigma_prior=[[float(value) for value in median], float(spread)],
         start_noise=int(problem.noise.start is not None),
         data_sha256=problem.data.history.data_sha256,
         versions=versions(),
@@ -96,7 +96,7 @@ def problem_of(
     noise = Noise(
         scalar="state" not in group(idata, "posterior")["sigma"].dims,
         nu=float(attrs["nu"]) if "nu" in attrs else None,
-        prior=(tuple(float(each) for each in median), float(spread)),
+        prior=(tuple(float(value) for value in median), float(spread)),
     )
     if history is None:
         history = from_segments(scene, start, actions, observed)

@@ -244,7 +244,7 @@ def _trouble(
                 " shape and the frame of the body, or look for an effect that the model lacks"
                 " (pbrl-ppl close-loop)",
             )
-    silent = uninformed(idata, effects={one.effect for one in problem.physics.effects})
+    silent = uninformed(idata, effects={attached.effect for attached in problem.physics.effects})
     if silent:
         yield (
             UninformedWarning,
