@@ -48,7 +48,7 @@ def attach(
         for item in extra
         for effect in (item.effect if isinstance(item, Attached) else item,)
     }
-    attached: list[Attached] = []
+    result: list[Attached] = []
     for body in scene.dynamic:
         for name in body.effects:
             if name not in by_name:
@@ -58,35 +58,39 @@ def attach(
                     f"body {body.name!r} declares the effect {name!r}, which is not in the"
                     f" catalogue{hint} (known: {', '.join(by_name)})"
                 )
-            attached.append(by_name[name].on(body.name))
+            result.append(by_name[name].on(body.name))
     for item in extra:
         if isinstance(item, Attached):
-            attached.append(item)
+            result.append(item)
         else:
             on = [item.on(body.name) for body in scene.dynamic if item.applies(scene, body)]
             if not on:
                 raise EffectError(f"effect {item.name} applies to no body of this scene")
-            attached.extend(on)
+            result.extend(on)
     bodies = {body.name: body for body in scene.dynamic}
-    names = [(one.effect.name, one.body) for one in attached]
-    for one in attached:
-        if one.body not in bodies:
+    names = [(attached.effect.name, attached.body) for attached in result]
+    for attached in result:
+        if attached.body not in bodies:
             raise EffectError(
-                f"effect {one.effect.name} is put on {one.body!r}, which is not a moving body of"
-                f" the scene, or is kinematic (effects may be put on {', '.join(bodies)})"
+                f"effect {attached.effect.name} is put on {attached.body!r}, which is not a moving"
+                f" body of the scene, or is kinematic (effects may be put on {', '.join(bodies)})"
             )
-        if not one.effect.applies(scene, bodies[one.body]):
-            raise EffectError(f"effect {one.effect.name} does not apply to body {one.body!r}")
-        if names.count((one.effect.name, one.body)) > 1:
-            raise EffectError(f"effect {one.effect.name} is put on body {one.body!r} twice")
-    return tuple(attached)
+        if not attached.effect.applies(scene, bodies[attached.body]):
+            raise EffectError(
+                f"effect {attached.effect.name} does not apply to body {attached.body!r}"
+            )
+        if names.count((attached.effect.name, attached.body)) > 1:
+            raise EffectError(
+                f"effect {attached.effect.name} is put on body {attached.body!r} twice"
+            )
+    return tuple(result)
 
 
 def candidates(
     scene: Scene, declared: Iterable[Attached], effects: Iterable[Effect] = catalogue
 ) -> tuple[Attached, ...]:
     """Every effect on every body that the model does not have yet and that applies."""
-    present = {(one.effect.name, one.body) for one in declared}
+    present = {(attached.effect.name, attached.body) for attached in declared}
     return tuple(
         effect.on(body.name)
         for effect in effects

@@ -27,7 +27,7 @@ def hanging_body(scene: Scene, joint: Joint) -> str:
         raise EffectError("which bodies the hinge joins is to be inferred; none hangs in it yet")
     fixed = {WORLD, *(body.name for body in scene.bodies if body.static or body.kinematic)}
     depth = dict.fromkeys(fixed, 0)
-    pairs = [each.bodies for each in _hinges(scene) if each.bodies]
+    pairs = [hinge.bodies for hinge in _hinges(scene) if hinge.bodies]
     for _ in pairs:
         for pair in pairs:
             for near, far in (pair, pair[::-1]):

@@ -59,7 +59,7 @@ def segment_rows(scene: Scene, start: Array, actions: Array, observed: Array) ->
             "trajectory": trajectory,
             "step": step,
             "time": step * scene.time_step,
-            "body": np.array([each.name for each in scene.moving])[body],
+            "body": np.array([mover.name for mover in scene.moving])[body],
             **dict(zip(STATE, states.reshape(-1, len(STATE)).T, strict=True)),
             **dict(zip(WRENCH, wrenches.reshape(-1, len(WRENCH)).T, strict=True)),
         }

@@ -5,8 +5,6 @@ from pbrl_ppl.model.declaration import build_model, physics_model, prior_predict
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
     Observations,
-    StartNoise,
-    estimate_sigma,
     log_density,
     next_state_random,
     robust,
@@ -17,6 +15,7 @@ from pbrl_ppl.model.noise import Noise, sigma_prior
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
 from pbrl_ppl.model.problem import Problem
+from pbrl_ppl.model.start_noise import StartNoise, estimate_sigma
 from pbrl_ppl.model.table1 import build_layout, index_priors
 from pbrl_ppl.model.transition import Transition
 

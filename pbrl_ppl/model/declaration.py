@@ -15,14 +15,11 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.model.library import ParameterLibrary
-from pbrl_ppl.model.likelihood import (
-    StartNoise,
-    next_state_logp,
-    next_state_random,
-)
+from pbrl_ppl.model.likelihood import next_state_logp, next_state_random
 from pbrl_ppl.model.noise import Noise
 from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
 from pbrl_ppl.model.problem import Problem
+from pbrl_ppl.model.start_noise import StartNoise
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.model.tails import tail_tensor
 from pbrl_ppl.parameters import Block, Layout
@@ -231,8 +228,8 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
     name = f"i_{block.name[0]}"
     if not block.conditional or name not in variables:
         return None
-    free = next(each.owners for each in layout.blocks if each.name == name)
-    held = [variables[name][free.index(each)] if each in free else 0 for each in block.owners]
+    free = next(index_block.owners for index_block in layout.blocks if index_block.name == name)
+    held = [variables[name][free.index(owner)] if owner in free else 0 for owner in block.owners]
     return pt.stack(held)
 
 

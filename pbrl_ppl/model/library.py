@@ -64,19 +64,19 @@ class ParameterLibrary:
         object.__setattr__(self, "sets", _frozen({k: dict(v) for k, v in sets.items()}))
         given = dict(self.probabilities or {})
         nested = {k: dict(v) for k, v in given.items() if isinstance(v, Mapping | tuple)}
-        every = {k: v for k, v in given.items() if k not in nested}
-        if every and nested:
+        by_set = {k: v for k, v in given.items() if k not in nested}
+        if by_set and nested:
             raise ParameterError(
                 "library: probabilities are by set or by body, not both; give each body's own"
             )
-        for where, each in ({"the library": every} if every else nested).items():
-            wrong = [name for name in each if name not in self.names]
+        for where, weights in ({"the library": by_set} if by_set else nested).items():
+            wrong = [name for name in weights if name not in self.names]
             if wrong:
                 raise ParameterError(
                     f"probabilities of {where}: there is no set {wrong[0]!r}"
                     f"{nearest(wrong[0], self.names)}"
                 )
-            values = np.array(list(each.values()), dtype=float)
+            values = np.array(list(weights.values()), dtype=float)
             if not (np.isfinite(values).all() and (values >= 0).all() and values.sum() > 0):
                 raise ParameterError(
                     f"probabilities of {where} are {', '.join(f'{v:g}' for v in values)}; expected"
@@ -102,7 +102,7 @@ class ParameterLibrary:
     def prior(self, body: str) -> Array:
         """Probability of each set for a body, shape (set,)."""
         given: dict[str, Any] = dict(self.probabilities or {})
-        if any(isinstance(each, tuple) for each in given.values()):
+        if any(isinstance(value, tuple) for value in given.values()):
             given = dict(given.get(body, ()))
         p = np.array([float(given.get(name, 0.0)) for name in self.names])
         return p / p.sum() if p.sum() else np.full(len(p), 1.0 / len(p))

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import Segments
-from pbrl_ppl.model.likelihood import Observations, StartNoise
+from pbrl_ppl.model.likelihood import Observations
+from pbrl_ppl.model.start_noise import StartNoise
 
 Array = NDArray[np.float64]
 

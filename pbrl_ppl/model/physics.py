@@ -86,5 +86,5 @@ class Physics:
 
     def changed(self, **fields: object) -> Physics:
         """The same with other fields; itself, with its worlds, where they are equal."""
-        other = replace(self, **fields)  # type: ignore[arg-type]
-        return self if other == self else other
+        copy = replace(self, **fields)  # type: ignore[arg-type]
+        return self if copy == self else copy

@@ -136,7 +136,7 @@ def index_priors(scene: Scene, joint: Joint) -> tuple[Prior, Prior]:
     """
     declared = {index: dict(table) for index, table in joint.prior}
     upper = float(len(scene.joinable) - 1)
-    one, other = (
+    prior_a, prior_b = (
         Prior(
             "categorical",
             lower=0.0,
@@ -147,7 +147,7 @@ def index_priors(scene: Scene, joint: Joint) -> tuple[Prior, Prior]:
         )
         for index in JOINT_INDICES
     )
-    return one, other
+    return prior_a, prior_b
 
 
 def _joint_blocks(scene: Scene) -> list[Block]:
@@ -174,7 +174,9 @@ def _joint_blocks(scene: Scene) -> list[Block]:
                 holders = (joint.bodies[side],) * len(holders)
             anchor = (joint.anchor_a, joint.anchor_b)[side]
             centre = None if anchor is None else anchor[axis]
-            conditional.append(tuple(anchor_prior(scene, each, axis, centre) for each in holders))
+            conditional.append(
+                tuple(anchor_prior(scene, holder, axis, centre) for holder in holders)
+            )
         priors = tuple(_union(alternatives) for alternatives in conditional)
         owners = tuple(owner for owner, _ in joints)
         blocks.append(Block(name, owners, unit, priors, of="joint", conditional=tuple(conditional)))
@@ -192,7 +194,7 @@ def _union(priors: tuple[Prior, ...]) -> Prior:
     """A prior over the support of all of these: what is known before the index is."""
     if len(set(priors)) == 1:
         return priors[0]
-    lower, upper = min(each.lower for each in priors), max(each.upper for each in priors)
+    lower, upper = min(prior.lower for prior in priors), max(prior.upper for prior in priors)
     return replace(priors[0], mu=(lower + upper) / 2, sigma=upper - lower, lower=lower, upper=upper)
 
 
@@ -215,7 +217,7 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
     for body in scene.moving:
         names = [
             *BODY_PARAMETERS,
-            *(v for one in effects if one.body == body.name for v in one.variables),
+            *(v for attached in effects if attached.body == body.name for v in attached.variables),
         ]
         for name, _ in body.prior:
             if name not in names:
@@ -232,12 +234,12 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
             priors = tuple(table1(body)[name] for body in bodies)
             blocks.append(Block(name, tuple(body.name for body in bodies), unit, priors))
     blocks += _joint_blocks(scene)
-    for effect in dict.fromkeys(one.effect for one in effects):
-        on = tuple(one.body for one in effects if one.effect == effect)
-        for each in effect.parameters:
-            name = effect.variable(each)
-            priors = tuple(declared_prior(scene.body(owner), name, each.prior) for owner in on)
-            blocks.append(Block(name, on, each.unit, priors, effect=effect.name))
+    for effect in dict.fromkeys(attached.effect for attached in effects):
+        on = tuple(attached.body for attached in effects if attached.effect == effect)
+        for parameter in effect.parameters:
+            name = effect.variable(parameter)
+            priors = tuple(declared_prior(scene.body(owner), name, parameter.prior) for owner in on)
+            blocks.append(Block(name, on, parameter.unit, priors, effect=effect.name))
     return Layout(tuple(blocks))
 
 

@@ -19,9 +19,9 @@ def tail_places(physics: Physics) -> list[int]:
     """Where phi holds parameters of the noise stage."""
     labels = physics.layout.labels
     return [
-        labels.index(f"{variable}[{one.body}]")
-        for one in at_stage(physics.effects, Noise)
-        for variable in one.variables
+        labels.index(f"{variable}[{attached.body}]")
+        for attached in at_stage(physics.effects, Noise)
+        for variable in attached.variables
     ]
 
 
@@ -45,8 +45,8 @@ def degrees_of_freedom(physics: Physics, phi: Array, nu: float | None) -> Array:
     """
     labels = physics.layout.labels
 
-    def value(one: Attached, variable: str) -> Array:
-        return np.asarray(phi[..., labels.index(f"{variable}[{one.body}]")])
+    def value(attached: Attached, variable: str) -> Array:
+        return np.asarray(phi[..., labels.index(f"{variable}[{attached.body}]")])
 
     zero = np.full(phi.shape[:-1], 0.0 if nu is None else 1.0 / nu)
     tails = np.stack(_tails(physics, value, zero), axis=-1)[..., None, None, :, None]
@@ -58,8 +58,8 @@ def tail_tensor(physics: Physics, variables: Mapping[str, Any], nu: float | None
     """Reciprocal degrees of freedom of each body's noise, a tensor of shape (body,)."""
     owners = {block.name: block.owners for block in physics.layout.blocks}
 
-    def value(one: Attached, variable: str) -> Any:
-        return variables[variable][owners[variable].index(one.body)]
+    def value(attached: Attached, variable: str) -> Any:
+        return variables[variable][owners[variable].index(attached.body)]
 
     zero = pt.constant(0.0 if nu is None else 1.0 / nu)
     return pt.stack(_tails(physics, value, zero))
@@ -71,10 +71,10 @@ def _tails(physics: Physics, value: Any, zero: Any) -> list[Any]:
     result = []
     for body in physics.scene.moving:
         tail = zero
-        for one in acting:
-            if one.body == body.name and isinstance(one.effect.stage, Noise):
-                names = [parameter.name for parameter in one.effect.parameters]
-                values = [value(one, variable) for variable in one.variables]
-                tail = tail + one.effect.stage.tail(dict(zip(names, values, strict=True)))
+        for attached in acting:
+            if attached.body == body.name and isinstance(attached.effect.stage, Noise):
+                names = [parameter.name for parameter in attached.effect.parameters]
+                values = [value(attached, variable) for variable in attached.variables]
+                tail = tail + attached.effect.stage.tail(dict(zip(names, values, strict=True)))
         result.append(tail)
     return result

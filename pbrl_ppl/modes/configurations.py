@@ -130,7 +130,7 @@ def alike(scene: Scene) -> tuple[Alike, ...]:
             ((scene.joinable[i], scene.joinable[j]), float(both[i, j] + both[j, i]))
             for i, j in pairs
         ]
-        possible = [each for each in weighed if each[1] > 0]
+        possible = [option for option in weighed if option[1] > 0]
         found.append(Alike(tuple(names), (*possible, (None, float(both.trace())))))
     return tuple(found)
 
@@ -165,7 +165,8 @@ def index_law(pair: Pair, scene: Scene, p_a: Array, p_b: Array) -> Array:
 def number(scene: Scene) -> int:
     """How many configurations there are."""
     return math.prod(
-        math.comb(len(each.weights) + len(each.names) - 1, len(each.names)) for each in alike(scene)
+        math.comb(len(group.weights) + len(group.names) - 1, len(group.names))
+        for group in alike(scene)
     )
 
 
@@ -185,7 +186,7 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
     >>> from pbrl_ppl.scene.scene import Body, Joint, Shape
     >>> pucks = tuple(Body(name, Shape.circle(0.1)) for name in "ab")
     >>> scene = Scene(time_step=0.1, bodies=pucks, joints=(Joint("hinge", known=False),))
-    >>> [each.pairs[0][1] for each in configurations(scene)]
+    >>> [configuration.pairs[0][1] for configuration in configurations(scene)]
     [None, ('a', 'b'), ('a', 'world'), ('b', 'world')]
     """
     groups = alike(scene)
@@ -193,9 +194,13 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
         combinations_with_replacement([pair for pair, _ in own.weights], len(own.names))
         for own in groups
     )
-    found = [_configuration(groups, each) for each in product(*ways)]
-    possible = [each for each in found if each.empty or np.isfinite(each.log_prior)]
-    return tuple(sorted(possible, key=lambda one: not one.empty))
+    found = [_configuration(groups, held) for held in product(*ways)]
+    possible = [
+        configuration
+        for configuration in found
+        if configuration.empty or np.isfinite(configuration.log_prior)
+    ]
+    return tuple(sorted(possible, key=lambda configuration: not configuration.empty))
 
 
 def nothing(scene: Scene) -> Configuration:
@@ -209,7 +214,7 @@ def one_more(scene: Scene, configuration: Configuration) -> tuple[Configuration,
     groups, chosen, found = alike(scene), dict(configuration.pairs), []
     for i, own in enumerate(groups):
         order = [pair for pair, _ in own.weights]
-        held = [[chosen[name] for name in each.names] for each in groups]
+        held = [[chosen[name] for name in group.names] for group in groups]
         if None not in held[i]:
             continue
         for pair in order[:-1]:
@@ -237,13 +242,13 @@ def stored(found: Sequence[Weighed]) -> str:
     """Configurations as a posterior's attribute, the most probable first."""
     rows = [
         {
-            "joints": dict(each.configuration.pairs),
-            "probability": each.probability,
-            "log_evidence": each.evidence.log_z,
-            "error": each.evidence.error,
-            "ess": each.evidence.ess,
+            "joints": dict(weighed.configuration.pairs),
+            "probability": weighed.probability,
+            "log_evidence": weighed.evidence.log_z,
+            "error": weighed.evidence.error,
+            "ess": weighed.evidence.ess,
         }
-        for each in sorted(found, key=lambda each: -each.probability)
+        for weighed in sorted(found, key=lambda weighed: -weighed.probability)
     ]
     return json.dumps(rows)
 

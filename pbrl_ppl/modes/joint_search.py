@@ -82,25 +82,25 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
     problem.segments  # noqa: B018  # checks the start states, once for all
     console = Console(stderr=True)
     modes, evidence = _tried(problem, seed, console, progress)
-    every, worth = tuple(modes), _worth(modes)
+    tried, worth = tuple(modes), _worth(modes)
     leading = _leading(evidence, _CONTENDERS, at_least=_BEST)
-    for each in track(leading, "looking again", console=console, disable=not progress):
-        if each.empty:
-            better = _apart(modes[each].problem, seed + 1)
+    for configuration in track(leading, "looking again", console=console, disable=not progress):
+        if configuration.empty:
+            better = _apart(modes[configuration].problem, seed + 1)
         else:
-            better = _searched_again(modes[each], each, worth, seed)
-        if better.log_posterior > modes[each].log_posterior:
-            modes[each], evidence[each] = better, laplace(better)
+            better = _searched_again(modes[configuration], configuration, worth, seed)
+        if better.log_posterior > modes[configuration].log_posterior:
+            modes[configuration], evidence[configuration] = better, laplace(better)
     close = _leading(evidence, _MARGIN)
     if len(close) > 1:
         rng = np.random.default_rng(seed)
-        for each in track(close, "weighing joints", console=console, disable=not progress):
-            evidence[each] = importance(modes[each], rng)
-    score = np.array([_score(each, evidence[each]) for each in every])
+        for configuration in track(close, "weighing joints", console=console, disable=not progress):
+            evidence[configuration] = importance(modes[configuration], rng)
+    score = np.array([_score(configuration, evidence[configuration]) for configuration in tried])
     probability = np.exp(score - logsumexp(score))
     return tuple(
-        Weighed(each, modes[each], evidence[each], float(p))
-        for each, p in zip(every, probability, strict=True)
+        Weighed(configuration, modes[configuration], evidence[configuration], float(p))
+        for configuration, p in zip(tried, probability, strict=True)
     )
 
 
@@ -117,21 +117,26 @@ def _tried(
     evidence = {apart: laplace(modes[apart])}
 
     def extend(parents: Mapping[Configuration, Configuration], what: str) -> None:
-        for each, parent in track(
+        for configuration, parent in track(
             list(parents.items()), what, console=console, disable=not progress
         ):
-            own = each.problem(problem)
-            modes[each] = _joint(own, each, modes[parent], _worth(modes))
-            evidence[each] = laplace(modes[each])
+            own = configuration.problem(problem)
+            modes[configuration] = _joint(own, configuration, modes[parent], _worth(modes))
+            evidence[configuration] = laplace(modes[configuration])
 
     if number(scene) <= MOST:
-        others = [each for each in configurations(scene) if not each.empty]
+        others = [
+            configuration for configuration in configurations(scene) if not configuration.empty
+        ]
         extend(dict.fromkeys(others, apart), "trying joints")
         return modes, evidence
     best, levels = [apart], len(apart.pairs)
     for level in range(levels):
         grown = {
-            each: parent for parent in best for each in one_more(scene, parent) if each not in modes
+            configuration: parent
+            for parent in best
+            for configuration in one_more(scene, parent)
+            if configuration not in modes
         }
         if len(modes) + len(grown) > MOST:
             raise FitError(_too_many(scene, len(grown)))
@@ -141,7 +146,7 @@ def _tried(
         least = max(score.values()) - 2 * _CONTENDERS
         best = sorted((e for e in grown if score[e] > least), key=lambda e: -score[e])
         room = (MOST - len(modes)) // max(levels - level - 1, 1)
-        most = max((len(one_more(scene, each)) for each in best[:1]), default=1)
+        most = max((len(one_more(scene, configuration)) for configuration in best[:1]), default=1)
         best = best[: max(room // max(most, 1), 1)]
     return modes, evidence
 
@@ -169,7 +174,9 @@ def _leading(
     evidence: dict[Configuration, Evidence], within: float, at_least: int = 1
 ) -> list[Configuration]:
     """Those whose posterior log-weight is near the best, or among the first."""
-    order = sorted(evidence, key=lambda each: -_score(each, evidence[each]))
+    order = sorted(
+        evidence, key=lambda configuration: -_score(configuration, evidence[configuration])
+    )
     least = _score(order[0], evidence[order[0]]) - within
     return [e for i, e in enumerate(order) if i < at_least or _score(e, evidence[e]) > least]
 
@@ -254,8 +261,8 @@ def _placed(problem: Problem, configuration: Configuration) -> list[Array]:
     alternatives = [
         _anchors(problem, name, joint) for name, joint in _joined(problem, configuration)
     ]
-    count = min(len(each) for each in alternatives)
-    return [np.concatenate([each[i] for each in alternatives]) for i in range(count)]
+    count = min(len(anchors) for anchors in alternatives)
+    return [np.concatenate([anchors[i] for anchors in alternatives]) for i in range(count)]
 
 
 def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
@@ -263,7 +270,7 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
 
     A hinge's are linear least squares; a rod's are not, and are sought from several starts.
     """
-    priors = [problem.layout.priors[problem.layout.index(each, name)] for each in JOINT_ANCHORS]
+    priors = [problem.layout.priors[problem.layout.index(anchor, name)] for anchor in JOINT_ANCHORS]
     a, b = (_states(problem, body) for body in joint.bodies or ())
     reference = [_reference(problem, body) for body in joint.bodies or ()]
 
@@ -293,7 +300,7 @@ def _states(problem: Problem, body: str) -> Array:
     rows = rows[:: -(-len(rows) // _ROWS)]
     if body == WORLD:
         return np.zeros((len(rows), 6))
-    names = [each.name for each in problem.scene.moving]
+    names = [mover.name for mover in problem.scene.moving]
     return np.asarray(rows[:, names.index(body)])
 
 

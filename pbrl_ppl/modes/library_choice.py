@@ -37,7 +37,7 @@ class _Combinations:
             raise FitError("fit: the model has no library to choose from")
         priors = [library.prior(body) for body in bodies]
         possible = [np.flatnonzero(p) for p in priors]
-        count = prod(len(each) for each in possible)
+        count = prod(len(sets) for sets in possible)
         measured = problem.observations.values[:, :, part.bodies]
         if count * measured.size > _MOST:
             raise FitError(
@@ -66,8 +66,8 @@ class _Combinations:
         size = max(1, _NUMBERS // max(self.residual.size, 1))
         for begin in range(0, len(sigma), size):
             part = sigma[begin : begin + size, None]
-            each = log_density(self.residual[None], part, None, seen, nu).sum(axis=-1)
-            result[begin : begin + size] = each
+            log_likelihood = log_density(self.residual[None], part, None, seen, nu).sum(axis=-1)
+            result[begin : begin + size] = log_likelihood
         return np.asarray(result + self.log_prior)
 
 
@@ -112,14 +112,14 @@ def choose_from_library(
     parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
     median, spread = problem.noise_prior
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
-    every = np.ones(len(median))
+    ones = np.ones(len(median))
     if problem.noise.scalar:
         counts = counts.sum(keepdims=True)
 
     def density(log_sigma: Array) -> Array:
-        sigma = np.exp(log_sigma) * every
-        each = [logsumexp(part.log_joint(sigma, problem.nu()), axis=1) for part in parts]
-        return np.asarray(np.sum(each, axis=0) + log_noise_prior(problem, log_sigma))
+        sigma = np.exp(log_sigma) * ones
+        log_sums = [logsumexp(part.log_joint(sigma, problem.nu()), axis=1) for part in parts]
+        return np.asarray(np.sum(log_sums, axis=0) + log_noise_prior(problem, log_sigma))
 
     begin = np.log(_rough_sigma(problem, parts, median))
     begin = begin.mean(keepdims=True) if problem.noise.scalar else begin
@@ -144,17 +144,17 @@ def choose_from_library(
         sigmas.append(np.exp(log_sigma))
         index = np.zeros((draws, len(problem.scene.moving)), dtype=np.intp)
         for own, part in zip(parts, problem.simulator.parts, strict=True):
-            joint = own.log_joint(np.exp(log_sigma) * every, problem.nu())
+            joint = own.log_joint(np.exp(log_sigma) * ones, problem.nu())
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
             index[:, part.bodies] = own.indices[which]
         chosen.append(index)
     names = [body.name for body in problem.scene.moving]
     owners = [owner for block in problem.layout.blocks for owner in block.owners]
-    every_index = np.stack(chosen)
-    of = every_index[..., [names.index(owner) for owner in owners]]
+    indices = np.stack(chosen)
+    of = indices[..., [names.index(owner) for owner in owners]]
     phi = table[np.arange(len(owners)), of]
-    return phi, np.stack(sigmas), every_index, np.stack(accepted)
+    return phi, np.stack(sigmas), indices, np.stack(accepted)
 
 
 def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> Array:

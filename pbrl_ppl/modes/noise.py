@@ -31,20 +31,20 @@ def profile_sigma(problem: Problem, residual: Array, phi: Array | None = None) -
     """
     noise = problem.noise.start
     residual = np.nan_to_num(residual, nan=FAR_OFF)
-    every = np.ones(residual.shape[-1])
+    ones = np.ones(residual.shape[-1])
     if problem.nu(phi) is None and (noise is None or problem.noise.scalar):
-        z = whiten(residual, every, noise).reshape(residual.shape)
-        return np.asarray(np.exp(gaussian_log_sigma(problem, (z**2).sum((0, 1, 2)))) * every)
+        z = whiten(residual, ones, noise).reshape(residual.shape)
+        return np.asarray(np.exp(gaussian_log_sigma(problem, (z**2).sum((0, 1, 2)))) * ones)
     begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
     if noise is not None:
         begin = begin - np.log(np.median(noise.gain))
 
     def cost(log_sigma: Array) -> float:
-        likelihood = problem.log_density(residual, np.exp(log_sigma) * every, phi).sum()
+        likelihood = problem.log_density(residual, np.exp(log_sigma) * ones, phi).sum()
         return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
 
     bounds = [(b - 6, b + 6) for b in begin]
-    return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x) * every)
+    return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x) * ones)
 
 
 def gaussian_log_sigma(problem: Problem, square: Array) -> Array:

@@ -159,7 +159,9 @@ class Layout:
 
     def scale(self, phi: Array) -> Array:
         """What is a large change of each entry of phi, shape (p,); zero of a discrete one."""
-        least = np.array([0.0 if each.discrete else min(each.sigma, 1.0) for each in self.priors])
+        least = np.array(
+            [0.0 if prior.discrete else min(prior.sigma, 1.0) for prior in self.priors]
+        )
         return np.where(self.discrete, 0.0, np.maximum(np.abs(phi), 0.1 * least))
 
     def slices(self) -> Iterator[tuple[Block, slice]]:

@@ -199,9 +199,9 @@ def redescribed(layout: Layout, phi: Array, rng: np.random.Generator) -> Array:
     """
     for wheel in wheels(layout):
         if wheel.period > 1:
-            each = wheel.log_priors(phi, wheel.period)
+            log_prior = wheel.log_priors(phi, wheel.period)
             # the largest of log-probabilities with Gumbel noise is a draw
-            phi = wheel.turned(phi, (each + rng.gumbel(size=each.shape)).argmax(axis=0))
+            phi = wheel.turned(phi, (log_prior + rng.gumbel(size=log_prior.shape)).argmax(axis=0))
     return phi
 
 
@@ -225,9 +225,9 @@ def evened(layout: Layout, phi: Array) -> Array:
     result = np.zeros(np.shape(phi))
     for wheel in wheels(layout):
         if wheel.period > 1:
-            each = wheel.log_priors(phi)
+            log_prior = wheel.log_priors(phi)
             with np.errstate(invalid="ignore"):  # outside the support, where there is no prior
-                change = logsumexp(each, axis=0) - np.log(4.0) - each[0]
+                change = logsumexp(log_prior, axis=0) - np.log(4.0) - log_prior[0]
             result[..., wheel.places[0]] = np.nan_to_num(change)
     return result
 
@@ -244,25 +244,25 @@ def _fold(angle: Array, mu_x: Array, mu_y: Array, period: int) -> tuple[Array, A
         [np.cos(theta), np.sin(theta), np.where(odd, mu_y, mu_x), np.where(odd, mu_x, mu_y)]
     )
     barred = np.where(turns % period == 0, 0.0, np.inf)
-    every = np.arange(len(angle))
+    draw = np.arange(len(angle))
     chosen = np.where((mu_x <= mu_y) | (period > 1), 0, 1)
     # half a turn changes nothing else: begin on the first draw's side
-    chosen = chosen + np.where(np.cos(theta[chosen, every] - theta[chosen[0], 0]) < 0, 2, 0)
+    chosen = chosen + np.where(np.cos(theta[chosen, draw] - theta[chosen[0], 0]) < 0, 2, 0)
     for _ in range(_ROUNDS):
-        centre = points[:, chosen, every].mean(axis=1)
+        centre = points[:, chosen, draw].mean(axis=1)
         off = ((points - centre[:, None, None]) ** 2).sum(axis=0) + barred
         nearest = off.argmin(axis=0)
         if (nearest == chosen).all():
             break
         chosen = nearest
-    centre = points[:, chosen, every].mean(axis=1)
+    centre = points[:, chosen, draw].mean(axis=1)
     if period == 1 and centre[2] > centre[3]:
         chosen = (chosen + 1) % 4
-    if np.mean(np.cos(theta[chosen, every])) < 0:  # in (-pi/2, pi/2]
+    if np.mean(np.cos(theta[chosen, draw])) < 0:  # in (-pi/2, pi/2]
         chosen = (chosen + 2) % 4
     swapped = chosen % 2 == 1
     return (
-        _wrapped(theta[chosen, every]),
+        _wrapped(theta[chosen, draw]),
         np.where(swapped, mu_y, mu_x),
         np.where(swapped, mu_x, mu_y),
     )

@@ -27,12 +27,12 @@ def joined_parts(parts: Parts, together: Collection[str]) -> Parts:
     >>> joined_parts((("a", "b"), ("c",), ("d",)), ["b", "d"])
     (('a', 'b', 'd'), ('c',))
     """
-    one = tuple(name for part in parts if set(part) & set(together) for name in part)
-    if not one:
+    joined = tuple(name for part in parts if set(part) & set(together) for name in part)
+    if not joined:
         return parts
-    first = next(part for part in parts if part[0] == one[0])
+    first = next(part for part in parts if part[0] == joined[0])
     return tuple(
-        one if part is first else part
+        joined if part is first else part
         for part in parts
         if part is first or not set(part) & set(together)
     )

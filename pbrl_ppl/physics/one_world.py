@@ -72,29 +72,29 @@ class OneWorld:
         differ: Bools = np.asarray((~_same(whole, apart)).any(axis=(-3, -1)))
         if not differ.any():
             return states, met
-        for one, other in combinations((part.bodies for part in self.parted.parts), 2):
-            both = np.concatenate([one, other])
+        for bodies_a, bodies_b in combinations((part.bodies for part in self.parted.parts), 2):
+            both = np.concatenate([bodies_a, bodies_b])
             moved = differ[..., both].any(axis=-1)
             if not moved.any():
                 continue
-            near: Bools = self._near(whole, start, one, other)
-            near |= self._near(apart, start, one, other)
+            near: Bools = self._near(whole, start, bodies_a, bodies_b)
+            near |= self._near(apart, start, bodies_a, bodies_b)
             met[..., both] |= np.expand_dims(moved & near, -1)
         return np.where((met & differ)[..., None, :, None], whole, states), met
 
-    def _near(self, states: Array, start: Array, one: Ints, other: Ints) -> Bools:
+    def _near(self, states: Array, start: Array, bodies_a: Ints, bodies_b: Ints) -> Bools:
         """Whether a body of one part comes near one of another, shape (..., transition)."""
         begin = start[:, None, :, :2]
         first = np.broadcast_to(begin, (*states.shape[:-4], *begin.shape))
         places = np.concatenate([first, states[..., :2]], axis=-3)
         found = np.zeros(states.shape[:-3], dtype=bool)
-        for i, j in product(one, other):
+        for i, j in product(bodies_a, bodies_b):
             way = places[..., i, :] - places[..., j, :]
             least = (1.0 + SHARE) * (self._reach[i] + self._reach[j])
             found |= come_near(way[..., :-1, :], way[..., 1:, :], least).any(axis=-1)
         return found
 
 
-def _same(one: Array, other: Array) -> Bools:
+def _same(a: Array, b: Array) -> Bools:
     """Whether numbers are the same to rounding, or both are lost."""
-    return np.asarray((abs(one - other) <= _ROUNDING) | (np.isnan(one) & np.isnan(other)))
+    return np.asarray((abs(a - b) <= _ROUNDING) | (np.isnan(a) & np.isnan(b)))

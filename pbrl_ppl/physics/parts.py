@@ -87,7 +87,7 @@ class PartedSimulator:
             simulator = Simulator(
                 own,
                 chosen,
-                tuple(one for one in effects if one.body in part),
+                tuple(attached for attached in effects if attached.body in part),
                 substeps=substeps,
                 threads=threads,
                 extrapolate=extrapolate,

@@ -290,14 +290,14 @@ def _put(points: Array, poses: Array) -> Array:
 
 
 def _depth(
-    one: tuple[Array, float], at_one: Array, other: tuple[Array, float], at_other: Array
+    part_a: tuple[Array, float], poses_a: Array, part_b: tuple[Array, float], poses_b: Array
 ) -> Array:
     """How far two convex parts must move to part, at each pose (m); negative if they are apart.
 
     The engine's own answer is not used: it is zero for polygons whose centres coincide.
     """
-    a, b = _put(one[0], at_one), _put(other[0], at_other)
-    radii = one[1] + other[1]
+    a, b = _put(part_a[0], poses_a), _put(part_b[0], poses_b)
+    radii = part_a[1] + part_b[1]
     if a.shape[1] == 1:
         return radii - _distance(a[:, 0], b)
     if b.shape[1] == 1:

@@ -100,10 +100,10 @@ def _laws(
 ) -> list[tuple[int, Attached, Array]]:
     """Body, effect and parameters of each law of a stage."""
     acting = at_stage(effects, stage)
-    edges = np.cumsum([0, *(len(one.effect.parameters) for one in acting)])
+    edges = np.cumsum([0, *(len(attached.effect.parameters) for attached in acting)])
     return [
-        (names.index(one.body), one, parameters[begin:end])
-        for one, begin, end in zip(acting, edges[:-1], edges[1:], strict=True)
+        (names.index(attached.body), attached, parameters[begin:end])
+        for attached, begin, end in zip(acting, edges[:-1], edges[1:], strict=True)
     ]
 
 

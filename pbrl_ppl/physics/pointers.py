@@ -43,7 +43,9 @@ def pointers(world: World) -> Pointers:
     ffi = _chipmunk_cffi.ffi
 
     def at(objects: list[Any]) -> NDArray[np.int64]:
-        return np.array([int(ffi.cast("intptr_t", each)) for each in objects], dtype=np.int64)
+        return np.array(
+            [int(ffi.cast("intptr_t", c_object)) for c_object in objects], dtype=np.int64
+        )
 
     def whole(numbers: list[int]) -> NDArray[np.int64]:
         return np.array(numbers, dtype=np.int64)

@@ -78,13 +78,13 @@ class EngineInput(NamedTuple):
     indices: NDArray[np.int64]
 
 
-def _is_patch(one: Attached) -> bool:
+def _is_patch(attached: Attached) -> bool:
     """Whether an effect puts friction under its body: it is tried."""
-    stage = one.effect.stage
+    stage = attached.effect.stage
     if not isinstance(stage, Properties):
         return False
     row = {name: np.zeros((1, 1)) for name in (*COLUMNS, "moment_per_mass")}
-    centre = {p.name: np.full((1, 1), p.prior.centre) for p in one.effect.parameters}
+    centre = {p.name: np.full((1, 1), p.prior.centre) for p in attached.effect.parameters}
     never = np.full((1, 1), np.inf)
     stage.modify(row, centre, Clock(never, never, never))
     return bool(row["patch_mu"].any())
@@ -124,22 +124,25 @@ class EngineProperties:
         self._bodies = bodies
         #: Whether a body's numbers depend on the time.
         self.timed = any(
-            isinstance(one.effect.stage, Properties) and one.effect.stage.timed for one in effects
+            isinstance(attached.effect.stage, Properties) and attached.effect.stage.timed
+            for attached in effects
         )
         #: How many discs the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
         #: Which bodies have friction under them.
-        self.patches = tuple(sorted({bodies.index(one.body) for one in effects if _is_patch(one)}))
+        self.patches = tuple(
+            sorted({bodies.index(attached.body) for attached in effects if _is_patch(attached)})
+        )
         self._bind_joints(scene, places)
 
-    def values(self, one: Attached, phi: Array, axes: int = 0) -> dict[str, Array]:
+    def values(self, attached: Attached, phi: Array, axes: int = 0) -> dict[str, Array]:
         """An effect's parameters by name, shape (proposal, 1, ...) with so many further axes.
 
         One that is not in phi has its null value.
         """
         result = {}
-        for parameter in one.effect.parameters:
-            place = self._places.get(f"{one.effect.variable(parameter)}[{one.body}]")
+        for parameter in attached.effect.parameters:
+            place = self._places.get(f"{attached.effect.variable(parameter)}[{attached.body}]")
             column = np.full(len(phi), parameter.null) if place is None else phi[:, place]
             result[parameter.name] = column.reshape(-1, *(1,) * axes)
         return result
@@ -147,9 +150,13 @@ class EngineProperties:
     def sensors(self, phi: Array) -> list[tuple[int, Sensor, Values]]:
         """Body, sensor and its parameters, shape (proposal, 1, 1), in their order."""
         return [
-            (self._bodies.index(one.body), one.effect.stage, self.values(one, phi, 2))
-            for one in at_stage(self._effects, Sensor)
-            if isinstance(one.effect.stage, Sensor)
+            (
+                self._bodies.index(attached.body),
+                attached.effect.stage,
+                self.values(attached, phi, 2),
+            )
+            for attached in at_stage(self._effects, Sensor)
+            if isinstance(attached.effect.stage, Sensor)
         ]
 
     def _bind_joints(self, scene: Scene, places: dict[str, int]) -> None:
@@ -175,8 +182,8 @@ class EngineProperties:
         length = self._lengths(self._anchors, self._held)
         #: Which joints have no length, one a joint.
         self.hinges = tuple(
-            joint.kind == "hinge" or bool(joint.known and each < _NO_LENGTH)
-            for joint, each in zip(scene.joints, length, strict=True)
+            joint.kind == "hinge" or bool(joint.known and distance < _NO_LENGTH)
+            for joint, distance in zip(scene.joints, length, strict=True)
         )
 
     def _lengths(self, anchors: Array, held: NDArray[np.int64]) -> Array:
@@ -225,14 +232,14 @@ class EngineProperties:
         clock = clock if self.timed and clock is not None else Clock(never, never, never)
         m = clock.begin.shape[1]
         result = np.repeat(bodies[:, None], m, axis=1)
-        for name in dict.fromkeys(one.body for one in modifying):
+        for name in dict.fromkeys(attached.body for attached in modifying):
             i = self._bodies.index(name)
             row = {key: result[:, :, i, column].copy() for key, column in COLUMN.items()}
             del row["moment"]
             row["moment_per_mass"] = np.full((len(phi), m), self._unit_moment[i])
-            for one in modifying:
-                if one.body == name and isinstance(one.effect.stage, Properties):
-                    one.effect.stage.modify(row, self.values(one, phi, 1), clock)
+            for attached in modifying:
+                if attached.body == name and isinstance(attached.effect.stage, Properties):
+                    attached.effect.stage.modify(row, self.values(attached, phi, 1), clock)
             row["moment"] = row["mass"] * row["moment_per_mass"]
             for key, column in COLUMN.items():
                 result[:, :, i, column] = row[key]
@@ -242,8 +249,8 @@ class EngineProperties:
         """Parameters of the laws of a stage, one after the other, shape (proposal, q)."""
         columns = [
             column
-            for one in at_stage(self._effects, stage)
-            for column in self.values(one, phi).values()
+            for attached in at_stage(self._effects, stage)
+            for column in self.values(attached, phi).values()
         ]
         return np.stack([np.zeros(len(phi)), *columns], axis=1)[:, 1:].copy()
 
@@ -251,9 +258,9 @@ class EngineProperties:
         """The structure stage's discs, shape (proposal, disc, 3)."""
         rows = [
             np.stack(np.broadcast_arrays(disc.x, disc.y, disc.radius), axis=-1)
-            for one in at_stage(self._effects, Structure)
-            if isinstance(one.effect.stage, Structure)
-            for disc in one.effect.stage.discs(self.values(one, phi))
+            for attached in at_stage(self._effects, Structure)
+            if isinstance(attached.effect.stage, Structure)
+            for disc in attached.effect.stage.discs(self.values(attached, phi))
         ]
         discs = np.stack(rows, axis=1) if rows else np.zeros((len(phi), 0, 3))
         if not (np.isfinite(discs).all() and (discs[..., 2] >= 0).all()):

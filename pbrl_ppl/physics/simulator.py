@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
-from concurrent.futures import ThreadPoolExecutor
 from functools import cached_property
-from queue import SimpleQueue
 from typing import Any
 
 import numpy as np
@@ -18,7 +16,7 @@ from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.numerics import differentiate
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import calls, compiled, plain
-from pbrl_ppl.physics.pointers import pointers
+from pbrl_ppl.physics.engines import Engine, share_out
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Scene
@@ -89,7 +87,7 @@ class Simulator:
         self.substeps, self.threads, self.path = substeps, threads, path
         self.extrapolate = extrapolate
         self._properties = EngineProperties(scene, effects, layout)
-        self._worlds: OrderedDict[Joined, list[_Engine]] = OrderedDict()
+        self._worlds: OrderedDict[Joined, list[Engine]] = OrderedDict()
         self._lock = threading.Lock()  # the worlds serve one call at a time
 
     def __getstate__(self) -> dict[str, object]:
@@ -253,8 +251,8 @@ class Simulator:
     def _commands(self) -> tuple[NDArray[Any], ...]:
         """Address, body, first parameter and memory of each command law."""
         memory = [
-            isinstance(one.effect.stage, Command) and one.effect.stage.memory
-            for one in at_stage(self.effects, Command)
+            isinstance(attached.effect.stage, Command) and attached.effect.stage.memory
+            for attached in at_stage(self.effects, Command)
         ]
         return (*self._laws(Command), np.array(memory, dtype=bool))
 
@@ -264,14 +262,14 @@ class Simulator:
         return self._laws(Force)
 
     def _laws(self, kind: type) -> tuple[NDArray[Any], ...]:
-        attached = at_stage(self.effects, kind)
+        acting = at_stage(self.effects, kind)
         names = [body.name for body in self.scene.moving]
-        sizes = [len(one.effect.parameters) for one in attached]
-        stages = [one.effect.stage for one in attached]
+        sizes = [len(attached.effect.parameters) for attached in acting]
+        stages = [attached.effect.stage for attached in acting]
         addresses = [calls.law_address(s.law) for s in stages if isinstance(s, Command | Force)]
         return (
             np.array(addresses, dtype=np.int64),
-            np.array([names.index(one.body) for one in attached], dtype=np.int64),
+            np.array([names.index(attached.body) for attached in acting], dtype=np.int64),
             np.cumsum([0, *sizes])[:-1].astype(np.int64),
         )
 
@@ -307,7 +305,7 @@ class Simulator:
             self.scene.time_step, self.scene.normal_gravity, *self.levels,
         )  # fmt: skip
 
-        def run(engine: _Engine, first: int, last: int) -> None:
+        def run(engine: Engine, first: int, last: int) -> None:
             while first < last:
                 stop = compiled.rollout(calls.FUNCTIONS, engine.pointers, *shared, first, last, out)
                 if stop < last:  # diverged: that world is spoilt, and the item is lost
@@ -323,34 +321,5 @@ class Simulator:
             while len(self._worlds) > _KEPT:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
-                engines.append(_Engine(self._new_world(joined)))
-            if workers == 1:
-                run(engines[0], 0, len(out))
-                return
-            # chunks, so that a thread which the machine slows down takes fewer of them
-            chunks = min(8 * workers, max(workers, len(out) // 64))
-            edges = np.linspace(0, len(out), chunks + 1).astype(int)
-            idle: SimpleQueue[_Engine] = SimpleQueue()
-            for engine in engines[:workers]:
-                idle.put(engine)
-
-            def serve(first: int, last: int) -> None:
-                engine = idle.get()
-                try:
-                    run(engine, first, last)
-                finally:
-                    idle.put(engine)
-
-            with ThreadPoolExecutor(workers) as pool:
-                list(pool.map(serve, edges[:-1], edges[1:]))
-
-
-class _Engine:
-    """A world of one thread, and where its C objects are."""
-
-    def __init__(self, world: World) -> None:
-        self.renew(world)
-
-    def renew(self, world: World) -> None:
-        """Take another world."""
-        self.world, self.pointers = world, pointers(world)
+                engines.append(Engine(self._new_world(joined)))
+            share_out(run, engines[:workers], len(out))

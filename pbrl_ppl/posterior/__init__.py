@@ -3,6 +3,7 @@
 from pbrl_ppl.posterior.comparison import Comparison, compare
 from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
 from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
+from pbrl_ppl.posterior.origin import problem_of, versions
 from pbrl_ppl.posterior.record import (
     MIN_ESS,
     checked,
@@ -10,8 +11,6 @@ from pbrl_ppl.posterior.record import (
     evaluate,
     parameter_draws,
     predictive_rows,
-    problem_of,
-    versions,
 )
 from pbrl_ppl.posterior.store import (
     DATATREE,

@@ -75,8 +75,8 @@ def compare(before: Any, after: Any) -> Comparison | None:
     Comparison or None
         None where ArviZ cannot say: with fewer than 100 draws, or likelihoods that are not finite.
     """
-    for each in (before, after):
-        sizes = group(each, "posterior").sizes
+    for posterior in (before, after):
+        sizes = group(posterior, "posterior").sizes
         if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
             return None
     with warnings.catch_warnings(), np.errstate(all="ignore"):

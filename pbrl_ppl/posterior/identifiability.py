@@ -128,9 +128,10 @@ class Identifiability:
     def to_dict(self) -> dict[str, Any]:
         """Plain values for ``report.json``."""
         return {
-            "parameters": [asdict(each) for each in self.parameters],
+            "parameters": [asdict(width) for width in self.parameters],
             "directions": [
-                {"weights": dict(each.weights), "effect": each.effect} for each in self.directions
+                {"weights": dict(direction.weights), "effect": direction.effect}
+                for direction in self.directions
             ],
             "sentences": list(self.sentences),
         }
@@ -198,7 +199,7 @@ def identify(
         widths = tuple(_width(label, float(a), float(b), moved=0.0) for label, a, b in pairs)
     else:
         widths = _widths(layout, prior, posterior)
-    verdicts = {each.parameter: each.verdict for each in widths}
+    verdicts = {width.parameter: width.verdict for width in widths}
     silent = tuple(
         label
         for label, own in zip(labels, np.diag(gram), strict=True)
@@ -225,12 +226,12 @@ def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[st
     scene = scene_of(idata)
     layout = build_layout(scene, attach(scene, (), effects))
     widths = _widths(layout, _prior_draws(layout), _flat(idata))
-    return tuple(each.parameter for each in widths if each.verdict == PRIOR_ONLY)
+    return tuple(width.parameter for width in widths if width.verdict == PRIOR_ONLY)
 
 
 def _flat(idata: Any) -> dict[str, Array]:
     """Posterior draws by label, shape (draw,), chains joined."""
-    return {str(name): each.to_numpy().ravel() for name, each in scalars(idata).items()}
+    return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
 
 
 def _prior_draws(layout: Layout) -> dict[str, Array]:

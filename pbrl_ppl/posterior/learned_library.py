@@ -72,7 +72,8 @@ def library_probabilities(idata: Any) -> pd.DataFrame:
     index = group(idata, "posterior")["library_index"].transpose("chain", "draw", "body")
     share = {name: (index == i).mean(("chain", "draw")) for i, name in enumerate(names)}
     return pd.DataFrame(
-        {name: each.to_numpy() for name, each in share.items()}, index=index["body"].to_numpy()
+        {name: probability.to_numpy() for name, probability in share.items()},
+        index=index["body"].to_numpy(),
     )
 
 

@@ -1,35 +1,29 @@
-"""The whole record of a fit: predictions, likelihoods, units, origin, convergence."""
+"""The record of a fit: predictions, likelihoods, units, origin and convergence."""
 
 from __future__ import annotations
 
-import importlib.metadata
 import json
-import sys
 import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
-from pbrl_ppl.history import History, Segments, from_segments
-from pbrl_ppl.model import Noise, Observations, ParameterLibrary, Problem, sigma_prior
+from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
+from pbrl_ppl.posterior.origin import origin
 from pbrl_ppl.posterior.store import (
-    attributes,
     convergence,
     draws,
     from_groups,
     group,
     groups,
-    scene_of,
 )
-from pbrl_ppl.state import INPUT, STATE
 
 Array = NDArray[np.float64]
 
@@ -42,7 +36,6 @@ _DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE = 64, 20_000
 _LEAST_DRAWS = 4
 #: A parameter is stuck if this share of its draws is within this share of its support's end.
 _STUCK, _NEAR = 0.5, 0.01
-PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
 
 
 def complete(
@@ -99,7 +92,7 @@ def complete(
         "observed_data": xr.Dataset({"next_state": (dims, problem.observations.values)}, coords),
         "constant_data": data["constant_data"],
     }
-    idata = from_groups(result, _origin(problem, seed) | {"method": method})
+    idata = from_groups(result, origin(problem, seed) | {"method": method})
     if ATTRIBUTE in trace.attrs:
         idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
     return checked(problem, idata, asked)
@@ -150,64 +143,6 @@ def evaluate(
     return likelihood, np.stack(predictive)
 
 
-def problem_of(
-    idata: Any, effects: Iterable[Effect] = catalogue, history: History | None = None
-) -> Problem:
-    """The problem that a posterior was fitted to, from what the posterior holds.
-
-    Start noise and a user's own effects are not in it.
-
-    Parameters
-    ----------
-    idata : InferenceData or DataTree
-        As made by :func:`pbrl_ppl.fit`.
-    effects : iterable of Effect
-        Where the names of its effects are looked up.
-    history : History, optional
-        Other data for the same problem, the noise's prior included.
-
-    Raises
-    ------
-    PosteriorError
-        If it holds no scene or lacks a group.
-    EffectError
-        If an effect is not among ``effects``.
-    """
-    attrs, scene = idata.attrs, scene_of(idata)
-    given, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
-    values = measured.transpose("transition", "step", "body", "state").to_numpy()
-    columns = tuple(STATE.index(str(name)) for name in measured["state"].values)
-    start, actions = given["start"].to_numpy(), given["actions"].to_numpy()
-    observed = np.full((*values.shape[:3], len(STATE)), np.nan)
-    observed[..., columns] = values
-    if "sigma_prior" in attrs:
-        median, spread = json.loads(str(attrs["sigma_prior"]))
-    else:  # a file of an older version
-        none = np.zeros(len(start), dtype=np.int64)
-        segments = Segments(start, actions, observed, none, none, actions)
-        median, spread = sigma_prior(Observations(values, columns), segments)
-    noise = Noise(
-        scalar="state" not in group(idata, "posterior")["sigma"].dims,
-        nu=float(attrs["nu"]) if "nu" in attrs else None,
-        prior=(tuple(float(each) for each in median), float(spread)),
-    )
-    if history is None:
-        history = from_segments(scene, start, actions, observed)
-    elif actions.shape[-1] == len(INPUT):  # recorded since
-        history = history.numbered(float(actions[..., INPUT.index("trajectory")].max()) + 1.0)
-    return Problem.of(
-        scene,
-        history,
-        attach(scene, (), effects),
-        horizon=int(attrs["horizon"]),
-        substeps=int(attrs["substeps"]),
-        columns=columns,
-        noise=noise,
-        library=ParameterLibrary.from_json(str(attrs["library"])) if "library" in attrs else None,
-        together=tuple(json.loads(str(attrs.get("together", "[]")))),
-    )
-
-
 def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
     """Draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
     named = draws(trace)
@@ -243,43 +178,6 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
         posterior[block.name].attrs["units"] = block.unit
     posterior["sigma"].attrs["units"] = "the unit of each state dimension"
     return posterior
-
-
-def _origin(problem: Problem, seed: int) -> dict[str, Any]:
-    scene = problem.scene
-    median, spread = problem.noise_prior
-    for body in scene.dynamic:
-        new = [
-            one.effect.name
-            for one in problem.physics.effects
-            if one.body == body.name and one.effect.name not in body.effects
-        ]
-        scene = scene.with_effects(body.name, *new)
-    return attributes(
-        scene,
-        effects=[[one.effect.name, one.body] for one in problem.physics.effects],
-        seed=seed,
-        horizon=problem.data.horizon,
-        **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
-        **({} if problem.library is None else {"library": problem.library.to_json()}),
-        substeps=problem.physics.substeps,
-        together=list(problem.physics.together),
-        sigma_prior=[[float(each) for each in median], float(spread)],
-        start_noise=int(problem.noise.start is not None),
-        data_sha256=problem.data.history.data_sha256,
-        versions=versions(),
-    )
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a posterior depends on."""
-    found = {"python": ".".join(map(str, sys.version_info[:3]))}
-    for name in PACKAGES:
-        try:
-            found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 def checked(problem: Problem, idata: Any, asked: int | None = None) -> Any:
@@ -346,7 +244,7 @@ def _trouble(
                 " shape and the frame of the body, or look for an effect that the model lacks"
                 " (pbrl-ppl close-loop)",
             )
-    silent = uninformed(idata, effects={one.effect for one in problem.physics.effects})
+    silent = uninformed(idata, effects={attached.effect for attached in problem.physics.effects})
     if silent:
         yield (
             UninformedWarning,

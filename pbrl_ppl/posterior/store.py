@@ -238,13 +238,13 @@ def scalars(posterior: Any) -> xr.Dataset:
     for name, variable in group(posterior, "posterior").data_vars.items():
         others = [dim for dim in variable.dims if dim not in ("chain", "draw")]
         for place in np.ndindex(*(variable.sizes[dim] for dim in others)):
-            one = variable.isel(dict(zip(others, place, strict=True)))
+            scalar = variable.isel(dict(zip(others, place, strict=True)))
             labels = [
-                str(one.coords[d].item()) if d in one.coords else str(i)
+                str(scalar.coords[d].item()) if d in scalar.coords else str(i)
                 for d, i in zip(others, place, strict=True)
             ]
             label = f"{name}[{', '.join(labels)}]" if labels else str(name)
-            flat[label] = one.reset_coords(drop=True).transpose("chain", "draw")
+            flat[label] = scalar.reset_coords(drop=True).transpose("chain", "draw")
     return xr.Dataset(flat)
 
 
@@ -262,10 +262,10 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
         By label, such as ``mass[cart]``. One that is the same in all draws, as the index of a joint
         that is certain, has converged: 1, and the number of draws.
     """
-    every = scalars(idata)
-    one = [str(name) for name, v in every.data_vars.items() if v.min() == v.max()]
-    constant = {name: float(every[name].size) for name in one}
-    flat = every.drop_vars(one)
+    variables = scalars(idata)
+    fixed = [str(name) for name, v in variables.data_vars.items() if v.min() == v.max()]
+    constant = {name: float(variables[name].size) for name in fixed}
+    flat = variables.drop_vars(fixed)
     if not flat.data_vars:
         return dict.fromkeys(constant, 1.0), constant
     # chains that each stand still at a place of their own have an infinite R-hat

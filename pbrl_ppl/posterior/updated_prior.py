@@ -108,7 +108,7 @@ def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
             law = np.sum(laws, axis=0)
             both = zip(JOINT_INDICES, (law.sum(axis=1), law.sum(axis=0)), strict=True)
             named = [(index, zip(scene.joinable, p.tolist(), strict=True)) for index, p in both]
-            found = tuple((index, tuple((n, p) for n, p in each if p)) for index, each in named)
+            found = tuple((index, tuple((n, p) for n, p in table if p)) for index, table in named)
             joint = replace(joint, prior=found)
         joints.append(joint)
     return tuple(joints)

@@ -26,7 +26,7 @@ INDEX_NAMES = ("i_a", "i_b")
 
 def nearest(name: object, known: Iterable[str]) -> str:
     """Return ``; did you mean "..."?`` with the known name nearest to this one, or nothing."""
-    lower = {each.lower(): each for each in known}
+    lower = {candidate.lower(): candidate for candidate in known}
     close = difflib.get_close_matches(str(name).lower(), list(lower), n=1, cutoff=0.0)
     return f'; did you mean "{lower[close[0]]}"?' if close else ""
 

@@ -194,8 +194,11 @@ def _self_intersection(a: Floats) -> tuple[int, int] | None:
             v, w = a[j], a[(j + 1) % n]
             if j == i + 1 or (j + 1) % n == i:
                 # Neighbours share a corner; they meet elsewhere only when one folds back.
-                corner, one, two = (u, o, w) if j == i + 1 else (o, u, v)
-                folded = side(corner, one, two) == 0 and float((one - corner) @ (two - corner)) > 0
+                corner, first, second = (u, o, w) if j == i + 1 else (o, u, v)
+                folded = (
+                    side(corner, first, second) == 0
+                    and float((first - corner) @ (second - corner)) > 0
+                )
                 if folded:
                     return i, j
                 continue

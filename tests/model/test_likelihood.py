@@ -15,13 +15,12 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import Segments
 from pbrl_ppl.model.likelihood import (
     Observations,
-    StartNoise,
-    estimate_sigma,
     log_density,
     next_state_logp,
     next_state_random,
     whiten,
 )
+from pbrl_ppl.model.start_noise import StartNoise, estimate_sigma
 
 N, H, K = 7, 2, 2
 COLUMNS = (0, 2, 5)  # x, theta, omega

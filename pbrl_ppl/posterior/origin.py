@@ -1,0 +1,115 @@
+"""Origin of a posterior: the attributes that say what was fitted, and the problem made of them."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import json
+import sys
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from pbrl_ppl.effects import Effect, attach, catalogue
+from pbrl_ppl.history import History, Segments, from_segments
+from pbrl_ppl.model import Noise, Observations, ParameterLibrary, Problem, sigma_prior
+from pbrl_ppl.posterior.store import attributes, group, scene_of
+from pbrl_ppl.state import INPUT, STATE
+
+PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
+
+
+def origin(problem: Problem, seed: int) -> dict[str, Any]:
+    """Attributes of a posterior: scene, effects, settings, data and versions."""
+    scene = problem.scene
+    median, spread = problem.noise_prior
+    for body in scene.dynamic:
+        new = [
+            attached.effect.name
+            for attached in problem.physics.effects
+            if attached.body == body.name and attached.effect.name not in body.effects
+        ]
+        scene = scene.with_effects(body.name, *new)
+    return attributes(
+        scene,
+        effects=[[attached.effect.name, attached.body] for attached in problem.physics.effects],
+        seed=seed,
+        horizon=problem.data.horizon,
+        **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
+        **({} if problem.library is None else {"library": problem.library.to_json()}),
+        substeps=problem.physics.substeps,
+        together=list(problem.physics.together),
+        sigma_prior=[[float(value) for value in median], float(spread)],
+        start_noise=int(problem.noise.start is not None),
+        data_sha256=problem.data.history.data_sha256,
+        versions=versions(),
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a posterior depends on."""
+    found = {"python": ".".join(map(str, sys.version_info[:3]))}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def problem_of(
+    idata: Any, effects: Iterable[Effect] = catalogue, history: History | None = None
+) -> Problem:
+    """The problem that a posterior was fitted to, from what the posterior holds.
+
+    Start noise and a user's own effects are not in it.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+    effects : iterable of Effect
+        Where the names of its effects are looked up.
+    history : History, optional
+        Other data for the same problem, the noise's prior included.
+
+    Raises
+    ------
+    PosteriorError
+        If it holds no scene or lacks a group.
+    EffectError
+        If an effect is not among ``effects``.
+    """
+    attrs, scene = idata.attrs, scene_of(idata)
+    given, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
+    values = measured.transpose("transition", "step", "body", "state").to_numpy()
+    columns = tuple(STATE.index(str(name)) for name in measured["state"].values)
+    start, actions = given["start"].to_numpy(), given["actions"].to_numpy()
+    observed = np.full((*values.shape[:3], len(STATE)), np.nan)
+    observed[..., columns] = values
+    if "sigma_prior" in attrs:
+        median, spread = json.loads(str(attrs["sigma_prior"]))
+    else:  # a file of an older version
+        none = np.zeros(len(start), dtype=np.int64)
+        segments = Segments(start, actions, observed, none, none, actions)
+        median, spread = sigma_prior(Observations(values, columns), segments)
+    noise = Noise(
+        scalar="state" not in group(idata, "posterior")["sigma"].dims,
+        nu=float(attrs["nu"]) if "nu" in attrs else None,
+        prior=(tuple(float(value) for value in median), float(spread)),
+    )
+    if history is None:
+        history = from_segments(scene, start, actions, observed)
+    elif actions.shape[-1] == len(INPUT):  # recorded since
+        history = history.numbered(float(actions[..., INPUT.index("trajectory")].max()) + 1.0)
+    return Problem.of(
+        scene,
+        history,
+        attach(scene, (), effects),
+        horizon=int(attrs["horizon"]),
+        substeps=int(attrs["substeps"]),
+        columns=columns,
+        noise=noise,
+        library=ParameterLibrary.from_json(str(attrs["library"])) if "library" in attrs else None,
+        together=tuple(json.loads(str(attrs.get("together", "[]")))),
+    )
