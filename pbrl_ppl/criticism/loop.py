@@ -172,7 +172,7 @@ class _Loop:
         ]
         verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
         if remainder is not None:
-            square_before, square_after = (each.normalised_rmse**2 for each in errors)
+            square_before, square_after = (error.normalised_rmse**2 for error in errors)
             explained = square_before - square_after
             if not steps or remainder.share * square_after > LARGE_REMAINDER * explained:
                 verdict = findings.UNEXPLAINED
@@ -182,7 +182,7 @@ class _Loop:
             numerical=Numerical(
                 self.scene.substeps, revised.problem.physics.substeps, shift(revised)
             ),
-            candidates=tuple(each.candidate for each in first),
+            candidates=tuple(signature.candidate for signature in first),
             added=tuple(_added(step, revised, after) for step in steps),
             unexplained=remainder,
             before=errors[0],
@@ -215,7 +215,11 @@ def _added(step: Step, revised: Mode, posterior: Any) -> Added:
     """Summarise an added effect with its posterior."""
     candidate, effect = step.signature.candidate, step.signature.attached.effect
     named = posterior_draws(posterior)
-    bodies = [one.body for one in revised.problem.physics.effects if one.effect.name == effect.name]
+    bodies = [
+        attached.body
+        for attached in revised.problem.physics.effects
+        if attached.effect.name == effect.name
+    ]
     estimates = {}
     for parameter in effect.parameters:
         values = named[effect.variable(parameter)][:, bodies.index(candidate.body)]

@@ -41,7 +41,7 @@ def choose_horizon(mode: Mode) -> Mode:
         tried.append((worst, mode))
         if worst <= LARGEST_SPREAD:
             break
-    return min(tried, key=lambda each: each[0])[1]
+    return min(tried, key=lambda pair: pair[0])[1]
 
 
 def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:

@@ -55,7 +55,7 @@ class Selection:
 
     def best_addition(self, mode: Mode, ranked: list[Signature]) -> Step | None:
         """Refit with the leading candidates; the best that held-out data confirm, or None."""
-        order = [one.effect.name for one in self.missing(mode)]
+        order = [attached.effect.name for attached in self.missing(mode)]
 
         def rank(item: tuple[Signature, Mode]) -> float:
             signature, fitted = item
@@ -66,13 +66,15 @@ class Selection:
         while waiting:
             # those far behind the first wait until it has failed
             enough = WORTH_A_REFIT * waiting[0].candidate.statistic
-            leading = [each for each in waiting if each.candidate.statistic >= enough]
-            waiting = [each for each in waiting if each.candidate.statistic < enough]
-            fits = [(each, self._refit(mode, each)) for each in leading]
+            leading = [
+                signature for signature in waiting if signature.candidate.statistic >= enough
+            ]
+            waiting = [signature for signature in waiting if signature.candidate.statistic < enough]
+            fits = [(signature, self._refit(mode, signature)) for signature in leading]
             while fits:
                 best = max(map(rank, fits))
                 tied = [item for item in fits if rank(item) > best - TIE]
-                item = min(tied, key=lambda each: order.index(each[0].attached.effect.name))
+                item = min(tied, key=lambda pair: order.index(pair[0].attached.effect.name))
                 fits.remove(item)
                 step = self._confirm(mode, *item, ranked)
                 if step is not None:
@@ -107,16 +109,16 @@ class Selection:
 
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
         """Drop effects that later ones have made unnecessary; what gained most comes first."""
-        for step in sorted(steps, key=lambda each: each.elpd_difference):
+        for step in sorted(steps, key=lambda addition: addition.elpd_difference):
             without = self._without(mode, step.signature.attached)
             gains = self.held_out.gains(without, mode)
             if gains.sum() < MIN_ELPD or gains.sum() < MIN_ELPD_SE * standard_error(gains):
                 mode = without
-                steps = [each for each in steps if each is not step]
-        return mode, sorted(steps, key=lambda each: -each.elpd_difference)
+                steps = [addition for addition in steps if addition is not step]
+        return mode, sorted(steps, key=lambda addition: -addition.elpd_difference)
 
     def _without(self, mode: Mode, effect: Attached) -> Mode:
-        kept = tuple(each for each in mode.problem.physics.effects if each != effect)
+        kept = tuple(attached for attached in mode.problem.physics.effects if attached != effect)
         problem = mode.problem.with_physics(effects=kept)
         labels = mode.problem.layout.labels
         phi = [mode.phi[labels.index(label)] for label in problem.layout.labels]
@@ -129,13 +131,13 @@ def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
     The noise's shape is scored and never added: misfit would pass for noise. A scene declares it.
     """
     kept: list[Signature] = []
-    for each in sorted(ranked, key=lambda each: order.index(each.attached.effect.name)):
-        if isinstance(each.attached.effect.stage, Noise):
+    for signature in sorted(ranked, key=lambda entry: order.index(entry.attached.effect.name)):
+        if isinstance(signature.attached.effect.stage, Noise):
             continue
-        significant = each.candidate.p_value < TRY_P
-        if significant and not any(twins(each, other) for other in kept):
-            kept.append(each)
-    return sorted(kept, key=lambda each: each.log_p)
+        significant = signature.candidate.p_value < TRY_P
+        if significant and not any(twins(signature, earlier) for earlier in kept):
+            kept.append(signature)
+    return sorted(kept, key=lambda entry: entry.log_p)
 
 
 def _log_likelihood(mode: Mode) -> float:
