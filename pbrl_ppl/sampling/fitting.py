@@ -94,7 +94,7 @@ def _metropolis(job: Job) -> Any:
     options: dict[str, Any] = {"inner": 10, "initial_point": blank_point(model, problem)}
     options["extra"] = evened_logp(model, problem)
     if job.mode.others and len(blocks) == 1:
-        hills = [gaussian_blocks(model, other)[0] for other in job.mode.others]
+        hills = [gaussian_blocks(model, peak)[0] for peak in job.mode.others]
         jumps = Jumps((gaussian_blocks(model, job.mode)[0], *hills))
     else:
         jumps = None

@@ -122,10 +122,10 @@ class _Mover:
         """Log-density of each part's parameters with the transform's, shape (particle, part)."""
         phi = self.phi(u)
         layout = self.problem.layout
-        each = layout.log_prior(phi) + evened(layout, phi)
+        terms = layout.log_prior(phi) + evened(layout, phi)
         for i, prior in enumerate(self.priors):
-            each[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
-        return np.stack([each[:, part.places].sum(axis=1) for part in self.parts], axis=1)
+            terms[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
+        return np.stack([terms[:, part.places].sum(axis=1) for part in self.parts], axis=1)
 
     def likelihood(self, residual: Array, noise: Array, u: Array) -> Array:
         """Of each part, shape (particle, part), for log sigma (particle, state)."""
@@ -212,9 +212,9 @@ class _Mover:
             accepted = _accepted(there - here + gain, rng)
             rates[walk].append(accepted.mean(axis=0))
             u, here = self._chosen(accepted, y, u), np.where(accepted, there, here)
-        for walk, each in rates.items():
-            if each:
-                self._learn(np.mean(each, axis=0), walk)
+        for walk, measured in rates.items():
+            if measured:
+                self._learn(np.mean(measured, axis=0), walk)
         return u, begin - here
 
     def _noisy(self, residual: Array, noise: Array, u: Array, rng: np.random.Generator) -> Array:

@@ -55,8 +55,8 @@ def thinned(trace: Any, thin: int) -> Any:
         return trace
     per_draw = ("posterior", "sample_stats")
     data = {
-        name: each.isel(draw=slice(thin - 1, None, thin)) if name in per_draw else each
-        for name, each in groups(trace).items()
+        name: dataset.isel(draw=slice(thin - 1, None, thin)) if name in per_draw else dataset
+        for name, dataset in groups(trace).items()
     }
     return from_groups(data, {})
 
@@ -66,7 +66,7 @@ def appended(earlier: Any, trace: Any) -> Any:
     data = groups(trace)
     for name in ("posterior", "sample_stats"):
         old, new = group(earlier, name), data[name]
-        shared = [str(each) for each in new.data_vars if each in old]
+        shared = [str(variable) for variable in new.data_vars if variable in old]
         both = xr.concat([old[shared], new[shared]], dim="draw")
         data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
     return from_groups(data, {})
