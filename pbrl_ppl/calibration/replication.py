@@ -163,12 +163,12 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     of_truth = problem.log_density(residual, truth.sigma, truth.phi).sum(keepdims=True)
     true = _quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
     ranks = [
-        rank(column, value, each)
-        for column, value, each in zip(drawn.T, true, ess.values(), strict=True)
+        rank(column, value, effective)
+        for column, value, effective in zip(drawn.T, true, ess.values(), strict=True)
     ]
     return {
-        "rank": [each[0] for each in ranks],
-        "size": [each[1] for each in ranks],
+        "rank": [pair[0] for pair in ranks],
+        "size": [pair[1] for pair in ranks],
         "truth": true.tolist(),
         "ess": list(ess.values()),
         "r_hat": list(r_hat.values()),
