@@ -295,7 +295,7 @@ class _Search:
         steps, (node, action, intervals) = [], last
         while intervals:
             steps.append((action, intervals))
-            node, action, intervals = (int(each) for each in self.edges[node])
+            node, action, intervals = (int(entry) for entry in self.edges[node])
         return steps[::-1]
 
 
@@ -310,8 +310,8 @@ def played(
     """World-frame wrenches of actions from a start, one an interval, shape (time, body, 3)."""
     scene, states = dynamics.scene, np.repeat(start[None, None], dynamics.draws, axis=0)
     wrenches = np.zeros((sum(intervals for _, intervals in steps), len(start), 3))
-    each = [action for action, intervals in steps for _ in range(intervals)]
-    for i, action in enumerate(each):
+    sequence = [action for action, intervals in steps for _ in range(intervals)]
+    for i, action in enumerate(sequence):
         wrenches[i] = actions.wrenches(scene, np.array([action]), mean_angle(states[..., 2]))[0]
         last = wrenches[i - 1] if i else dynamics.before
         states = dynamics.step(states, wrenches[i : i + 1], last[None])

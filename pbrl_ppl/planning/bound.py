@@ -108,7 +108,7 @@ class _Field:
 
 def _distances(scene: Scene, body: Body, target: Target, start: Array) -> _Field | None:
     """Distances of a body's origin from its target around what does not move, if anything does."""
-    static = tuple(each for each in scene.bodies if each.static)
+    static = tuple(obstacle for obstacle in scene.bodies if obstacle.static)
     if (not scene.walls and not static) or target.x is None or target.y is None:
         return None
     points = np.array([start[:2], [target.x, target.y]])

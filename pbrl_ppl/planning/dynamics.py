@@ -137,19 +137,19 @@ class Dynamics:
         """Of one draw: the nearest to the mean of all, in units of their spread."""
         offset = (self.phi - self.phi.mean(axis=0)) / np.maximum(self.phi.std(axis=0), 1e-12)
         i = int(np.argmin((offset**2).sum(axis=1)))
-        one = copy(self)
-        one.phi = self.phi[i : i + 1]
+        chosen = copy(self)
+        chosen.phi = self.phi[i : i + 1]
         if self._noise is not None:
             sigma, columns, nu = self._noise
             own = nu[i : i + 1] if isinstance(nu, np.ndarray) else nu
-            one._noise = (sigma[i : i + 1], columns, own)
-        return one
+            chosen._noise = (sigma[i : i + 1], columns, own)
+        return chosen
 
     def after(self, before: Array) -> Dynamics:
         """The same after these wrenches, shape (body, 3), N and N m."""
-        other = copy(self)
-        other.before = np.asarray(before, dtype=float).reshape(self.before.shape)
-        return other
+        later = copy(self)
+        later.before = np.asarray(before, dtype=float).reshape(self.before.shape)
+        return later
 
     def mass(self, body: str) -> Array:
         """A body's mass under each draw, shape (draw,), kg."""
