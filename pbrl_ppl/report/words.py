@@ -14,8 +14,8 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 def verdict_in_words(findings: Findings) -> str:
     """Say the verdict in a sentence or two, for a reader who knows no statistics."""
     found = joined(
-        f"{one.sentence.rstrip('.')} ({plain(one.effect)}) on the {plain(one.body)}"
-        for one in findings.added
+        f"{added.sentence.rstrip('.')} ({plain(added.effect)}) on the {plain(added.body)}"
+        for added in findings.added
     )
     left = findings.unexplained
     rest = "a pattern remains in the errors" if left is None else left.sentence.rstrip(".")
