@@ -173,7 +173,7 @@ def compared(
     rng = np.random.default_rng(SEED + 3)
     way, angle, off = rng.uniform([1.5, -np.pi, -AHEAD], [3.0, np.pi, AHEAD], (count, 3)).T
     starts = np.stack([way * np.cos(angle), way * np.sin(angle), angle + np.pi + off], axis=1)
-    mode, draws = (open_loop(idata, starts, each, nodes) for each in (None, DRAWS))
+    mode, draws = (open_loop(idata, starts, size, nodes) for size in (None, DRAWS))
     ahead = draws.sum(axis=1) - mode.sum(axis=1)
     better, differ = int((ahead > 0).sum()), int((ahead != 0).sum())
     chance = float(binomtest(better, differ, alternative="greater").pvalue) if differ else 1.0
