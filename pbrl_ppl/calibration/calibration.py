@@ -198,7 +198,7 @@ def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[t
 
 
 def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """All that a replication's numbers depend on, as JSON has it."""
+    """Provenance of a calibration: all that its numbers depend on, as JSON has it."""
     about = {
         "scene": design.scene.to_toml(),
         "history": design.data.history.data_sha256,

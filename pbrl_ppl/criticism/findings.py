@@ -1,4 +1,4 @@
-"""What the loop found: plain results, and the JSON contract they are written in."""
+"""Findings of the loop as plain results, and the JSON contract they are written in."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ class Unexplained:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """All that closing the loop found out.
+    """Findings of the closed loop.
 
     Parameters
     ----------

@@ -162,7 +162,7 @@ class _Loop:
         before: Any,
         after: Any,
     ) -> Findings:
-        """Put everything together."""
+        """Assemble verdict, held-out errors, posteriors and provenance."""
         horizon = revised.problem.data.horizon
         held_out = self.held_out
         rollout = held_out.rollout_horizon(horizon, self.scene.time_step)

@@ -1,4 +1,4 @@
-"""How far ahead to predict, and with how many engine steps, chosen from the data."""
+"""Prediction horizon and engine substeps, chosen from the data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Residuals traced to missing effects: score statistics with signatures from the simulator."""
+"""Score tests of candidate effects, with signatures from the simulator."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ABSORBED = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """What a candidate effect would do to the residual, and how much of that is seen in it.
+    """Signature of a candidate effect in the residual, and how much of it is seen there.
 
     Parameters
     ----------
@@ -156,7 +156,7 @@ def _prior_slopes(problem: Problem, phi: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """What the residual says of a signature's columns."""
+    """Score test of a signature's columns."""
 
     statistic: float
     log_p: float

@@ -1,4 +1,4 @@
-"""Findings as a page."""
+"""Report: the findings as a page of HTML."""
 
 from __future__ import annotations
 

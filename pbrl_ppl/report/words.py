@@ -72,7 +72,7 @@ def chance(p_value: float) -> str:
 
 
 def odds(p_value: float) -> str:
-    """How often chance alone does it."""
+    """Write a p-value as odds: how often chance alone does it."""
     if p_value < 1e-300:
         return "less than once in 10³⁰⁰ times"
     if p_value > 0.1:
