@@ -1,4 +1,4 @@
-"""The engine about a mode as polynomials of the parameters: cheap enough to look far ahead."""
+"""Emulator of the engine about a mode, by polynomials of the parameters."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draws in PyMC's form, made by other means, thinned or joined."""
+"""Traces in PyMC's form: made of draws, thinned or concatenated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
-    """Draws as PyMC gives them, made by other means.
+    """A trace in PyMC's form, of draws made without PyMC.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ def thinned(trace: Any, thin: int) -> Any:
 
 
 def appended(earlier: Any, trace: Any) -> Any:
-    """The draws of two runs, one after the other."""
+    """Concatenate the draws of two runs."""
     data = groups(trace)
     for name in ("posterior", "sample_stats"):
         old, new = group(earlier, name), data[name]

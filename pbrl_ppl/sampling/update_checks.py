@@ -1,4 +1,4 @@
-"""What an update needs of a posterior and of new data: one message for each way to lack it."""
+"""Checks of a posterior and of new data before an update, with a message for each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _GROUPS = ("posterior_predictive", "observed_data", "constant_data")
 
 
 def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
-    """What earlier updates did; refuses posteriors and data with which there is nothing to do."""
+    """Log of earlier updates; refuses posteriors and data that an update cannot use."""
     for name in ("posterior", "log_likelihood", *_GROUPS):
         group(idata, name)
     if "data_sha256" not in idata.attrs:

@@ -190,7 +190,7 @@ def _updated(
 
 
 def _worn(base: xr.Dataset, result: Any) -> bool:
-    """Whether there are too few effective draws by now, of which there were enough."""
+    """Whether the effective sample size fell below its minimum, and was above it before."""
     if float(base["min_ess"]) < MIN_ESS:
         return False
     return min(convergence(result)[1].values()) < MIN_ESS
@@ -232,7 +232,7 @@ def _chain_and_draw(data: xr.Dataset) -> dict[str, Any]:
 
 
 def _used(data: xr.Dataset) -> xr.Dataset:
-    """Without coordinates that no variable has."""
+    """The dataset without coordinates that no variable has."""
     dims = {dim for variable in data.data_vars.values() for dim in variable.dims}
     return data.drop_vars([str(c) for c in data.coords if not set(data[c].dims) <= dims])
 
