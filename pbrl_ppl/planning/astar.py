@@ -144,7 +144,7 @@ Edge = tuple[int, int, int]
 
 
 class _Search:
-    """The tree, what is open and what is closed."""
+    """State of the search: the tree, the open queue and the closed set."""
 
     def __init__(
         self,
@@ -176,7 +176,7 @@ class _Search:
         return bool(self.queue)
 
     def begin(self) -> None:
-        """Begin at the root."""
+        """Reset tree, queue and closed set to the root."""
         # the tree; it has room for more nodes than there are
         self.states, self.cost = self.root.copy(), np.zeros(1)
         self.last = self.dynamics.before[None].copy()  # what acted on the way to each node
@@ -195,14 +195,14 @@ class _Search:
             self.least_distance = np.inf
 
     def expand(self) -> None:
-        """Take the most promising nodes, and try all actions at each, in one engine call each."""
+        """Expand the most promising nodes by all actions, in one engine call each."""
         size = min(max(1, _BATCH // self.dynamics.draws), len(self.queue))
         batch = [heapq.heappop(self.queue)[1] for _ in range(size)]
         count = len(self.actions.actions)
         self._try(np.repeat(batch, count), np.tile(np.arange(count), size))
 
     def follow(self, steps: list[tuple[int, int]]) -> None:
-        """Put on the tree the nodes along a path from the root, as far as they are in new cells."""
+        """Add the nodes along a path from the root, as far as they are in new cells."""
         for action, intervals in steps:
             last = self.size - 1
             self._try(np.array([last]), np.array([action]), intervals)
@@ -254,7 +254,7 @@ class _Search:
         which: Ints,
         interval: int,
     ) -> None:
-        """Put on the tree what is in a new cell, or got there more cheaply."""
+        """Add nodes that are in a new cell, or got there more cheaply."""
         ahead = tail_mean(self.to_go(states), self.tail)
         chosen = []
         keys = self._cells(states, far)

@@ -70,7 +70,7 @@ class Target:
 
 @dataclass(frozen=True)
 class Goal:
-    """What a plan is for.
+    """Targets of a plan, and its penalty for contact.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""From a posterior, a start and a goal to a plan, and the plan as a file."""
+"""Planning from a posterior, a start and a goal; the plan as a file."""
 
 from __future__ import annotations
 
