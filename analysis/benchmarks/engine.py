@@ -118,7 +118,7 @@ def naive(
     walls: Sequence[Wall] = (),
     substeps: int = SUBSTEPS,
 ) -> np.ndarray:
-    """What one would write first: a new Space for each transition, stepped from Python."""
+    """Naive baseline: a new Space for each transition, stepped from Python."""
     out = np.empty((len(start), 1, 1, 6))
     step = TIME_STEP / substeps
     mass, wheel = values["mass"], (values["w_x"], values["w_y"])

@@ -59,7 +59,7 @@ def measure_cart() -> Iterator[Row]:
 
 
 def python_astar(start: np.ndarray, nodes: int) -> float:
-    """A* as one would write it first: one node and one action at a time, pymunk from Python.
+    """Naive baseline of A*: one node and one action at a time, pymunk from Python.
 
     Returns states generated a second, with the same heuristic, actions and cells.
     """
