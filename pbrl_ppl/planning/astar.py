@@ -169,7 +169,7 @@ class _Search:
         self.begin()
 
     def open(self) -> bool:
-        """Whether anything is left to try; where nothing is, begin anew with finer cells."""
+        """Whether the queue holds anything; where it does not, begin anew with finer cells."""
         if not self.queue and self.best is None and self.refined < _REFINED:
             self.refined += 1
             self.begin()

@@ -165,7 +165,7 @@ class Goal:
                 )
 
     def places(self, scene: Scene) -> list[int]:
-        """Where the targets' bodies are among the scene's moving ones."""
+        """Indices of the targets' bodies among the scene's moving ones."""
         moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
@@ -196,7 +196,7 @@ class Goal:
         return np.asarray(np.sqrt((weight[:, None] * offset**2).sum(axis=(-2, -1))))
 
     def shortfall(self, scene: Scene, states: Array) -> Array:
-        """How far off in units of the tolerances, of the worst target; at most 1 is there."""
+        """Error of the worst target in units of its tolerances; at most 1 is there."""
         offset = self.errors(scene, states)
         worst = np.zeros(offset.shape[:-2])
         for i, (t, place) in enumerate(zip(self.targets, self.places(scene), strict=True)):

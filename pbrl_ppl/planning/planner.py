@@ -74,7 +74,7 @@ class Plan:
 
     @property
     def duration(self) -> float:
-        """How long the plan takes (s)."""
+        """Duration of the plan (s)."""
         return len(self.wrenches) * self.scene.time_step
 
     def to_dataframe(self) -> pd.DataFrame:
