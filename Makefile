@@ -34,6 +34,7 @@ lint: $(VENV)/.installed-lint
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/python -c 'from tests.test_rooms import test_sizes; test_sizes()'
 
 clean:
 	rm -rf .venv .venv-next build out *.egg-info

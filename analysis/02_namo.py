@@ -100,7 +100,7 @@ def main() -> None:
     say(f"the goal is {'' if done.reached else 'not '}reached, {done.distance:.2f} m from it")
 
     figure, axes = plt.subplots(2, 2, figsize=(10, 7.4), layout="constrained")
-    for each, title in zip(
+    for panel, title in zip(
         axes.flat,
         (
             "1. What the robot sees",
@@ -110,11 +110,11 @@ def main() -> None:
         ),
         strict=True,
     ):
-        each.set_title(title, fontsize=10, loc="left")
-        draw_goal(each, SCENE, GOAL)
+        panel.set_title(title, fontsize=10, loc="left")
+        draw_goal(panel, SCENE, GOAL)
     draw_scene(axes[0, 0], SCENE, seen.states[-1], names=True)
-    for each, states in zip(axes.flat[1:], (expected, failed.states, done.states), strict=True):
-        draw_motion(each, SCENE, states)
+    for panel, states in zip(axes.flat[1:], (expected, failed.states, done.states), strict=True):
+        draw_motion(panel, SCENE, states)
     figure.savefig(OUT / "namo.png", dpi=100)
     say(str(OUT / "namo.png"))
 

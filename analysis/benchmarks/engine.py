@@ -118,7 +118,7 @@ def naive(
     walls: Sequence[Wall] = (),
     substeps: int = SUBSTEPS,
 ) -> np.ndarray:
-    """What one would write first: a new Space for each transition, stepped from Python."""
+    """Naive baseline: a new Space for each transition, stepped from Python."""
     out = np.empty((len(start), 1, 1, 6))
     step = TIME_STEP / substeps
     mass, wheel = values["mass"], (values["w_x"], values["w_y"])
@@ -222,7 +222,7 @@ def rows() -> list[Row]:
             timed(lambda: plain(phi, start, actions))),
         Row("proposals_30", "30 proposals in one call / 30 calls",
             "<= 1.0", timed(lambda: usual(proposals, start, actions)),
-            timed(lambda: [usual(each, start, actions) for each in proposals])),
+            timed(lambda: [usual(proposal, start, actions) for proposal in proposals])),
         Row("op_overhead", "the Op / the rollout it wraps, less one",
             "<= 5 %", *op_sides(scene, layout, phi, start, actions), offset=-1.0),
     ]  # fmt: skip
@@ -237,12 +237,12 @@ def op_sides(
     function = pytensor.function([variable], op(variable, start, actions), trust_input=True)
     wiggle = np.random.default_rng(3)
 
-    def other() -> np.ndarray:
+    def moved() -> np.ndarray:
         return phi * (1.0 + 1e-6 * wiggle.random())
 
     return (
-        timed(lambda: function(other())),
-        timed(lambda: op.simulator(other(), start, actions)),
+        timed(lambda: function(moved())),
+        timed(lambda: op.simulator(moved(), start, actions)),
     )
 
 
@@ -250,8 +250,11 @@ def touching(scene: Scene) -> float:
     """Share of the apartment's transitions in which shapes come close enough to touch."""
     layout = build_layout(scene)
     phi, start, actions = apartment_data(scene, TRANSITIONS)
-    one, two = (Simulator(scene, layout, extrapolate=each)(phi, start, actions) for each in (0, 1))
-    return float((one == two).all(axis=(1, 2, 3)).mean())
+    plain, extrapolated = (
+        Simulator(scene, layout, extrapolate=extrapolate)(phi, start, actions)
+        for extrapolate in (0, 1)
+    )
+    return float((plain == extrapolated).all(axis=(1, 2, 3)).mean())
 
 
 def machine() -> str:

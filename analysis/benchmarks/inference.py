@@ -168,7 +168,7 @@ def sampled(scene: pp.Scene, history: pp.History, **options) -> tuple[float, flo
 
 
 def judged(took: float, idata: object) -> tuple[float, float, float]:
-    """The same of a fit that there is."""
+    """Seconds, largest R-hat and least ESS of a finished fit."""
     r_hat, ess = convergence(idata)
     return took, max(r_hat.values()), min(ess.values())
 
@@ -246,7 +246,7 @@ def measure_noise_free() -> Iterator[Row]:
 
 
 class PythonLoop(Op):
-    """What one would write first: pymunk stepped from Python, a new Space a transition."""
+    """Naive baseline: pymunk stepped from Python, a new Space a transition."""
 
     __props__ = ()
 

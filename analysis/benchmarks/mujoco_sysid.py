@@ -85,7 +85,7 @@ def sysid_seconds() -> float:
     command = rng.normal(0, [12.0, 12.0, 2.0], (COMMANDS + 1, 3))
     command = np.repeat(command, STEPS, axis=0)[: COMMANDS * STEPS + 1]
     begin = sysid.create_initial_state(model, data.qpos, data.qvel, data.act)
-    states, measured = (each[0] for each in rollout.rollout(model, data, begin, command[:-1]))
+    states, measured = (batch[0] for batch in rollout.rollout(model, data, begin, command[:-1]))
     measured = measured + NOISE * rng.standard_normal(measured.shape)
     sequences = sysid.ModelSequences(
         "cart", spec, "pushed", begin,

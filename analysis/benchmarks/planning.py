@@ -44,22 +44,22 @@ def measure_cart() -> Iterator[Row]:
     """A* with the true parameters, around the wall."""
     dynamics = pp.Dynamics.known(walled(), CART)
     plans = [pp.plan(dynamics, start, GOAL, PUSHES) for start in starts()]
-    took = np.array([each.seconds for each in plans])
+    took = np.array([plan.seconds for plan in plans])
     what = f"cart around a wall, {STARTS} starts, A*: "
     yield (
         "cart_success",
         what + "share that reach 0.1 m, 0.1 rad",
         "1",
-        np.mean([each.reached for each in plans]),
+        np.mean([plan.reached for plan in plans]),
     )
     yield "cart_seconds_max", "the same: longest search (s)", "<= 60", took.max()
     yield "cart_seconds_median", "the same: median search (s)", "", float(np.median(took))
-    rate = sum(each.nodes for each in plans) / took.sum()
+    rate = sum(plan.nodes for plan in plans) / took.sum()
     yield "nodes_per_second", "the same: states generated a second", "", rate
 
 
 def python_astar(start: np.ndarray, nodes: int) -> float:
-    """A* as one would write it first: one node and one action at a time, pymunk from Python.
+    """Naive baseline of A*: one node and one action at a time, pymunk from Python.
 
     Returns states generated a second, with the same heuristic, actions and cells.
     """

@@ -101,7 +101,7 @@ def success(idata: object, starts: np.ndarray, draws: int | None) -> tuple[float
 
 
 def measure_cart(count: int = STARTS) -> Iterator[Row]:
-    """A cart that 20 transitions with the noise of motion capture have told of."""
+    """Success with a posterior of 20 transitions, with the noise of motion capture."""
     idata = noisy_posterior()
     rng = np.random.default_rng(SEED)
     starts = rng.uniform([-4.0, -2.0, -np.pi], [-2.0, 2.0, np.pi], (count, 3))
@@ -125,7 +125,7 @@ def free_cart() -> pp.Scene:
 
 
 def bimodal_posterior(n: int = 20, draws: int = 200) -> object:
-    """Of a cart pushed sideways before a range finder, which sees y and its speed alone.
+    """Posterior of a cart pushed sideways before a range finder, which sees y and its speed alone.
 
     A wheel as far on the other side of the middle gives the mirror image of each motion, of which
     the range finder sees the same, and the prior is symmetric: so the posterior is.
@@ -173,7 +173,7 @@ def compared(
     rng = np.random.default_rng(SEED + 3)
     way, angle, off = rng.uniform([1.5, -np.pi, -AHEAD], [3.0, np.pi, AHEAD], (count, 3)).T
     starts = np.stack([way * np.cos(angle), way * np.sin(angle), angle + np.pi + off], axis=1)
-    mode, draws = (open_loop(idata, starts, each, nodes) for each in (None, DRAWS))
+    mode, draws = (open_loop(idata, starts, size, nodes) for size in (None, DRAWS))
     ahead = draws.sum(axis=1) - mode.sum(axis=1)
     better, differ = int((ahead > 0).sum()), int((ahead != 0).sum())
     chance = float(binomtest(better, differ, alternative="greater").pvalue) if differ else 1.0
@@ -181,7 +181,7 @@ def compared(
 
 
 def measure_bimodal(count: int = STARTS) -> Iterator[Row]:
-    """A wheel in front or at the back, no one knows."""
+    """Success with a bimodal posterior: the wheel in front or at the back."""
     mode, draws, chance = compared(bimodal_posterior(), count)
     what = f"wheel in front or at the back, {count} starts x both in truth, open loop: share that"
     yield "bimodal_map_success", f"{what} reaches with the mode", "", float(mode.mean())

@@ -93,8 +93,8 @@ def measure_loop(count: int = STARTS) -> Iterator[Row]:
     except ImportError as error:
         print(f"final_distance_ratio is left out: {error}", file=sys.stderr)
         return
-    named = ", ".join(one.effect for one in loop.added) or "nothing"
-    before, after = (float(np.median(each)) for each in before_and_after(loop, count))
+    named = ", ".join(added.effect for added in loop.added) or "nothing"
+    before, after = (float(np.median(distances)) for distances in before_and_after(loop, count))
     what = f"undeclared drag of {DRAG:g} kg/s in Box2D, {count} starts: median final distance (m)"
     yield "final_distance_before", f"{what}, declared model", "", before
     yield "final_distance_after", f"the same, revised model (added: {named})", "", after

@@ -96,8 +96,8 @@ def follow(
         What was measured.
     """
     states = [start]
-    for i, each in enumerate(wrenches, start=1):
-        states.append(world(each))
+    for i, wrench in enumerate(wrenches, start=1):
+        states.append(world(wrench))
         if expected is not None and math.dist(states[-1][0, :2], expected[i, 0, :2]) > LOST:
             break
     measured, last = np.array(states), states[-1]
@@ -117,9 +117,9 @@ def go_round(world: World) -> pp.Acted:
 def movable(idata: Any, body: str, draws: int = 200) -> float:
     """Probability that a body moves when the robot leans on it for 1 s, by a posterior's draws."""
     dynamics = pp.Dynamics.of(idata, draws, threads=1)
-    i = [each.name for each in SCENE.dynamic].index(body)
+    i = [mover.name for mover in SCENE.dynamic].index(body)
     start = np.zeros((len(SCENE.dynamic), 6))
-    start[:, :3] = [each.pose for each in SCENE.dynamic]
+    start[:, :3] = [mover.pose for mover in SCENE.dynamic]
     reach = SCENE.body("robot").shape.radius - SCENE.body(body).shape.bounds[0]
     start[0, :2] = start[i, :2] - [reach, 0.0]
     wrenches = np.zeros((10, len(start), 3))

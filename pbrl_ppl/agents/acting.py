@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Acted:
-    """What happened.
+    """Record of acting: measured states, wrenches played, and how near the goal they led.
 
     Attributes
     ----------

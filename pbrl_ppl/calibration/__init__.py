@@ -1,4 +1,4 @@
-"""Whether the sampler is right: simulation-based calibration."""
+"""Simulation-based calibration: whether the sampler is right."""
 
 from pbrl_ppl.calibration.calibration import calibrate
 from pbrl_ppl.calibration.ranks import Calibration, bins

@@ -198,12 +198,12 @@ def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[t
 
 
 def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """All that a replication's numbers depend on, as JSON has it."""
+    """Provenance of a calibration: all that its numbers depend on, as JSON has it."""
     about = {
         "scene": design.scene.to_toml(),
         "history": design.data.history.data_sha256,
-        "effects": [[one.effect.name, one.body, repr(one.effect.parameters)]
-                    for one in design.physics.effects],
+        "effects": [[attached.effect.name, attached.body, repr(attached.effect.parameters)]
+                    for attached in design.physics.effects],
         "horizon": design.data.horizon,
         "substeps": design.physics.substeps,
         "scalar_sigma": design.noise.scalar,
@@ -230,12 +230,12 @@ def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
         if isinstance(error, OutputError):
             raise
         raise OutputError(f"{path}: cannot be made or read: {error}") from error
-    other = [key for key, value in about.items() if found.get(key) != value]
-    if other:
+    changed = [key for key, value in about.items() if found.get(key) != value]
+    if changed:
         raise OutputError(
-            f"{folder}: holds a calibration with another {', '.join(other)}"
-            f" ({other[0]}: {found.get(other[0])!r:.80}, expected {about[other[0]]!r:.80}); choose"
-            " another folder, or the arguments it was begun with"
+            f"{folder}: holds a calibration with another {', '.join(changed)}"
+            f" ({changed[0]}: {found.get(changed[0])!r:.80}, expected {about[changed[0]]!r:.80});"
+            " choose another folder, or the arguments it was begun with"
         )
     return folder
 

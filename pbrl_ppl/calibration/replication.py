@@ -36,7 +36,7 @@ _MOST_REDRAWN = 50
 
 
 class Truth(NamedTuple):
-    """What a replication was simulated with, and the simulated next states.
+    """True parameters of a replication, and the next states simulated with them.
 
     Attributes
     ----------
@@ -163,12 +163,12 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     of_truth = problem.log_density(residual, truth.sigma, truth.phi).sum(keepdims=True)
     true = _quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
     ranks = [
-        rank(column, value, each)
-        for column, value, each in zip(drawn.T, true, ess.values(), strict=True)
+        rank(column, value, effective)
+        for column, value, effective in zip(drawn.T, true, ess.values(), strict=True)
     ]
     return {
-        "rank": [each[0] for each in ranks],
-        "size": [each[1] for each in ranks],
+        "rank": [pair[0] for pair in ranks],
+        "size": [pair[1] for pair in ranks],
         "truth": true.tolist(),
         "ess": list(ess.values()),
         "r_hat": list(r_hat.values()),
@@ -176,14 +176,14 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
 
 
 def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
-    """What is ranked, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
+    """Ranked quantities, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
     if problem.noise.scalar:
         sigma = sigma[:, :1]
     return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])
 
 
 def labels(problem: Problem) -> tuple[str, ...]:
-    """Names of what is ranked, such as ``mass[cart]``."""
+    """Names of the ranked quantities, such as ``mass[cart]``."""
     names = problem.observations.names
     sigma = ("sigma",) if problem.noise.scalar else tuple(f"sigma[{name}]" for name in names)
     return (*problem.layout.labels, *sigma, "log_likelihood")

@@ -1,4 +1,4 @@
-"""The program: its commands, and how it ends."""
+"""Command-line program: its commands and exit codes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What every command needs: reading files, progress, interrupts, and messages in a line."""
+"""Helpers of the commands: reading files, progress, interrupts, and messages in a line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a model lacks: residual, score, effect, refit, verdict, held-out error."""
+"""Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
 from pbrl_ppl.criticism.findings import (
     ADEQUATE,

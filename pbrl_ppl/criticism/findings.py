@@ -1,4 +1,4 @@
-"""What the loop found: plain results, and the JSON contract they are written in."""
+"""Findings of the loop as plain results, and the JSON contract they are written in."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ class Unexplained:
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """All that closing the loop found out.
+    """Findings of the closed loop.
 
     Parameters
     ----------
@@ -244,28 +244,28 @@ class Findings:
                 "numerical": vars(self.numerical),
                 "added": [
                     {
-                        "effect": one.effect,
-                        "body": one.body,
-                        "statistic": one.statistic,
-                        "p_value": one.p_value,
-                        "parameters": {name: vars(e) for name, e in one.parameters.items()},
-                        "not_separable_from": one.not_separable_from,
-                        "elpd_difference": one.elpd_difference,
-                        "elpd_difference_se": one.elpd_difference_se,
+                        "effect": added.effect,
+                        "body": added.body,
+                        "statistic": added.statistic,
+                        "p_value": added.p_value,
+                        "parameters": {name: vars(e) for name, e in added.parameters.items()},
+                        "not_separable_from": added.not_separable_from,
+                        "elpd_difference": added.elpd_difference,
+                        "elpd_difference_se": added.elpd_difference_se,
                     }
-                    for one in self.added
+                    for added in self.added
                 ],
                 "candidates": [
                     {
-                        "effect": one.effect,
-                        "body": one.body,
-                        "statistic": one.statistic,
-                        "dof": one.dof,
-                        "p_value": one.p_value,
-                        "estimate": one.estimate,
-                        "identifiable": one.identifiable,
+                        "effect": candidate.effect,
+                        "body": candidate.body,
+                        "statistic": candidate.statistic,
+                        "dof": candidate.dof,
+                        "p_value": candidate.p_value,
+                        "estimate": candidate.estimate,
+                        "identifiable": candidate.identifiable,
                     }
-                    for one in self.candidates
+                    for candidate in self.candidates
                 ],
                 "unexplained": None if self.unexplained is None else vars(self.unexplained),
                 "error": {
@@ -284,9 +284,9 @@ class Findings:
 def _clean(value: Any) -> Any:
     """Plain JSON values."""
     if isinstance(value, Mapping):
-        return {str(key): _clean(each) for key, each in value.items()}
+        return {str(key): _clean(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):
-        return [_clean(each) for each in value]
+        return [_clean(item) for item in value]
     if isinstance(value, (float, np.floating)):
         return float(value) if np.isfinite(value) else None
     if isinstance(value, np.integer):

@@ -1,4 +1,4 @@
-"""Errors on held-out data: predictive density, rollouts, and what noise alone would give."""
+"""Held-out errors: log predictive density, rollouts, and the noise floor."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class HeldOut:
         return mode.problem.on(self._data[horizon])
 
     def noisy(self, mode: Mode, horizon: int | None = None) -> Problem:
-        """The same with the start states' noise, linearised at the mode once."""
+        """The held-out problem with the start states' noise, linearised at the mode once."""
         horizon = mode.problem.data.horizon if horizon is None else horizon
         known = self._noisy.setdefault(mode, {})
         if horizon not in known:
@@ -111,7 +111,7 @@ class HeldOut:
         )
 
     def noise_floor(self, mode: Mode, rollout: int) -> Errors:
-        """Errors that measurement noise alone would give, at both ends of a prediction."""
+        """Noise floor: errors from measurement noise alone, at both ends of a prediction."""
 
         def expected(problem: Problem) -> dict[str, float]:
             names = problem.observations.names

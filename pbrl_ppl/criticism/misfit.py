@@ -1,4 +1,4 @@
-"""What is left in the residual after the catalogue: a permutation test of a flexible regression."""
+"""Permutation test, by kernel regression, of what the catalogue leaves in the residual."""
 
 from __future__ import annotations
 

@@ -59,17 +59,17 @@ class PriorCheck:
         found = []
         for body in self.dataset["body"].values:
             for state in self.dataset["state"].values:
-                one = self.dataset.sel(body=body, state=state)
+                changes = self.dataset.sel(body=body, state=state)
                 unit = STATE_UNITS[STATE.index(str(state))]
-                share = float(one["share_beyond"])
+                share = float(changes["share_beyond"])
                 if not share > MOST_BEYOND:  # or not measured
                     continue
                 found.append(
-                    f"{state} of {body} changes by up to {float(one['measured_largest']):.3g}"
+                    f"{state} of {body} changes by up to {float(changes['measured_largest']):.3g}"
                     f" {unit} in {self.seconds:g} s; under the prior 94 % of changes are within"
-                    f" {float(one['predicted_extent']):.3g} {unit}, and none of {self.draws} draws"
-                    f" from it reaches {100 * share:.0f} % of the measured ones: check units, or"
-                    " the prior's hyper-parameters"
+                    f" {float(changes['predicted_extent']):.3g} {unit}, and none of {self.draws}"
+                    f" draws from it reaches {100 * share:.0f} % of the measured ones: check units,"
+                    " or the prior's hyper-parameters"
                 )
         if self.diverged > 0.1 * self.draws:
             found.append(
@@ -168,7 +168,7 @@ def _compare(predicted: Array, measured: Array) -> xr.Dataset:
     dims = ("body", "state")
     some = seen.any(axis=0)
     safe = np.where(some, 1.0, np.nan)
-    pooled, own = (np.where(some, each, 0.0) for each in (pooled, measured))
+    pooled, own = (np.where(some, values, 0.0) for values in (pooled, measured))
     predicted_quantiles = np.nanquantile(pooled, QUANTILES, axis=0) * safe
     measured_quantiles = np.nanquantile(own, QUANTILES, axis=0) * safe
     return xr.Dataset(

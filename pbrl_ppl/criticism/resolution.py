@@ -1,4 +1,4 @@
-"""How far ahead to predict, and with how many engine steps, chosen from the data."""
+"""Prediction horizon and engine substeps, chosen from the data."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def choose_horizon(mode: Mode) -> Mode:
         tried.append((worst, mode))
         if worst <= LARGEST_SPREAD:
             break
-    return min(tried, key=lambda each: each[0])[1]
+    return min(tried, key=lambda pair: pair[0])[1]
 
 
 def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:

@@ -1,4 +1,4 @@
-"""Effects with a place, a threshold or a time: tried at many values, and the looks paid for."""
+"""Grid scan of effects with a place, a threshold or a time, corrected for the looks."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
 def _points(
     proposed: Array, free: Array, null: Array, steps: Array
 ) -> tuple[Array, list[tuple[Array, tuple[int, ...], list[int]]]]:
-    """Values to simulate, and for each look its own, its columns and which rows are its."""
+    """Points to simulate, and each look's values, free columns and rows of the points."""
     points: list[Array] = []
     plan = []
     for row, unknown in zip(proposed, free, strict=True):

@@ -1,4 +1,4 @@
-"""Residuals traced to missing effects: score statistics with signatures from the simulator."""
+"""Score tests of candidate effects, with signatures from the simulator."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ABSORBED = 1e-3
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """What a candidate effect would do to the residual, and how much of that is seen in it.
+    """Signature of a candidate effect in the residual, and how much of it is seen there.
 
     Parameters
     ----------
@@ -76,7 +76,11 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
     """
     if not candidates:
         return []
-    smooth = [one for one in candidates if one.effect.scan is None and not _of_noise(one)]
+    smooth = [
+        attached
+        for attached in candidates
+        if attached.effect.scan is None and not _of_noise(attached)
+    ]
     residual, jacobian, signatures = _signatures(mode, smooth)
     q, r = np.linalg.qr(jacobian)
     # a parameter that the data and the prior say nothing about has no direction
@@ -84,14 +88,14 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
     left = residual - q @ (q.T @ residual)
     derived = dict(zip(smooth, signatures, strict=True))
 
-    def score(one: Attached) -> Signature:
-        if _of_noise(one):
-            return _tail_score(mode, one, left, len(candidates))
-        if one in derived:
-            evidence = _evidence(derived[one], q, left, _side(one))
-            values = np.array(one.effect.null) + evidence.size
-            return _signature(one, evidence, values, 1, len(candidates))
-        return _best_look(one, looks(mode, one), q, left, len(candidates))
+    def score(attached: Attached) -> Signature:
+        if _of_noise(attached):
+            return _tail_score(mode, attached, left, len(candidates))
+        if attached in derived:
+            evidence = _evidence(derived[attached], q, left, _side(attached))
+            values = np.array(attached.effect.null) + evidence.size
+            return _signature(attached, evidence, values, 1, len(candidates))
+        return _best_look(attached, looks(mode, attached), q, left, len(candidates))
 
     return sorted(map(score, candidates), key=lambda signature: signature.log_p)
 
@@ -117,10 +121,10 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
     null = np.zeros(wide.layout.size)
     null[declared] = mode.phi
     columns: list[list[int]] = []
-    for one in candidates:
+    for attached in candidates:
         places = []
-        for parameter in one.effect.parameters:
-            place = labels.index(f"{one.effect.variable(parameter)}[{one.body}]")
+        for parameter in attached.effect.parameters:
+            place = labels.index(f"{attached.effect.variable(parameter)}[{attached.body}]")
             null[place] = parameter.null
             places.append(place)
         columns.append(places)
@@ -152,7 +156,7 @@ def _prior_slopes(problem: Problem, phi: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """What the residual says of a signature's columns."""
+    """Score test of a signature's columns."""
 
     statistic: float
     log_p: float
@@ -191,25 +195,25 @@ def _evidence(signature: Array, q: Array, residual: Array, side: int = 0) -> _Ev
     return _Evidence(statistic, log_p, share, size, basis, direction)
 
 
-def _side(one: Attached) -> int:
+def _side(attached: Attached) -> int:
     """On which side of its null value a single parameter must be; 0 if on any."""
-    if len(one.effect.parameters) > 1:
+    if len(attached.effect.parameters) > 1:
         return 0
-    (parameter,) = one.effect.parameters
+    (parameter,) = attached.effect.parameters
     lower, upper = parameter.prior.support
     return int(parameter.null == lower) - int(parameter.null == upper)
 
 
 def _signature(
-    one: Attached, evidence: _Evidence, values: Array, n_looks: int, n_candidates: int
+    attached: Attached, evidence: _Evidence, values: Array, n_looks: int, n_candidates: int
 ) -> Signature:
     """A candidate's signature, its p-value corrected for the looks and for the candidates."""
-    effect = one.effect
+    effect = attached.effect
     log_p = min(0.0, evidence.log_p + np.log(max(1, n_looks)))
     names = [parameter.name for parameter in effect.parameters]
     candidate = Candidate(
         effect=effect.name,
-        body=one.body,
+        body=attached.body,
         sentence=effect.sentence,
         statistic=evidence.statistic,
         dof=len(names),
@@ -219,15 +223,15 @@ def _signature(
         identifiable=evidence.share,
         looks=n_looks,
     )
-    return Signature(one, candidate, log_p, evidence.basis, evidence.direction)
+    return Signature(attached, candidate, log_p, evidence.basis, evidence.direction)
 
 
 def _best_look(
-    one: Attached, tried: Sequence[Look], q: Array, residual: Array, n_candidates: int
+    attached: Attached, tried: Sequence[Look], q: Array, residual: Array, n_candidates: int
 ) -> Signature:
     """The look of a scan that explains most; of a whole change, only its own sign counts."""
     best = _evidence(np.zeros((len(residual), 1)), q, residual)
-    values = np.array(one.effect.null)
+    values = np.array(attached.effect.null)
     for look in tried:
         rows = np.pad(look.signature, ((0, len(residual) - len(look.signature)), (0, 0)))
         found = _evidence(rows, q, residual, 0 if look.columns else 1)
@@ -235,14 +239,14 @@ def _best_look(
             best, values = found, look.values.copy()
             for column, size in zip(look.columns, found.size, strict=False):
                 values[column] += size
-    return _signature(one, best, values, len(tried), n_candidates)
+    return _signature(attached, best, values, len(tried), n_candidates)
 
 
-def _of_noise(one: Attached) -> bool:
-    return isinstance(one.effect.stage, Noise)
+def _of_noise(attached: Attached) -> bool:
+    return isinstance(attached.effect.stage, Noise)
 
 
-def _tail_score(mode: Mode, one: Attached, left: Array, n_candidates: int) -> Signature:
+def _tail_score(mode: Mode, attached: Attached, left: Array, n_candidates: int) -> Signature:
     """Score of the noise's tail: the kurtosis, with what sigma can absorb projected out.
 
     The derivative of Student-t's log-density by the reciprocal of its degrees of freedom at zero is
@@ -264,17 +268,17 @@ def _tail_score(mode: Mode, one: Attached, left: Array, n_candidates: int) -> Si
         log_p=float(norm.logsf(score / np.sqrt(variance))) if heavier else 0.0,
         share=1.0,
     )
-    values = np.array(one.effect.null)
+    values = np.array(attached.effect.null)
     if heavier and len(values) == 1:
         values = values + score / variance
-    return _signature(one, evidence, values, 1, n_candidates)
+    return _signature(attached, evidence, values, 1, n_candidates)
 
 
-def twins(one: Signature, other: Signature) -> bool:
+def twins(first: Signature, second: Signature) -> bool:
     """Whether two candidates are the same physics here, such as drags on a single pendulum."""
-    if one.basis.shape != other.basis.shape or one.candidate.dof != other.candidate.dof:
+    if first.basis.shape != second.basis.shape or first.candidate.dof != second.candidate.dof:
         return False
-    overlap = np.linalg.svd(one.basis.T @ other.basis, compute_uv=False)
+    overlap = np.linalg.svd(first.basis.T @ second.basis, compute_uv=False)
     return bool(overlap.size and overlap.min() > SAME)
 
 
@@ -289,13 +293,13 @@ def inseparable(leader: Signature, others: Sequence[Signature]) -> tuple[str, ..
         All ranked candidates.
     """
     names = []
-    for other in others:
-        if other is leader or other.basis.shape[1] == 0:
+    for signature in others:
+        if signature is leader or signature.basis.shape[1] == 0:
             continue
-        cosine = float(np.linalg.norm(other.basis.T @ leader.direction))
-        behind = leader.candidate.statistic - other.candidate.statistic
+        cosine = float(np.linalg.norm(signature.basis.T @ leader.direction))
+        behind = leader.candidate.statistic - signature.candidate.statistic
         if cosine > PARALLEL and behind < DECISIVE:
-            same_body = other.attached.body == leader.attached.body
-            name = other.attached.effect.name
-            names.append(name if same_body else f"{name} on {other.attached.body}")
+            same_body = signature.attached.body == leader.attached.body
+            name = signature.attached.effect.name
+            names.append(name if same_body else f"{name} on {signature.attached.body}")
     return tuple(names)

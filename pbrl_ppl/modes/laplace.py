@@ -13,8 +13,7 @@ from scipy.optimize import least_squares
 from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, profile_sigma
 from pbrl_ppl.modes.tails import best_tails, tail_precision
-from pbrl_ppl.numerics import differentiate
-from pbrl_ppl.parameters import box, inside, likeliest, prior_residual
+from pbrl_ppl.parameters import box, differentiate, inside, likeliest, prior_residual
 from pbrl_ppl.physics import PartedSimulator
 
 Array = NDArray[np.float64]

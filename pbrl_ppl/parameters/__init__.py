@@ -1,5 +1,6 @@
 """Phi: priors as data, the layout of the parameter vector, the wheel's symmetry."""
 
+from pbrl_ppl.parameters.differences import differentiate
 from pbrl_ppl.parameters.layout import (
     BODY_PARAMETERS,
     JOINT_ANCHORS,
@@ -32,6 +33,7 @@ __all__ = [
     "Prior",
     "Wheel",
     "box",
+    "differentiate",
     "evened",
     "fold_draws",
     "fold_wheels",

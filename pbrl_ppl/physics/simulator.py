@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Attached, Clock, Command, Force, at_stage, needs_inputs
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import fill_hinges, hung_bodies
-from pbrl_ppl.numerics import differentiate
-from pbrl_ppl.parameters import Layout
+from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, compiled, plain
 from pbrl_ppl.physics.engines import Engine, share_out
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties

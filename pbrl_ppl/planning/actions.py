@@ -1,4 +1,4 @@
-"""What a planner may do: wrenches on bodies, and for how long."""
+"""Actions of a planner: wrenches on bodies, and their durations."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ class ActionSet:
 
     @classmethod
     def recorded(cls, idata: Any) -> ActionSet:
-        """Such as the posterior's data were recorded with, so that the model knows what they do.
+        """Actions like those in the posterior's data, so that the model knows what they do.
 
         For each body that was pushed: a force along its x or y, either way, and a torque, either
         way, alone and together, of the size that a tenth of the recorded ones exceed.

@@ -144,7 +144,7 @@ Edge = tuple[int, int, int]
 
 
 class _Search:
-    """The tree, what is open and what is closed."""
+    """State of the search: the tree, the open queue and the closed set."""
 
     def __init__(
         self,
@@ -169,14 +169,14 @@ class _Search:
         self.begin()
 
     def open(self) -> bool:
-        """Whether anything is left to try; where nothing is, begin anew with finer cells."""
+        """Whether the queue holds anything; where it does not, begin anew with finer cells."""
         if not self.queue and self.best is None and self.refined < _REFINED:
             self.refined += 1
             self.begin()
         return bool(self.queue)
 
     def begin(self) -> None:
-        """Begin at the root."""
+        """Reset tree, queue and closed set to the root."""
         # the tree; it has room for more nodes than there are
         self.states, self.cost = self.root.copy(), np.zeros(1)
         self.last = self.dynamics.before[None].copy()  # what acted on the way to each node
@@ -195,14 +195,14 @@ class _Search:
             self.least_distance = np.inf
 
     def expand(self) -> None:
-        """Take the most promising nodes, and try all actions at each, in one engine call each."""
+        """Expand the most promising nodes by all actions, in one engine call each."""
         size = min(max(1, _BATCH // self.dynamics.draws), len(self.queue))
         batch = [heapq.heappop(self.queue)[1] for _ in range(size)]
         count = len(self.actions.actions)
         self._try(np.repeat(batch, count), np.tile(np.arange(count), size))
 
     def follow(self, steps: list[tuple[int, int]]) -> None:
-        """Put on the tree the nodes along a path from the root, as far as they are in new cells."""
+        """Add the nodes along a path from the root, as far as they are in new cells."""
         for action, intervals in steps:
             last = self.size - 1
             self._try(np.array([last]), np.array([action]), intervals)
@@ -254,7 +254,7 @@ class _Search:
         which: Ints,
         interval: int,
     ) -> None:
-        """Put on the tree what is in a new cell, or got there more cheaply."""
+        """Add nodes that are in a new cell, or got there more cheaply."""
         ahead = tail_mean(self.to_go(states), self.tail)
         chosen = []
         keys = self._cells(states, far)
@@ -295,7 +295,7 @@ class _Search:
         steps, (node, action, intervals) = [], last
         while intervals:
             steps.append((action, intervals))
-            node, action, intervals = (int(each) for each in self.edges[node])
+            node, action, intervals = (int(entry) for entry in self.edges[node])
         return steps[::-1]
 
 
@@ -310,8 +310,8 @@ def played(
     """World-frame wrenches of actions from a start, one an interval, shape (time, body, 3)."""
     scene, states = dynamics.scene, np.repeat(start[None, None], dynamics.draws, axis=0)
     wrenches = np.zeros((sum(intervals for _, intervals in steps), len(start), 3))
-    each = [action for action, intervals in steps for _ in range(intervals)]
-    for i, action in enumerate(each):
+    sequence = [action for action, intervals in steps for _ in range(intervals)]
+    for i, action in enumerate(sequence):
         wrenches[i] = actions.wrenches(scene, np.array([action]), mean_angle(states[..., 2]))[0]
         last = wrenches[i - 1] if i else dynamics.before
         states = dynamics.step(states, wrenches[i : i + 1], last[None])

@@ -1,4 +1,4 @@
-"""How long it takes to the goal at least: the heuristic of A*."""
+"""Heuristic of A*: a lower bound on the time to the goal."""
 
 from __future__ import annotations
 
@@ -107,8 +107,8 @@ class _Field:
 
 
 def _distances(scene: Scene, body: Body, target: Target, start: Array) -> _Field | None:
-    """Distances of a body's origin from its target around what does not move, if anything does."""
-    static = tuple(each for each in scene.bodies if each.static)
+    """Distances of a body's origin from its target around walls and static bodies; None without."""
+    static = tuple(obstacle for obstacle in scene.bodies if obstacle.static)
     if (not scene.walls and not static) or target.x is None or target.y is None:
         return None
     points = np.array([start[:2], [target.x, target.y]])

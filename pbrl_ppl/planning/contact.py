@@ -1,4 +1,4 @@
-"""What a goal charges for touching anything."""
+"""Contact penalty of a goal."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 class Dynamics:
-    """How bodies move under each of some parameter draws.
+    """Transition model under each of some parameter draws.
 
     All moving bodies are in one world, whether or not they met in the data: a plan may push one
     into another.
@@ -67,7 +67,7 @@ class Dynamics:
     def known(
         cls, scene: Scene, parameters: Mapping[str, object], effects: Any = (), **options: Any
     ) -> Dynamics:
-        """Of parameters by name, as of :class:`pbrl_ppl.Transition`: the true model, say."""
+        """Dynamics of named parameters, as of :class:`pbrl_ppl.Transition`: the true model, say."""
         layout = build_layout(scene, attach(scene, effects))
         return cls(scene, layout.to_vector(parameters), effects, **options)
 
@@ -81,7 +81,7 @@ class Dynamics:
         effects: Iterable[Effect] = catalogue,
         threads: int = 2,
     ) -> Dynamics:
-        """Of a posterior.
+        """Dynamics of a posterior's draws.
 
         Parameters
         ----------
@@ -130,26 +130,26 @@ class Dynamics:
 
     @property
     def draws(self) -> int:
-        """How many."""
+        """Number of parameter draws."""
         return len(self.phi)
 
     def single(self) -> Dynamics:
-        """Of one draw: the nearest to the mean of all, in units of their spread."""
+        """Dynamics of one draw: the nearest to the mean of all, in units of their spread."""
         offset = (self.phi - self.phi.mean(axis=0)) / np.maximum(self.phi.std(axis=0), 1e-12)
         i = int(np.argmin((offset**2).sum(axis=1)))
-        one = copy(self)
-        one.phi = self.phi[i : i + 1]
+        chosen = copy(self)
+        chosen.phi = self.phi[i : i + 1]
         if self._noise is not None:
             sigma, columns, nu = self._noise
             own = nu[i : i + 1] if isinstance(nu, np.ndarray) else nu
-            one._noise = (sigma[i : i + 1], columns, own)
-        return one
+            chosen._noise = (sigma[i : i + 1], columns, own)
+        return chosen
 
     def after(self, before: Array) -> Dynamics:
-        """The same after these wrenches, shape (body, 3), N and N m."""
-        other = copy(self)
-        other.before = np.asarray(before, dtype=float).reshape(self.before.shape)
-        return other
+        """Dynamics after these previous wrenches, shape (body, 3), N and N m."""
+        later = copy(self)
+        later.before = np.asarray(before, dtype=float).reshape(self.before.shape)
+        return later
 
     def mass(self, body: str) -> Array:
         """A body's mass under each draw, shape (draw,), kg."""

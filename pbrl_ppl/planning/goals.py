@@ -52,23 +52,25 @@ class Target:
     speed: float | None = None
 
     def __post_init__(self) -> None:
-        for each in fields(self)[1:]:
-            value = getattr(self, each.name)
-            if value is None and each.default is None:
+        for field in fields(self)[1:]:
+            value = getattr(self, field.name)
+            if value is None and field.default is None:
                 continue
             if isinstance(value, bool) or not isinstance(value, int | float | np.number):
-                raise GoalError(f"goal of {self.body}: {each.name} is {value!r}, expected a number")
-            positive = each.name not in POSE
+                raise GoalError(
+                    f"goal of {self.body}: {field.name} is {value!r}, expected a number"
+                )
+            positive = field.name not in POSE
             if not math.isfinite(value) or (positive and value <= 0):
                 what = "a positive number" if positive else "a finite number"
-                raise GoalError(f"goal of {self.body}: {each.name} is {value}, expected {what}")
+                raise GoalError(f"goal of {self.body}: {field.name} is {value}, expected {what}")
         if self.x is None and self.y is None and self.theta is None:
             raise GoalError(f"goal of {self.body}: x, y and theta are all free; give one")
 
 
 @dataclass(frozen=True)
 class Goal:
-    """What a plan is for.
+    """Targets of a plan, and its penalty for contact.
 
     Attributes
     ----------
@@ -121,16 +123,16 @@ class Goal:
             If a pose has not three values, or an option is unknown.
         """
         penalty = {k: options.pop(k) for k in ("contact_penalty",) if k in options}
-        known = [each.name for each in fields(Target)][4:]
+        known = [field.name for field in fields(Target)][4:]
         for name in options:
             if name not in known:
                 raise GoalError(f'goal: unknown option "{name}"{nearest(name, known)}')
         for name, pose in targets.items():
             if len(pose) != 3:
                 raise GoalError(f"goal of {name}: got {len(pose)} values, expected x, y, theta")
-        each: Any = options
+        shared: Any = options
         found = tuple(
-            Target(name, pose[0], pose[1], pose[2], **each) for name, pose in targets.items()
+            Target(name, pose[0], pose[1], pose[2], **shared) for name, pose in targets.items()
         )
         return cls(found, **penalty)
 
@@ -163,7 +165,7 @@ class Goal:
                 )
 
     def places(self, scene: Scene) -> list[int]:
-        """Where the targets' bodies are among the scene's moving ones."""
+        """Indices of the targets' bodies among the scene's moving ones."""
         moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
@@ -194,7 +196,7 @@ class Goal:
         return np.asarray(np.sqrt((weight[:, None] * offset**2).sum(axis=(-2, -1))))
 
     def shortfall(self, scene: Scene, states: Array) -> Array:
-        """How far off in units of the tolerances, of the worst target; at most 1 is there."""
+        """Error of the worst target in units of its tolerances; at most 1 is there."""
         offset = self.errors(scene, states)
         worst = np.zeros(offset.shape[:-2])
         for i, (t, place) in enumerate(zip(self.targets, self.places(scene), strict=True)):
@@ -243,7 +245,7 @@ def read_tables(path: str | Path, tables: Iterable[Mapping[str, Any]], kind: Any
     """
     name = f"[[{kind.__name__.lower()}]]"
     for given in tables:
-        check_keys(given, [each.name for each in fields(kind)], f"{path}: {name}")
+        check_keys(given, [field.name for field in fields(kind)], f"{path}: {name}")
         if "body" not in given:
             raise GoalError(f"{path}: one {name} has no body; name it")
         yield kind(**given)

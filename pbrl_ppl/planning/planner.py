@@ -1,4 +1,4 @@
-"""From a posterior, a start and a goal to a plan, and the plan as a file."""
+"""Planning from a posterior, a start and a goal; the plan as a file."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Plan:
 
     @property
     def duration(self) -> float:
-        """How long the plan takes (s)."""
+        """Duration of the plan (s)."""
         return len(self.wrenches) * self.scene.time_step
 
     def to_dataframe(self) -> pd.DataFrame:

@@ -30,7 +30,7 @@ _ARRIVAL = 0.2
 
 
 class Horizon:
-    """Wrenches for the next intervals, improved at every step and moved on by one.
+    """Receding horizon: wrenches for the next intervals, improved and moved on at every step.
 
     Parameters
     ----------

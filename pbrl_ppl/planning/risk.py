@@ -1,4 +1,4 @@
-"""What many draws' costs come to: their mean, or that of the worst."""
+"""Risk over draws: the mean cost, or the conditional value at risk."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a search for a plan comes to."""
+"""Result of a search for a plan."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ NODES = 2_000_000
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a search came to.
+    """Result of a search.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What people see: plots and reports; the only place that imports matplotlib."""
+"""Plots and reports; the only place that imports matplotlib."""
 
 from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
 from pbrl_ppl.report.loop import Loop, check_folder, close_loop

@@ -17,15 +17,15 @@ def plot_prior_check(check: PriorCheck) -> Figure:
     figure, panels = blank_figure(8.0, 0.8 + 1.3 * rows, rows, 2, grid="x")
     pairs = [(body, state) for body in bodies for state in states]
     for axes, (body, state) in zip(panels, pairs, strict=False):
-        one = check.dataset.sel(body=body, state=state)
+        changes = check.dataset.sel(body=body, state=state)
         for place, (name, colour) in enumerate((("predicted", PLAIN), ("measured", AFTER))):
-            low, lower, middle, upper, high = one[name].to_numpy()
+            low, lower, middle, upper, high = changes[name].to_numpy()
             axes.plot([low, high], [place] * 2, color=colour, linewidth=2)
             axes.plot([lower, upper], [place] * 2, color=colour, linewidth=7)
             axes.plot(middle, place, "o", color="white", markeredgecolor=colour)
         axes.set_yticks([0, 1], ["prior", "measured"])
         axes.set_ylim(1.6, -0.6)
-        share = float(one["share_inside"])
+        share = float(changes["share_inside"])
         axes.set_title(f"{state} of {body}: {100 * share:.0f} % as expected", fontsize=9)
         axes.set_xlabel(f"change in {check.seconds:g} s ({UNITS[str(state)]})", fontsize=8)
     for axes in panels[len(pairs) :]:

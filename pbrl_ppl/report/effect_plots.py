@@ -27,22 +27,22 @@ MOST_CANDIDATES, MOST_ADDED = 20, 12
 
 def plot_candidates(findings: Findings) -> Figure:
     """Score statistic of the candidates, best on top, with the threshold of each."""
-    added = {(one.effect, one.body) for one in findings.added}
+    added = {(addition.effect, addition.body) for addition in findings.added}
     shown = [
-        one
-        for place, one in enumerate(findings.candidates)
-        if place < MOST_CANDIDATES or (one.effect, one.body) in added
+        candidate
+        for place, candidate in enumerate(findings.candidates)
+        if place < MOST_CANDIDATES or (candidate.effect, candidate.body) in added
     ]
     figure, (axes,) = blank_figure(8.0, 0.9 + 0.3 * max(len(shown), 3), 1, 1, grid="x")
-    several = len({one.body for one in shown}) > 1
+    several = len({candidate.body for candidate in shown}) > 1
     total = max(len(findings.candidates), 1)
-    thresholds = [float(chi2.isf(LEVEL / total, one.dof)) for one in shown]
-    for place, (one, threshold) in enumerate(zip(shown, thresholds, strict=True)):
-        hardly = one.identifiable < HARDLY
-        is_added = (one.effect, one.body) in added
+    thresholds = [float(chi2.isf(LEVEL / total, candidate.dof)) for candidate in shown]
+    for place, (candidate, threshold) in enumerate(zip(shown, thresholds, strict=True)):
+        hardly = candidate.identifiable < HARDLY
+        is_added = (candidate.effect, candidate.body) in added
         axes.barh(
             place,
-            one.statistic,
+            candidate.statistic,
             height=0.7,
             color=AFTER if is_added else PLAIN,
             edgecolor="white",
@@ -50,17 +50,20 @@ def plot_candidates(findings: Findings) -> Figure:
         )
         axes.plot([threshold] * 2, [place - 0.45, place + 0.45], color=BEFORE, linewidth=2)
         axes.annotate(
-            f"{one.statistic:.3g}{', hardly identifiable' if hardly else ''}",
-            (one.statistic, place),
+            f"{candidate.statistic:.3g}{', hardly identifiable' if hardly else ''}",
+            (candidate.statistic, place),
             xytext=(4, 0),
             textcoords="offset points",
             va="center",
             fontsize=8,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5},
         )
-    if shown and max(one.statistic for one in shown) > 12 * max(thresholds):
+    if shown and max(candidate.statistic for candidate in shown) > 12 * max(thresholds):
         axes.set_xscale("asinh", linear_width=5.0)
-    labels = [f"{plain(one.effect)}{f' · {one.body}' if several else ''}" for one in shown]
+    labels = [
+        f"{plain(candidate.effect)}{f' · {candidate.body}' if several else ''}"
+        for candidate in shown
+    ]
     axes.set_yticks(range(len(shown)), labels)
     axes.margins(x=0.1)
     axes.set_xlim(left=0.0)
@@ -79,16 +82,18 @@ def plot_candidates(findings: Findings) -> Figure:
 def plot_added(findings: Findings) -> Figure:
     """Posterior of every parameter of the added effects, with the value that means no effect."""
     shown = [
-        (one, name, estimate) for one in findings.added for name, estimate in one.parameters.items()
+        (added, name, estimate)
+        for added in findings.added
+        for name, estimate in added.parameters.items()
     ][:MOST_ADDED]
     columns = min(max(len(shown), 1), 2)
     rows = max(-(-len(shown) // columns), 1)
     figure, panels = blank_figure(8.0 if columns > 1 else 5.0, 2.6 * rows, rows, columns, grid="x")
     draws = scalars(findings.posterior_after)
     nulls = {(effect.name, p.name): p.null for effect in catalogue for p in effect.parameters}
-    for axes, (one, name, estimate) in zip(panels, shown, strict=False):
+    for axes, (added, name, estimate) in zip(panels, shown, strict=False):
         low, high = estimate.hdi
-        variable = f"{one.effect}_{name}[{one.body}]"
+        variable = f"{added.effect}_{name}[{added.body}]"
         top = 1.0
         if variable in draws:
             values = draws[variable].to_numpy().ravel()
@@ -101,12 +106,12 @@ def plot_added(findings: Findings) -> Figure:
                 axes.fill_between(grid[inside], density[inside], color=AFTER, alpha=0.25)
         axes.plot([low, high], [-0.06 * top] * 2, color=AFTER, linewidth=4, solid_capstyle="butt")
         axes.plot(estimate.mean, -0.06 * top, "o", color="white", markeredgecolor=AFTER)
-        null = nulls.get((one.effect, name))
+        null = nulls.get((added.effect, name))
         if null is not None:
             _mark_null(axes, null, estimate.mean, max(estimate.sd, 1e-12), top)
         axes.set_ylim(-0.14 * top, 1.15 * top)
         axes.set_yticks([])
-        axes.set_title(f"{plain(one.effect)} on {one.body}", fontsize=10)
+        axes.set_title(f"{plain(added.effect)} on {added.body}", fontsize=10)
         axes.set_xlabel(f"{plain(name)} ({estimate.unit})")
     for axes in panels[len(shown) :]:
         axes.set_visible(False)

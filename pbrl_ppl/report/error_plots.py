@@ -66,7 +66,7 @@ def plot_errors(findings: Findings) -> Figure:
     ]
     kinds = [(kind, title) for kind, title in kinds if getattr(findings.before, kind)]
     names = [list(getattr(findings.before, kind)) for kind, _ in kinds]
-    height = 1.2 + 0.42 * max((len(each) for each in names), default=1)
+    height = 1.2 + 0.42 * max((len(states) for states in names), default=1)
     figure, panels = blank_figure(8.0, height, 1, max(len(kinds), 1), grid="x")
     for axes, (kind, title), dims in zip(panels, kinds, names, strict=False):
         before, after, floor = (

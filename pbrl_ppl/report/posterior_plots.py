@@ -55,7 +55,11 @@ def most_interesting(findings: Findings, table: pd.DataFrame | None = None) -> l
         Its :func:`summary`, where that is at hand.
     """
     table = summary(findings.posterior_after) if table is None else table
-    own = [f"{one.effect}_{name}[{one.body}]" for one in findings.added for name in one.parameters]
+    own = [
+        f"{added.effect}_{name}[{added.body}]"
+        for added in findings.added
+        for name in added.parameters
+    ]
     worst = table["r_hat"].fillna(np.inf).sort_values(ascending=False, kind="stable").index
     return list(dict.fromkeys([*(n for n in own if n in table.index), *worst]))[:MOST_PARAMETERS]
 

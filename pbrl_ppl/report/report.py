@@ -1,4 +1,4 @@
-"""Findings as a page."""
+"""Report: the findings as a page of HTML."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def render(findings: Findings) -> str:
         posterior=_posterior_rows(findings, table),
         units=UNITS,
         shown=parameters,
-        added={(one.effect, one.body) for one in findings.added},
+        added={(added.effect, added.body) for added in findings.added},
         best=_largest_fall(findings),
         good={"r_hat": GOOD_R_HAT, "ess": GOOD_ESS},
         hardly=HARDLY,
@@ -80,9 +80,9 @@ def render(findings: Findings) -> str:
 def _posterior_rows(findings: Findings, table: pd.DataFrame) -> list[dict[str, Any]]:
     """One row per parameter of the revised model: its summary, unit, and what is wrong with it."""
     units = dict(BODY_PARAMETERS) | {
-        f"{one.effect}_{name}": e.unit
-        for one in findings.added
-        for name, e in one.parameters.items()
+        f"{added.effect}_{name}": e.unit
+        for added in findings.added
+        for name, e in added.parameters.items()
     }
     units |= {effect.variable(p): p.unit for effect in catalogue for p in effect.parameters}
     rows = []

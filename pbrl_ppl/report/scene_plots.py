@@ -167,7 +167,7 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
 
 
 def _place(target: Target) -> Array:
-    """Where a target is, shape (1, 2), or (0, 2) if it has no place."""
+    """Place of a target, shape (1, 2), or (0, 2) if it has none."""
     if target.x is None or target.y is None:
         return np.zeros((0, 2))
     return np.array([[target.x, target.y]])

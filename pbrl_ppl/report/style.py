@@ -1,4 +1,4 @@
-"""What all pictures share: colours, panels, units, and their rendering as PNG."""
+"""Style shared by all pictures: colours, panels, units, and their rendering as PNG."""
 
 from __future__ import annotations
 

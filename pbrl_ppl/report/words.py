@@ -14,8 +14,8 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 def verdict_in_words(findings: Findings) -> str:
     """Say the verdict in a sentence or two, for a reader who knows no statistics."""
     found = joined(
-        f"{one.sentence.rstrip('.')} ({plain(one.effect)}) on the {plain(one.body)}"
-        for one in findings.added
+        f"{added.sentence.rstrip('.')} ({plain(added.effect)}) on the {plain(added.body)}"
+        for added in findings.added
     )
     left = findings.unexplained
     rest = "a pattern remains in the errors" if left is None else left.sentence.rstrip(".")
@@ -72,7 +72,7 @@ def chance(p_value: float) -> str:
 
 
 def odds(p_value: float) -> str:
-    """How often chance alone does it."""
+    """Write a p-value as odds: how often chance alone does it."""
     if p_value < 1e-300:
         return "less than once in 10³⁰⁰ times"
     if p_value > 0.1:

@@ -1,4 +1,4 @@
-"""The engine about a mode as polynomials of the parameters: cheap enough to look far ahead."""
+"""Emulator of the engine about a mode, by polynomials of the parameters."""
 
 from __future__ import annotations
 
@@ -113,10 +113,10 @@ def emulate(
             emulator = Emulator(problem, phi[good], residual[good], degree)
             cheap = Surrogate(problem, unpack, emulator)
             chain = explore(blocks, cheap, q, _APART * runs, rng)[_APART - 1 :: _APART]
-            drawn = [unpack(each)[:2] for each in chain]
-            phi, sigma = (np.array(each) for each in zip(*drawn, strict=True))
+            drawn = [unpack(point)[:2] for point in chain]
+            phi, sigma = (np.array(column) for column in zip(*drawn, strict=True))
             residual = problem.residual(phi)
-            told = np.array([emulator(each).copy() for each in phi])
+            told = np.array([emulator(point).copy() for point in phi])
             exact = problem.log_density(residual, sigma, phi).sum(axis=-1)
             off = problem.log_density(told, sigma, phi).sum(axis=-1) - exact
             if np.isfinite(off).all() and off.std() < close:

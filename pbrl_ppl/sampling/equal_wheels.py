@@ -13,7 +13,7 @@ from pbrl_ppl.parameters import MIXED, Wheel, wheels
 
 
 def evened_logp(model: pm.Model, problem: Problem) -> Any:
-    """What to add to the model's log-density: `parameters.evened` as an expression.
+    """Correction of the model's log-density: `parameters.evened` as an expression.
 
     A chain on one hill then stands for all of the wheel's; which description a draw is to have is
     chosen afterwards, by the prior (`parameters.redescribed`).

@@ -1,4 +1,4 @@
-"""What a fit needs of its model and its arguments."""
+"""Checks of a model and of the arguments before a fit."""
 
 from __future__ import annotations
 

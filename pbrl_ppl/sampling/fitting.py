@@ -51,7 +51,7 @@ class Method:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """What a sampler is asked for."""
+    """Arguments of a sampler's run."""
 
     model: pm.Model
     mode: Mode
@@ -88,13 +88,13 @@ class Job:
 
 
 def _metropolis(job: Job) -> Any:
-    """Adaptive blocks that look ahead with a cheap posterior; see AdaptiveMetropolis."""
+    """Block-wise adaptive Metropolis with a surrogate; see AdaptiveMetropolis."""
     problem, model = job.mode.problem, job.model
     blocks = gaussian_blocks(model, job.mode)
     options: dict[str, Any] = {"inner": 10, "initial_point": blank_point(model, problem)}
     options["extra"] = evened_logp(model, problem)
     if job.mode.others and len(blocks) == 1:
-        hills = [gaussian_blocks(model, other)[0] for other in job.mode.others]
+        hills = [gaussian_blocks(model, peak)[0] for peak in job.mode.others]
         jumps = Jumps((gaussian_blocks(model, job.mode)[0], *hills))
     else:
         jumps = None

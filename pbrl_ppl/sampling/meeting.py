@@ -1,4 +1,4 @@
-"""Bodies that were apart in the data, and meet under the parameters that a fit has found."""
+"""Collisions, under fitted parameters, of bodies that were apart in the data."""
 
 from __future__ import annotations
 

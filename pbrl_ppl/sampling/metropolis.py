@@ -1,4 +1,4 @@
-"""Metropolis in blocks that learn the posterior's shape, with a cheap posterior to look ahead."""
+"""Block-wise adaptive Metropolis with the surrogate transition method."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _LARGEST_BETA = float(np.log(0.95))
 
 @dataclass(eq=False)
 class Gaussian:
-    """What is known of a block's posterior, in the sampler's unconstrained space, and its moves.
+    """Gaussian approximation of a block's posterior, in the unconstrained space, and its moves.
 
     Two proposals take turns at random: a random walk, which finds its way anywhere, and a
     Crank-Nicolson step that is reversible for this Gaussian (Rudolf and Sprungk, 2018), which makes
@@ -113,14 +113,14 @@ class Gaussian:
         return q, here, rate
 
     def lengthen(self, change: float, walk: bool) -> None:
-        """Lengthen the moves of one kind by about this share, or shorten them."""
+        """Adapt the step size of one kind of move, by about this share."""
         if walk:
             self.log_scale += change
         else:
             self.log_beta = min(self.log_beta + change, _LARGEST_BETA)
 
     def learn(self, x: Array, rate: float, walk: bool) -> None:
-        """Take account of where the chain is, and of the last proposal's acceptance rate."""
+        """Adapt mean, covariance and step size to the chain's place and acceptance rate."""
         self.seen += 1
         gain = 1.0 / (self.seen + _GUESS)
         self.lengthen((rate - TARGET_ACCEPTANCE) * self.seen**-0.6, walk)
@@ -135,7 +135,7 @@ class Gaussian:
 
 @dataclass(frozen=True, eq=False)
 class Jumps:
-    """Moves between hills of the posterior that a walk would not cross (mode jumping).
+    """Mode jumping: moves between hills of the posterior that a walk would not cross.
 
     Where a point is on one hill, in units of that hill's Gaussian, the proposal is on another;
     from there the same jump leads back (Tjelmeland and Hegstad, 2001, without their local search).
@@ -170,14 +170,14 @@ class Jumps:
 
 @dataclass_state
 class AdaptiveState(StepMethodState):
-    """What a chain must not inherit from the one before it."""
+    """Adapted state of the sampler, which every chain begins anew."""
 
     tune: bool
     blocks: list[Gaussian]
 
 
 class AdaptiveMetropolis(ArrayStepShared):
-    """Adaptive Metropolis, block by block, that looks ahead with a cheap posterior.
+    """Block-wise adaptive Metropolis that looks ahead with a surrogate of the posterior.
 
     With ``rough``, a block makes ``inner`` steps under that cheap posterior, and where they end is
     accepted or not by the exact one
@@ -299,7 +299,7 @@ def explore(
     rounds: int,
     rng: np.random.Generator,
 ) -> Array:
-    """Where a chain of rounds over the blocks, which learn on the way, has been.
+    """States of a chain of rounds over the blocks, which adapt on the way.
 
     Parameters
     ----------

@@ -62,7 +62,7 @@ def mix(
         configurations as an attribute.
     """
     rng = np.random.default_rng(seed)
-    probability = np.array([each.probability for each in found])
+    probability = np.array([configuration.probability for configuration in found])
     wanted = np.flatnonzero(allocate(probability, chains * draws))
     traces = {}
     for i in wanted[np.argsort(-probability[wanted])]:
@@ -166,15 +166,19 @@ def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator) -> Non
 
 def _stats(traces: Mapping[int, Any], label: Labels) -> xr.Dataset:
     """The samplers' own record of the draws; what differs in shape is left out."""
-    each = {i: group(t, "sample_stats").isel(draw=slice(label.shape[1])) for i, t in traces.items()}
-    first = next(iter(each.values()))
+    records = {
+        i: group(t, "sample_stats").isel(draw=slice(label.shape[1])) for i, t in traces.items()
+    }
+    first = next(iter(records.values()))
     mixed = {}
     for name, variable in first.data_vars.items():
-        same = [own[name].sizes == variable.sizes for own in each.values() if name in own]
-        if len(same) < len(each) or not all(same) or variable.dims[:2] != ("chain", "draw"):
+        same = [
+            record[name].sizes == variable.sizes for record in records.values() if name in record
+        ]
+        if len(same) < len(records) or not all(same) or variable.dims[:2] != ("chain", "draw"):
             continue
         values = variable.to_numpy().copy()
-        for i, own in each.items():
-            values[label == i] = own[name].to_numpy()[label == i]
+        for i, record in records.items():
+            values[label == i] = record[name].to_numpy()[label == i]
         mixed[str(name)] = (variable.dims, values)
     return xr.Dataset(mixed, first.coords)

@@ -1,4 +1,4 @@
-"""Particles moved by Metropolis steps, all of them proposed in one engine call."""
+"""Rejuvenation of particles by Metropolis steps, all proposed in one engine call."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def rejuvenate(
     rng: np.random.Generator,
     progress: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Array, Array, float]:
-    """Move particles of a posterior until they have forgotten where they were.
+    """Rejuvenate particles of a posterior by Metropolis steps, until they have decorrelated.
 
     Parts of the scene that have nothing to do with each other are moved and judged each on its own,
     for given the noise they are independent; then the noise, for which the engine is not needed.
@@ -76,7 +76,7 @@ def rejuvenate(
 
 
 def _correlation(before: Array, after: Array) -> float:
-    """Largest correlation of a column with itself a while ago."""
+    """Largest correlation over the columns between the particles before and after."""
     a, b = before - before.mean(axis=0), after - after.mean(axis=0)
     size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
     return float(((a * b).sum(axis=0) / np.maximum(size, 1e-300)).max(initial=0.0))
@@ -122,13 +122,13 @@ class _Mover:
         """Log-density of each part's parameters with the transform's, shape (particle, part)."""
         phi = self.phi(u)
         layout = self.problem.layout
-        each = layout.log_prior(phi) + evened(layout, phi)
+        terms = layout.log_prior(phi) + evened(layout, phi)
         for i, prior in enumerate(self.priors):
-            each[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
-        return np.stack([each[:, part.places].sum(axis=1) for part in self.parts], axis=1)
+            terms[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
+        return np.stack([terms[:, part.places].sum(axis=1) for part in self.parts], axis=1)
 
     def likelihood(self, residual: Array, noise: Array, u: Array) -> Array:
-        """Of each part, shape (particle, part), for log sigma (particle, state)."""
+        """Log-likelihood of each part, shape (particle, part), for log sigma (particle, state)."""
         problem, sigma = self.problem, np.exp(noise) * np.ones(residual.shape[-1])
         measured, phi = problem.observations.measured, self.phi(u)
         nu = problem.nu(phi)
@@ -149,7 +149,7 @@ class _Mover:
         return self.prior(u) + self.likelihood(residual, noise, u), residual
 
     def rough(self, u: Array, noise: Array) -> Array:
-        """The same with the coarse engine."""
+        """Log-density of each part with the coarse engine."""
         states = self.problem.predict(self.phi(u), self.coarse) + self.correction
         residual = self.problem.observations.residual(states)
         return self.prior(u) + self.likelihood(residual, noise, u)
@@ -193,12 +193,12 @@ class _Mover:
         return y, gain
 
     def _learn(self, rates: Array, walk: bool) -> None:
-        """Lengthen or shorten the parts' steps; many particles say at once how many pass."""
+        """Adapt the parts' step sizes to acceptance rates over all particles."""
         for block, rate in zip(self.blocks, rates, strict=True):
             block.lengthen(rate - TARGET_ACCEPTANCE, walk)
 
     def _ahead(self, u: Array, noise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Where several steps under the coarse posterior lead, and what undoes its preference.
+        """Proposal by several steps under the coarse posterior, and its log Hastings ratio.
 
         That is right for steps that are as likely in the reverse order: none may learn from
         those before it, and all learn at the end.
@@ -212,9 +212,9 @@ class _Mover:
             accepted = _accepted(there - here + gain, rng)
             rates[walk].append(accepted.mean(axis=0))
             u, here = self._chosen(accepted, y, u), np.where(accepted, there, here)
-        for walk, each in rates.items():
-            if each:
-                self._learn(np.mean(each, axis=0), walk)
+        for walk, measured in rates.items():
+            if measured:
+                self._learn(np.mean(measured, axis=0), walk)
         return u, begin - here
 
     def _noisy(self, residual: Array, noise: Array, u: Array, rng: np.random.Generator) -> Array:

@@ -1,4 +1,4 @@
-"""What samplers begin with: the Laplace approximation in their space, and dispersed points."""
+"""Starting points of samplers: the Laplace approximation in their space, and dispersed points."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
-    """One block a part of the scene, and one for the noise; guessed at by the Laplace method."""
+    """Blocks from the Laplace approximation: one a part of the scene, and one for the noise."""
     problem = mode.problem
     places, offset = {}, 0
     point = blank_point(model, problem)
@@ -76,7 +76,7 @@ def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
 
 
 def constrain(prior: Prior, u: Any) -> Any:
-    """The way back from :func:`unconstrain`."""
+    """Inverse of :func:`unconstrain`."""
     if prior.family in ("log_normal", "half_normal"):
         return np.exp(u)
     if prior.family == "truncated_normal":
@@ -119,7 +119,7 @@ def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[st
 
 
 def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, Array]]]:
-    """A posterior as if it were a mode, and where each of its chains ended.
+    """Gaussian approximation of a posterior, in a mode's form, and the last draw of each chain.
 
     Parameters
     ----------
@@ -163,5 +163,5 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
 
 
 def _range(prior: Prior) -> Array:
-    """Where most of a prior is, by simulation: it only limits where chains begin."""
+    """The 2 % and 98 % quantiles of a prior, by simulation: they only limit where chains begin."""
     return np.quantile(prior.sample(np.random.default_rng(0), 2000), [0.02, 0.98])

@@ -1,4 +1,4 @@
-"""A cheap posterior for a sampler to look ahead with."""
+"""Surrogate of the posterior, for a sampler to look ahead with."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Draws in PyMC's form, made by other means, thinned or joined."""
+"""Traces in PyMC's form: made of draws, thinned or concatenated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
-    """Draws as PyMC gives them, made by other means.
+    """A trace in PyMC's form, of draws made without PyMC.
 
     Parameters
     ----------
@@ -55,18 +55,18 @@ def thinned(trace: Any, thin: int) -> Any:
         return trace
     per_draw = ("posterior", "sample_stats")
     data = {
-        name: each.isel(draw=slice(thin - 1, None, thin)) if name in per_draw else each
-        for name, each in groups(trace).items()
+        name: dataset.isel(draw=slice(thin - 1, None, thin)) if name in per_draw else dataset
+        for name, dataset in groups(trace).items()
     }
     return from_groups(data, {})
 
 
 def appended(earlier: Any, trace: Any) -> Any:
-    """The draws of two runs, one after the other."""
+    """Concatenate the draws of two runs."""
     data = groups(trace)
     for name in ("posterior", "sample_stats"):
         old, new = group(earlier, name), data[name]
-        shared = [str(each) for each in new.data_vars if each in old]
+        shared = [str(variable) for variable in new.data_vars if variable in old]
         both = xr.concat([old[shared], new[shared]], dim="draw")
         data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
     return from_groups(data, {})

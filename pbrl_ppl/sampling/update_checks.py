@@ -1,4 +1,4 @@
-"""What an update needs of a posterior and of new data: one message for each way to lack it."""
+"""Checks of a posterior and of new data before an update, with a message for each."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _GROUPS = ("posterior_predictive", "observed_data", "constant_data")
 
 
 def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
-    """What earlier updates did; refuses posteriors and data with which there is nothing to do."""
+    """Log of earlier updates; refuses posteriors and data that an update cannot use."""
     for name in ("posterior", "log_likelihood", *_GROUPS):
         group(idata, name)
     if "data_sha256" not in idata.attrs:
@@ -43,7 +43,7 @@ def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
         )
     done: list[dict[str, Any]] = json.loads(str(idata.attrs.get("updates", "[]")))
     known = [str(idata.attrs["data_sha256"])]
-    known += [each[key] for each in done for key in ("data_sha256", "before_sha256")]
+    known += [entry[key] for entry in done for key in ("data_sha256", "before_sha256")]
     if history.data_sha256 in known:
         raise PosteriorError(
             "update: these data are in the posterior already, and would count twice; pass only"
@@ -87,7 +87,7 @@ def check_engine(idata: Any, problem: Problem) -> None:
     some = {"transition": slice(_CHECKED)}
     few = {name: group(idata, name).isel(some) for name in ("observed_data", "constant_data")}
     held = from_groups(few | {"posterior": group(idata, "posterior")}, idata.attrs)
-    first = problem_of(held, {one.effect for one in problem.physics.effects})
+    first = problem_of(held, {attached.effect for attached in problem.physics.effects})
     phi, sigma = parameter_draws(problem, idata)
     now = first.log_density(first.residual(phi[0]), sigma[0], phi[0])
     then = group(idata, "log_likelihood")["next_state"].isel(chain=0, draw=0).to_numpy()

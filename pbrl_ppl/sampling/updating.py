@@ -132,8 +132,8 @@ def update(
     chained = f"{idata.attrs['data_sha256']}{history.data_sha256}"
     result.attrs["updates"] = json.dumps([*done, entry])
     result.attrs["data_sha256"] = hashlib.sha256(chained.encode()).hexdigest()
-    for each in caught:  # they are the caller's
-        warnings.warn(each.message, stacklevel=2)
+    for warning in caught:  # they are the caller's
+        warnings.warn(warning.message, stacklevel=2)
     return result
 
 
@@ -190,7 +190,7 @@ def _updated(
 
 
 def _worn(base: xr.Dataset, result: Any) -> bool:
-    """Whether there are too few effective draws by now, of which there were enough."""
+    """Whether the effective sample size fell below its minimum, and was above it before."""
     if float(base["min_ess"]) < MIN_ESS:
         return False
     return min(convergence(result)[1].values()) < MIN_ESS
@@ -205,7 +205,9 @@ def _reweighted(
 ) -> Any:
     """Equally weighted draws: those of the fit, repeated or left out within their chain."""
     chains, n = base.sizes["chain"], base.sizes["draw"]
-    ancestor = np.stack([_systematic(each, n, rng) for each in weights.reshape(chains, n)])
+    ancestor = np.stack(
+        [_systematic(chain_weights, n, rng) for chain_weights in weights.reshape(chains, n)]
+    )
     where = xr.DataArray(ancestor, dims=("chain", "draw"))
     drawn = base.isel(chain=xr.DataArray(np.arange(chains), dims="chain"), draw=where)
     drawn = drawn.assign_coords(chain=base["chain"], draw=base["draw"])
@@ -230,8 +232,8 @@ def _chain_and_draw(data: xr.Dataset) -> dict[str, Any]:
 
 
 def _used(data: xr.Dataset) -> xr.Dataset:
-    """Without coordinates that no variable has."""
-    dims = {dim for each in data.data_vars.values() for dim in each.dims}
+    """The dataset without coordinates that no variable has."""
+    dims = {dim for variable in data.data_vars.values() for dim in variable.dims}
     return data.drop_vars([str(c) for c in data.coords if not set(data[c].dims) <= dims])
 
 
@@ -285,10 +287,14 @@ def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
         held = group(idata, name).transpose("transition", ...)
         total = held.sizes["transition"] + segments.n
         both = {
-            str(key): (each.dims, np.concatenate([each.to_numpy(), new[str(key)]]), each.attrs)
-            for key, each in held.data_vars.items()
+            str(key): (
+                variable.dims,
+                np.concatenate([variable.to_numpy(), new[str(key)]]),
+                variable.attrs,
+            )
+            for key, variable in held.data_vars.items()
         }
-        coords = {key: each for key, each in held.coords.items() if key != "transition"}
+        coords = {key: coordinate for key, coordinate in held.coords.items() if key != "transition"}
         result[name] = xr.Dataset(both, coords | {"transition": np.arange(total)}, held.attrs)
     return result
 

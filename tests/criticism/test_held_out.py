@@ -28,9 +28,9 @@ def test_start_noise_is_linearised_once_for_each_mode_and_horizon(histories, mon
     seen: list[tuple[float, int]] = []
     sensitivity = Problem.sensitivity
 
-    def counted(problem, phi, steps):
+    def counted(problem, phi, *options):
         seen.append((float(phi[0]), problem.data.horizon))
-        return sensitivity(problem, phi, steps)
+        return sensitivity(problem, phi, *options)
 
     monkeypatch.setattr(Problem, "sensitivity", counted)
     held_out = HeldOut(test, seed=1)

@@ -12,8 +12,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import with_start_noise
 from pbrl_ppl.modes.search import find_mode, find_modes
-from pbrl_ppl.numerics import differentiate
-from pbrl_ppl.parameters import fold_wheels
+from pbrl_ppl.parameters import differentiate, fold_wheels
 from pbrl_ppl.scene import Scene
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history

@@ -1,0 +1,146 @@
+"""Stepwise selection of effects: refit with the leaders, confirm on held-out data, prune."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from pbrl_ppl.criticism.held_out import HeldOut, standard_error
+from pbrl_ppl.criticism.resolution import noisy, with_enough_substeps
+from pbrl_ppl.criticism.score import Signature, inseparable, twins
+from pbrl_ppl.effects import Attached, Effect, Noise, candidates
+from pbrl_ppl.modes import Mode, find_mode
+from pbrl_ppl.parameters import inside
+from pbrl_ppl.scene import Scene
+
+#: A candidate is tried if chance alone gives its statistic less often than this (corrected).
+TRY_P = 0.01
+#: It is kept if it gains this much log predictive density, in nats and in standard errors ...
+MIN_ELPD, MIN_ELPD_SE = 4.0, 2.0
+#: ... and makes the held-out error this much smaller.
+MIN_ERROR_FALL = 0.01
+#: Candidates that are refitted in a round.
+TRIED = 4
+#: A candidate with less than this share of the leader's statistic waits until that has failed.
+WORTH_A_REFIT = 0.5
+#: Likelihoods that differ by less do not choose between effects: the catalogue's order does.
+TIE = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One effect added: its signature, the new mode and what it gained."""
+
+    signature: Signature
+    not_separable_from: tuple[str, ...]
+    after: Mode
+    elpd_difference: float
+    elpd_difference_se: float
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """The data and the catalogue that effects are chosen by."""
+
+    scene: Scene
+    held_out: HeldOut
+    catalogue: tuple[Effect, ...]
+    say: Callable[[str], None]
+
+    def missing(self, mode: Mode) -> tuple[Attached, ...]:
+        """Candidate effects for a model."""
+        return candidates(self.scene, mode.problem.physics.effects, self.catalogue)
+
+    def best_addition(self, mode: Mode, ranked: list[Signature]) -> Step | None:
+        """Refit with the leading candidates; the best that held-out data confirm, or None."""
+        order = [attached.effect.name for attached in self.missing(mode)]
+
+        def rank(item: tuple[Signature, Mode]) -> float:
+            signature, fitted = item
+            penalty = 0.5 * signature.candidate.dof * np.log(fitted.problem.segments.n)
+            return float(_log_likelihood(fitted) - penalty)
+
+        waiting = _distinct(ranked, order)[:TRIED]
+        while waiting:
+            # those far behind the first wait until it has failed
+            enough = WORTH_A_REFIT * waiting[0].candidate.statistic
+            leading = [
+                signature for signature in waiting if signature.candidate.statistic >= enough
+            ]
+            waiting = [signature for signature in waiting if signature.candidate.statistic < enough]
+            fits = [(signature, self._refit(mode, signature)) for signature in leading]
+            while fits:
+                best = max(map(rank, fits))
+                tied = [item for item in fits if rank(item) > best - TIE]
+                item = min(tied, key=lambda pair: order.index(pair[0].attached.effect.name))
+                fits.remove(item)
+                step = self._confirm(mode, *item, ranked)
+                if step is not None:
+                    return step
+        return None
+
+    def _refit(self, mode: Mode, signature: Signature) -> Mode:
+        """Mode with the candidate in the model, under the same noise structure."""
+        effects = (*mode.problem.physics.effects, signature.attached)
+        problem = mode.problem.with_physics(effects=effects)
+        labels = list(problem.layout.labels)
+        phi = np.array([prior.centre for prior in problem.layout.priors])
+        for label, value in zip(mode.problem.layout.labels, mode.phi, strict=True):
+            phi[labels.index(label)] = value
+        effect = signature.attached.effect
+        for name, value in signature.candidate.estimate.items():
+            label = f"{effect.name}_{name}[{signature.attached.body}]"
+            phi[labels.index(label)] = value
+        return find_mode(problem, initial=inside(problem.layout.priors, phi))
+
+    def _confirm(
+        self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
+    ) -> Step | None:
+        """Accept an improvement on held-out data that is clear and that matters."""
+        fitted = with_enough_substeps(noisy(fitted, rounds=1), self.say)
+        gains = self.held_out.gains(mode, fitted)
+        total, error = float(gains.sum()), standard_error(gains)
+        fall = self.held_out.fall(mode, fitted)
+        if total < MIN_ELPD or total < MIN_ELPD_SE * error or fall < MIN_ERROR_FALL:
+            return None
+        return Step(signature, inseparable(signature, ranked), fitted, total, error)
+
+    def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
+        """Drop effects that later ones have made unnecessary; what gained most comes first."""
+        for step in sorted(steps, key=lambda addition: addition.elpd_difference):
+            without = self._without(mode, step.signature.attached)
+            gains = self.held_out.gains(without, mode)
+            if gains.sum() < MIN_ELPD or gains.sum() < MIN_ELPD_SE * standard_error(gains):
+                mode = without
+                steps = [addition for addition in steps if addition is not step]
+        return mode, sorted(steps, key=lambda addition: -addition.elpd_difference)
+
+    def _without(self, mode: Mode, effect: Attached) -> Mode:
+        kept = tuple(attached for attached in mode.problem.physics.effects if attached != effect)
+        problem = mode.problem.with_physics(effects=kept)
+        labels = mode.problem.layout.labels
+        phi = [mode.phi[labels.index(label)] for label in problem.layout.labels]
+        return noisy(find_mode(problem, initial=np.array(phi)), rounds=1)
+
+
+def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
+    """Significant candidates, best first; of twins, the one that the catalogue names first.
+
+    The noise's shape is scored and never added: misfit would pass for noise. A scene declares it.
+    """
+    kept: list[Signature] = []
+    for signature in sorted(ranked, key=lambda entry: order.index(entry.attached.effect.name)):
+        if isinstance(signature.attached.effect.stage, Noise):
+            continue
+        significant = signature.candidate.p_value < TRY_P
+        if significant and not any(twins(signature, earlier) for earlier in kept):
+            kept.append(signature)
+    return sorted(kept, key=lambda entry: entry.log_p)
+
+
+def _log_likelihood(mode: Mode) -> float:
+    problem = mode.problem
+    residual = problem.residual(mode.phi)
+    return float(problem.log_density(residual, mode.sigma, mode.phi).sum())
