@@ -135,7 +135,8 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     dict of str to list
         ``rank``, ``size``, ``truth``, ``ess`` and ``r_hat``, over the parameters.
     """
-    problem = simulated(design, truth.values)
+    # bodies that met in the simulation belong together, however far apart they ended
+    problem = simulated(design, truth.values).joined(truth.phi[None], truth.sigma[None])
     model = build_model(problem)
     settings = {"cores": 1, **settings}
     for again in range(_AGAIN + 1):

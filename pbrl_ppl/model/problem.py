@@ -136,6 +136,8 @@ class Problem:
         phi, sigma : ndarray
             Draws at which to look, shapes (n, p) and (n, state).
         """
+        if len(self.simulator.parts) == 1:
+            return self
         segments, columns = self.segments, list(self.observations.columns)
         states, met = self.one_world.told(phi, segments.start, self.inputs)
         if not met.any():

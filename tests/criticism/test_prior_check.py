@@ -114,8 +114,8 @@ def test_draws_that_diverge_are_left_out_and_counted(scene, history, monkeypatch
     model = physics_model(scene, history)
     honest = type(model.problem).predict
 
-    def sometimes(problem, phi):
-        states = honest(problem, phi)
+    def sometimes(problem, phi, engine=None):
+        states = honest(problem, phi, engine)
         states[phi[:, 0] > np.exp(1.0)] = np.nan  # the upper half of the masses
         return states
 
@@ -124,7 +124,9 @@ def test_draws_that_diverge_are_left_out_and_counted(scene, history, monkeypatch
     assert 10 < check.diverged < 50
     assert any(f"diverged on {check.diverged} of 60 draws" in each for each in check.sentences)
     assert np.isfinite(check.dataset["predicted"]).all()
-    monkeypatch.setattr(type(model.problem), "predict", lambda p, phi: np.nan * honest(p, phi))
+    monkeypatch.setattr(
+        type(model.problem), "predict", lambda p, phi, engine=None: np.nan * honest(p, phi)
+    )
     with pytest.raises(FitError, match="diverged on 60 of 60 draws"):
         prior_predictive_check(model, draws=60)
 

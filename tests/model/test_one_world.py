@@ -7,14 +7,18 @@ import pymc as pm
 import pytest
 import xarray as xr
 
+from pbrl_ppl.calibration.replication import draw_truths
 from pbrl_ppl.criticism import prior_predictive_check
+from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.model import Problem, build_layout, physics_model
+from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Simulator
 from pbrl_ppl.posterior import evaluate, from_groups, group, problem_of
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.state import STATE
 
 A, B = 0, 1
 APART, FORCE = 1.2, 20.0  # m, N
@@ -68,6 +72,16 @@ def within_the_noise(problem: Problem, mass, sigma, next_state) -> None:
     assert abs(off).max() < 6.0
 
 
+def posterior_of(model, phi):
+    """Draws (n, 1) of the mass, each with the recorded noise."""
+    variables = {
+        "mass": (("chain", "draw", "mass_body"), phi.reshape(1, -1, 1)),
+        "sigma": (("chain", "draw", "state"), np.full((1, len(phi), 6), 0.002)),
+    }
+    coords = {name: list(model.coords[name]) for name in ("mass_body", "state")}
+    return from_groups({"posterior": xr.Dataset(variables, coords)}, {})
+
+
 @pytest.mark.filterwarnings("ignore:Numba will use object mode")
 def test_prior_draws_collide(model) -> None:
     drawn = pm.sample_prior_predictive(50, model=model, random_seed=1)
@@ -80,12 +94,7 @@ def test_prior_draws_collide(model) -> None:
 
 def test_posterior_draws_collide(model) -> None:
     phi, sigma = np.array([[TRUE], [TOO_LIGHT]]), np.full((2, 6), 0.002)
-    variables = {
-        "mass": (("chain", "draw", "mass_body"), phi[None]),
-        "sigma": (("chain", "draw", "state"), sigma[None]),
-    }
-    coords = {name: list(model.coords[name]) for name in ("mass_body", "state")}
-    trace = from_groups({"posterior": xr.Dataset(variables, coords)}, {})
+    trace = posterior_of(model, phi)
     drawn = pm.sample_posterior_predictive(trace, model=model, random_seed=1, progressbar=False)
     values = group(drawn, "posterior_predictive")["next_state"].values[0]
     within_the_noise(model.problem, phi, sigma, values)
@@ -100,6 +109,30 @@ def test_posterior_draws_collide(model) -> None:
 def test_the_prior_check_s_draws_collide(model) -> None:
     check = prior_predictive_check(model, draws=50, seed=1)
     assert float(check.dataset["predicted_extent"].sel(body="b", state="x")) > 0.1
+
+
+def test_calibration_s_data_collide(model) -> None:
+    truths, _ = draw_truths(model.problem, 20, seed=1)
+    for truth in truths:
+        within_the_noise(model.problem, truth.phi, truth.sigma[None], truth.values[None])
+    assert max(truth.values[..., B, 0].max() for truth in truths) > APART + 0.1
+
+
+def test_held_out_errors_are_of_one_world(model) -> None:
+    phi = np.array([TOO_LIGHT])
+    mode = Mode(
+        model.problem, phi, np.full(6, 0.002), np.zeros((0, 1)), np.eye(1), log_posterior=0.0
+    )
+    held = HeldOut(model.problem.data.history, seed=1)
+    expected = of_one_world(model.problem, phi)
+    shown = held.rollout(mode, mode)
+    assert shown.body == "a"  # which the other stops
+    np.testing.assert_allclose(shown.before[1], expected[0, 0, A], atol=1e-9)
+    off = model.problem.observations.residual(expected)[:, -1]
+    errors = held.errors(mode, mode, posterior_of(model, phi), rollout=1)
+    for i, name in enumerate(STATE):
+        found = errors.one_step_rmse[name]
+        assert found == pytest.approx(np.sqrt((off[..., i] ** 2).mean()), rel=1e-6), name
 
 
 def test_what_has_not_met_is_predicted_as_the_likelihood_has_it(model) -> None:
