@@ -22,6 +22,7 @@ LONGEST = (
     "sampling/test_updating.py",
     "posterior/test_updated_prior.py",
     "sampling/test_fitting.py",
+    "sampling/test_emulator.py",
     "criticism/test_criticism.py",
     "domains/test_namo.py",
     "planning/test_planning_modes.py",

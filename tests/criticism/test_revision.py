@@ -67,6 +67,9 @@ def test_the_undeclared_effect_is_added_and_nothing_else(case, shared_data):
         low, high = found.added[0].parameters[parameter].hdi
         assert low <= true <= high, (parameter, low, true, high)
     assert found.added[0].elpd_difference > 2 * found.added[0].elpd_difference_se
+    # leave-one-out on the training data says so too, of every transition
+    assert found.loo.elpd_difference > 2 * found.loo.elpd_difference_se
+    assert found.loo.transitions == train.n_transitions
     # as good as if the effect had been declared from the start
     declared = revise(scene.with_effects("cart", name), train, test, seed=1, draws=50)
     assert declared.verdict == "adequate"
