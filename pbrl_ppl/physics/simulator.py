@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
 from functools import cached_property
 from typing import Any
 
@@ -16,7 +17,7 @@ from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, compiled, plain
 from pbrl_ppl.physics.engines import Engine, share_out
-from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
+from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT
@@ -31,6 +32,8 @@ _KEPT = 64
 _A_THREAD = 1000
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]
+#: And whether there is friction under bodies: what worlds differ in.
+Choice = tuple[Joined, bool]
 
 
 class Simulator:
@@ -86,7 +89,7 @@ class Simulator:
         self.substeps, self.threads, self.path = substeps, threads, path
         self.extrapolate = extrapolate
         self._properties = EngineProperties(scene, effects, layout)
-        self._worlds: OrderedDict[Joined, list[Engine]] = OrderedDict()
+        self._worlds: OrderedDict[Choice, list[Engine]] = OrderedDict()
         self._lock = threading.Lock()  # the worlds serve one call at a time
 
     def __getstate__(self) -> dict[str, object]:
@@ -139,21 +142,31 @@ class Simulator:
         n, horizon, k = actions.shape[:3]
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         run = self._run_plain if self.path == "plain" else self._run_compiled
-        if not given.indices.shape[1]:
-            run((), given, starts, inputs, out.reshape(-1, horizon, k, 6))
-        else:
-            # each choice of the bodies that joints hold is a world of its own
-            choices, which = np.unique(given.indices, axis=0, return_inverse=True)
-            for i, choice in enumerate(choices):
-                joined = tuple((int(a), int(b)) for a, b in choice)
-                rows = which.ravel() == i
-                part = np.full((int(rows.sum()) * n, horizon, k, 6), np.nan)
-                own = starts[rows] if len(starts) > 1 else starts
-                run(joined, EngineInput(*(array[rows] for array in given)), own, inputs, part)
-                out[rows] = part.reshape(-1, n, horizon, k, 6)
+        for choice, rows in self._choices(given):
+            own = starts[rows] if len(starts) > 1 else starts
+            count = int(rows.sum())
+            part = np.full((count * n, horizon, k, 6), np.nan)
+            run(choice, EngineInput(*(array[rows] for array in given)), own, inputs, part)
+            out[rows] = part.reshape(count, n, horizon, k, 6)
         for i, sensor, values in self._properties.sensors(proposals):
             out[..., i, :] = sensor.measure(out[..., i, :], values)
         return out if phi.ndim == 2 else out[0]
+
+    def _choices(self, given: EngineInput) -> Iterator[tuple[Choice, Any]]:
+        """The worlds that proposals need, and which of them each is for.
+
+        What bodies an inferred joint holds makes another world; and so does friction under bodies,
+        whose joints would cost ten times as much as all else where the coefficient is zero, as it
+        is when candidates are scored.
+        """
+        sliding = given.bodies[..., list(self._properties.patches), COLUMN["patch_mu"]] > 0
+        proposals, joints, _ = given.indices.shape
+        indices = given.indices.reshape(proposals, 2 * joints)
+        keys = np.column_stack([sliding.any(axis=(1, 2)), indices])
+        choices, which = np.unique(keys, axis=0, return_inverse=True)
+        for i, (slides, *pairs) in enumerate(choices.astype(int).tolist()):
+            joined = tuple(zip(pairs[::2], pairs[1::2], strict=True))
+            yield (joined, bool(slides)), which.ravel() == i
 
     def _inputs(self, actions: Array) -> tuple[Array, Clock | None]:
         """What the engine's loop looks at, and when the intervals are."""
@@ -177,7 +190,7 @@ class Simulator:
             flat = {name: value[..., 0] for name, value in values.items()}
             states[:, :, i] = sensor.invert(states[:, :, i], flat)
         # a hinged body's place follows from its angle
-        names = [body.name for body in self.scene.dynamic]
+        names = [body.name for body in self.scene.moving]
         hung = [names.index(name) for name in hung_bodies(self.scene)]
         states[:, :, hung, 0:2] = states[:, :, hung, 3:5] = np.nan
         fill_hinges(states, self.scene)
@@ -272,12 +285,13 @@ class Simulator:
             np.cumsum([0, *sizes])[:-1].astype(np.int64),
         )
 
-    def _new_world(self, joined: Joined) -> World:
-        properties = self._properties
-        return World(self.scene, properties.hinges, joined, properties.n_discs, properties.patches)
+    def _new_world(self, choice: Choice) -> World:
+        joined, slides = choice
+        own = self._properties
+        return World(self.scene, own.hinges, joined, own.n_discs, own.patches if slides else ())
 
     def _run_plain(
-        self, joined: Joined, given: EngineInput, starts: Array, inputs: Array, out: Array
+        self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array
     ) -> None:
         for item in range(len(out)):
             p, t = divmod(item, len(inputs))
@@ -285,7 +299,7 @@ class Simulator:
             total = np.zeros_like(out[item])
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
                 states, touched = plain.rollout(
-                    self._new_world(joined), self.effects, given, p, t, start, inputs[t],
+                    self._new_world(choice), self.effects, given, p, t, start, inputs[t],
                     int(count),
                 )  # fmt: skip
                 if level == 0 or np.isnan(states).any():  # diverged
@@ -297,7 +311,7 @@ class Simulator:
                 out[item] = total
 
     def _run_compiled(
-        self, joined: Joined, given: EngineInput, starts: Array, inputs: Array, out: Array
+        self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array
     ) -> None:
         shared = (
             tuple(given[:-1]), self._commands, self._forces, starts, inputs,
@@ -309,16 +323,16 @@ class Simulator:
                 stop = compiled.rollout(calls.FUNCTIONS, engine.pointers, *shared, first, last, out)
                 if stop < last:  # diverged: that world is spoilt, and the item is lost
                     out[stop] = np.nan
-                    engine.renew(self._new_world(joined))
+                    engine.renew(self._new_world(choice))
                 first = stop + 1
 
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.threads, len(out), steps // _A_THREAD))
         with self._lock:
-            engines = self._worlds.setdefault(joined, [])
-            self._worlds.move_to_end(joined)
+            engines = self._worlds.setdefault(choice, [])
+            self._worlds.move_to_end(choice)
             while len(self._worlds) > _KEPT:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
-                engines.append(Engine(self._new_world(joined)))
+                engines.append(Engine(self._new_world(choice)))
             share_out(run, engines[:workers], len(out))

@@ -208,3 +208,16 @@ def test_friction_and_radius_are_recovered() -> None:
     sd = np.sqrt(np.diag(mode.covariance))
     assert (np.abs(mode.phi - truth) < 3.3 * sd).all()
     assert (sd < 0.02 * truth).all()
+
+
+def test_nothing_is_solved_where_the_coefficient_is_zero() -> None:
+    """Candidates are scored there, on all bodies: joints that do nothing would cost ten times."""
+    sim = simulator(floor(), (BY_NAME["sliding_friction"],))
+    start, actions = state(vx=1.0)[None, None], np.zeros((1, 1, 1, 3))
+    sim(np.array([0.0, RADIUS]), start, actions)
+    worlds = [engine.world for engines in sim._worlds.values() for engine in engines]
+    assert [world.patches for world in worlds] == [[]]
+    both = sim(np.array([[MU, RADIUS], [0.0, RADIUS]]), start, actions)
+    np.testing.assert_array_equal(both[0], sim(np.array([MU, RADIUS]), start, actions))
+    np.testing.assert_allclose(both[1, 0, 0, 0], state(x=0.1, vx=1.0), atol=1e-15)
+    assert len(sim._worlds) == 2
