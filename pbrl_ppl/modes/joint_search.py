@@ -41,6 +41,8 @@ _CONTENDERS, _BEST, _STARTS, _SCREENED = 100.0, 2, 4, 200
 #: ends this far below the best log-posterior so far is hopeless, and goes no further: wrong joints
 #: are explained by masses so unlike that the engine takes a hundred times as long.
 _ROUGH, _FIRST, _HOPELESS = 8, 2, 300.0
+#: Configurations to which further joints are added, at most.
+_BREADTH = 4
 #: Starts of the search for a rod's anchors by geometry, and how many are kept.
 _GEOMETRIC, _KEPT = 12, 2
 #: Rows of the recording that the geometry is taken from, at most.
@@ -55,8 +57,8 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
     importance sampler's.
 
     All configurations are tried where there are at most 300. Where there are more, each joint is
-    tried by itself first, and further ones are added to the best so far (beam search), 300 in all.
-    Then the probabilities are among what was tried, and joints that explain the recording only
+    tried by itself first, and further ones are added to the best few (beam search), about 300 in
+    all. Then the probabilities are among what was tried, and joints that explain the recording only
     together may be missed.
 
     Parameters
@@ -138,7 +140,7 @@ def _tried(
             for configuration in one_more(scene, parent)
             if configuration not in modes
         }
-        if len(modes) + len(grown) > MOST:
+        if not level and len(modes) + len(grown) > MOST:
             raise FitError(_too_many(scene, len(grown)))
         extend(grown, f"trying joint {level + 1} of {levels}")
         # one that is impossible by the prior may lead to what is not: if each joint joins something
@@ -147,7 +149,7 @@ def _tried(
         best = sorted((e for e in grown if score[e] > least), key=lambda e: -score[e])
         room = (MOST - len(modes)) // max(levels - level - 1, 1)
         most = max((len(one_more(scene, configuration)) for configuration in best[:1]), default=1)
-        best = best[: max(room // max(most, 1), 1)]
+        best = best[: int(np.clip(room // max(most, 1), 1, _BREADTH))]
     return modes, evidence
 
 

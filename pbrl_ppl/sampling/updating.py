@@ -166,7 +166,9 @@ def _updated(
             return checked(problem, result), how | {"did": "reweighted"}
     # from here on all data are needed
     whole = problem_of(from_groups(groups(idata) | data, idata.attrs | together), effects)
-    if share < _REFIT or heavy or whole.library is not None:  # sets cannot be moved by steps
+    # sets of parameters, and which bodies a joint joins, cannot be moved by steps
+    chosen_among = whole.library is not None or whole.layout.discrete.any()
+    if share < _REFIT or heavy or chosen_among:
         why = f"their tail has a shape k of {k:.2g}" if heavy else f"worth {share:.1%} of the draws"
         warnings.warn(
             f"update: the new data leave the posterior so far behind ({why}) that all of them are"

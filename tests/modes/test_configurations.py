@@ -13,7 +13,7 @@ import xarray as xr
 from scipy import stats
 from scipy.special import logsumexp
 
-from pbrl_ppl.errors import FitError, PosteriorError, UninformedWarning
+from pbrl_ppl.errors import FitError, PosteriorError, RefitWarning, UninformedWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_layout, physics_model
 from pbrl_ppl.modes import Mode, find_mode, weigh
@@ -39,7 +39,7 @@ from pbrl_ppl.posterior import (
     save_posterior,
     updated_scene,
 )
-from pbrl_ppl.sampling import fit, mixture
+from pbrl_ppl.sampling import fit, mixture, updating
 from pbrl_ppl.scene import WORLD, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.histories import simulated_history
@@ -501,6 +501,26 @@ def test_the_file_holds_all_of_it(fitted, tmp_path) -> None:
     said = identify(loaded)
     assert said.parameters == ()  # all but the joint is known, and a free joint takes no part
     assert updated_scene(loaded).joints[0].bodies is None
+
+
+def test_an_update_fits_anew_rather_than_move_an_index(fitted, monkeypatch) -> None:
+    """A step from body 1 to body 1.3 is none."""
+    truth = scene(Joint("hinge", ("a", "b"), *HELD), poses=LINED)
+    more = simulated_history(
+        truth, {}, seed=9, trajectories=1, intervals=2, noise=NOISE, poses=LINED, substeps=20
+    )
+    monkeypatch.setattr(updating, "_MOVE", 1.1)  # no weights are good enough
+    asked = []
+
+    def refit(model, **options):
+        asked.append(model.problem.layout.discrete.any())
+        raise InterruptedError
+
+    monkeypatch.setattr(updating, "fit", refit)
+    with warnings.catch_warnings(), pytest.raises(InterruptedError):
+        warnings.simplefilter("ignore", RefitWarning)
+        updating.update(fitted, more)
+    assert asked == [True]
 
 
 def test_probabilities_need_a_joint_of_unknown_bodies() -> None:

@@ -13,12 +13,16 @@ from tests.helpers.joints import scene
 from tests.helpers.worlds import body
 
 NOISE = (0.002, 0.002, 0.004, 0.01, 0.01, 0.02)
-HINGES = {("a", "b"): ((0.12, 0.02), (-0.14, 0.0)), ("c", "f"): ((0.0, 0.1), (0.05, -0.16))}
+#: In the bounds of discs that do not touch.
+HINGES = {
+    ("a", "b"): ((0.17, 0.17), (-0.17, -0.17)),
+    ("c", "f"): ((-0.17, 0.17), (0.17, -0.17)),
+}
 
 
 def discs(*joints: Joint, names: str = "abcdefg") -> Scene:
     """Discs of which all but the joints is known."""
-    made = tuple(body(name, Shape.circle(0.1), mass=1.0 + 0.2 * i) for i, name in enumerate(names))
+    made = tuple(body(name, Shape.circle(0.2), mass=1.0 + 0.2 * i) for i, name in enumerate(names))
     return Scene(time_step=0.1, bodies=made, joints=joints, substeps=4)
 
 
@@ -30,10 +34,10 @@ def test_two_hinges_among_seven_bodies() -> None:
     truth = discs(*(Joint("hinge", pair, *at) for pair, at in HINGES.items()))
     poses = np.zeros((7, 3))
     poses[:, 0] = np.arange(7.0)
-    poses[1] = poses[0] + [0.26, 0.02, 0.0]
-    poses[5] = poses[2] + [-0.05, 0.26, 0.0]
+    poses[1] = poses[0] + [0.34, 0.34, 0.0]
+    poses[5] = poses[2] + [-0.34, 0.34, 0.0]
     history = simulated_history(
-        truth, {}, seed=2, trajectories=4, intervals=2, noise=NOISE, poses=poses, substeps=4,
+        truth, {}, seed=2, trajectories=3, intervals=2, noise=NOISE, poses=poses, substeps=4,
         wrench_sd=(5.0, 5.0, 0.1),
     )  # fmt: skip
     found = weigh(Problem.of(free, history), seed=1)
