@@ -6,11 +6,11 @@ class PbrlError(Exception):
 
 
 class SceneError(PbrlError, ValueError):
-    """A scene that cannot be: an unknown key, an impossible shape, a joint to nowhere."""
+    """An invalid scene: an unknown key, an impossible shape, a joint to nowhere."""
 
 
 class HistoryError(PbrlError, ValueError):
-    """A history that cannot be used: missing columns, bad times, values that are not numbers."""
+    """An invalid history: missing columns, bad times, values that are not numbers."""
 
 
 class ParameterError(PbrlError, ValueError):
@@ -22,7 +22,7 @@ class EffectError(PbrlError, ValueError):
 
 
 class SimulationError(PbrlError, RuntimeError):
-    """The engine was asked for something impossible."""
+    """An impossible request to the engine: wrong shapes, an unknown path, no substeps."""
 
 
 class PosteriorError(PbrlError, ValueError):
@@ -58,4 +58,4 @@ class FitError(PbrlError, ValueError):
 
 
 class GoalError(PbrlError, ValueError):
-    """A goal, a start or a set of actions that cannot be."""
+    """An invalid goal, start or set of actions."""

@@ -1,4 +1,4 @@
-"""The command arrives late."""
+"""Pure time delay of the command."""
 
 from typing import Any
 

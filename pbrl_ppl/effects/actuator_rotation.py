@@ -1,4 +1,4 @@
-"""The commanded force is turned by an angle."""
+"""Rotation of the commanded force by a constant angle."""
 
 import math
 from typing import Any

@@ -1,4 +1,4 @@
-"""A force fixed in the body."""
+"""A constant force in the body's frame."""
 
 import math
 from typing import Any

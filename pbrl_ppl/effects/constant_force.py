@@ -1,4 +1,4 @@
-"""A force fixed in the world."""
+"""A constant force in the world's frame."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A torque bias."""
+"""A constant torque."""
 
 from typing import Any
 

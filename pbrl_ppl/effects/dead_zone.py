@@ -1,4 +1,4 @@
-"""A force below a threshold is lost."""
+"""Dead zone of an actuator: a force below a threshold is lost."""
 
 import math
 from typing import Any

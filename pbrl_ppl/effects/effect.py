@@ -151,12 +151,12 @@ class Attached:
 
 
 def at_stage(effects: tuple[Attached, ...], stage: type) -> list[Attached]:
-    """Those that act at a stage, in their order."""
+    """Effects that act at a stage, in their order."""
     return [attached for attached in effects if isinstance(attached.effect.stage, stage)]
 
 
 def needs_inputs(effects: tuple[Attached, ...]) -> bool:
-    """Whether an effect looks at the command before, or at the clock."""
+    """Whether any effect needs the previous command or the clock."""
     stages = [attached.effect.stage for attached in effects]
     return any(
         (isinstance(stage, Command) and stage.memory)

@@ -1,4 +1,4 @@
-"""Some measurements are far off."""
+"""Heavy-tailed measurement noise: Student's t distribution."""
 
 from typing import Any
 

@@ -1,4 +1,4 @@
-"""A static disc that the scene does not show."""
+"""Static obstacle, a disc, that the scene does not show."""
 
 from typing import Any
 

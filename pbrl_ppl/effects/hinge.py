@@ -1,4 +1,4 @@
-"""Which body hangs in a hinge, and so has the hinge's friction."""
+"""Hanging bodies: which body of a hinge has the hinge's friction."""
 
 from __future__ import annotations
 

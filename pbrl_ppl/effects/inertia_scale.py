@@ -1,4 +1,4 @@
-"""The moment of inertia is not that of a uniform body."""
+"""Moment of inertia as a multiple of a uniform body's."""
 
 from typing import Any
 

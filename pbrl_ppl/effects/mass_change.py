@@ -1,4 +1,4 @@
-"""A body takes up a load at some trajectory or time."""
+"""Step change of a body's mass at some trajectory or time."""
 
 from typing import Any
 

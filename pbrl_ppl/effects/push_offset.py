@@ -1,4 +1,4 @@
-"""The commanded force acts beside the body's origin."""
+"""Moment of a commanded force that acts beside the body's origin."""
 
 import math
 from typing import Any

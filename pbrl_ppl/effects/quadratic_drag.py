@@ -1,4 +1,4 @@
-"""Drag that grows with the square of the speed."""
+"""Quadratic drag: a force that grows with the square of the speed."""
 
 import math
 from typing import Any

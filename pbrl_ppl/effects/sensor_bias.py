@@ -1,4 +1,4 @@
-"""What is measured is off by a constant."""
+"""Additive sensor bias: a constant error of the measured state."""
 
 from typing import Any
 

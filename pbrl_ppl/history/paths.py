@@ -20,7 +20,7 @@ def kinematic_bodies(scene: Scene) -> Bools:
 
 
 def check_paths(rows: Rows, scene: Scene) -> None:
-    """Refuse a kinematic body whose pose is not there on every row."""
+    """Raise `HistoryError` where a kinematic body's pose is missing on a row."""
     follows = kinematic_bodies(scene)[rows.body]
     empty = np.isnan(rows.state[:, :3]) & follows[:, None]
     if empty.any():

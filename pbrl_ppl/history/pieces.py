@@ -1,4 +1,4 @@
-"""Where trajectories are cut into pieces of a horizon's length."""
+"""Cuts of trajectories into pieces of a horizon's length."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A history again, from the segments that a problem or a posterior file holds."""
+"""Histories rebuilt from the segments that a problem or a posterior file holds."""
 
 from __future__ import annotations
 

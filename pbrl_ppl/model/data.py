@@ -1,4 +1,4 @@
-"""What a model is fitted to: a history cut into segments, and what was measured along them."""
+"""Data of a model: a history cut into segments, and the observations along them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class Data:
     columns: tuple[int, ...] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave what was computed behind when it goes to another process."""
+        """State to pickle: the fields, without what was computed from them."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
@@ -53,5 +53,5 @@ class Data:
 
     @cached_property
     def observations(self) -> Observations:
-        """What was measured at the segments' steps."""
+        """Observations at the segments' steps."""
         return Observations.of(self.segments, self.columns)

@@ -224,7 +224,7 @@ def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
 
 
 def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
-    """Whose bounds hold an anchor: the index variable, 0 where the body is given."""
+    """Index variable that selects each anchor's prior; 0 where the body is given."""
     name = f"i_{block.name[0]}"
     if not block.conditional or name not in variables:
         return None
@@ -236,7 +236,7 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
 def _log_density(
     value: Any, predicted: Any, whole: Any, sigma: Any, *tail: Any, **fixed: Any
 ) -> Any:
-    """Of what was measured, whose bodies met or not: parts of the scene will do."""
+    """Log-density of the measurements about the predictions in parts; ``whole`` is for draws."""
     return next_state_logp(value, predicted, sigma, tail=tail[0] if tail else None, **fixed)
 
 
@@ -259,7 +259,7 @@ def _random(
 
 
 def _coords(problem: Problem) -> dict[str, Any]:
-    """Coordinates by name: every dimension of the model says what it runs over."""
+    """Coordinates of the model's dimensions, by name."""
     segments = problem.segments
     coords: dict[str, Any] = {
         "body": [body.name for body in problem.scene.moving],

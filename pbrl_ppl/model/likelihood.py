@@ -164,7 +164,7 @@ def cells(nu: float | Array | None, shape: tuple[int, ...]) -> float | Array | N
 
 
 def robust(z: Array, nu: float | Array | None) -> Array:
-    """Whitened residuals of which half the squares are the negative log-density, up to a constant.
+    """Least-squares residuals: half their squares are the negative log-density but a constant.
 
     Parameters
     ----------

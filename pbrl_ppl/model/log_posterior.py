@@ -12,7 +12,7 @@ Ints = NDArray[np.intp]
 
 
 def noise_law(problem: Problem) -> tuple[Array, float]:
-    """P(sigma): log sigma is normal about these, one a free sigma, with this standard deviation.
+    """P(sigma): mean of log sigma, one a free sigma, and its standard deviation; it is normal.
 
     Parameters
     ----------

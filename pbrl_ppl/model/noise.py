@@ -1,4 +1,4 @@
-"""How measurements scatter about predictions: Eq. 11's sigma, its prior and its tails."""
+"""Measurement noise: Eq. 11's sigma, its prior and its tails."""
 
 from __future__ import annotations
 

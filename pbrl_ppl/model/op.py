@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 class _EngineOp(Op):
-    """What the prediction and its derivative share: inputs and how impossible ones are answered."""
+    """Base of the prediction and of its derivative: inputs, and the answer to impossible ones."""
 
     __props__ = ("scene", "layout", "effects", "substeps", "threads", "parts")
 
@@ -185,7 +185,7 @@ class JacobianOp(_EngineOp):
 
 @numba_funcify.register(_EngineOp)
 def _numba_engine(op: _EngineOp, node: Any = None, **kwargs: Any) -> Any:
-    """For the numba backend: step out to the rollout, which is compiled code of its own."""
+    """Numba dispatch of the Op: a call of the rollout in object mode."""
     kind = numba.types.Array(numba.float64, 2 + len(op._last), "C")
 
     @numba.njit

@@ -1,4 +1,4 @@
-"""What a model predicts with: a scene's bodies, their effects and the engine's settings."""
+"""Physics of a model: a scene's bodies, their effects and the engine's settings."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class Physics:
         object.__setattr__(self, "layout", build_layout(self.scene, self.effects))
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave the engine's worlds behind when it goes to another process."""
+        """State to pickle, without the engine's worlds."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property

@@ -189,7 +189,7 @@ class Problem:
 
     @property
     def observations(self) -> Observations:
-        """What was measured at the segments' steps."""
+        """Observations at the segments' steps."""
         return self.data.observations
 
     @cached_property
@@ -239,7 +239,7 @@ class Problem:
         return degrees_of_freedom(self.physics, phi, self.noise.nu)
 
     def robust(self, phi: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
-        """Whitened residuals whose half squares are the negative log-density, up to a constant.
+        """Least-squares residuals: half their squares are the negative log-density but a constant.
 
         Shape (..., transition, cell).
         """

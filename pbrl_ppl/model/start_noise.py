@@ -14,7 +14,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class StartNoise:
-    """How noise in a segment's measured start state spreads over its predictions.
+    """First-order propagation of a measured start state's noise to the segment's predictions.
 
     To first order the residual's covariance is ``S + F S F^T``, with ``S = diag(sigma^2)`` and
     ``F`` the derivative of the prediction by the start state. Its correlation and the ratio of its

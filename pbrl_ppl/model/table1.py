@@ -191,7 +191,7 @@ def _has(body: Body, name: str) -> bool:
 
 
 def _union(priors: tuple[Prior, ...]) -> Prior:
-    """A prior over the support of all of these: what is known before the index is."""
+    """Prior on the union of the supports: that of an anchor whose index is unknown."""
     if len(set(priors)) == 1:
         return priors[0]
     lower, upper = min(prior.lower for prior in priors), max(prior.upper for prior in priors)

@@ -66,7 +66,7 @@ def tail_tensor(physics: Physics, variables: Mapping[str, Any], nu: float | None
 
 
 def _tails(physics: Physics, value: Any, zero: Any) -> list[Any]:
-    """Of each body, the sum of its effects' tails; ``value`` gives a parameter."""
+    """Sum of the effects' tails for each body; ``value`` gives a parameter."""
     acting = at_stage(physics.effects, Noise)
     result = []
     for body in physics.scene.moving:

@@ -1,4 +1,4 @@
-"""What joints of unknown bodies may join: every choice, and the problem that each one leaves."""
+"""Configurations of joints of unknown bodies, and the problem that each one leaves."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ class Configuration:
 
 @dataclass(frozen=True, eq=False)
 class Weighed:
-    """A configuration, and how probable it is.
+    """A configuration with its mode, evidence and posterior probability.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Weighed:
 
 @dataclass(frozen=True)
 class Alike:
-    """Joints of unknown bodies of one kind and one prior: which is called the first is no matter.
+    """Exchangeable joints: of unknown bodies, of one kind and one prior.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ class Alike:
 
 
 def alike(scene: Scene) -> tuple[Alike, ...]:
-    """The joints whose bodies the scene does not name, those together that may be exchanged."""
+    """Groups of exchangeable joints, of those whose bodies the scene does not name."""
     groups: dict[tuple[str, Prior, Prior], list[str]] = {}
     for name, joint in zip(scene.joint_names, scene.joints, strict=True):
         if joint.bodies is None:
@@ -163,7 +163,7 @@ def index_law(pair: Pair, scene: Scene, p_a: Array, p_b: Array) -> Array:
 
 
 def number(scene: Scene) -> int:
-    """How many configurations there are."""
+    """Number of configurations."""
     return math.prod(
         math.comb(len(group.weights) + len(group.names) - 1, len(group.names))
         for group in alike(scene)
@@ -254,7 +254,7 @@ def stored(found: Sequence[Weighed]) -> str:
 
 
 def joint_probabilities(idata: Any) -> dict[str, dict[str, float]]:
-    """How probable it is what a joint of unknown bodies joins.
+    """Posterior probabilities of what each joint of unknown bodies joins.
 
     Parameters
     ----------
@@ -297,7 +297,7 @@ def joint_probabilities(idata: Any) -> dict[str, dict[str, float]]:
 
 
 def doubts(idata: Any) -> str | None:
-    """What is to be said where the evidences are too rough for their probabilities, if they are."""
+    """Warning of evidences too rough for their probabilities; None where they are not."""
     for row in json.loads(str(idata.attrs.get(ATTRIBUTE, "[]"))):
         probability, error, ess = row["probability"], row["error"], row["ess"]
         if error is None:

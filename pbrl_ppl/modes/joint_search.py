@@ -1,4 +1,4 @@
-"""Which configuration of the joints explains a recording: a mode and the evidence of each."""
+"""Model comparison over the configurations of the joints: a mode and the evidence of each."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed
 
 
 def _carried(base: Mode, problem: Problem, default: Array) -> Array:
-    """The parameters of one problem where another has them too."""
+    """Parameters of a problem at a base mode's values, the default where the base has none."""
     values = dict(zip(base.problem.layout.labels, base.phi, strict=True))
     labels = problem.layout.labels
     return np.array([values.get(label, x) for label, x in zip(labels, default, strict=True)])

@@ -1,4 +1,4 @@
-"""A mode of the posterior: where a Gauss-Newton climb ends, and a Laplace covariance there."""
+"""Modes of the posterior by Gauss-Newton steps, and the Laplace covariance there."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The posterior of which parameter set each body has: summed over all of them, exactly."""
+"""Exact posterior of each body's parameter set, by enumeration of all combinations."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class _Combinations:
         self.residual = self.observations.residual(states)
 
     def log_joint(self, sigma: Array, nu: float | Array | None) -> Array:
-        """Of data and combination given sigma (draw, state), shape (draw, combination)."""
+        """Log-density of data and combination given sigma (draw, state): (draw, combination)."""
         seen = self.observations.measured
         result = np.empty((len(sigma), len(self.indices)))
         size = max(1, _NUMBERS // max(self.residual.size, 1))
@@ -158,7 +158,7 @@ def choose_from_library(
 
 
 def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> Array:
-    """Noise under each part's best combination, which depends on it: begun with a guess."""
+    """Fixed-point estimate of sigma under each part's best combination, from a first guess."""
     observations = problem.observations
     residual = np.zeros_like(observations.values)
     for turn in range(3):

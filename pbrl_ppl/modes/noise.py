@@ -1,4 +1,4 @@
-"""The most probable sigma at given residuals, under its prior."""
+"""Maximum a posteriori sigma at given residuals."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def profile_sigma(problem: Problem, residual: Array, phi: Array | None = None) -
 
 
 def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
-    """The same for independent Gaussian residuals, in closed form.
+    """Maximum a posteriori log sigma of independent Gaussian residuals, in closed form.
 
     The density ``-(n + 1) t - S exp(-2 t) / 2 - (t - m)^2 / 2 s^2`` of t = log sigma has its only
     maximum where ``y exp(2 y) = s^2 S exp(2 (a - m))``, with ``a = s^2 (n + 1)`` and
@@ -77,7 +77,7 @@ def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
 
 
 def gaussian_profile(problem: Problem, square: Array) -> Array:
-    """Log-density of data and sigma at that sigma, up to a constant, shape (...)."""
+    """Profile log-density of data and sigma at that maximum, up to a constant, shape (...)."""
     t = gaussian_log_sigma(problem, square)
     count = problem.observations.measured.sum((0, 1, 2))
     likelihood = -(count * t + 0.5 * square * np.exp(-2 * t)).sum(axis=-1)

@@ -143,7 +143,7 @@ def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
 
 
 def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
-    """Leave out what predicts the same as one before it, and is on the same hill.
+    """Drop modes that predict the same as an earlier one and are on the same hill.
 
     A wheel's other description is, and so is what differs where the data are silent. A mirror image
     is not: it predicts the same, but what is linear in between would not.
@@ -160,7 +160,7 @@ def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
 
 
 def _part(problem: Problem, transitions: int) -> Problem:
-    """The problem, roughly, on evenly chosen trajectories of about so many transitions."""
+    """The coarse problem on evenly chosen trajectories of about so many transitions."""
     history = problem.data.history
     share = transitions / max(problem.segments.n, 1)
     count = max(2, math.ceil(share * history.n_trajectories))
@@ -186,7 +186,7 @@ def find_mode(
 
 
 def _polish(problem: Problem, found: Peak) -> Peak:
-    """Go on by the exact engine's derivative, as far as that leads."""
+    """Refine a peak with the exact engine's derivative, while that raises the log-posterior."""
     if not problem.layout.size:
         return found
     found = described(problem, found)

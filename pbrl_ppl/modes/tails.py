@@ -1,4 +1,4 @@
-"""The most probable tails of the noise, found by themselves: they move no prediction."""
+"""Maximum a posteriori tails of the noise, apart from the rest of phi: they move no prediction."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def _tail_cost(problem: Problem, phi: Array, sigma: Array) -> Callable[[Array], 
 
 
 def best_tails(problem: Problem, phi: Array, sigma: Array) -> Array:
-    """Phi with the most probable tails; a density's constant depends on them."""
+    """Phi with the maximum a posteriori tails, all else fixed."""
     if not problem.tails:
         return phi
     tails = list(problem.tails)

@@ -158,7 +158,7 @@ class Layout:
                     yield self.index(block.name, owner), self.index(side, owner), conditional
 
     def scale(self, phi: Array) -> Array:
-        """What is a large change of each entry of phi, shape (p,); zero of a discrete one."""
+        """Scale of each entry of phi, for step sizes, shape (p,); zero of a discrete one."""
         least = np.array(
             [0.0 if prior.discrete else min(prior.sigma, 1.0) for prior in self.priors]
         )
@@ -173,7 +173,7 @@ class Layout:
 
     @property
     def discrete(self) -> NDArray[np.bool_]:
-        """Which entries are whole numbers that stand for names, shape (p,)."""
+        """Which entries are discrete, indices of names, shape (p,)."""
         return np.array([prior.discrete for prior in self.priors], dtype=bool)
 
     def owner_kind(self, place: int) -> str:

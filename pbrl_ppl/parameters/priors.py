@@ -102,19 +102,19 @@ class Prior:
 
     @property
     def discrete(self) -> bool:
-        """Whether the values are whole numbers that stand for names."""
+        """Whether the prior is categorical: its values are indices of names."""
         return self.family == "categorical"
 
     @property
     def probabilities(self) -> Array:
-        """Of a discrete prior's numbers from ``lower`` up, shape (number,)."""
+        """Probabilities of a discrete prior's numbers from ``lower`` up, shape (number,)."""
         n = int(self.upper - self.lower) + 1
         weights = np.array(self.weights or (1.0,) * n)
         return np.asarray(weights / weights.sum())
 
     @property
     def uniform(self) -> bool:
-        """Whether it is an angle of which nothing is known."""
+        """Whether it is an angle's uniform prior: a von Mises with kappa 0."""
         return self.family == "von_mises" and self.kappa == 0
 
     @property
@@ -129,7 +129,7 @@ class Prior:
         return float(np.clip(self.mu, *self.support))
 
     def residual(self, x: Array) -> Array:
-        """Half its square is the negative log-density up to a constant, so MAP is least squares.
+        """Least-squares residual: half its square is the negative log-density up to a constant.
 
         Parameters
         ----------

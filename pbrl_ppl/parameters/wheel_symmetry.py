@@ -1,4 +1,4 @@
-"""A wheel's four equal descriptions, which of them the prior can tell apart, and the choice of one.
+"""Symmetry of the wheel: four descriptions of equal likelihood, and the folding onto one of them.
 
 ``w_theta`` and ``w_theta + pi/2`` with ``mu_x`` and ``mu_y`` swapped are the same wheel, so the
 likelihood is the same for both. The prior is the same only where it is uniform in the angle and
@@ -46,12 +46,12 @@ class Wheel:
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Of the angle and the two frictions."""
+        """Labels of the angle and the two frictions."""
         return tuple(f"{name}[{self.owner}]" for name in MIXED)
 
     @property
     def period(self) -> int:
-        """Quarter turns that the prior does not notice: 1, 2 (half a turn), or 4, a whole one."""
+        """Period of the prior in quarter turns: 1, 2 (half a turn), or 4 (no symmetry)."""
         angle, mu_x, mu_y = self.priors
         if not angle.uniform:
             return 4
@@ -206,7 +206,7 @@ def redescribed(layout: Layout, phi: Array, rng: np.random.Generator) -> Array:
 
 
 def evened(layout: Layout, phi: Array) -> Array:
-    """What to add to the log-prior so that a wheel's four descriptions share their prior evenly.
+    """Correction of the log-prior that makes a wheel's four descriptions equally probable.
 
     A chain then needs to see one of them only; `redescribed` gives each its own share.
 

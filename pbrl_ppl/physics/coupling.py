@@ -1,4 +1,4 @@
-"""Which bodies of a history have to do with each other."""
+"""Independent parts of a scene: bodies that come near in a history or share a joint, together."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def independent_parts(scene: Scene, history: History) -> Parts:
 
 
 def come_near(begin: Array, end: Array, least: float) -> NDArray[np.bool_]:
-    """Whether two bodies come nearer than ``least`` (m), or may have, for one's place is unknown.
+    """Whether two bodies come nearer than ``least`` (m), or may have where a place is unknown.
 
     Parameters
     ----------

@@ -30,7 +30,7 @@ class Part:
     memory: OrderedDict[tuple[object, ...], Array] = field(default_factory=OrderedDict)
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave the memory behind when it goes to another process."""
+        """State to pickle, without the memory."""
         return self.__dict__ | {"memory": OrderedDict()}
 
 

@@ -1,4 +1,4 @@
-"""Start states that cannot be: bodies deep inside each other or a wall, joints that are apart."""
+"""Checks of start states: bodies that interpenetrate, joints whose anchors are apart."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def check_history(scene: Scene, history: History, segments: Segments) -> None:
 
 
 def overlap(scene: Scene, poses: Array) -> Array:
-    """How deep the deepest two shapes are inside each other (m), shape (n,).
+    """Penetration depth of the deepest two shapes (m), shape (n,).
 
     Negative where bodies are apart by so much at least, no more than their bounding circles are;
     pairs that a joint joins do not count.
@@ -188,7 +188,7 @@ class _Solid:
 
 @dataclass(frozen=True, eq=False)
 class _Solids:
-    """What takes up room in a scene: moving bodies, then walls and static bodies."""
+    """Solids of a scene: moving bodies, then walls and static bodies."""
 
     solids: tuple[_Solid, ...]
     fixed: Array  # poses of those that do not move, (fixed, 3)
@@ -269,7 +269,7 @@ def _near(world: _Solids, poses: Array) -> NDArray[np.bool_]:
 
 
 def _circles(world: _Solids, poses: Array) -> Array:
-    """How deep the circles about each pair are in each other, shape (transition, pair)."""
+    """Penetration depth of each pair's bounding circles, shape (transition, pair)."""
     i, j = np.array(world.pairs, dtype=int).reshape(-1, 2).T
     cores = np.array([solid.core for solid in world.solids])
     reach = np.array([solid.reach for solid in world.solids])
@@ -292,7 +292,7 @@ def _put(points: Array, poses: Array) -> Array:
 def _depth(
     part_a: tuple[Array, float], poses_a: Array, part_b: tuple[Array, float], poses_b: Array
 ) -> Array:
-    """How far two convex parts must move to part, at each pose (m); negative if they are apart.
+    """Penetration depth of two convex parts at each pose (m); negative if they are apart.
 
     The engine's own answer is not used: it is zero for polygons whose centres coincide.
     """
@@ -306,7 +306,7 @@ def _depth(
 
 
 def _behind(a: Array, b: Array) -> Array:
-    """How far corners b reach behind the edge of a behind which they reach least, shape (n,)."""
+    """Least depth of corners b behind an edge of a (separating axes), shape (n,)."""
     least = np.full(len(a), np.inf)
     for corner, after in zip(
         np.moveaxis(a, 1, 0), np.moveaxis(np.roll(a, -1, 1), 1, 0), strict=True

@@ -1,4 +1,4 @@
-"""The reference rollout: a new engine world a transition, in plain Python. Slow, and clear."""
+"""The reference rollout in plain Python: a new engine world a transition, which is slow."""
 
 from __future__ import annotations
 

@@ -79,7 +79,7 @@ class EngineInput(NamedTuple):
 
 
 def _is_patch(attached: Attached) -> bool:
-    """Whether an effect puts friction under its body: it is tried."""
+    """Whether an effect puts friction under its body, by a trial evaluation."""
     stage = attached.effect.stage
     if not isinstance(stage, Properties):
         return False

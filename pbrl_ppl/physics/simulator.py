@@ -93,13 +93,13 @@ class Simulator:
         self._lock = threading.Lock()  # the worlds serve one call at a time
 
     def __getstate__(self) -> dict[str, object]:
-        """Leave the C objects behind: another process builds its own."""
+        """State to pickle, without the C objects: another process builds its own."""
         left = ("_lock", "_commands", "_forces")
         kept = {key: value for key, value in self.__dict__.items() if key not in left}
         return kept | {"_worlds": OrderedDict()}
 
     def __setstate__(self, state: dict[str, object]) -> None:
-        """Build what was left behind."""
+        """Restore a pickled simulator."""
         self.__dict__.update(state)
         self._lock = threading.Lock()
 
@@ -169,7 +169,7 @@ class Simulator:
             yield (joined, bool(slides)), which.ravel() == i
 
     def _inputs(self, actions: Array) -> tuple[Array, Clock | None]:
-        """What the engine's loop looks at, and when the intervals are."""
+        """Inputs of the rollout, and times of the intervals."""
         if not needs_inputs(self.effects):
             return np.ascontiguousarray(actions[..., :3]), None
         if actions.shape[-1] == 3:
@@ -181,7 +181,7 @@ class Simulator:
         return actions, Clock(*np.moveaxis(when, -1, 0))
 
     def _states(self, phi: Array, measured: Array) -> Array:
-        """States from what was measured, shape (1 or proposal, transition, body, 6)."""
+        """True states by the sensors' inverses, shape (1 or proposal, transition, body, 6)."""
         sensors = self._properties.sensors(phi)
         if not sensors:
             return measured[None]

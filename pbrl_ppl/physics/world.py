@@ -162,7 +162,7 @@ class World:
         self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
 
     def _add_shapes(self) -> None:
-        """Add the moving shapes so that contacts are found in an order without a past.
+        """Add the moving shapes so that the contacts' order does not depend on earlier transitions.
 
         The engine numbers shapes as they are added and visits them by that number modulo the size
         of a hash table: the first must get a multiple of it, here and whenever they are added anew.

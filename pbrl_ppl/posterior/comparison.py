@@ -96,7 +96,7 @@ def compare(before: Any, after: Any) -> Comparison | None:
 
 
 def _gain(az: Any, first: Any, second: Any) -> tuple[float, float]:
-    """What the second model gains, from the table that has the better one first."""
+    """Difference of elpd, second less first model, and its standard error, by ``az.compare``."""
     exact = {"round_to": "none"} if DATATREE else {}
     table = az.compare({"before": first, "after": second}, **exact)
     worse = table.iloc[-1]
@@ -105,7 +105,7 @@ def _gain(az: Any, first: Any, second: Any) -> tuple[float, float]:
 
 
 def _summary(loo: Any) -> LeaveOneOut:
-    """ArviZ 1.x has other names than 0.x."""
+    """Summary of an ArviZ result, whose names differ between 0.x and 1.x."""
     elpd, p = (loo.elpd, loo.p) if DATATREE else (loo["elpd_loo"], loo["p_loo"])
     good = float(loo.good_k)
     # written so that a shape that is not a number counts as high

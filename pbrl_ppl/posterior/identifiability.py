@@ -249,7 +249,7 @@ def _prior_draws(layout: Layout) -> dict[str, Array]:
 
 
 def _natural(prior: Prior, x: Array) -> Array:
-    """On the scale on which the prior has a width."""
+    """Values on the prior's natural scale: the logarithm for ``log_normal``."""
     return np.log(x) if prior.family == "log_normal" else x
 
 

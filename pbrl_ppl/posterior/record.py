@@ -99,7 +99,7 @@ def complete(
 
 
 def predictive_rows(draws: int) -> NDArray[np.intp]:
-    """Which of so many draws, chains joined, the stored predictions are made with."""
+    """Indices of the draws, chains joined, that the stored predictions are made with."""
     return np.linspace(0, draws - 1, min(_PREDICTIVE_DRAWS, draws)).astype(int)
 
 
@@ -181,7 +181,7 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
 
 
 def checked(problem: Problem, idata: Any, asked: int | None = None) -> Any:
-    """Store what is wrong with a posterior, and warn of it."""
+    """Store a posterior's warnings, and issue them."""
     found = list(_trouble(problem, idata, asked))
     idata.attrs["warnings"] = json.dumps([message for _, message in found])
     for kind, message in found:
@@ -192,7 +192,7 @@ def checked(problem: Problem, idata: Any, asked: int | None = None) -> Any:
 def _trouble(
     problem: Problem, idata: Any, asked: int | None
 ) -> Iterator[tuple[type[Warning], str]]:
-    """What is wrong, and the cure."""
+    """Category and message of each warning, with the cure."""
     on = "go on with resume= this posterior"
     if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
         on = "name the bodies that were found in the scene, fit that and go on with resume="

@@ -169,7 +169,7 @@ def load_posterior(path: str | Path) -> Any:
 
 
 def attributes(scene: Scene, **values: Any) -> dict[str, Any]:
-    """What a posterior file says of itself: plain strings and numbers, no pickle."""
+    """Attributes of a posterior file: plain strings and numbers, no pickle."""
     packed = {
         key: v if isinstance(v, (int, float, str)) else json.dumps(v) for key, v in values.items()
     }

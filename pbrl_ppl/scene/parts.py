@@ -102,7 +102,7 @@ class Body:
             self._check_kinematic(where)
 
     def _check_kinematic(self, where: str) -> None:
-        """Refuse what acts on bodies that forces move."""
+        """Raise `SceneError` where a kinematic body is given what only dynamic bodies have."""
         for name in ("static", "wheel", "effects"):
             if getattr(self, name):
                 raise SceneError(

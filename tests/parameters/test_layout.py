@@ -189,7 +189,7 @@ def test_unknown_family_is_refused() -> None:
 def test_truncated_prior_far_from_its_support_can_be_sampled() -> None:
     """A belief that a scene file may state, 30 sigma outside, must not hang the sampler."""
     code = (
-        "import numpy as np; from pbrl_ppl.distributions import Prior;"
+        "import numpy as np; from pbrl_ppl.parameters import Prior;"
         "prior = Prior('truncated_normal', mu=4.0, sigma=0.1, lower=0.0, upper=1.0);"
         "draws = prior.sample(np.random.default_rng(0), 5);"
         "raise SystemExit(not ((draws >= 0.9) & (draws <= 1)).all())"
