@@ -23,7 +23,7 @@ from pbrl_ppl.physics.world import DIVERGED, FAR, TINY
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(inline="always")
 def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-untyped-def]
     """Clear what the engine remembers of the last transition.
 
@@ -122,23 +122,26 @@ def _act(  # type: ignore[no-untyped-def]
         )
 
 
-@numba.njit(nogil=True, cache=True)
+@numba.njit(inline="always")  # a call costs as much as a substep: the world is many arrays
 def _transition(  # type: ignore[no-untyped-def]
     fn, world, properties, joints, commands, command_parameters, forces, force_parameters, start,
-    inputs, time_step, normal_gravity, substeps, out,
+    inputs, time_step, normal_gravity, substeps, room, out,
 ):  # fmt: skip
     """One transition of horizon H into ``out`` (H, body, 6); says what became of it."""
     k = len(world.bodies)
     step = time_step / substeps
-    state = start.copy()
-    signal = np.zeros(8)
-    previous, command, wrench = np.zeros((k, 3)), np.zeros((k, 3)), np.zeros((k, 3))
+    state, signal, previous, command, wrench, axes = room
+    for i in range(k):
+        for d in range(6):
+            state[i, d] = start[i, d]
     bodies = properties[0]
-    axes = np.empty((len(world.wheel_body), 2))
     for j in range(len(axes)):
         turn = bodies[world.wheel_body[j], W_THETA]
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
     touched = _FREE
+    driven = world.kinematic.any()
+    acting = len(commands[0]) + len(forces[0]) > 0
+    sliding = len(world.patch_body) > 0
     watch = len(world.obstacles) > 0 or k > 1
     for i in range(k):
         body = world.bodies[i]
@@ -152,19 +155,25 @@ def _transition(  # type: ignore[no-untyped-def]
             set_properties(fn, world, bodies, joints)
             set_strengths(fn, world, bodies, normal_gravity, 1.0)
             call_int(fn.cpSpaceSetIterations, world.space, iterations(world, bodies))
-        drive(fn, world, state, inputs[h])
+        if driven:
+            drive(fn, world, state, inputs[h])
+        for i in range(k):
+            for w in range(3):
+                wrench[i, w] = inputs[h, i, w]
         for s in range(substeps):
-            _act(
-                state, inputs[h], commands, command_parameters, forces, force_parameters,
-                s / substeps, (s + 1) / substeps, signal, previous, command, wrench,
-            )  # fmt: skip
+            if acting:
+                _act(
+                    state, inputs[h], commands, command_parameters, forces, force_parameters,
+                    s / substeps, (s + 1) / substeps, signal, previous, command, wrench,
+                )  # fmt: skip
             for i in range(k):
-                if world.kinematic[i]:
+                if driven and world.kinematic[i]:
                     continue
                 call2(fn.cpBodySetForce, world.bodies[i], wrench[i, 0], wrench[i, 1])
                 call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
             place_wheels(fn, world, bodies, state, axes, step)
-            place_patches(fn, world, bodies, state, step, normal_gravity)
+            if sliding:
+                place_patches(fn, world, bodies, state, step, normal_gravity)
             call1(fn.cpSpaceStep, world.space, step)
             for i in range(k):
                 body = world.bodies[i]
@@ -202,6 +211,11 @@ def rollout(  # type: ignore[no-untyped-def]
     scratch = np.empty((horizon, inputs.shape[2], 6))
     total = np.empty_like(scratch)
     timed = bodies.shape[1] > 1
+    k = len(world.bodies)
+    room = (
+        np.empty((k, 6)), np.empty(8), np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 3)),
+        np.empty((len(world.wheel_body), 2)),
+    )  # fmt: skip
     proposal = -1
     state = _TOUCHED  # what an earlier call left behind is unknown
     for item in range(first, last):
@@ -221,7 +235,7 @@ def rollout(  # type: ignore[no-untyped-def]
                 state = _transition(
                     fn, world, properties, joints[p], commands, command_parameters[p], forces,
                     force_parameters[p], start[p if len(start) > 1 else 0, t], inputs[t],
-                    time_step, normal_gravity, counts[level], scratch,
+                    time_step, normal_gravity, counts[level], room, scratch,
                 )  # fmt: skip
                 if state != _TOUCHED or before == _TOUCHED:
                     break

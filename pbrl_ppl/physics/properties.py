@@ -121,6 +121,8 @@ class EngineProperties:
         self._moved = np.array(moved, dtype=int).reshape(-1, 3).T
         self._unit_moment = np.array([body.shape.unit_moment for body in scene.moving])
         self._places = places
+        stages = (Structure, Properties, Command, Force, Sensor)
+        self._acting: dict[type, list[Attached]] = {s: at_stage(effects, s) for s in stages}
         self._bodies = bodies
         #: Whether a body's numbers depend on the time.
         self.timed = any(
@@ -155,7 +157,7 @@ class EngineProperties:
                 attached.effect.stage,
                 self.values(attached, phi, 2),
             )
-            for attached in at_stage(self._effects, Sensor)
+            for attached in self._acting[Sensor]
             if isinstance(attached.effect.stage, Sensor)
         ]
 
@@ -224,7 +226,7 @@ class EngineProperties:
 
     def _modified(self, bodies: Array, phi: Array, clock: Clock | None) -> Array:
         """The properties stage, and the moments that follow from it."""
-        modifying = at_stage(self._effects, Properties)
+        modifying = self._acting[Properties]
         bodies[..., COLUMN["moment"]] = bodies[..., COLUMN["mass"]] * self._unit_moment
         if not modifying:
             return bodies[:, None]
@@ -247,22 +249,26 @@ class EngineProperties:
 
     def _law_parameters(self, phi: Array, stage: type) -> Array:
         """Parameters of the laws of a stage, one after the other, shape (proposal, q)."""
+        if not self._acting[stage]:
+            return np.empty((len(phi), 0))
         columns = [
             column
-            for attached in at_stage(self._effects, stage)
+            for attached in self._acting[stage]
             for column in self.values(attached, phi).values()
         ]
-        return np.stack([np.zeros(len(phi)), *columns], axis=1)[:, 1:].copy()
+        return np.stack(columns, axis=1)
 
     def _discs(self, phi: Array) -> Array:
         """The structure stage's discs, shape (proposal, disc, 3)."""
+        if not self._acting[Structure]:
+            return np.empty((len(phi), 0, 3))
         rows = [
             np.stack(np.broadcast_arrays(disc.x, disc.y, disc.radius), axis=-1)
-            for attached in at_stage(self._effects, Structure)
+            for attached in self._acting[Structure]
             if isinstance(attached.effect.stage, Structure)
             for disc in attached.effect.stage.discs(self.values(attached, phi))
         ]
-        discs = np.stack(rows, axis=1) if rows else np.zeros((len(phi), 0, 3))
+        discs = np.stack(rows, axis=1)
         if not (np.isfinite(discs).all() and (discs[..., 2] >= 0).all()):
             raise ParameterError(
                 "a hidden disc has a place or radius that is not finite, or a radius below 0; give"

@@ -99,8 +99,10 @@ def set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-unt
         torque = on * bodies[world.pivot_body[j], _TORQUE]
         call1(fn.cpConstraintSetMaxForce, world.pivots[0, j], torque)
         call1(fn.cpConstraintSetMaxForce, world.pivots[1, j], np.inf if on else 0.0)
-    for joint in world.patches.ravel():  # on again in every substep
-        call1(fn.cpConstraintSetMaxForce, joint, 0.0)
+    for j in range(len(world.patch_body)):
+        for point in range(len(world.ring)):  # on again in every substep
+            call1(fn.cpConstraintSetMaxForce, world.patches[0, j, point], 0.0)
+            call1(fn.cpConstraintSetMaxForce, world.patches[1, j, point], 0.0)
 
 
 @numba.njit(nogil=True, cache=True)

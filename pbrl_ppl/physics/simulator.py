@@ -34,6 +34,8 @@ _A_THREAD = 1000
 Joined = tuple[tuple[int, int], ...]
 #: And whether there is friction under bodies: what worlds differ in.
 Choice = tuple[Joined, bool]
+#: Where there is nothing to choose.
+_ONE_WORLD: Choice = ((), False)
 
 
 class Simulator:
@@ -142,12 +144,15 @@ class Simulator:
         n, horizon, k = actions.shape[:3]
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         run = self._run_plain if self.path == "plain" else self._run_compiled
-        for choice, rows in self._choices(given):
-            own = starts[rows] if len(starts) > 1 else starts
-            count = int(rows.sum())
-            part = np.full((count * n, horizon, k, 6), np.nan)
-            run(choice, EngineInput(*(array[rows] for array in given)), own, inputs, part)
-            out[rows] = part.reshape(count, n, horizon, k, 6)
+        if not (self._properties.patches or given.indices.shape[1]):
+            run(_ONE_WORLD, given, starts, inputs, out.reshape(-1, horizon, k, 6))
+        else:
+            for choice, rows in self._choices(given):
+                own = starts[rows] if len(starts) > 1 else starts
+                count = int(rows.sum())
+                part = np.full((count * n, horizon, k, 6), np.nan)
+                run(choice, EngineInput(*(array[rows] for array in given)), own, inputs, part)
+                out[rows] = part.reshape(count, n, horizon, k, 6)
         for i, sensor, values in self._properties.sensors(proposals):
             out[..., i, :] = sensor.measure(out[..., i, :], values)
         return out if phi.ndim == 2 else out[0]
