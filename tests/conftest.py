@@ -18,6 +18,7 @@ BELOW_THE_MODEL = ("scene", "parameters", "history", "effects", "physics")
 #: Files that take longest, longest first: workers begin with them, and fill up with the short ones.
 LONGEST = (
     "criticism/test_revision.py",
+    "criticism/test_revision_pivots.py",
     "modes/test_configurations.py",
     "sampling/test_updating.py",
     "posterior/test_updated_prior.py",

@@ -9,7 +9,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import revise
 from tests.helpers.histories import COLUMNS
-from tests.helpers.places import ROOT
+from tests.helpers.places import ROOT, load
 
 #: Effect in the truth file -> name in the catalogue, and its parameters' names.
 NAMES = {
@@ -25,12 +25,6 @@ pytestmark = [
     pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
 ]
-
-
-def load(folder, data=None):
-    data = data or folder
-    scene = pp.Scene.load(folder / "scene.toml")
-    return scene, *(pp.History.load(data / f"{part}.csv", scene) for part in ("train", "test"))
 
 
 def test_clean_cart_is_adequate(shared_data):
@@ -77,23 +71,6 @@ def test_the_undeclared_effect_is_added_and_nothing_else(case, shared_data):
     assert ratio == pytest.approx(1.0, abs=0.02)
     for dimension, error in found.after.rollout_rmse.items():
         assert error < found.before.rollout_rmse[dimension]
-
-
-def test_friction_of_a_real_pivot(shared_data):
-    found = revise(*load(shared_data / "real" / "pendulum-swing"), seed=1, draws=40)
-    assert found.candidates[0].effect == "pivot_damping"
-    assert {"pivot_damping", "pivot_friction"} & {one.effect for one in found.added}
-    assert found.rollout_horizon == 50  # 1 s
-    assert found.before.rollout_rmse["theta"] == pytest.approx(0.013, abs=0.001)
-    assert found.after.rollout_rmse["theta"] <= 0.0045
-
-
-def test_a_pivot_of_another_engine():
-    folder = ROOT / "models" / "pendulum"
-    found = revise(*load(folder, folder / "recorded"), seed=1, draws=100)
-    assert [one.effect for one in found.added] == ["pivot_friction"]
-    low, high = found.added[0].parameters["torque"].hdi
-    assert low <= 0.015 <= high
 
 
 def test_an_effect_outside_the_catalogue_gets_no_wrong_name(make_history):

@@ -20,7 +20,7 @@ from pbrl_ppl.errors import (
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import record
+from pbrl_ppl.posterior import origin
 from pbrl_ppl.posterior import save_posterior as save
 from pbrl_ppl.posterior.record import MAX_RHAT, MIN_ESS, complete
 from pbrl_ppl.posterior.store import (
@@ -111,7 +111,7 @@ def test_origin(model, fitted) -> None:
     versions = json.loads(attrs["versions"])
     assert versions["pymc"] == pm.__version__
     assert versions["numpy"] == np.__version__
-    assert set(versions) == {"python", *record.PACKAGES}
+    assert set(versions) == {"python", *origin.PACKAGES}
 
 
 def test_convergence_is_stored(fitted) -> None:
