@@ -92,6 +92,7 @@ def test_prior_draws_collide(model) -> None:
     assert 0.5 < pushed.mean() < 1.0  # P(mass < 0.5 kg) is 0.9
 
 
+@pytest.mark.filterwarnings("ignore:Numba will use object mode")
 def test_posterior_draws_collide(model) -> None:
     phi, sigma = np.array([[TRUE], [TOO_LIGHT]]), np.full((2, 6), 0.002)
     trace = posterior_of(model, phi)
