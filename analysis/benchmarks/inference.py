@@ -322,7 +322,7 @@ def measure_ratio() -> Iterator[Row]:
 
 
 #: Wall-clock seconds that each method is given, the mode apart: the effort is the same for all.
-EFFORT = 120.0
+EFFORT = 60.0
 #: Draws a chain of a first run, and twice as many of a second: their difference is a draw's cost.
 PILOT = {"metropolis": 400, "paper": 20, "demetropolisz": 60, "smc": 30, "nuts": 4}
 _CHAINS, _MOST_DRAWS = 4, 200_000
@@ -364,7 +364,7 @@ def measure_joint() -> Iterator[Row]:
         found = pp.joint_probabilities(idata)["joint1"][joined]
         r_hat = max(convergence(idata)[0].values())
         yield f"{key}_probability", f"{what} the truth, {joined}", "> 0.99", found
-        yield f"{key}_seconds", f"the same: seconds (largest R-hat {r_hat:.2f})", "<= 120", took
+        yield f"{key}_seconds", f"the same: seconds (largest R-hat {r_hat:.2f})", "<= 60", took
 
 
 PARTS: dict[str, Callable[[], Iterator[Row]]] = {

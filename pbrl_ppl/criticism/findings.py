@@ -31,7 +31,8 @@ class Candidate:
     statistic : float
         Score statistic S; chi-squared with ``dof`` degrees of freedom if the effect is absent.
     dof : int
-        Number of the effect's parameters.
+        Number of the signature's columns: the effect's parameters, less those that are scanned, and
+        one where all are.
     p_value : float
         Probability of a statistic at least as large by chance, corrected for the number of
         candidates.
@@ -264,6 +265,7 @@ class Findings:
                         "p_value": candidate.p_value,
                         "estimate": candidate.estimate,
                         "identifiable": candidate.identifiable,
+                        "looks": candidate.looks,
                     }
                     for candidate in self.candidates
                 ],

@@ -216,7 +216,7 @@ def _signature(
         body=attached.body,
         sentence=effect.sentence,
         statistic=evidence.statistic,
-        dof=len(names),
+        dof=evidence.size.size,
         p_value=float(min(1.0, np.exp(log_p) * n_candidates)),
         estimate=dict(zip(names, values.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},

@@ -36,7 +36,10 @@ def plot_candidates(findings: Findings) -> Figure:
     figure, (axes,) = blank_figure(8.0, 0.9 + 0.3 * max(len(shown), 3), 1, 1, grid="x")
     several = len({candidate.body for candidate in shown}) > 1
     total = max(len(findings.candidates), 1)
-    thresholds = [float(chi2.isf(LEVEL / total, candidate.dof)) for candidate in shown]
+    thresholds = [
+        float(chi2.isf(LEVEL / (total * max(candidate.looks, 1)), candidate.dof))
+        for candidate in shown
+    ]
     for place, (candidate, threshold) in enumerate(zip(shown, thresholds, strict=True)):
         hardly = candidate.identifiable < HARDLY
         is_added = (candidate.effect, candidate.body) in added

@@ -354,6 +354,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "p_value",
         "estimate",
         "identifiable",
+        "looks",
     ]
     assert list(got["error"]) == ["before", "after", "noise_floor"]
     assert got["error"]["before"]["normalised_rmse"] == 2.4
