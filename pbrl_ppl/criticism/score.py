@@ -166,6 +166,11 @@ class _Evidence:
     direction: Array
 
 
+def _none(n: int) -> _Evidence:
+    """No evidence of one column, over n whitened residuals."""
+    return _Evidence(0.0, 0.0, 0.0, np.zeros(1), np.zeros((n, 0)), np.zeros(n))
+
+
 def _evidence(signature: Array, q: Array, residual: Array, side: int = 0) -> _Evidence:
     """The score statistic of a signature, projected off the declared parameters' directions ``q``.
 
@@ -230,7 +235,7 @@ def _best_look(
     attached: Attached, tried: Sequence[Look], q: Array, residual: Array, n_candidates: int
 ) -> Signature:
     """The look of a scan that explains most; of a whole change, only its own sign counts."""
-    best = _evidence(np.zeros((len(residual), 1)), q, residual)
+    best = _none(len(residual))
     values = np.array(attached.effect.null)
     for look in tried:
         rows = np.pad(look.signature, ((0, len(residual) - len(look.signature)), (0, 0)))
@@ -261,9 +266,8 @@ def _tail_score(mode: Mode, attached: Attached, left: Array, n_candidates: int) 
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0
-    nothing = _evidence(np.zeros((len(left), 1)), np.zeros((len(left), 0)), left)
     evidence = replace(
-        nothing,
+        _none(len(left)),
         statistic=score**2 / variance if heavier else 0.0,
         log_p=float(norm.logsf(score / np.sqrt(variance))) if heavier else 0.0,
         share=1.0,

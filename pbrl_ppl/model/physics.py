@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from typing import TypeVar
 
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.model.table1 import build_layout
@@ -13,6 +14,9 @@ from pbrl_ppl.scene import Scene
 
 #: Engine steps an interval where a rough answer will do.
 COARSE = 4
+
+
+_Engine = TypeVar("_Engine", PartedSimulator, OneWorld)
 
 
 @dataclass(frozen=True)
@@ -56,20 +60,15 @@ class Physics:
     @cached_property
     def simulator(self) -> PartedSimulator:
         """The engine for this scene with these effects."""
-        return PartedSimulator(
-            self.scene,
-            self.layout,
-            self.effects,
-            self.parts,
-            substeps=self.substeps,
-            threads=self.threads,
-            extrapolate=self.extrapolate,
-        )
+        return self._engine(PartedSimulator)
 
     @cached_property
     def one_world(self) -> OneWorld:
         """The engine for predictions, in which bodies of different parts may meet."""
-        return OneWorld(
+        return self._engine(OneWorld)
+
+    def _engine(self, kind: type[_Engine]) -> _Engine:
+        return kind(
             self.scene,
             self.layout,
             self.effects,

@@ -1,6 +1,7 @@
 """The engine: world building, wheel, joints and the batched rollout; alone in importing pymunk."""
 
 from pbrl_ppl.physics.coupling import Parts, independent_parts, joined_parts
+from pbrl_ppl.physics.inputs import after_recording
 from pbrl_ppl.physics.one_world import OneWorld
 from pbrl_ppl.physics.parts import Part, PartedSimulator
 from pbrl_ppl.physics.placement import check_history, check_placement, overlap
@@ -12,6 +13,7 @@ __all__ = [
     "PartedSimulator",
     "Parts",
     "Simulator",
+    "after_recording",
     "check_history",
     "check_placement",
     "independent_parts",

@@ -17,6 +17,7 @@ from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, compiled, plain
 from pbrl_ppl.physics.engines import Engine, share_out
+from pbrl_ppl.physics.inputs import after_recording
 from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Scene
@@ -180,8 +181,7 @@ class Simulator:
         if actions.shape[-1] == 3:
             previous = np.zeros_like(actions)
             previous[:, 1:] = actions[:, :-1]
-            later = np.full_like(actions, np.inf)
-            actions = np.concatenate([actions, previous, later], axis=-1)
+            actions = after_recording(actions, previous)
         when = actions[:, :, 0, 6:].reshape(1, -1, 3)
         return actions, Clock(*np.moveaxis(when, -1, 0))
 

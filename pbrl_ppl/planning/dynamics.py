@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.model import build_layout, log_posterior, next_state_random
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Simulator, after_recording
 from pbrl_ppl.posterior import draws as all_draws
 from pbrl_ppl.posterior import group, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
@@ -178,8 +178,7 @@ class Dynamics:
         actions = wrenches[:, None]
         if self._whole:  # the time is after the recording
             last = np.broadcast_to(self.before if previous is None else previous, wrenches.shape)
-            later = np.full_like(wrenches, np.inf)
-            actions = np.concatenate([wrenches, last, later], axis=-1)[:, None]
+            actions = after_recording(wrenches, last)[:, None]
         # what had diverged stays so; the engine refuses it
         lost = np.asarray(~np.isfinite(states).all(axis=(-2, -1)))
         given = np.where(lost[..., None, None], 0.0, states) if lost.any() else states
