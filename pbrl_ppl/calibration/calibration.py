@@ -25,7 +25,7 @@ from pbrl_ppl.calibration.replication import Record, draw_truths, labels, replic
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History, write_atomically
-from pbrl_ppl.model import Problem, physics_model, sigma_prior
+from pbrl_ppl.model import Problem, physics_model
 from pbrl_ppl.posterior import versions
 from pbrl_ppl.scene import Scene
 
@@ -46,6 +46,7 @@ def calibrate(
     sigma: str = "per_dimension",
     nu: float | None = None,
     substeps: int | None = None,
+    trajectories: bool = False,
     draws: int = 1500,
     tune: int = 500,
     chains: int = 4,
@@ -56,9 +57,9 @@ def calibrate(
 
     Start states, actions and which cells are measured are the history's; what was measured counts
     for nothing but the prior of sigma, which stays that of the history. A start state is exact, as
-    in Eq. 11. A wheel's equal descriptions are folded into one, of truth and draws alike. The
-    log-likelihood is ranked too: the parameters' ranks alone cannot see a fit that ignores its
-    data.
+    in Eq. 11, or measured with an error, with ``trajectories``. A wheel's equal descriptions are
+    folded into one, of truth and draws alike. The log-likelihood is ranked too: the parameters'
+    ranks alone cannot see a fit that ignores its data.
 
     Parameters
     ----------
@@ -77,7 +78,7 @@ def calibrate(
         there, with more replications if more are asked for. Made if missing.
     executor : concurrent.futures.Executor, optional
         Where replications are run; by default here, one after another.
-    horizon, sigma, nu, substeps : optional
+    horizon, sigma, nu, substeps, trajectories : optional
         As of :func:`pbrl_ppl.physics_model`.
     draws, tune, chains : int
         As of :func:`pbrl_ppl.fit`. A fit with fewer than 99 effective draws is done again with four
@@ -119,16 +120,17 @@ def calibrate(
     if replications < 2:
         raise ValueError(f"replications is {replications}, expected at least 2, better 200")
     model = physics_model(
-        scene, history, effects, horizon=horizon, sigma=sigma, nu=nu, substeps=substeps
-    )
+        scene, history, effects, horizon=horizon, sigma=sigma, nu=nu, substeps=substeps,
+        trajectories=trajectories,
+    )  # fmt: skip
     design: Problem = model.problem
     if design.layout.discrete.any():
         raise FitError(
             "calibrate: which bodies a joint joins is unknown, and ranks are for parameters that"
             " are not whole numbers; name the bodies in the scene"
         )
-    median, spread = sigma_prior(design.observations, design.segments)
     # a prior that looked at the simulated data would not be the one they were simulated from
+    median, spread = design.noise_prior
     design = design.with_noise(prior=(tuple(median.tolist()), spread))
     settings = {"draws": draws, "tune": tune, "chains": chains, **options}
     about = _about(design, seed, settings)
@@ -208,6 +210,7 @@ def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str,
         "substeps": design.physics.substeps,
         "scalar_sigma": design.noise.scalar,
         "nu": design.noise.nu,
+        "trajectories": design.trajectories is not None,
         "sigma_prior": design.noise.prior,
         "seed": seed,
         "settings": dict(settings),

@@ -19,9 +19,15 @@ from pbrl_ppl.errors import (
     UninformedWarning,
 )
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import Problem, build_model, prior_predictive_draws
+from pbrl_ppl.model import (
+    Problem,
+    build_model,
+    prior_predictive_draws,
+    simulated_trajectories,
+    with_measurements,
+)
 from pbrl_ppl.parameters import fold_wheels
-from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws
+from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.state import STATE
 
@@ -78,14 +84,17 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
         If too few draws can be simulated.
     """
     model = build_model(design)
-    names = [block.name for block in design.layout.blocks] + ["sigma", "next_state"]
+    whole = design.trajectories is not None
+    names = [*(block.name for block in design.layout.blocks), *design.noise_variables]
+    names += [] if whole else ["next_state"]
     total = n
     while total <= _MOST_REDRAWN * n:
         drawn = prior_predictive_draws(model, names, total, seed)
-        phi, values = design.layout.to_vectors(drawn, total), drawn["next_state"]
-        shape = total, len(design.observations.columns)
-        sigma = np.broadcast_to(drawn["sigma"].reshape(total, -1), shape)
-        possible = np.isfinite(values).all(axis=tuple(range(1, values.ndim)))
+        phi = design.layout.to_vectors(drawn, total)
+        sigma = np.hstack([drawn[name].reshape(total, -1) for name in design.noise_variables])
+        sigma = np.broadcast_to(sigma, (total, len(design.noise_prior[0])))
+        values = _trajectories(design, phi, sigma, seed) if whole else drawn["next_state"]
+        possible = np.asarray(np.isfinite(values).reshape(total, -1).all(axis=1))
         chosen = np.flatnonzero(possible)[:n]
         if len(chosen) == n:
             truths = [Truth(phi[i], sigma[i], values[i]) for i in chosen]
@@ -95,6 +104,16 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
         f"calibrate: {possible.sum()} of {len(possible)} draws from the prior can be simulated,"
         f" expected at least 1 in {_MOST_REDRAWN}; make the scene's prior narrower"
     )
+
+
+def _trajectories(design: Problem, phi: Array, sigma: Array, seed: int) -> Array:
+    """Measured states of whole trajectories, 0 where nothing is measured, one set a draw."""
+    every = [
+        simulated_trajectories(design, phi[i], sigma[i], np.random.default_rng([seed, i]))
+        for i in range(len(phi))
+    ]
+    measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
+    return np.where(measured, np.array(every), 0.0)
 
 
 def simulated(design: Problem, values: Array) -> Problem:
@@ -107,8 +126,12 @@ def simulated(design: Problem, values: Array) -> Problem:
     design : Problem
         Start states, actions and which cells are measured.
     values : ndarray
-        Next states, shape (transition, H, body, state), SI units.
+        Next states, shape (transition, H, body, state), SI units; of whole trajectories all
+        measured states, shape (trajectory, time, body, 6).
     """
+    if design.trajectories is not None:
+        measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
+        return with_measurements(design, np.where(measured, values, np.nan))
     segments, observations = design.segments, design.observations
     observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)
     observed[..., list(observations.columns)] = np.where(observations.measured, values, np.nan)
@@ -160,6 +183,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
         if min(ess.values()) >= MOST_DRAWS or again == _AGAIN:
             break
         settings |= {key: _LONGER * settings[key] for key in ("draws", "tune")}
+    problem = problem_of(idata, {attached.effect for attached in problem.physics.effects})
     residual = problem.residual(truth.phi)
     of_truth = problem.log_density(residual, truth.sigma, truth.phi).sum(keepdims=True)
     true = _quantities(problem, truth.phi[None], truth.sigma[None], of_truth)[0]
@@ -185,6 +209,7 @@ def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -
 
 def labels(problem: Problem) -> tuple[str, ...]:
     """Names of the ranked quantities, such as ``mass[cart]``."""
-    names = problem.observations.names
-    sigma = ("sigma",) if problem.noise.scalar else tuple(f"sigma[{name}]" for name in names)
+    sigma: tuple[str, ...] = ("sigma",)
+    if not problem.noise.scalar:
+        sigma = tuple(f"{v}[{name}]" for v, own in problem.noise_variables.items() for name in own)
     return (*problem.layout.labels, *sigma, "log_likelihood")

@@ -33,9 +33,6 @@ def close_loop(
     substeps: Annotated[
         int | None, typer.Option(min=1, help="Engine steps per interval, for the scene's.")
     ] = None,
-    horizon: Annotated[
-        int | None, typer.Option(min=1, help="Intervals predicted at once; chosen if not given.")
-    ] = None,
     draws: Annotated[
         int | None, typer.Option(min=100, help="Posterior draws of each chain.")
     ] = None,
@@ -63,7 +60,6 @@ def close_loop(
             history,
             held_out,
             seed=seed,
-            horizon=horizon,
             draws=draws,
             progress=progress,
         )

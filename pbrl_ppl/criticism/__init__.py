@@ -1,25 +1,28 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
-from pbrl_ppl.criticism.findings import (
-    ADEQUATE,
-    UNEXPLAINED,
+from pbrl_ppl.criticism.findings import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
+from pbrl_ppl.criticism.loop import revise
+from pbrl_ppl.criticism.prior_check import PriorCheck, prior_predictive_check
+from pbrl_ppl.criticism.results import (
+    Acceleration,
     Added,
     Candidate,
     Errors,
-    Findings,
+    ResidualTest,
     Unexplained,
 )
-from pbrl_ppl.criticism.loop import revise
-from pbrl_ppl.criticism.prior_check import PriorCheck, prior_predictive_check
 
 __all__ = [
     "ADEQUATE",
+    "NOT_CONVERGED",
     "UNEXPLAINED",
+    "Acceleration",
     "Added",
     "Candidate",
     "Errors",
     "Findings",
     "PriorCheck",
+    "ResidualTest",
     "Unexplained",
     "prior_predictive_check",
     "revise",

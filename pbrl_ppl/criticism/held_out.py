@@ -1,8 +1,8 @@
-"""Held-out errors: log predictive density, rollouts, and the noise floor."""
+"""Held-out errors: log predictive density, forecasts, and the noise floor."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 from weakref import WeakKeyDictionary
 
@@ -10,17 +10,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import logsumexp
 
-from pbrl_ppl.criticism.findings import Errors, Rollout
+from pbrl_ppl.criticism.forecast import filtered_states, forecast
+from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Data, Problem, StartNoise
+from pbrl_ppl.model import Problem, along_trajectories, cells_of
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
-from pbrl_ppl.state import STATE_UNITS
+from pbrl_ppl.state import STATE, STATE_UNITS
 
 Array = NDArray[np.float64]
 
-#: Rollouts of the error table last this long (s), or a whole trajectory.
+#: Forecasts of the error table last this long (s), or a whole trajectory.
 ROLLOUT_SECONDS = 1.0
 _DRAWS = 100
 
@@ -32,171 +33,128 @@ class HeldOut:
     Parameters
     ----------
     history : History
-        Measured transitions that no fit has seen.
+        Measured transitions that neither a fit nor a choice between models has seen.
     seed : int
         Of the posterior draws.
     """
 
     history: History
     seed: int
-    _data: dict[int, Data] = field(default_factory=dict, init=False, repr=False)
-    _noisy: WeakKeyDictionary[Mode, dict[int, Problem]] = field(
+    _problems: WeakKeyDictionary[Mode, Problem] = field(
         default_factory=WeakKeyDictionary, init=False, repr=False
     )
 
-    def problem(self, mode: Mode, horizon: int | None = None) -> Problem:
-        """A mode's problem on the held-out history, its start states taken as exact."""
-        horizon = mode.problem.data.horizon if horizon is None else horizon
-        if horizon not in self._data:
-            data = replace(mode.problem.data, history=self.history, horizon=horizon)
-            measured, trained = data.observations, mode.problem.observations
-            if measured.columns != trained.columns:
+    def problem(self, mode: Mode) -> Problem:
+        """A mode's problem on the held-out trajectories, linearised there once.
+
+        Raises
+        ------
+        HistoryError
+            If they do not measure what the training history measures.
+        """
+        if mode not in self._problems:
+            trained = mode.problem.trajectories
+            if trained is None:
+                raise TypeError("held out: the mode is not one of whole trajectories")
+            cells = trained.cells
+            measured = cells_of(mode.problem.scene, self.history).sensors
+            if not set(measured) <= set(cells.sensors):
+                names = [", ".join(STATE[d] for d in own) for own in (measured, cells.sensors)]
                 raise HistoryError(
-                    f"test history measures {', '.join(measured.names)}, the training history"
-                    f" {', '.join(trained.names)}; they must be the same"
+                    f"test history measures {names[0]}, the training history {names[1]}; they must"
+                    " be the same"
                 )
-            self._data[horizon] = data
-        return mode.problem.on(self._data[horizon])
-
-    def noisy(self, mode: Mode, horizon: int | None = None) -> Problem:
-        """The held-out problem with the start states' noise, linearised at the mode once."""
-        horizon = mode.problem.data.horizon if horizon is None else horizon
-        known = self._noisy.setdefault(mode, {})
-        if horizon not in known:
-            problem = self.problem(mode, horizon)
-            measured = problem.observations.measured.reshape(problem.segments.n, -1)
-            sensitivity = problem.sensitivity(mode.phi, mode.sigma, problem.one_world)
-            start = StartNoise.of(sensitivity, measured, mode.sigma)
-            known[horizon] = problem.with_noise(start=start)
-        return known[horizon]
-
-    def gains(self, before: Mode, after: Mode) -> Array:
-        """Held-out log predictive density gained, shape (transition,)."""
-        rng = np.random.default_rng(self.seed)
-        return _elpd(self.noisy(after), *_laplace_draws(after, rng)) - _elpd(
-            self.noisy(before), *_laplace_draws(before, rng)
-        )
-
-    def fall(self, before: Mode, after: Mode) -> float:
-        """Share by which the residual falls, in units of the later model's noise."""
-        scale = self.noisy(after)
-        return 1.0 - _normalised(scale, after, after) / _normalised(scale, before, after)
+            problem = mode.problem.with_data(history=self.history, states=None)
+            self._problems[mode] = along_trajectories(problem, mode.phi, mode.sigma, cells)
+        return self._problems[mode]
 
     def residuals(self, mode: Mode, unit: Mode) -> dict[str, Array]:
-        """Residuals of a mode in units of another's noise, by state dimension."""
-        scale = self.noisy(unit)
-        observations = scale.observations
-        z = _whitened(scale, mode, unit).reshape(observations.values.shape)
+        """Innovations of a mode in units of another's noise, by state dimension."""
+        noise = self.problem(unit).trajectories
+        z = self._whitened(mode, unit)
+        dimension = noise.cells.places % len(STATE)  # type: ignore[union-attr]
+        seen = noise.seen  # type: ignore[union-attr]
         return {
-            name: z[..., i][observations.measured[..., i]]
-            for i, name in enumerate(observations.names)
+            STATE[d]: z[:, dimension == d][seen[:, dimension == d]]
+            for d in np.unique(dimension)
+            if seen[:, dimension == d].any()
         }
 
-    def rollout_horizon(self, horizon: int, time_step: float) -> int:
-        """Intervals of the rollouts in the error table: a second, or a whole trajectory."""
+    def rollout_horizon(self, time_step: float) -> int:
+        """Intervals of the forecasts in the error table: a second, or a whole trajectory."""
         longest = int(self.history.dataset["n_rows"].min()) - 1
-        return min(longest, max(horizon, round(ROLLOUT_SECONDS / time_step)))
+        return min(longest, max(1, round(ROLLOUT_SECONDS / time_step)))
 
     def errors(self, mode: Mode, scale: Mode, posterior: Any, rollout: int) -> Errors:
         """Errors of a model; ``scale`` is the model whose noise is the unit."""
-        problem = self.noisy(mode)
+        problem = self.problem(mode)
         pick = np.random.default_rng(self.seed)
         phi, sigma = parameter_draws(mode.problem, posterior)
         chosen = pick.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
+        seen = self.problem(scale).trajectories.seen  # type: ignore[union-attr]
         return Errors(
-            one_step_rmse=_rmse(self.problem(mode, 1), mode),
-            rollout_rmse=_rmse(self.problem(mode, rollout), mode),
-            normalised_rmse=_normalised(self.noisy(scale), mode, scale),
+            one_step_rmse=forecast(problem, mode.phi, mode.sigma, 1).rmse(),
+            rollout_rmse=forecast(problem, mode.phi, mode.sigma, rollout).rmse(),
+            normalised_rmse=float(np.sqrt((self._whitened(mode, scale) ** 2).sum() / seen.sum())),
             elpd=float(_elpd(problem, phi[chosen], sigma[chosen]).sum()),
         )
 
     def noise_floor(self, mode: Mode, rollout: int) -> Errors:
-        """Noise floor: errors from measurement noise alone, at both ends of a prediction."""
-
-        def expected(problem: Problem) -> dict[str, float]:
-            names = problem.observations.names
-            noise = problem.noise.start
-            gain = noise.gain if noise else np.ones(1)
-            gain = np.broadcast_to(gain, (problem.segments.n, gain.shape[-1]))
-            gain = gain.reshape(problem.observations.values.shape)[:, -1]
-            seen = problem.observations.measured[:, -1]
-            square = ((gain * mode.sigma) ** 2 * seen).sum((0, 1)) / np.maximum(seen.sum((0, 1)), 1)
-            return dict(zip(names, np.sqrt(square).tolist(), strict=True))
-
-        problem = self.noisy(mode)
-        measured = problem.observations.measured
-        at_mode = problem.log_density(
-            np.zeros_like(problem.observations.values), mode.sigma, mode.phi
-        )
+        """Noise floor: errors from the noise of measurements alone, at both ends of a forecast."""
+        problem = self.problem(mode)
+        noise = problem.trajectories
+        at_best = -noise.log_scale(mode.sigma).sum()  # type: ignore[union-attr]
+        cells = noise.seen.sum()  # type: ignore[union-attr]
         return Errors(
-            one_step_rmse=expected(self.noisy(mode, 1)),
-            rollout_rmse=expected(self.noisy(mode, rollout)),
+            one_step_rmse=forecast(problem, mode.phi, mode.sigma, 1).floor(),
+            rollout_rmse=forecast(problem, mode.phi, mode.sigma, rollout).floor(),
             normalised_rmse=1.0,
-            elpd=float(at_mode.sum() - 0.5 * measured.sum()),
+            elpd=float(at_best - 0.5 * cells * (1.0 + np.log(2 * np.pi))),
         )
 
     def rollout(self, declared: Mode, revised: Mode) -> Rollout:
         """Follow the body that moves most over the first held-out trajectory."""
-        scene = revised.problem.scene
-        length = int(self.history.dataset["n_rows"].min()) - 1
-        problem = self.problem(revised, length)
-        first = slice(0, 1)
-        start, actions = problem.segments.start[first], problem.segments.inputs[first]
-        measured = problem.observations.values[0]
-        columns = problem.observations.columns
-        spread = np.nanstd(measured, axis=0)
-        body = int(np.argmax(np.nansum(spread / np.maximum(revised.sigma, 1e-12), axis=1)))
-        predictions = [
-            np.concatenate([start, mode.problem.one_world(mode.phi, start, actions)[0]])
-            for mode in (declared, revised)
-        ]
-        origin = np.where(np.isfinite(start[0, body]), start[0, body], np.nan)
+        problem = self.problem(revised)
+        scene, dataset = problem.scene, self.history.dataset
+        length = int(dataset["n_rows"].min()) - 1
+        measured = dataset["observed"].to_numpy()[0, : length + 1]
+        columns = [d for d in range(len(STATE)) if np.isfinite(measured[..., d]).any()]
+        noise = _by_dimension(revised)
+        spread = np.nanstd(measured[..., columns], axis=0) / [noise.get(d, 1.0) for d in columns]
+        free = np.array([not body.kinematic for body in scene.moving])
+        body = int(np.argmax(np.where(free, np.nansum(spread, axis=1), -1.0)))
+        predicted = []
+        for mode in (declared, revised):
+            own = self.problem(mode)
+            start = filtered_states(own, mode.phi, mode.sigma)[:1, 0]
+            inputs = own.inputs[:length, 0][None]
+            states = own.one_world(mode.phi, start, inputs)[0]
+            predicted.append(np.concatenate([start, states])[:, body][:, columns])
         return Rollout(
             body=scene.moving[body].name,
             time=np.arange(length + 1, dtype=float) * scene.time_step,
-            names=problem.observations.names,
+            names=tuple(STATE[d] for d in columns),
             units=tuple(STATE_UNITS[d] for d in columns),
-            measured=np.vstack([origin[list(columns)], measured[:, body]]),
-            before=predictions[0][:, body][:, columns],
-            after=predictions[1][:, body][:, columns],
+            measured=measured[:, body][:, columns],
+            before=predicted[0],
+            after=predicted[1],
         )
 
+    def _whitened(self, mode: Mode, unit: Mode) -> Array:
+        """Innovations of a mode, linearised and in units of noise as another says."""
+        physics = mode.problem.physics
+        model = self.problem(unit).with_physics(effects=physics.effects, substeps=physics.substeps)
+        return model.whitened(mode.phi, unit.sigma, model.one_world)
 
-def standard_error(gains: Array) -> float:
-    """Standard error of a sum of independent gains."""
-    return float(np.sqrt(len(gains)) * gains.std(ddof=1)) if len(gains) > 1 else np.inf
 
-
-def _laplace_draws(mode: Mode, rng: np.random.Generator) -> tuple[Array, Array]:
-    """Draws of phi and sigma from the Laplace approximation, cut at the supports."""
-    # directions that the data say nothing about do not matter for prediction
-    phi = mode.draws(rng, _DRAWS)
-    counts = np.maximum(mode.problem.observations.measured.sum((0, 1, 2)), 1)
-    sigma = mode.sigma * np.exp(rng.standard_normal((_DRAWS, len(counts))) * np.sqrt(0.5 / counts))
-    return phi, sigma
+def _by_dimension(mode: Mode) -> dict[int, float]:
+    """Standard deviation of measuring each state dimension."""
+    noise = mode.problem.trajectories
+    sensors = () if noise is None else noise.cells.sensors
+    return dict(zip(sensors, mode.sigma.tolist(), strict=False))
 
 
 def _elpd(problem: Problem, phi: Array, sigma: Array) -> Array:
     """Log predictive density of each held-out transition, shape (transition,)."""
     density = problem.log_density(problem.residual(phi, problem.one_world), sigma, phi)
     return np.asarray(logsumexp(density, axis=0) - np.log(len(phi)))
-
-
-def _rmse(problem: Problem, mode: Mode) -> dict[str, float]:
-    """Error at the end of the horizon, per state dimension."""
-    residual = problem.residual(mode.phi, problem.one_world)[:, -1]
-    seen = problem.observations.measured[:, -1]
-    square = (residual**2).sum((0, 1)) / np.maximum(seen.sum((0, 1)), 1)
-    return dict(zip(problem.observations.names, np.sqrt(square).tolist(), strict=True))
-
-
-def _normalised(scale: Problem, mode: Mode, unit: Mode) -> float:
-    """Root mean square held-out residual of a mode, in units of another's noise."""
-    z = _whitened(scale, mode, unit)
-    return float(np.sqrt((z**2).sum() / scale.observations.measured.sum()))
-
-
-def _whitened(scale: Problem, mode: Mode, unit: Mode) -> Array:
-    physics = mode.problem.physics
-    model = scale.with_physics(effects=physics.effects, substeps=physics.substeps)
-    return model.whitened(mode.phi, unit.sigma, model.one_world)

@@ -6,18 +6,23 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from pbrl_ppl.criticism import findings
-from pbrl_ppl.criticism.findings import Added, Estimate, Findings, Numerical
+from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut
-from pbrl_ppl.criticism.misfit import find_remainder
-from pbrl_ppl.criticism.resolution import choose_horizon, noisy, shift, with_enough_substeps
+from pbrl_ppl.criticism.misfit import Misfit, find_misfit
+from pbrl_ppl.criticism.resolution import shift, with_enough_substeps
+from pbrl_ppl.criticism.results import Acceleration, Added, Candidate, Estimate, Numerical
 from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.criticism.selection import Selection, Step
-from pbrl_ppl.effects import Effect, attach
+from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
+from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_model
-from pbrl_ppl.modes import Mode, find_mode
+from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.posterior import compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import fit
@@ -25,11 +30,12 @@ from pbrl_ppl.scene import Scene
 
 #: Effects added at most.
 MOST_ADDED = 5
-#: Names are not to be trusted if what is left is more than this share of what they explained (of
-#: the squared error); with less, the verdict is what was added, and the rest is reported beside it.
+#: Names are not to be trusted if more than this share of what was missing (of its square) remains.
 LARGE_REMAINDER = 0.1
-#: Draws kept of each chain, tuning draws at least, and engine steps of a long recording.
-DRAWS, LEAST_TUNE, LONG = 800, 100, 20_000
+#: Draws kept of each chain, and tuning draws at least.
+DRAWS, LEAST_TUNE = 300, 100
+#: Chains with a larger R-hat or fewer effective draws give no verdict.
+WORST_RHAT, LEAST_ESS = 1.05, 100.0
 
 
 def revise(
@@ -39,7 +45,6 @@ def revise(
     *,
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
-    horizon: int | None = None,
     substeps: int | None = None,
     draws: int | None = None,
     progress: Callable[[str], None] | None = None,
@@ -57,12 +62,10 @@ def revise(
         Effects to consider; add your own to the package's.
     seed : int
         The same seed gives the same findings.
-    horizon : int, optional
-        Intervals predicted from one measured state; chosen from the data by default.
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws kept of each chain; 800 by default, half of that for long recordings.
+        Posterior draws kept of each chain; 300 by default.
     progress : callable, optional
         Told the name of each stage.
 
@@ -82,11 +85,11 @@ def revise(
     catalogue = tuple(catalogue)
     if test is None:
         train, test = train.split(0.25, seed)
-    held_out = HeldOut(test, seed)
-    loop = _Loop(scene, train, held_out, catalogue, seed, say)
-    selection = Selection(scene, held_out, catalogue, say)
+    loop = _Loop(scene, train, HeldOut(test, seed), seed, say)
+    loop.check()
+    selection = Selection(scene, catalogue, say)
     say("fitting the declared model")
-    declared = loop.declared_mode(horizon, substeps)
+    declared = loop.declared_mode(attach(scene, (), catalogue), substeps)
     say("scoring what the model might lack")
     first = rank_candidates(declared, selection.missing(declared))
     current, ranked = declared, first
@@ -103,15 +106,40 @@ def revise(
         say("checking that each added effect is still needed")
         current, added = selection.prune(current, added)
     say("testing what is left")
-    remainder = find_remainder(current, seed=seed)
+    before, left = unexplained_acceleration(declared), unexplained_acceleration(current)
+    horizon = loop.held_out.rollout_horizon(scene.time_step)
+    misfit = find_misfit(current, left, horizon=horizon, seed=seed)
+    if added and misfit.unexplained is not None and not _explained(before, left):
+        # part of a misfit goes to whatever is there: no name is to be had from that
+        say("no effect of the catalogue explains what is missing")
+        added, current, left = [], declared, before
+        misfit = find_misfit(current, left, horizon=horizon, seed=seed)
     say("sampling the posterior of the declared model")
-    before = loop.posterior(declared, draws)
-    after = before
+    posterior = loop.posterior(declared, draws)
+    revised = posterior
     if added:
         say("sampling the posterior of the revised model")
-        after = loop.posterior(current, draws)
+        revised = loop.posterior(current, draws)
     say("comparing errors on held-out data")
-    return loop.findings(declared, current, first, added, remainder, before, after)
+    models = _Models(declared, current, posterior, revised, before, left)
+    return loop.findings(models, first, added, misfit, tuple(selection.small))
+
+
+@dataclass(frozen=True, eq=False)
+class _Models:
+    """The declared and the revised model: modes, posteriors, what they leave."""
+
+    declared: Mode
+    revised: Mode
+    before: Any
+    after: Any
+    left_before: Left
+    left_after: Left
+
+
+def _explained(before: Left, after: Left) -> bool:
+    """Whether what was added explains nearly all of what was missing."""
+    return after.square <= LARGE_REMAINDER * before.square
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,31 +149,35 @@ class _Loop:
     scene: Scene
     train: History
     held_out: HeldOut
-    catalogue: tuple[Effect, ...]
     seed: int
     say: Callable[[str], None]
 
-    def declared_mode(self, horizon: int | None, substeps: int | None) -> Mode:
-        """Mode of the declared model, with the horizon chosen and the engine's error small."""
-        problem = Problem.of(
-            self.scene,
-            self.train,
-            attach(self.scene, (), self.catalogue),
-            horizon=1 if horizon is None else horizon,
-            substeps=substeps,
-            threads=2,
-        )
+    def check(self) -> None:
+        """See that the test history is of the same scene, and can be used.
+
+        Raises
+        ------
+        HistoryError
+            If it is not.
+        """
+        names = [body.name for body in self.scene.moving]
+        for history in (self.train, self.held_out.history):
+            if list(history.bodies) != names:
+                raise HistoryError(
+                    f"history: it is of {', '.join(history.bodies)}, the scene has"
+                    f" {', '.join(names)}; load it with this scene"
+                )
+
+    def declared_mode(self, effects: tuple[Attached, ...], substeps: int | None) -> Mode:
+        """Mode of the declared model along trajectories, the engine's error small."""
+        problem = Problem.of(self.scene, self.train, effects, substeps=substeps, threads=2)
         mode = find_mode(problem, seed=self.seed)
-        mode = choose_horizon(mode) if horizon is None else noisy(mode)
-        return with_enough_substeps(mode, self.say)
+        return with_enough_substeps(trajectory_mode(problem, mode.phi), self.say)
 
     def posterior(self, mode: Mode, draws: int | None) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
-        problem = mode.problem
-        if draws is None:
-            steps = problem.segments.n * problem.data.horizon * problem.simulator.steps
-            draws = DRAWS if steps < LONG else DRAWS // 2
-        model = build_model(problem.with_physics(threads=1))
+        draws = DRAWS if draws is None else draws
+        model = build_model(mode.problem.with_physics(threads=1))
         tune = max(LEAST_TUNE, 5 * draws // 8)
         fitted = fit(model, seed=self.seed, draws=draws, tune=tune, start=mode, progress=False)
         if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
@@ -154,28 +186,24 @@ class _Loop:
 
     def findings(
         self,
-        declared: Mode,
-        revised: Mode,
+        models: _Models,
         first: list[Signature],
         steps: list[Step],
-        remainder: findings.Unexplained | None,
-        before: Any,
-        after: Any,
+        misfit: Misfit,
+        small: tuple[Candidate, ...],
     ) -> Findings:
         """Assemble verdict, held-out errors, posteriors and provenance."""
-        horizon = revised.problem.data.horizon
-        held_out = self.held_out
-        rollout = held_out.rollout_horizon(horizon, self.scene.time_step)
+        held_out, declared, revised = self.held_out, models.declared, models.revised
+        rollout = held_out.rollout_horizon(self.scene.time_step)
         errors = [
             held_out.errors(mode, revised, posterior, rollout)
-            for mode, posterior in ((declared, before), (revised, after))
+            for mode, posterior in ((declared, models.before), (revised, models.after))
         ]
         verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
-        if remainder is not None:
-            square_before, square_after = (error.normalised_rmse**2 for error in errors)
-            explained = square_before - square_after
-            if not steps or remainder.share * square_after > LARGE_REMAINDER * explained:
-                verdict = findings.UNEXPLAINED
+        if misfit.unexplained is not None and not steps:
+            verdict = findings.UNEXPLAINED
+        if not all(map(_converged, (models.before, models.after))):
+            verdict = findings.NOT_CONVERGED
         return Findings(
             scene=self.scene,
             verdict=verdict,
@@ -183,17 +211,16 @@ class _Loop:
                 self.scene.substeps, revised.problem.physics.substeps, shift(revised)
             ),
             candidates=tuple(signature.candidate for signature in first),
-            added=tuple(_added(step, revised, after) for step in steps),
-            unexplained=remainder,
+            added=tuple(_added(step, revised, models.after) for step in steps),
+            unexplained=misfit.unexplained,
             before=errors[0],
             after=errors[1],
             noise_floor=held_out.noise_floor(revised, rollout),
-            posterior_before=before,
-            posterior_after=after,
+            posterior_before=models.before,
+            posterior_after=models.after,
             residuals_before=held_out.residuals(declared, revised),
             residuals_after=held_out.residuals(revised, revised),
             rollout=held_out.rollout(declared, revised),
-            horizon=horizon,
             rollout_horizon=rollout,
             provenance={
                 "seed": self.seed,
@@ -202,13 +229,37 @@ class _Loop:
                 "test_sha256": held_out.history.data_sha256,
                 "transitions": self.train.n_transitions,
                 "test_transitions": held_out.history.n_transitions,
-                "horizon": horizon,
                 "rollout_horizon": rollout,
                 "rollout_seconds": rollout * self.scene.time_step,
             },
-            identifiability=identify(after, mode=revised),
-            loo=compare(before, after),
+            tests=misfit.tests,
+            acceleration=_acceleration(models.left_before, models.left_after),
+            small=small,
+            identifiability=identify(models.after, mode=revised),
+            loo=compare(models.before, models.after),
         )
+
+
+def _acceleration(before: Left, after: Left) -> Acceleration:
+    """Unexplained accelerations of both models, for the report."""
+
+    def named(left: Left, values: Any) -> dict[str, Any]:
+        return dict(zip(left.names, values.tolist(), strict=True))
+
+    return Acceleration(
+        named(before, before.size),
+        named(after, after.size),
+        named(before, before.relative),
+        named(after, after.relative),
+        named(after, after.certain),
+    )
+
+
+def _converged(posterior: Any) -> bool:
+    """Whether chains agree well enough for a verdict; warnings begin earlier."""
+    attrs = posterior.attrs
+    r_hat, ess = attrs.get("max_rhat", np.inf), attrs.get("min_ess", 0.0)
+    return bool(r_hat <= WORST_RHAT and ess >= LEAST_ESS)
 
 
 def _added(step: Step, revised: Mode, posterior: Any) -> Added:

@@ -1,149 +1,173 @@
-"""Permutation test, by kernel regression, of what the catalogue leaves in the residual."""
+"""Tests of what a model leaves: unexplained acceleration, whiteness, dependence, forecasts."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
-from pbrl_ppl.criticism.findings import Unexplained
+from pbrl_ppl.criticism.dependence import find_dependence
+from pbrl_ppl.criticism.forecast import forecast
+from pbrl_ppl.criticism.results import ResidualTest, Unexplained
+from pbrl_ppl.criticism.unexplained import FALSE_ALARM, MATTERS, Left, trajectories
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 
-#: Chance of calling clean data unexplained.
-FALSE_ALARM = 0.01
-#: Less than this share of the residual's variance does not matter.
-SMALLEST_SHARE = 0.02
-_PERMUTATIONS = 499
-_FOLDS = 5
-_RIDGE = 1.0
-#: More transitions than this say the same more slowly.
-_MOST = 1500
-
-FEATURES = (
-    "position x",
-    "position y",
-    "orientation (cosine)",
-    "orientation (sine)",
-    "forward speed",
-    "sideways speed",
-    "angular speed",
-    "speed",
-    "commanded forward force",
-    "commanded sideways force",
-    "commanded torque",
-    "time",
-)
+#: Lags of the test of whiteness (Ljung, System Identification, chapter 16).
+_LAGS = 5
+#: A share of the innovations' variance that matters.
+_SHARE = 0.02
+#: Forecasts may be this many times worse than noise alone makes them.
+_WORSE = 1.5
 
 
-def find_remainder(mode: Mode, *, seed: int = 0) -> Unexplained | None:
-    """Test whether the residual of a fitted model still depends on state, action or time.
+@dataclass(frozen=True, eq=False)
+class Misfit:
+    """Tests of what a model leaves, and where structure is that no effect explains.
 
-    A kernel ridge regression with one smooth term a quantity predicts the residual of trajectories
-    that it was not trained on; the null distribution comes from shuffling the transitions.
+    Parameters
+    ----------
+    tests : tuple of ResidualTest
+        In the order of the report.
+    unexplained : Unexplained or None
+        Where it is strongest; None where all tests are passed.
+    """
+
+    tests: tuple[ResidualTest, ...]
+    unexplained: Unexplained | None
+
+
+def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfit:
+    """Test what a fitted model leaves of the data that it was fitted to.
 
     Parameters
     ----------
     mode : Mode
-        A fitted model.
+        Of whole trajectories.
+    left : Left
+        Its unexplained acceleration.
+    horizon : int
+        Intervals of the forecasts.
     seed : int
-        Of the shuffling and the folds.
-
-    Returns
-    -------
-    Unexplained or None
-        Where the structure is strongest; None if there is none beyond chance.
+        Of permutations.
     """
-    rng = np.random.default_rng(seed)
-    problem = mode.problem
-    n, k = problem.segments.n, len(problem.scene.moving)
-    tests = len(problem.scene.dynamic)
-    chosen = np.sort(rng.permutation(n)[:_MOST])
-    columns = problem.observations.columns
-    # a segment's residual in one number a dimension: independent cells, so their scaled sum
-    target = mode.whitened_residual().reshape(n, problem.data.horizon, k, len(columns)).sum(1)
-    target = target[chosen] / np.sqrt(problem.data.horizon)
-    groups = problem.segments.trajectory[chosen]
-    best: Unexplained | None = None
-    for i, body in enumerate(problem.scene.moving):
-        if body.kinematic:
-            continue
-        features = _features(mode, i)[chosen]
-        y = target[:, i] - target[:, i].mean(axis=0)
-        kernels = _kernels(features)
-        smoother = _cross_validated(kernels.sum(axis=0), groups, rng)
-        shares = _explained(smoother, y)
-        null = np.array(
-            [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
-        )
-        at = int(np.argmax(shares))
-        p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * tests
-        if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE:
-            continue
-        if best is None or shares[at] > best.share:
-            best = _describe(body.name, STATE[columns[at]], kernels, y[:, at], shares[at], p_value)
-    return best
-
-
-def _features(mode: Mode, body: int) -> Array:
-    """State and action at each segment's start, in the body's frame, shape (transition, 12)."""
-    segments = mode.problem.segments
-    x, y, theta, vx, vy, omega = segments.start[:, body].T
-    fx, fy, torque = segments.actions[:, :, body].mean(axis=1).T
-    c, s = np.cos(theta), np.sin(theta)
-    time = segments.step.astype(float)
-    return np.stack(
-        [
-            x, y, c, s, c * vx + s * vy, c * vy - s * vx, omega, np.hypot(vx, vy),
-            c * fx + s * fy, c * fy - s * fx, torque, time,
-        ],
-        axis=1,
-    )  # fmt: skip
-
-
-def _kernels(features: Array) -> Array:
-    """One Gaussian kernel a quantity, on ranks scaled to unit range, shape (feature, n, n)."""
-    order = np.argsort(np.argsort(features, axis=0), axis=0) / max(len(features) - 1, 1)
-    varies = np.ptp(features, axis=0) > 1e-9
-    order = np.where(varies, order, 0.0)
-    difference = order.T[:, :, None] - order.T[:, None, :]
-    kernels = np.exp(-0.5 * (difference / 0.2) ** 2)
-    kernels[~varies] = 0.0
-    return kernels / max(int(varies.sum()), 1)
-
-
-def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Matrix that predicts each transition from those of other trajectories."""
-    smoother = np.zeros_like(kernel)
-    names = rng.permutation(np.unique(groups))
-    for held in np.array_split(names, min(_FOLDS, len(names))):
-        out = np.isin(groups, held)
-        inner = kernel[np.ix_(~out, ~out)] + _RIDGE * np.eye(int((~out).sum()))
-        smoother[np.ix_(out, ~out)] = np.linalg.solve(inner, kernel[np.ix_(~out, out)]).T
-    return smoother
-
-
-def _explained(smoother: Array, y: Array) -> Array:
-    """Share of variance predicted, per column."""
-    size = np.maximum((y**2).sum(axis=0), 1e-300)
-    return np.asarray(1.0 - ((y - smoother @ y) ** 2).sum(axis=0) / size)
-
-
-def _describe(
-    body: str, dimension: str, kernels: Array, y: Array, share: float, p_value: float
-) -> Unexplained:
-    weights = np.linalg.solve(kernels.sum(axis=0) + _RIDGE * np.eye(len(y)), y)
-    parts = np.array([np.var(kernel @ weights) for kernel in kernels])
-    name = FEATURES[int(np.argmax(parts))]
-    return Unexplained(
-        body=body,
-        dimension=dimension,
-        depends_on=name,
-        share=float(share),
-        p_value=min(1.0, p_value),
-        sentence=(
-            f"the error of {dimension} of {body} still depends on its {name}:"
-            f" {share:.0%} of it could be predicted, and nothing in the catalogue does so"
+    dependence = find_dependence(mode, seed=seed)
+    tests = (
+        _acceleration(left),
+        _whiteness(mode),
+        _forecasts(mode, horizon),
+        ResidualTest(
+            "dependence on state, command and time",
+            1.0 if dependence is None else dependence.p_value,
+            0.0 if dependence is None else dependence.share,
+            dependence is None,
+            "what is left depends on no recorded quantity"
+            if dependence is None
+            else dependence.sentence,
         ),
     )
+    failed = [test for test in tests if not test.passed]
+    if not failed:
+        return Misfit(tests, None)
+    if dependence is None:
+        first = failed[0]
+        noise = trajectories(mode)
+        body, dimension = _where(mode, left, noise.cells.places)
+        dependence = Unexplained(
+            body=body,
+            dimension=dimension,
+            depends_on="nothing that was recorded",
+            share=first.size,
+            p_value=first.p_value,
+            sentence=first.sentence,
+        )
+    return Misfit(tests, dependence)
+
+
+def _where(mode: Mode, left: Left, places: NDArray[np.intp]) -> tuple[str, str]:
+    """Body and state dimension whose innovations are largest where most is unexplained."""
+    worst = int(np.argmax(left.relative))
+    d = STATE.index(left.names[worst])
+    own = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
+    size = (mode.whitened_residual()[:, own] ** 2).mean(axis=0)
+    body = int(places[own[int(np.argmax(size))]] // len(STATE))
+    return mode.problem.scene.moving[body].name, left.names[worst]
+
+
+def _acceleration(left: Left) -> ResidualTest:
+    """Whether a step adds more than the model says."""
+    passed = left.worst < MATTERS
+    worst = int(np.argmax(np.where(left.certain, left.relative, -1.0)))
+    unit = "rad/s²" if left.names[worst] == "omega" else "m/s²"
+    some = bool(left.certain.any())
+    sentence = "no acceleration is left unexplained beyond what chance brings"
+    if some:
+        sentence = (
+            f"an acceleration of {left.size[worst]:.2g} {unit} in {left.names[worst]} is left"
+            f" unexplained in each interval, {100 * left.relative[worst]:.2g} % of what the bodies'"
+            " own is"
+        )
+    p_value = float(min(1.0, left.p_value[worst] * len(left.names)))
+    return ResidualTest(
+        "unexplained acceleration", p_value, float(left.relative[worst]), passed, sentence
+    )
+
+
+def _whiteness(mode: Mode) -> ResidualTest:
+    """Portmanteau test of the innovations' correlation with those before them, of each cell."""
+    noise = trajectories(mode)
+    white, first = mode.whitened_residual(), noise.first
+    number = np.cumsum(first)
+    statistic, count, worst = 0.0, 0, (0.0, 0, 0)
+    for lag in range(1, _LAGS + 1):
+        same = number[lag:] == number[:-lag]
+        later, earlier = white[lag:][same], white[:-lag][same]
+        seen = noise.seen[lag:][same] & noise.seen[:-lag][same]
+        n = seen.sum(axis=0)
+        enough = n > 2 * _LAGS
+        correlation = (later * earlier * seen).sum(axis=0) / np.maximum(n, 1)
+        statistic += float((n * correlation**2)[enough].sum())
+        count += int(enough.sum())
+        place = int(np.argmax(np.abs(correlation) * enough))
+        if abs(correlation[place]) > abs(worst[0]):
+            worst = (float(correlation[place]), lag, place)
+    p_value = float(chi2.sf(statistic, max(count, 1)))
+    passed = p_value > FALSE_ALARM or worst[0] ** 2 < _SHARE
+    place = noise.cells.places[worst[2]]
+    body = mode.problem.scene.moving[place // len(STATE)].name
+    sentence = "errors of one interval say nothing of those of the next"
+    if not passed:
+        sentence = (
+            f"the error of {STATE[place % len(STATE)]} of {body} is correlated with itself"
+            f" {worst[1]} interval{'s' * (worst[1] > 1)} later ({worst[0]:.2f})"
+        )
+    return ResidualTest("whiteness", p_value, abs(worst[0]), passed, sentence)
+
+
+def _forecasts(mode: Mode, horizon: int) -> ResidualTest:
+    """Whether errors grow with the length of a forecast as noise alone makes them."""
+    noise = trajectories(mode)
+    lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
+    told = forecast(mode.problem, mode.phi, mode.sigma, min(horizon, int(lengths.max())))
+    worst, p_value, name = 0.0, 1.0, ""
+    for d in np.unique(told.dimension):
+        own = told.dimension == d
+        z = (told.error[:, own] ** 2 / told.variance[:, own])[np.isfinite(told.error[:, own])]
+        if not z.size:
+            continue
+        # forecasts overlap by half, so that half of them count
+        chance = float(chi2.sf(z.sum() / 2, max(z.size / 2, 1)))
+        if np.sqrt(z.mean()) > worst:
+            worst, p_value, name = float(np.sqrt(z.mean())), chance, STATE[d]
+    passed = p_value > FALSE_ALARM or worst < _WORSE
+    seconds = horizon * mode.problem.scene.time_step
+    sentence = f"forecasts of {seconds:g} s are as good as noise lets them be"
+    if not passed:
+        sentence = (
+            f"after {seconds:g} s the error of {name} is {worst:.1f} times what noise alone makes"
+        )
+    return ResidualTest("forecasts", p_value, worst, passed, sentence)

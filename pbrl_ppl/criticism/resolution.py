@@ -1,66 +1,45 @@
-"""Prediction horizon and engine substeps, chosen from the data."""
+"""Engine substeps, chosen from the data: numerical error is the first suspect."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.modes import Mode, find_mode, with_start_noise
+from pbrl_ppl.modes import Mode, trajectory_mode
 
-#: A doubling of the substeps may move predictions by this share of the noise.
-SMALL_SHIFT = 0.1
+#: A doubling of the substeps may move innovations by this share of their noise.
+SMALL_SHIFT = 0.05
 MOST_SUBSTEPS = 640
-#: A start state's noise may spread to this many times the noise of the measured end.
-LARGEST_SPREAD = 3.0
-HORIZONS = (1, 2, 5, 10, 20, 50, 100)
-
-
-def noisy(mode: Mode, rounds: int = 2) -> Mode:
-    """Account for start-state noise and refit; from scratch twice, for it depends on the fit."""
-    for _ in range(rounds):
-        mode = find_mode(with_start_noise(mode.problem, mode), initial=mode.phi)
-    return mode
-
-
-def choose_horizon(mode: Mode) -> Mode:
-    """Shortest horizon at which the start state's noise does not drown the prediction."""
-    longest = int(mode.problem.data.history.dataset["n_rows"].min()) - 1
-    tried: list[tuple[float, Mode]] = []
-    for horizon in HORIZONS:
-        if horizon > max(1, longest // 2):
-            break
-        problem = mode.problem.with_data(horizon=horizon)
-        mode = noisy(mode if horizon == 1 else find_mode(problem, initial=mode.phi))
-        noise = mode.problem.noise.start
-        gain = noise.gain if noise else np.ones((1, 1))
-        cells = len(mode.problem.scene.moving) * len(mode.sigma)  # of the last interval
-        spread = np.sqrt(np.maximum(gain[:, -cells:] ** 2 - 1.0, 0.0))
-        worst = float(np.median(spread, axis=0).max())
-        tried.append((worst, mode))
-        if worst <= LARGEST_SPREAD:
-            break
-    return min(tried, key=lambda pair: pair[0])[1]
 
 
 def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
-    """Double the substeps until that no longer moves predictions, and refit."""
-    begin = mode.problem.physics.substeps
-    while shift(mode) > SMALL_SHIFT and mode.problem.physics.substeps < MOST_SUBSTEPS:
-        finer = mode.problem.with_physics(substeps=2 * mode.problem.physics.substeps)
-        mode = replace(mode, problem=finer)
-    if mode.problem.physics.substeps == begin:
+    """Double the substeps until that no longer moves predictions, and refit.
+
+    The engine's error is all but the same at neighbouring parameters, so it is looked at where the
+    model was fitted with fewer.
+    """
+    begin = substeps = mode.problem.physics.substeps
+    while shift(mode, substeps) > SMALL_SHIFT and substeps < MOST_SUBSTEPS:
+        substeps *= 2
+    if substeps == begin:
         return mode
-    say(f"using {mode.problem.physics.substeps} engine steps an interval")
-    return noisy(mode, rounds=1)
+    say(f"using {substeps} engine steps an interval")
+    return trajectory_mode(mode.problem.with_physics(substeps=substeps), mode.phi, mode.sigma)
 
 
-def shift(mode: Mode) -> float:
-    """Root mean square change of predictions in noise units if the substeps are doubled."""
+def shift(mode: Mode, substeps: int | None = None) -> float:
+    """Root mean square change of the innovations, in units of noise, if substeps are doubled.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of whole trajectories.
+    substeps : int, optional
+        To double; the mode's by default.
+    """
     problem = mode.problem
-    finer = problem.with_physics(substeps=2 * problem.physics.substeps)
-    change = (problem.residual(mode.phi) - finer.residual(mode.phi)) / mode.sigma
-    if problem.noise.start is not None:
-        change = change / problem.noise.start.gain.reshape(change.shape)
-    return float(np.sqrt(np.nanmean(change**2, axis=(0, 1, 2)).max()))
+    substeps = problem.physics.substeps if substeps is None else substeps
+    coarse, fine = (problem.with_physics(substeps=n) for n in (substeps, 2 * substeps))
+    change = coarse.whitened(mode.phi, mode.sigma) - fine.whitened(mode.phi, mode.sigma)
+    return float(np.sqrt(np.nanmean(change**2, axis=0).max()))

@@ -1,17 +1,18 @@
-"""Stepwise selection of effects: refit with the leaders, confirm on held-out data, prune."""
+"""Stepwise selection of effects: refit with the leaders, cross-validate, prune."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from pbrl_ppl.criticism.held_out import HeldOut, standard_error
-from pbrl_ppl.criticism.resolution import noisy, with_enough_substeps
+from pbrl_ppl.criticism.cross_validation import cross_validated, folds, standard_error
+from pbrl_ppl.criticism.resolution import with_enough_substeps
+from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, twins
 from pbrl_ppl.effects import Attached, Effect, Noise, candidates
-from pbrl_ppl.modes import Mode, find_mode
+from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.scene import Scene
 
@@ -19,7 +20,7 @@ from pbrl_ppl.scene import Scene
 TRY_P = 0.01
 #: It is kept if it gains this much log predictive density, in nats and in standard errors ...
 MIN_ELPD, MIN_ELPD_SE = 4.0, 2.0
-#: ... and makes the held-out error this much smaller.
+#: ... and what it does to the predictions is this share of their noise or more.
 MIN_ERROR_FALL = 0.01
 #: Candidates that are refitted in a round.
 TRIED = 4
@@ -45,9 +46,9 @@ class Selection:
     """The data and the catalogue that effects are chosen by."""
 
     scene: Scene
-    held_out: HeldOut
     catalogue: tuple[Effect, ...]
     say: Callable[[str], None]
+    small: list[Candidate] = field(default_factory=list, init=False)
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
         """Candidate effects for a model."""
@@ -93,17 +94,18 @@ class Selection:
         for name, value in signature.candidate.estimate.items():
             label = f"{effect.name}_{name}[{signature.attached.body}]"
             phi[labels.index(label)] = value
-        return find_mode(problem, initial=inside(problem.layout.priors, phi))
+        return trajectory_mode(problem, inside(problem.layout.priors, phi), mode.sigma)
 
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
-        """Accept an improvement on held-out data that is clear and that matters."""
-        fitted = with_enough_substeps(noisy(fitted, rounds=1), self.say)
-        gains = self.held_out.gains(mode, fitted)
-        total, error = float(gains.sum()), standard_error(gains)
-        fall = self.held_out.fall(mode, fitted)
-        if total < MIN_ELPD or total < MIN_ELPD_SE * error or fall < MIN_ERROR_FALL:
+        """Accept an improvement that cross-validation is sure of and that matters."""
+        fitted = with_enough_substeps(fitted, self.say)
+        total, error = _gain(mode, fitted)
+        if total < MIN_ELPD or total < MIN_ELPD_SE * error:
+            return None
+        if _share(mode, fitted) < MIN_ERROR_FALL:
+            self.small.append(signature.candidate)
             return None
         return Step(signature, inseparable(signature, ranked), fitted, total, error)
 
@@ -111,8 +113,8 @@ class Selection:
         """Drop effects that later ones have made unnecessary; what gained most comes first."""
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
             without = self._without(mode, step.signature.attached)
-            gains = self.held_out.gains(without, mode)
-            if gains.sum() < MIN_ELPD or gains.sum() < MIN_ELPD_SE * standard_error(gains):
+            total, error = _gain(without, mode)
+            if total < MIN_ELPD or total < MIN_ELPD_SE * error:
                 mode = without
                 steps = [addition for addition in steps if addition is not step]
         return mode, sorted(steps, key=lambda addition: -addition.elpd_difference)
@@ -122,7 +124,7 @@ class Selection:
         problem = mode.problem.with_physics(effects=kept)
         labels = mode.problem.layout.labels
         phi = [mode.phi[labels.index(label)] for label in problem.layout.labels]
-        return noisy(find_mode(problem, initial=np.array(phi)), rounds=1)
+        return trajectory_mode(problem, np.array(phi), mode.sigma)
 
 
 def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
@@ -138,6 +140,21 @@ def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
         if significant and not any(twins(signature, earlier) for earlier in kept):
             kept.append(signature)
     return sorted(kept, key=lambda entry: entry.log_p)
+
+
+def _gain(before: Mode, after: Mode) -> tuple[float, float]:
+    """Gain in cross-validated log predictive density, and its standard error."""
+    fold = folds(after)
+    gains = cross_validated(after, fold) - cross_validated(before, fold)
+    return float(gains.sum()), standard_error(gains)
+
+
+def _share(before: Mode, after: Mode) -> float:
+    """Share by which one model's innovations exceed another's, in units of the latter's noise."""
+    physics = before.problem.physics
+    model = after.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
+    worse, better = model.whitened(before.phi, after.sigma), after.whitened_residual()
+    return 1.0 - float(np.sqrt((better**2).sum() / (worse**2).sum()))
 
 
 def _log_likelihood(mode: Mode) -> float:

@@ -212,19 +212,42 @@ class History:
                 "horizon, or measure the states there"
             )
         follows = self.dataset["kinematic"].to_numpy()
-        action = self.dataset["action"].to_numpy().copy()
-        time_step = float(self.dataset.attrs["time_step"])
-        action[:, :-1, follows] = path_velocities(start[:, :, follows, :3], time_step)
         rows = step[:, None] + np.arange(horizon)
         after = rows >= intervals[trajectory][:, None]
         rows = np.where(after, 0, rows)
-        inputs = self._inputs(action)[trajectory[:, None], rows]
+        inputs = self._inputs(self._actions())[trajectory[:, None], rows]
         observed = self.dataset["observed"].to_numpy()[trajectory[:, None], rows + 1]
         inputs[after, :, :6], inputs[after, :, 6:] = 0.0, np.inf
         observed[after] = np.nan
         observed[:, :, follows] = np.nan
         actions = inputs[..., : len(WRENCH)]
         return Segments(start[trajectory, step], actions, observed, trajectory, step, inputs)
+
+    def transitions(self, states: Floats) -> Segments:
+        """Return every interval as a segment between given states.
+
+        Parameters
+        ----------
+        states : ndarray
+            Shape (trajectory, time, body, 6), SI units, without gaps.
+        """
+        intervals = self.dataset["n_rows"].to_numpy() - 1
+        trajectory = np.repeat(np.arange(len(intervals)), intervals)
+        step = np.concatenate([np.arange(n) for n in intervals])
+        inputs = self._inputs(self._actions())[trajectory, step][:, None]
+        observed = states[trajectory, step + 1][:, None].copy()
+        observed[:, :, self.dataset["kinematic"].to_numpy()] = np.nan
+        actions = inputs[..., : len(WRENCH)]
+        return Segments(states[trajectory, step], actions, observed, trajectory, step, inputs)
+
+    def _actions(self) -> Floats:
+        """Wrenches, of kinematic bodies velocities, shape (trajectory, time, body, 3)."""
+        follows = self.dataset["kinematic"].to_numpy()
+        poses = self.dataset["start"].to_numpy()[:, :, follows, :3]
+        action = self.dataset["action"].to_numpy().copy()
+        time_step = float(self.dataset.attrs["time_step"])
+        action[:, :-1, follows] = path_velocities(poses, time_step)
+        return action
 
     def _inputs(self, action: Floats) -> Floats:
         """What acts in each interval, shape (trajectory, interval, body, input)."""

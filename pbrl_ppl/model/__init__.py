@@ -11,15 +11,25 @@ from pbrl_ppl.model.likelihood import (
     whiten,
 )
 from pbrl_ppl.model.log_posterior import log_noise_prior, log_posterior, log_prior, noise_law
-from pbrl_ppl.model.noise import Noise, sigma_prior
+from pbrl_ppl.model.noise import Noise, estimate_sigma, sigma_prior
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
-from pbrl_ppl.model.problem import Problem
-from pbrl_ppl.model.start_noise import StartNoise, estimate_sigma
+from pbrl_ppl.model.problem import ACCELERATION, Problem
+from pbrl_ppl.model.simulation import simulated_trajectories, with_measurements
+from pbrl_ppl.model.smoothing import (
+    along_trajectories,
+    cells_of,
+    linearised,
+    single_transitions,
+    smoothed,
+)
 from pbrl_ppl.model.table1 import build_layout, index_priors
+from pbrl_ppl.model.trajectory_noise import Cells, TrajectoryNoise
 from pbrl_ppl.model.transition import Transition
 
 __all__ = [
+    "ACCELERATION",
+    "Cells",
     "Data",
     "Noise",
     "Observations",
@@ -27,12 +37,15 @@ __all__ = [
     "Physics",
     "Problem",
     "SimulatorOp",
-    "StartNoise",
+    "TrajectoryNoise",
     "Transition",
+    "along_trajectories",
     "build_layout",
     "build_model",
+    "cells_of",
     "estimate_sigma",
     "index_priors",
+    "linearised",
     "log_density",
     "log_noise_prior",
     "log_posterior",
@@ -43,5 +56,9 @@ __all__ = [
     "prior_predictive_draws",
     "robust",
     "sigma_prior",
+    "simulated_trajectories",
+    "single_transitions",
+    "smoothed",
     "whiten",
+    "with_measurements",
 ]

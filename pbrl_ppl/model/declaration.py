@@ -15,13 +15,15 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.model.library import ParameterLibrary
-from pbrl_ppl.model.likelihood import next_state_logp, next_state_random
+from pbrl_ppl.model.likelihood import Observations, next_state_logp, next_state_random
 from pbrl_ppl.model.noise import Noise
 from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
-from pbrl_ppl.model.problem import Problem
-from pbrl_ppl.model.start_noise import StartNoise
+from pbrl_ppl.model.problem import ACCELERATION, Problem
+from pbrl_ppl.model.smoothing import along_trajectories
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.model.tails import tail_tensor
+from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
+from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
 from pbrl_ppl.parameters import Block, Layout
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE
@@ -36,9 +38,9 @@ def physics_model(
     sigma: str = "per_dimension",
     nu: float | None = None,
     substeps: int | None = None,
-    noise: StartNoise | None = None,
     threads: int = 1,
     library: ParameterLibrary | None = None,
+    trajectories: bool = False,
 ) -> pm.Model:
     """Declare the model of the paper's section 3.2 for a scene and a history.
 
@@ -59,14 +61,16 @@ def physics_model(
         heavy tails; 4 is usual. Sigma is then its scale. Gaussian without it.
     substeps : int, optional
         Engine steps an interval; the scene's by default.
-    noise : StartNoise, optional
-        Spread of the start state's noise over the predictions; without it the start counts as
-        exact, as in the paper.
     threads : int
         Engine worlds that run side by side within one evaluation.
     library : ParameterLibrary, optional
         Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
         ``library_index`` holds the bodies' choices, and the parameters follow from it.
+    trajectories : bool
+        Whether whole trajectories are whitened together, with two noises: ``sigma``, the error of
+        measuring a state, and ``unexplained_acceleration``, what a step adds. Neighbours share a
+        measured state, which Eq. 11 takes as exact. The transitions are linearised about smoothed
+        states, at the prior's centre until :func:`pbrl_ppl.fit` finds the mode.
 
     Returns
     -------
@@ -82,8 +86,8 @@ def physics_model(
     SimulationError
         If bodies start deep inside each other or a wall, or a hinge's bodies apart.
     ValueError
-        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0, or both
-        ``library`` and ``noise`` are given.
+        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0, or
+        ``trajectories`` is given with a horizon, a library or a scalar sigma.
     ParameterError
         If the library does not fit the scene's bodies.
 
@@ -105,10 +109,13 @@ def physics_model(
         raise ValueError(f"horizon is {horizon}, expected at least 1")
     if nu is not None and not 0 < nu < np.inf:
         raise ValueError(f"nu is {nu}, expected degrees of freedom above 0, or None for a Gaussian")
-    if library is not None and noise is not None:
+    if trajectories and (horizon > 1 or library is not None):
         raise ValueError(
-            "library and noise are given; a library takes start states as exact: drop noise"
+            "trajectories is given with horizon or library; whole trajectories need neither: leave"
+            " it out"
         )
+    if trajectories and sigma == "scalar":
+        raise ValueError("sigma is 'scalar', expected 'per_dimension' with trajectories")
     longest = int(history.dataset["n_rows"].max()) - 1
     if horizon > longest:
         raise HistoryError(
@@ -122,9 +129,12 @@ def physics_model(
         horizon=horizon,
         substeps=substeps,
         threads=threads,
-        noise=Noise(scalar=sigma == "scalar", start=noise, nu=nu),
+        noise=Noise(scalar=sigma == "scalar", nu=nu),
         library=library,
     )
+    if trajectories:
+        centre = np.array([prior.centre for prior in problem.layout.priors])
+        problem = along_trajectories(problem, centre)
     return build_model(problem)
 
 
@@ -149,12 +159,7 @@ def build_model(problem: Problem) -> pm.Model:
                 )
         phi = pt.concatenate(list(table1.values())) if table1 else pt.zeros(0)
         # P(sigma)
-        median, spread = problem.noise_prior
-        if noise.scalar:
-            scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
-            sigma = pt.ones(len(median)) * scalar
-        else:
-            sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
+        sigma = _noise(problem)
         # Eq. 7: s' = f(s, a; Phi) + eps, and Eq. 11
         columns = list(observations.columns)
         predicted = simulate(phi, start, actions)[..., columns]
@@ -162,7 +167,9 @@ def build_model(problem: Problem) -> pm.Model:
         whole = predicted
         if len(problem.simulator.parts) > 1:
             whole = OneWorldOp(*settings, physics.parts)(phi, start, actions)[..., columns]
-        shape: dict[str, Any] = {"noise": noise.start, "nu": noise.nu}
+        shape: dict[str, Any] = {"noise": noise.trajectories, "nu": noise.nu}
+        if problem.trajectories is not None:
+            shape["linearised"] = np.nan_to_num(observations.values)
         tail = [tail_tensor(physics, table1, noise.nu)] if problem.tails else []
         pm.CustomDist(
             "next_state",
@@ -172,8 +179,8 @@ def build_model(problem: Problem) -> pm.Model:
             *tail,
             logp=partial(_log_density, observations=observations, **shape),
             random=partial(_random, **shape),
-            signature=f"(h,k,d),(h,k,d),(d){',(k)' * len(tail)}->(h,k,d)",
-            observed=np.nan_to_num(observations.values),
+            signature=_signature(problem),
+            observed=np.nan_to_num(problem.measured),
             dims=("transition", "step", "body", "state"),
         )
     model.problem = problem
@@ -223,6 +230,23 @@ def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
     return result
 
 
+def _noise(problem: Problem) -> Any:
+    """The noise parameters, shape (parameter,)."""
+    median, spread = problem.noise_prior
+    if problem.noise.scalar:
+        scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
+        return pt.ones(len(median)) * scalar
+    if problem.trajectories is None:
+        return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
+    split = len(problem.trajectories.cells.sensors)
+    mu = np.log(median)
+    sensor = pm.LogNormal("sigma", mu=mu[:split], sigma=spread, dims="sensor")
+    if split == len(mu):
+        return sensor
+    step = pm.LogNormal(ACCELERATION, mu=mu[split:], sigma=spread, dims="velocity")
+    return pt.concatenate([sensor, step])
+
+
 def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
     """Index variable that selects each anchor's prior; 0 where the body is given."""
     name = f"i_{block.name[0]}"
@@ -233,11 +257,33 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
     return pt.stack(held)
 
 
+def _signature(problem: Problem) -> str:
+    """Core dimensions: of one transition, or of all where they depend on each other."""
+    tail = ",(k)" * bool(problem.tails)
+    if problem.trajectories is not None:
+        return f"(n,h,k,d),(n,h,k,d),(m){tail}->(n,h,k,d)"
+    return f"(h,k,d),(h,k,d),(d){tail}->(h,k,d)"
+
+
 def _log_density(
-    value: Any, predicted: Any, whole: Any, sigma: Any, *tail: Any, **fixed: Any
+    value: Any,
+    predicted: Any,
+    whole: Any,
+    sigma: Any,
+    *tail: Any,
+    observations: Observations,
+    noise: TrajectoryNoise | None,
+    nu: float | None,
+    linearised: NDArray[np.float64] | None = None,
 ) -> Any:
     """Log-density of the measurements about the predictions in parts; ``whole`` is for draws."""
-    return next_state_logp(value, predicted, sigma, tail=tail[0] if tail else None, **fixed)
+    if noise is None:
+        own = tail[0] if tail else None
+        return next_state_logp(value, predicted, sigma, observations, nu, own)
+    # what was measured is in the noise, as deviations from the states of the linearisation
+    bodies = observations.values.shape[2]
+    tails = tail[0] if tail else np.full(bodies, 0.0 if nu is None else 1.0 / nu)
+    return TrajectoryDensityOp(noise)(linearised - predicted, sigma, tails)
 
 
 def _random(
@@ -245,17 +291,20 @@ def _random(
     whole: Any,
     sigma: Any,
     *tail: Any,
-    noise: StartNoise | None,
+    noise: TrajectoryNoise | None,
     nu: float | None,
+    linearised: NDArray[np.float64] | None = None,
     rng: np.random.Generator | None = None,
     size: Any = None,
 ) -> Any:
     rng = rng or np.random.default_rng()
+    if noise is not None and linearised is not None:
+        return noise.random(whole, linearised, sigma, rng)
     if not tail:
-        return next_state_random(whole, sigma, noise, rng, size, nu)
+        return next_state_random(whole, sigma, rng, size, nu)
     with np.errstate(divide="ignore"):
         own = 1.0 / np.asarray(tail[0], dtype=float)[..., :, None]
-    return next_state_random(whole, sigma, noise, rng, size, own)
+    return next_state_random(whole, sigma, rng, size, own)
 
 
 def _coords(problem: Problem) -> dict[str, Any]:
@@ -265,6 +314,7 @@ def _coords(problem: Problem) -> dict[str, Any]:
         "body": [body.name for body in problem.scene.moving],
         "full_state": list(STATE),
         "state": list(problem.observations.names),
+        **_noise_coords(problem),
         "wrench": list(INPUT[: problem.inputs.shape[-1]]),
         "transition": np.arange(segments.n),
         "step": np.arange(1, problem.data.horizon + 1),
@@ -272,6 +322,13 @@ def _coords(problem: Problem) -> dict[str, Any]:
     for block in problem.layout.blocks:
         coords.setdefault(_dim(problem, block), list(block.owners))
     return coords
+
+
+def _noise_coords(problem: Problem) -> dict[str, Any]:
+    if problem.trajectories is None:
+        return {}
+    names = map(list, problem.noise_variables.values())
+    return dict(zip(("sensor", "velocity"), names, strict=True))
 
 
 def _dim(problem: Problem, block: Block) -> str:

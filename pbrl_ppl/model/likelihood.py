@@ -13,7 +13,7 @@ from scipy.special import gammaln
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import Segments
-from pbrl_ppl.model.start_noise import StartNoise
+from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.state import STATE, THETA
 
 Array = NDArray[np.float64]
@@ -95,7 +95,7 @@ class Observations:
         return np.asarray(difference)
 
 
-def whiten(residual: Array, sigma: Array, noise: StartNoise | None) -> Array:
+def whiten(residual: Array, sigma: Array, noise: TrajectoryNoise | None) -> Array:
     """Residuals in units of their noise, independent of each other if the model is right.
 
     Parameters
@@ -104,25 +104,24 @@ def whiten(residual: Array, sigma: Array, noise: StartNoise | None) -> Array:
         Shape (..., transition, H, body, state).
     sigma : ndarray
         Noise of each state dimension, shape (state,) or (..., state) with the same leading axes.
-    noise : StartNoise or None
-        Spread of the start state's noise.
+    noise : TrajectoryNoise or None
+        What correlates residuals along trajectories; without it they are independent (Eq. 11).
 
     Returns
     -------
     ndarray
         Shape (..., transition, cell), dimensionless.
     """
+    if noise is not None:
+        return noise.whiten(residual, sigma)
     scaled = residual / np.asarray(sigma)[..., None, None, None, :]
-    flat = scaled.reshape(*scaled.shape[:-3], -1)
-    if noise is None:
-        return np.asarray(flat)
-    return np.asarray(np.einsum("tij,...tj->...ti", noise.unmix, flat / noise.gain))
+    return np.asarray(scaled.reshape(*scaled.shape[:-3], -1))
 
 
 def log_density(
     residual: Array,
     sigma: Array,
-    noise: StartNoise | None,
+    noise: TrajectoryNoise | None,
     measured: Bools,
     nu: float | Array | None = None,
 ) -> Array:
@@ -134,8 +133,8 @@ def log_density(
         Shape (..., transition, H, body, state).
     sigma : ndarray
         Shape (..., state).
-    noise : StartNoise or None
-        Spread of the start state's noise.
+    noise : TrajectoryNoise or None
+        What correlates residuals along trajectories.
     measured : ndarray
         Shape (transition, H, body, state).
     nu : float or ndarray, optional
@@ -147,12 +146,16 @@ def log_density(
     ndarray
         Shape (..., transition); minus infinity where the engine diverged.
     """
+    if noise is not None:
+        z, log_scale = noise.whitened(residual, sigma)
+        nu = noise.of_cells(nu, residual.shape)
+        norm = np.where(noise.seen, log_norm(nu), 0.0).sum(axis=-1)
+        result = norm - 0.5 * (robust(z, nu) ** 2).sum(-1) - log_scale
+        return np.where(np.isnan(result), -np.inf, result)
     z = whiten(residual, sigma, noise)
     log_sigma = np.where(measured, np.log(sigma)[..., None, None, None, :], 0.0).sum((-1, -2, -3))
     norm = np.where(measured, log_norm(nu), 0.0).sum((-1, -2, -3))
     result = -0.5 * (robust(z, cells(nu, residual.shape)) ** 2).sum(-1) - log_sigma + norm
-    if noise is not None:
-        result = result - noise.log_det
     return np.where(np.isnan(result), -np.inf, result)
 
 
@@ -201,7 +204,6 @@ def next_state_logp(
     predicted: Any,
     sigma: Any,
     observations: Observations,
-    noise: StartNoise | None,
     nu: float | None = None,
     tail: Any = None,
 ) -> Any:
@@ -215,8 +217,6 @@ def next_state_logp(
         Noise of each state dimension, shape (state,).
     observations : Observations
         Says which cells were measured.
-    noise : StartNoise or None
-        Spread of the start state's noise.
     nu : float, optional
         Degrees of freedom of a Student-t distribution; without it, Gaussian.
     tail : tensor, optional
@@ -230,8 +230,6 @@ def next_state_logp(
         wrapped = np.pi - pt.mod(np.pi - residual[..., theta], 2 * np.pi)
         residual = pt.set_subtensor(residual[..., theta], wrapped)
     z = (residual / sigma * measured).reshape((n, -1))
-    if noise is not None:
-        z = (pt.as_tensor(noise.unmix) @ (z / noise.gain)[:, :, None])[:, :, 0]
     log_sigma = (pt.log(sigma) * measured).sum(axis=(1, 2, 3))
     count = measured.sum(axis=(1, 2, 3))
     if tail is None:
@@ -245,15 +243,12 @@ def next_state_logp(
         at_zero = pt.gammaln((nus + 1) / 2) - pt.gammaln(nus / 2) - 0.5 * pt.log(nus * np.pi)
         norm = (pt.switch(heavy, at_zero, log_norm(None)) * measured.reshape((n, -1))).sum(axis=1)
     logp = -0.5 * square.sum(axis=1) - log_sigma + norm
-    if noise is not None:
-        logp = logp - noise.log_det
     return pt.switch(pt.isnan(logp), -np.inf, logp)
 
 
 def next_state_random(
     predicted: Any,
     sigma: Any,
-    noise: StartNoise | None,
     rng: np.random.Generator,
     size: Any = None,
     nu: float | Array | None = None,
@@ -269,8 +264,4 @@ def next_state_random(
         heavy = np.less(nu, _GAUSSIAN)
         heavy_z = rng.standard_t(np.where(heavy, nu, 1.0), shape)
         z = np.where(heavy, heavy_z, rng.standard_normal(shape))
-    if noise is not None:
-        flat = z.reshape(*z.shape[:-3], -1)
-        mixed = np.linalg.solve(noise.unmix, flat[..., None])[..., 0] * noise.gain
-        z = mixed.reshape(z.shape)
     return np.asarray(predicted + z * np.asarray(sigma))

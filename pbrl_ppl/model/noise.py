@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.history import Segments
 from pbrl_ppl.model.likelihood import Observations
-from pbrl_ppl.model.start_noise import StartNoise
+from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
 
 Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,17 +23,18 @@ class Noise:
     ----------
     scalar : bool
         One sigma for all state dimensions, as in the paper.
-    start : StartNoise, optional
-        Spread of the start state's noise over the predictions; without it the start is exact.
+    trajectories : TrajectoryNoise, optional
+        Noise of measured states along whole trajectories; without it start states are exact, as in
+        Eq. 11.
     nu : float, optional
         Degrees of freedom of Student-t noise; Gaussian without it.
     prior : tuple, optional
-        Medians of sigma's prior, one a measured state dimension, and its log-scale; by default
-        :func:`sigma_prior` takes them from the data.
+        Medians of the noise parameters' prior and its log-scale; by default :func:`sigma_prior`
+        takes them from the data.
     """
 
     scalar: bool = False
-    start: StartNoise | None = None
+    trajectories: TrajectoryNoise | None = None
     nu: float | None = None
     prior: tuple[tuple[float, ...], float] | None = None
 
@@ -52,3 +54,18 @@ def sigma_prior(observations: Observations, segments: Segments) -> tuple[Array, 
     seen = observations.measured
     typical = np.sqrt((change**2).sum((0, 1, 2)) / np.maximum(seen.sum((0, 1, 2)), 1))
     return np.maximum(0.1 * typical, 1e-9) * np.ones(len(columns)), 2.0
+
+
+def estimate_sigma(residual: Array, measured: Bools) -> Array:
+    """Maximum-likelihood noise of each state dimension under Eq. 11, shape (state,).
+
+    Parameters
+    ----------
+    residual : ndarray
+        Shape (transition, H, body, state).
+    measured : ndarray
+        Same shape.
+    """
+    count = np.maximum(measured.sum((0, 1, 2)), 1)
+    # histories without noise still need a scale
+    return np.asarray(np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / count), 1e-9))

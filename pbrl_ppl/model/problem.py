@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, needs_inputs
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.history import History, Segments, fill_hinges
+from pbrl_ppl.history import History, Segments
 from pbrl_ppl.model.data import Data
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
@@ -26,14 +26,18 @@ from pbrl_ppl.model.likelihood import (
 from pbrl_ppl.model.noise import Noise, sigma_prior
 from pbrl_ppl.model.physics import Physics
 from pbrl_ppl.model.tails import degrees_of_freedom, tail_places
+from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Parts, independent_parts, joined_parts
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 
 #: Phi, start states and wrenches in, next states out.
 Engine = Callable[[Array, Array, Array], Array]
+#: The variable of what a step adds: an acceleration that nothing in the model explains.
+ACCELERATION = "unexplained_acceleration"
 #: How far predictions may differ and be the same to the likelihood, in units of the noise.
 _SAME = 0.01
 
@@ -102,14 +106,16 @@ class Problem:
     def on(self, data: Data) -> Problem:
         """The same problem of other data.
 
-        The start state's noise, which is of each segment, is left out. Bodies that have to do with
+        The noise along trajectories, which is of these, is left out. Bodies that have to do with
         each other in another history are found anew; where they are the same, the physics stay.
         """
         physics = self.physics
         if data.history is not self.data.history:
             parts = _parts(physics.scene, data.history, physics.together)
             physics = physics.changed(parts=parts)
-        return replace(self, data=data, physics=physics, noise=replace(self.noise, start=None))
+        return replace(
+            self, data=data, physics=physics, noise=replace(self.noise, trajectories=None)
+        )
 
     def with_physics(self, **changes: Any) -> Problem:
         """The same problem with other physics; arguments are fields of :class:`Physics`."""
@@ -200,10 +206,40 @@ class Problem:
         median, spread = self.noise.prior
         return np.array(median), spread
 
+    @property
+    def trajectories(self) -> TrajectoryNoise | None:
+        """The noise along whole trajectories, if the likelihood is of those."""
+        return self.noise.trajectories
+
+    @property
+    def noise_variables(self) -> dict[str, tuple[str, ...]]:
+        """Variables of the noise, and the state dimensions of each, in the order of sigma."""
+        if self.trajectories is None:
+            return {"sigma": self.observations.names}
+        cells = self.trajectories.cells
+        return {
+            "sigma": tuple(STATE[d] for d in cells.sensors),
+            ACCELERATION: tuple(STATE[d] for d in cells.rates),
+        }
+
     def named(self, phi: Array, sigma: Array) -> dict[str, Array]:
-        """The model's variables at phi, shape (p,), and sigma, shape (state,)."""
-        noise = {"sigma": sigma[0] if self.noise.scalar else sigma}
+        """The model's variables at phi, shape (..., p), and sigma, shape (..., parameter)."""
+        if self.noise.scalar:
+            return self.layout.to_dict(phi) | {"sigma": sigma[..., 0]}
+        ends = np.cumsum([len(own) for own in self.noise_variables.values()])[:-1]
+        noise = dict(zip(self.noise_variables, np.split(sigma, ends, axis=-1), strict=True))
         return self.layout.to_dict(phi) | noise
+
+    @property
+    def measured(self) -> Array:
+        """Measured next states, shape (transition, H, body, state), NaN where missing."""
+        values = self.observations.values
+        if self.trajectories is None:
+            return values
+        segments = self.segments
+        observed = self.data.history.dataset["observed"].to_numpy()
+        raw = observed[segments.trajectory, segments.step + 1][:, None]
+        return np.asarray(raw[..., self.observations.columns])
 
     def predict(self, phi: Array, engine: Engine | None = None) -> Array:
         """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""
@@ -215,7 +251,7 @@ class Problem:
 
     def whitened(self, phi: Array, sigma: Array, engine: Engine | None = None) -> Array:
         """Residuals in units of their noise, shape (..., transition, cell)."""
-        return whiten(self.residual(phi, engine), sigma, self.noise.start)
+        return whiten(self.residual(phi, engine), sigma, self.trajectories)
 
     @cached_property
     def tails(self) -> tuple[int, ...]:
@@ -244,8 +280,11 @@ class Problem:
         Shape (..., transition, cell).
         """
         residual = self.residual(phi, engine)
-        z = whiten(residual, sigma, self.noise.start)
-        return robust(z, cells(self.nu(phi), residual.shape))
+        z = whiten(residual, sigma, self.trajectories)
+        nu = self.nu(phi)
+        if self.trajectories is not None:
+            return robust(z, self.trajectories.of_cells(nu, residual.shape))
+        return robust(z, cells(nu, residual.shape))
 
     def log_density(self, residual: Array, sigma: Array, phi: Array | None = None) -> Array:
         """Log-likelihood of each transition, shape (..., transition); see `likelihood`.
@@ -260,54 +299,16 @@ class Problem:
             Shape (..., p); needed where the noise's tails are inferred.
         """
         seen = self.observations.measured
-        return log_density(residual, sigma, self.noise.start, seen, self.nu(phi))
+        return log_density(residual, sigma, self.trajectories, seen, self.nu(phi))
 
     def next_states(
         self, states: Array, sigma: Array, rng: np.random.Generator, phi: Array | None = None
     ) -> Array:
         """Draw measured next states by Eq. 13 about predictions (..., transition, H, body, 6)."""
         predicted = states[..., self.observations.columns]
-        return next_state_random(predicted, sigma, self.noise.start, rng, nu=self.nu(phi))
-
-    def sensitivity(self, phi: Array, steps: Array, engine: Engine | None = None) -> Array:
-        """Derivative of the predictions by the measured start state, F.
-
-        Parameters
-        ----------
-        phi : ndarray
-            Where to differentiate, shape (p,).
-        steps : ndarray
-            Finite-difference step of each measured state dimension, shape (state,), in its units;
-            about the noise is right.
-
-        Returns
-        -------
-        ndarray
-            Shape (transition, cell, start cell): cells are H x body x state, start cells body x
-            state. Cells that were not measured have no noise, and so no derivative.
-        """
-        start, columns = self.segments.start, self.observations.columns
-        n, k = start.shape[:2]
-        trajectory, step = self.segments.trajectory, self.segments.step
-        raw = self.data.history.dataset["observed"].values[trajectory, step]
-        result = []
-        for body in range(k):
-            for column, h in zip(columns, steps, strict=True):
-                if self.scene.moving[body].kinematic:  # its path is given, not measured
-                    result.append(np.zeros((n, self.observations.values[0].size)))
-                    continue
-                plus, minus = raw.copy(), raw.copy()
-                plus[:, body, column] += h
-                minus[:, body, column] -= h
-                ends = []
-                for moved in (plus, minus):
-                    # what was not measured follows through the hinges, else stays
-                    fill_hinges(moved[:, None], self.scene)
-                    moved = np.where(np.isfinite(moved), moved, start)
-                    ends.append((engine or self.simulator)(phi, moved, self.inputs))
-                difference = (ends[0] - ends[1])[..., columns] / (2 * h)
-                result.append(difference.reshape(n, -1))
-        return np.stack(result, axis=-1)
+        if self.trajectories is not None:
+            return self.trajectories.random(predicted, self.observations.values, sigma, rng)
+        return next_state_random(predicted, sigma, rng, nu=self.nu(phi))
 
 
 def _parts(scene: Scene, history: History, together: tuple[str, ...]) -> Parts:

@@ -10,9 +10,11 @@ from pbrl_ppl.modes.configurations import (
     stored,
 )
 from pbrl_ppl.modes.joint_search import weigh
-from pbrl_ppl.modes.laplace import Mode, posterior_steps, with_start_noise
+from pbrl_ppl.modes.laplace import Mode, posterior_steps
 from pbrl_ppl.modes.library_choice import choose_from_library
+from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.modes.search import find_mode
+from pbrl_ppl.modes.trajectories import trajectory_mode
 
 __all__ = [
     "ATTRIBUTE",
@@ -25,7 +27,8 @@ __all__ = [
     "index_law",
     "joint_probabilities",
     "posterior_steps",
+    "profile_sigma",
     "stored",
+    "trajectory_mode",
     "weigh",
-    "with_start_noise",
 ]

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from pbrl_ppl.model import Problem, StartNoise, estimate_sigma, log_posterior
-from pbrl_ppl.modes.noise import FAR_OFF, profile_sigma
+from pbrl_ppl.model import Problem, log_posterior
+from pbrl_ppl.modes.noise import FAR_OFF, noise_covariance, profile_sigma
 from pbrl_ppl.modes.tails import best_tails, tail_precision
 from pbrl_ppl.parameters import box, differentiate, inside, likeliest, prior_residual
 from pbrl_ppl.physics import PartedSimulator
@@ -67,6 +67,15 @@ class Mode:
         """Cholesky factor of the covariance, shape (p, p)."""
         jitter = 1e-15 * np.eye(len(self.phi))
         return np.asarray(np.linalg.cholesky(self.covariance + jitter), dtype=float)
+
+    def noise_covariance(self) -> Array:
+        """Laplace covariance of the logarithm of sigma, shape (parameter, parameter)."""
+        if self.problem.trajectories is not None:
+            residual = self.problem.residual(self.phi)
+            return noise_covariance(self.problem, residual, self.sigma, self.phi)
+        # half the inverse of the number of measurements
+        counts = self.problem.observations.measured.sum((0, 1, 2))
+        return np.diag(0.5 / np.maximum(counts, 1))
 
     def draws(self, rng: np.random.Generator, n: int) -> Array:
         """Draws of phi from the Laplace approximation, cut at the supports, shape (n, p)."""
@@ -193,11 +202,3 @@ def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> 
     return Mode(
         problem, phi, sigma, jacobian[:n_cells], np.asarray(covariance, dtype=float), log_posterior
     )
-
-
-def with_start_noise(problem: Problem, mode: Mode) -> Problem:
-    """Account for the noise of measured start states, linearised at a mode."""
-    measured = problem.observations.measured.reshape(problem.segments.n, -1)
-    sensitivity = problem.sensitivity(mode.phi, mode.sigma)
-    sigma = estimate_sigma(problem.residual(mode.phi), problem.observations.measured, sensitivity)
-    return problem.with_noise(start=StartNoise.of(sensitivity, measured, sigma))

@@ -167,5 +167,5 @@ def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> 
             cost = np.log1p(z**2) if turn == 0 else z**2
             best = int(cost.reshape(len(z), -1).sum(axis=1).argmin())
             residual[:, :, part.bodies] = np.nan_to_num(own.residual[best])
-        sigma = estimate_sigma(residual, observations.measured, None)
+        sigma = estimate_sigma(residual, observations.measured)
     return sigma

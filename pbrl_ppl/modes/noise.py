@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import wrightomega
 
-from pbrl_ppl.model import Problem, log_noise_prior, noise_law, whiten
+from pbrl_ppl.model import Problem, TrajectoryNoise, log_noise_prior, noise_law
 
 Array = NDArray[np.float64]
 
@@ -15,29 +17,38 @@ Array = NDArray[np.float64]
 FAR_OFF = 1e3
 #: Sigma of a recording without noise still needs a scale.
 _LEAST = 1e-9
+#: How far the logarithm of a noise parameter may be from where trajectories were linearised.
+_FAR = 6.0
+#: Step of second differences in the logarithm of a noise parameter.
+_SECOND = 0.05
 
 
-def profile_sigma(problem: Problem, residual: Array, phi: Array | None = None) -> Array:
+def profile_sigma(
+    problem: Problem,
+    residual: Array,
+    phi: Array | None = None,
+    held: Mapping[int, float] | None = None,
+) -> Array:
     """Sigma of highest posterior density at given residuals, shape (state,).
 
     Parameters
     ----------
     problem : Problem
-        Says which cells were measured, how the start state's noise spreads, and P(sigma).
+        Says which cells were measured, how residuals are correlated, and P(sigma).
     residual : ndarray
         Shape (transition, H, body, state).
     phi : ndarray, optional
         Parameters, shape (p,); needed where the noise's tails are inferred.
+    held : dict of int to float, optional
+        Noise parameters of whole trajectories that are given.
     """
-    noise = problem.noise.start
+    if problem.trajectories is not None:
+        return _of_trajectories(problem, problem.trajectories, residual, phi, held or {})
     residual = np.nan_to_num(residual, nan=FAR_OFF)
     ones = np.ones(residual.shape[-1])
-    if problem.nu(phi) is None and (noise is None or problem.noise.scalar):
-        z = whiten(residual, ones, noise).reshape(residual.shape)
-        return np.asarray(np.exp(gaussian_log_sigma(problem, (z**2).sum((0, 1, 2)))) * ones)
     begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
-    if noise is not None:
-        begin = begin - np.log(np.median(noise.gain))
+    if problem.nu(phi) is None:
+        return np.asarray(np.exp(begin) * ones)
 
     def cost(log_sigma: Array) -> float:
         likelihood = problem.log_density(residual, np.exp(log_sigma) * ones, phi).sum()
@@ -45,6 +56,28 @@ def profile_sigma(problem: Problem, residual: Array, phi: Array | None = None) -
 
     bounds = [(b - 6, b + 6) for b in begin]
     return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x) * ones)
+
+
+def _of_trajectories(
+    problem: Problem,
+    noise: TrajectoryNoise,
+    residual: Array,
+    phi: Array | None,
+    held: Mapping[int, float],
+) -> Array:
+    """Noise parameters of highest posterior density along trajectories."""
+    residual = np.nan_to_num(residual, nan=FAR_OFF)
+
+    def cost(log_sigma: Array) -> float:
+        likelihood = problem.log_density(residual, np.exp(log_sigma), phi).sum()
+        return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
+
+    begin = np.log(noise.sigma)
+    bounds = [(b - _FAR, b + _FAR) for b in begin]
+    for place, value in held.items():
+        begin[place] = np.log(value)
+        bounds[place] = (begin[place], begin[place])
+    return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x))
 
 
 def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
@@ -82,3 +115,46 @@ def gaussian_profile(problem: Problem, square: Array) -> Array:
     count = problem.observations.measured.sum((0, 1, 2))
     likelihood = -(count * t + 0.5 * square * np.exp(-2 * t)).sum(axis=-1)
     return np.asarray(likelihood + log_noise_prior(problem, t) - t.sum(axis=-1))
+
+
+def noise_covariance(problem: Problem, residual: Array, sigma: Array, phi: Array) -> Array:
+    """Laplace covariance of the logarithm of the noise parameters, by second differences.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories.
+    residual : ndarray
+        Shape (transition, 1, body, state).
+    sigma : ndarray
+        Most probable noise parameters, shape (parameter,).
+    phi : ndarray
+        Parameters, shape (p,).
+
+    Returns
+    -------
+    ndarray
+        Shape (parameter, parameter); no direction is wider than the prior.
+    """
+    at, n = np.log(sigma), len(sigma)
+    spread = noise_law(problem)[1]
+
+    def cost(log_sigma: Array) -> float:
+        likelihood = problem.log_density(residual, np.exp(log_sigma), phi).sum()
+        return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
+
+    def moved(*places: tuple[int, float]) -> float:
+        point = at.copy()
+        for place, step in places:
+            point[place] += step
+        return cost(point)
+
+    middle, hessian, h = cost(at), np.empty((n, n)), _SECOND
+    for i in range(n):
+        hessian[i, i] = (moved((i, h)) - 2 * middle + moved((i, -h))) / h**2
+        for j in range(i):
+            mixed = moved((i, h), (j, h)) - moved((i, h), (j, -h))
+            mixed += moved((i, -h), (j, -h)) - moved((i, -h), (j, h))
+            hessian[i, j] = hessian[j, i] = mixed / (4 * h**2)
+    values, vectors = np.linalg.eigh(hessian)
+    return np.asarray((vectors / np.maximum(values, spread**-2)) @ vectors.T)

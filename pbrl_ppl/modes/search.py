@@ -96,7 +96,7 @@ def find_modes(
     # the basins show in a part of the data already, and with few engine steps
     part = problem if few else _part(problem, _PART)
     residual = part.residual(draws)
-    sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations.measured, None)
+    sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations.measured)
     z = np.nan_to_num(residual / sigma, nan=FAR_OFF).reshape(len(draws), -1)
     # log(1 + z^2): a good start fits most transitions, not the worst one
     order = np.argsort(np.log1p(np.minimum(z, FAR_OFF) ** 2).sum(axis=1))
@@ -164,7 +164,7 @@ def _part(problem: Problem, transitions: int) -> Problem:
     history = problem.data.history
     share = transitions / max(problem.segments.n, 1)
     count = max(2, math.ceil(share * history.n_trajectories))
-    if problem.noise.start is not None or count >= history.n_trajectories:
+    if problem.trajectories is not None or count >= history.n_trajectories:
         return problem.coarse
     chosen = np.linspace(0, history.n_trajectories - 1, count).astype(int)
     part = problem.coarse.with_data(history=history.select(chosen))

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import build_layout, log_posterior, next_state_random
+from pbrl_ppl.model import build_layout, log_posterior
 from pbrl_ppl.physics import Simulator, after_recording
+from pbrl_ppl.planning.noise import StepNoise, step_noise
 from pbrl_ppl.posterior import draws as all_draws
 from pbrl_ppl.posterior import group, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
@@ -35,9 +36,8 @@ class Dynamics:
         Parameter draws in the layout's order, shape (draw, p).
     effects : iterable of Effect or Attached
         Effects beside those that the scene declares.
-    noise : tuple of ndarray, int and float, optional
-        Sigma (draw, state), the columns it is of, and the degrees of freedom or None, or (draw,
-        1, 1, body, 1): then :meth:`noisy` works.
+    noise : StepNoise, optional
+        What a step adds under each draw: then :meth:`noisy` works.
     substeps, threads : int
         Of the engine.
     declared : iterable of Effect
@@ -50,7 +50,7 @@ class Dynamics:
         phi: Array,
         effects: Iterable[Effect | Attached] = (),
         *,
-        noise: tuple[Array, tuple[int, ...], float | Array | None] | None = None,
+        noise: StepNoise | None = None,
         substeps: int | None = None,
         threads: int = 2,
         declared: Iterable[Effect] = catalogue,
@@ -122,7 +122,7 @@ class Dynamics:
         return cls(
             problem.scene,
             phi[chosen],
-            noise=(sigma[chosen], problem.observations.columns, problem.nu(phi[chosen])),
+            noise=step_noise(problem, phi[chosen], sigma[chosen]),
             substeps=problem.physics.substeps,
             threads=threads,
             declared=effects,
@@ -140,9 +140,7 @@ class Dynamics:
         chosen = copy(self)
         chosen.phi = self.phi[i : i + 1]
         if self._noise is not None:
-            sigma, columns, nu = self._noise
-            own = nu[i : i + 1] if isinstance(nu, np.ndarray) else nu
-            chosen._noise = (sigma[i : i + 1], columns, own)
+            chosen._noise = self._noise.single(i)
         return chosen
 
     def after(self, before: Array) -> Dynamics:
@@ -198,14 +196,7 @@ class Dynamics:
         """
         if self._noise is None:
             raise PosteriorError("noise: these parameters are known, and have no sigma; leave it")
-        sigma, columns, nu = self._noise
-        out = states.copy()
-        for i, scale in enumerate(sigma):
-            own = nu[i][0] if isinstance(nu, np.ndarray) else nu
-            out[i][..., columns] = next_state_random(
-                states[i][..., columns], scale, None, rng, nu=own
-            )
-        return out
+        return self._noise.add(states, rng)
 
     def rollout(
         self, start: Array, wrenches: Array, rng: np.random.Generator | None = None

@@ -12,6 +12,7 @@ from pbrl_ppl.posterior.record import (
     parameter_draws,
     predictive_rows,
 )
+from pbrl_ppl.posterior.recording import both_recordings, recording
 from pbrl_ppl.posterior.store import (
     DATATREE,
     HDI_PROB,
@@ -35,6 +36,7 @@ __all__ = [
     "MIN_ESS",
     "Comparison",
     "Identifiability",
+    "both_recordings",
     "checked",
     "compare",
     "complete",
@@ -52,6 +54,7 @@ __all__ = [
     "parameter_draws",
     "predictive_rows",
     "problem_of",
+    "recording",
     "save_posterior",
     "scalars",
     "scene_of",

@@ -12,8 +12,16 @@ import numpy as np
 
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.history import History, Segments, from_segments
-from pbrl_ppl.model import Noise, Observations, ParameterLibrary, Problem, sigma_prior
-from pbrl_ppl.posterior.store import attributes, group, scene_of
+from pbrl_ppl.model import (
+    Noise,
+    Observations,
+    ParameterLibrary,
+    Problem,
+    along_trajectories,
+    sigma_prior,
+)
+from pbrl_ppl.posterior.recording import with_recording
+from pbrl_ppl.posterior.store import attributes, draws, group, scene_of
 from pbrl_ppl.state import INPUT, STATE
 
 PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
@@ -40,7 +48,6 @@ def origin(problem: Problem, seed: int) -> dict[str, Any]:
         substeps=problem.physics.substeps,
         together=list(problem.physics.together),
         sigma_prior=[[float(value) for value in median], float(spread)],
-        start_noise=int(problem.noise.start is not None),
         data_sha256=problem.data.history.data_sha256,
         versions=versions(),
     )
@@ -62,7 +69,7 @@ def problem_of(
 ) -> Problem:
     """The problem that a posterior was fitted to, from what the posterior holds.
 
-    Start noise and a user's own effects are not in it.
+    A user's own effects are not in it.
 
     Parameters
     ----------
@@ -98,11 +105,12 @@ def problem_of(
         nu=float(attrs["nu"]) if "nu" in attrs else None,
         prior=(tuple(float(value) for value in median), float(spread)),
     )
+    other = history is not None
     if history is None:
         history = from_segments(scene, start, actions, observed)
     elif actions.shape[-1] == len(INPUT):  # recorded since
         history = history.numbered(float(actions[..., INPUT.index("trajectory")].max()) + 1.0)
-    return Problem.of(
+    problem = Problem.of(
         scene,
         history,
         attach(scene, (), effects),
@@ -113,3 +121,14 @@ def problem_of(
         library=ParameterLibrary.from_json(str(attrs["library"])) if "library" in attrs else None,
         together=tuple(json.loads(str(attrs.get("together", "[]")))),
     )
+    recorded = with_recording(problem, given, str(attrs["data_sha256"]))
+    trajectories = recorded.trajectories
+    if not other or trajectories is None:
+        return recorded
+    # linearised where the posterior is
+    named = draws(idata)
+    phi = problem.layout.to_vectors(named, len(named["sigma"]))
+    sigma = np.hstack([named[name].reshape(len(phi), -1) for name in recorded.noise_variables])
+    likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
+    best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
+    return along_trajectories(problem, phi[best], sigma[best], trajectories.cells)

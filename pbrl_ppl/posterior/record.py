@@ -12,11 +12,12 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
-from pbrl_ppl.model import Problem
+from pbrl_ppl.model import ACCELERATION, Problem
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.origin import origin
+from pbrl_ppl.posterior.recording import recording
 from pbrl_ppl.posterior.store import (
     convergence,
     draws,
@@ -89,8 +90,8 @@ def complete(
             {"next_state": (("chain", "draw", *dims), predictive[None])},
             {"chain": [0], "draw": np.arange(len(predictive)), **coords},
         ),
-        "observed_data": xr.Dataset({"next_state": (dims, problem.observations.values)}, coords),
-        "constant_data": data["constant_data"],
+        "observed_data": xr.Dataset({"next_state": (dims, problem.measured)}, coords),
+        "constant_data": data["constant_data"].merge(recording(problem)),
     }
     idata = from_groups(result, origin(problem, seed) | {"method": method})
     if ATTRIBUTE in trace.attrs:
@@ -148,8 +149,8 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
     named = draws(trace)
     n = len(named["sigma"])
     phi = problem.layout.to_vectors(named, n)
-    sigma = named["sigma"].reshape(n, -1)
-    return phi, np.broadcast_to(sigma, (len(phi), len(problem.observations.columns)))
+    sigma = np.hstack([named[name].reshape(n, -1) for name in problem.noise_variables])
+    return phi, np.broadcast_to(sigma, (len(phi), len(problem.noise_prior[0])))
 
 
 def _folded(problem: Problem, trace: Any, seed: int | None) -> xr.Dataset:
@@ -177,6 +178,8 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     for block in problem.layout.blocks:
         posterior[block.name].attrs["units"] = block.unit
     posterior["sigma"].attrs["units"] = "the unit of each state dimension"
+    if problem.trajectories is not None:
+        posterior[ACCELERATION].attrs["units"] = "m/s^2, of omega rad/s^2"
     return posterior
 
 

@@ -155,7 +155,6 @@ def close_loop(
     *,
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
-    horizon: int | None = None,
     substeps: int | None = None,
     draws: int | None = None,
     progress: Callable[[str], None] | None = None,
@@ -174,12 +173,10 @@ def close_loop(
         Effects to consider; add your own to the package's.
     seed : int
         The same seed gives the same findings.
-    horizon : int, optional
-        Intervals predicted from one measured state; chosen from the data by default.
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws kept of each chain; 800 by default, half of that for long recordings.
+        Posterior draws kept of each chain; 300 by default.
     progress : callable, optional
         Told the name of each stage.
 
@@ -209,7 +206,6 @@ def close_loop(
         test,
         catalogue=catalogue,
         seed=seed,
-        horizon=horizon,
         substeps=substeps,
         draws=draws,
         progress=progress,

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pbrl_ppl.criticism import ADEQUATE, UNEXPLAINED, Findings
+from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -19,8 +19,21 @@ def verdict_in_words(findings: Findings) -> str:
     )
     left = findings.unexplained
     rest = "a pattern remains in the errors" if left is None else left.sentence.rstrip(".")
+    if findings.verdict == NOT_CONVERGED:
+        return (
+            "No verdict: the chains have not converged. Take more draws (--draws), or give the"
+            " parameters tighter priors."
+        )
     if findings.verdict == ADEQUATE:
-        return "Nothing is missing: the declared model explains the data up to measurement noise."
+        small = joined(
+            f"{plain(candidate.effect)} on the {plain(candidate.body)}"
+            for candidate in findings.small
+        )
+        beside = f" {small.capitalize()} is present, and changes predictions by less than 1 %."
+        return (
+            "Nothing was found missing: what the declared model leaves passed all tests of"
+            f" measurement noise.{beside if small else ''}"
+        )
     if findings.verdict == UNEXPLAINED and not found:
         return f"Something is missing that no effect in the catalogue explains: {rest}."
     if findings.verdict == UNEXPLAINED or left is not None:

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from pbrl_ppl.modes import Mode, choose_from_library, find_mode, weigh
+from pbrl_ppl.model import Problem, build_model, single_transitions
+from pbrl_ppl.modes import Mode, choose_from_library, find_mode, trajectory_mode, weigh
 from pbrl_ppl.posterior import complete, group
 from pbrl_ppl.sampling.emulator import emulate
 from pbrl_ppl.sampling.equal_wheels import evened_logp
@@ -286,7 +287,10 @@ def fit(
     elif resume is not None:
         trace = sampled(model, *from_posterior(problem, resume))
     else:
-        mode = find_mode(problem, seed=seed) if start is None else start
+        mode = _mode(problem, seed) if start is None else start
+        if start is None and problem.trajectories is not None:  # linearised at the mode by now
+            problem = mode.problem
+            model = build_model(problem)
         if joined := joined_model(problem, mode.phi[None], mode.sigma[None]):
             return again(joined)
         trace = sampled(model, mode)
@@ -298,6 +302,15 @@ def fit(
     # PyMC ends an interrupted run quietly, with the draws so far
     asked = draws if done < draws else None
     return complete(problem, trace, seed=seed, method=method, asked=asked)
+
+
+def _mode(problem: Problem, seed: int) -> Mode:
+    """The mode to sample about."""
+    if problem.trajectories is None:
+        return find_mode(problem, seed=seed)
+    single = single_transitions(problem)
+    near = find_mode(single, seed=seed)
+    return trajectory_mode(problem, near.phi)
 
 
 def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:

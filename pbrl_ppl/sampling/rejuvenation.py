@@ -94,7 +94,7 @@ class _Mover:
         if problem.noise.scalar:
             self.noise = self.noise[:, :1].copy()
         self.parts = problem.simulator.parts
-        if problem.noise.start is not None:  # it mixes the bodies' residuals
+        if problem.trajectories is not None:  # it mixes the bodies' residuals
             self.parts = problem.physics.changed(parts=None).simulator.parts
         self.blocks = [
             Gaussian(part.places, self.u[:, part.places].mean(axis=0), _spread(self.u, part.places))
@@ -129,7 +129,9 @@ class _Mover:
 
     def likelihood(self, residual: Array, noise: Array, u: Array) -> Array:
         """Log-likelihood of each part, shape (particle, part), for log sigma (particle, state)."""
-        problem, sigma = self.problem, np.exp(noise) * np.ones(residual.shape[-1])
+        problem, sigma = self.problem, np.exp(noise)
+        if problem.noise.scalar:
+            sigma = sigma * np.ones(residual.shape[-1])
         measured, phi = problem.observations.measured, self.phi(u)
         nu = problem.nu(phi)
         if len(self.parts) == 1:

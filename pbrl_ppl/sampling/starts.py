@@ -36,8 +36,10 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
         own = part.places
         if len(own):
             blocks.append(Gaussian(where[own], mean[own], covariance[np.ix_(own, own)]))
-    noise = places["sigma"], *_sigma_laplace(problem, mode)
-    if len(blocks) == 1:  # then the noise may as well move along
+    own = np.concatenate([places[name] for name in problem.noise_variables])
+    noise = own, *_sigma_laplace(problem, mode)
+    # along trajectories another noise costs a filter's gains
+    if len(blocks) == 1 and problem.trajectories is None:  # then the noise may as well move along
         only = blocks[0]
         return [
             Gaussian(
@@ -55,7 +57,9 @@ def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
     ``model.initial_point()`` has them too, and compiles a function for that.
     """
     shapes: dict[str, tuple[int, ...]] = {b.name: (len(b.owners),) for b in problem.layout.blocks}
-    shapes["sigma"] = () if problem.noise.scalar else (len(problem.observations.columns),)
+    shapes |= {name: (len(own),) for name, own in problem.noise_variables.items()}
+    if problem.noise.scalar:
+        shapes["sigma"] = ()
     return {
         value.name: np.zeros(shapes[model.values_to_rvs[value].name])
         for value in model.continuous_value_vars
@@ -98,6 +102,8 @@ def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
 
 def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     """Mean and covariance of log sigma: the latter half the inverse of the measurements."""
+    if problem.trajectories is not None:
+        return np.log(mode.sigma), mode.noise_covariance()
     counts = problem.observations.measured.sum((0, 1, 2))
     mean = np.log(mode.sigma)
     if problem.noise.scalar:
@@ -110,10 +116,13 @@ def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[st
     problem, priors = mode.problem, mode.problem.layout.priors
     low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
     factor, starts = mode.factor, []
+    wide: float | Array = 0.1
+    if problem.trajectories is not None:
+        wide = np.minimum(2.0 * np.sqrt(np.diag(mode.noise_covariance())), 2.0)
     for _ in range(chains):
         moved = mode.phi + 2.0 * factor @ rng.standard_normal(len(mode.phi))
         moved = np.where((moved < low) | (moved > high), mode.phi, moved)
-        sigma = mode.sigma * np.exp(0.1 * rng.standard_normal(len(mode.sigma)))
+        sigma = mode.sigma * np.exp(wide * rng.standard_normal(len(mode.sigma)))
         starts.append(problem.named(inside(priors, moved), sigma))
     return starts
 
@@ -141,7 +150,7 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
         If its variables are not the problem's.
     """
     posterior = group(idata, "posterior")
-    names = [*(block.name for block in problem.layout.blocks), "sigma"]
+    names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
     missing = [name for name in names if name not in posterior]
     if missing:
         raise PosteriorError(f"start: the posterior has no {', '.join(missing)}; of another model?")

@@ -36,7 +36,9 @@ class Unpack:
 
     def __init__(self, model: pm.Model, problem: Problem) -> None:
         variables = [model[block.name] for block in problem.layout.blocks]
-        outputs = model.replace_rvs_by_values([*variables, model["sigma"]])
+        self._parameters = len(problem.layout.blocks)
+        noise = [model[name] for name in problem.noise_variables]
+        outputs = model.replace_rvs_by_values([*variables, *noise])
         values = model.continuous_value_vars
         point = blank_point(model, problem)
         joined_outputs, joined = join_nonshared_inputs(
@@ -47,11 +49,13 @@ class Unpack:
         )
         self._function = compile_function([joined], joined_outputs)
         self._function.trust_input = True
-        self._states = len(problem.observations.columns)
+        self._states = len(problem.noise_prior[0])
 
     def __call__(self, q: Array) -> tuple[Array, Array, float]:
         """Parameters (p,), noise (state,) and the prior's log-density with the transforms'."""
-        prior, *phi, sigma = self._function(q)
+        prior, *values = self._function(q)
+        phi, noise = values[: self._parameters], values[self._parameters :]
+        sigma = np.concatenate([np.atleast_1d(own) for own in noise])
         return (
             np.concatenate([np.zeros(0), *phi]),
             np.broadcast_to(sigma, (self._states,)),

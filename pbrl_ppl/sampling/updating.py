@@ -18,6 +18,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.posterior import (
     MIN_ESS,
+    both_recordings,
     checked,
     complete,
     convergence,
@@ -28,6 +29,7 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     predictive_rows,
     problem_of,
+    recording,
     smoothed,
 )
 from pbrl_ppl.sampling.fitting import fit
@@ -143,7 +145,7 @@ def _updated(
     """The posterior with the problem's transitions, and what was done."""
     rng = np.random.default_rng(seed)
     base = _base(idata, problem)
-    names = [*(block.name for block in problem.layout.blocks), "sigma"]
+    names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
     phi, sigma = parameter_draws(problem, from_groups({"posterior": base[names]}, {}))
     rows = base["row"].to_numpy()
     problem = problem.joined(phi[rows], sigma[rows])
@@ -283,28 +285,30 @@ def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
     new = {
         "start": segments.start,
         "actions": problem.inputs,
-        "next_state": problem.observations.values,
+        "next_state": problem.measured,
     }
     for name in ("observed_data", "constant_data"):
-        held = group(idata, name).transpose("transition", ...)
-        total = held.sizes["transition"] + segments.n
+        held = group(idata, name)
+        own = held[[key for key in held.data_vars if key in new]].transpose("transition", ...)
+        total = own.sizes["transition"] + segments.n
         both = {
             str(key): (
                 variable.dims,
                 np.concatenate([variable.to_numpy(), new[str(key)]]),
                 variable.attrs,
             )
-            for key, variable in held.data_vars.items()
+            for key, variable in own.data_vars.items()
         }
-        coords = {key: coordinate for key, coordinate in held.coords.items() if key != "transition"}
+        coords = {key: coordinate for key, coordinate in own.coords.items() if key != "transition"}
         result[name] = xr.Dataset(both, coords | {"transition": np.arange(total)}, held.attrs)
+    more = both_recordings(group(idata, "constant_data"), recording(problem))
+    result["constant_data"] = result["constant_data"].merge(more)
     return result
 
 
 def _walkers(problem: Problem, like: xr.Dataset, phi: Array, sigma: Array) -> xr.Dataset:
     """Vectors (draw, p) and (draw, state) as named draws, shaped like others."""
-    named = problem.layout.to_dict(phi)
-    named["sigma"] = sigma[:, 0] if problem.noise.scalar else sigma
+    named = problem.named(phi, sigma)
     return like.assign(
         {
             name: (like[name].dims, values.reshape(like[name].shape))

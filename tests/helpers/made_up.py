@@ -6,13 +6,15 @@ from typing import Any
 import arviz as az
 import numpy as np
 
-from pbrl_ppl.criticism.findings import (
+from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.results import (
+    Acceleration,
     Added,
     Candidate,
     Errors,
     Estimate,
-    Findings,
     Numerical,
+    ResidualTest,
     Rollout,
     Unexplained,
 )
@@ -158,7 +160,31 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Findings:
             off.T if found else wrapped.T,
             wrapped.T,
         ),
-        horizon=1,
         rollout_horizon=20,
         provenance={"seed": 1, "versions": {"pymc": "5.28"}, "data_sha256": "ab" * 32},
+        tests=made_up_tests(verdict),
+        acceleration=made_up_acceleration(verdict),
     )
+
+
+def made_up_tests(verdict: str) -> tuple[ResidualTest, ...]:
+    whole = verdict != "unexplained"
+    said = "no acceleration is left" if whole else "an acceleration of 0.2 rad/s² in omega is left"
+    p_value, share = (0.4, 0.001) if whole else (1e-9, 0.34)
+    return (
+        ResidualTest("unexplained acceleration", p_value, share, whole, said),
+        ResidualTest("whiteness", 0.3, 0.05, True, "errors say nothing of those of the next"),
+    )
+
+
+def made_up_acceleration(verdict: str) -> Acceleration:
+    names = ("vx", "vy", "omega")
+    clean = dict(zip(names, (0.002, 0.002, 0.003), strict=True))
+    off = {name: 50 * value for name, value in clean.items()}
+    before, after = {
+        "adequate": (clean, clean),
+        "effects-added": (off, clean),
+        "unexplained": (off, off),
+    }.get(verdict, (off, off))
+    shares = [{name: value / 2 for name, value in each.items()} for each in (before, after)]
+    return Acceleration(before, after, *shares, dict.fromkeys(names, after is off))

@@ -11,9 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pbrl_ppl.criticism.findings import (
-    Errors,
-)
+from pbrl_ppl.criticism.results import Errors
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.posterior.comparison import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
@@ -304,11 +302,11 @@ def test_close_loop_hands_over_what_it_got(monkeypatch: pytest.MonkeyPatch) -> N
     monkeypatch.setattr(
         loop_module, "revise", lambda *args, **kw: calls.append((args, kw)) or made_up()
     )
-    loop = close_loop("scene", "train", "test", seed=3, horizon=2)  # type: ignore[arg-type]
+    loop = close_loop("scene", "train", "test", seed=3, substeps=20)  # type: ignore[arg-type]
     assert loop.verdict == "effects-added"
     ((args, options),) = calls
     assert args == ("scene", "train", "test")
-    assert (options["seed"], options["horizon"], options["draws"]) == (3, 2, None)
+    assert (options["seed"], options["substeps"], options["draws"]) == (3, 20, None)
     ours, theirs = (inspect.signature(each).parameters for each in (close_loop, revise))
     assert list(ours.values()) == list(theirs.values())
 

@@ -1,0 +1,155 @@
+"""Permutation test, by kernel regression, of whether innovations depend on what was recorded."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.criticism.results import Unexplained
+from pbrl_ppl.criticism.unexplained import trajectories
+from pbrl_ppl.modes import Mode
+from pbrl_ppl.state import STATE
+
+Array = NDArray[np.float64]
+
+#: Chance of calling clean data unexplained.
+FALSE_ALARM = 0.01
+#: Less than this share of the residual's variance does not matter.
+SMALLEST_SHARE = 0.02
+_PERMUTATIONS = 499
+_FOLDS = 5
+_RIDGE = 1.0
+#: More transitions than this say the same more slowly.
+_MOST = 1500
+
+FEATURES = (
+    "position x",
+    "position y",
+    "orientation (cosine)",
+    "orientation (sine)",
+    "forward speed",
+    "sideways speed",
+    "angular speed",
+    "speed",
+    "commanded forward force",
+    "commanded sideways force",
+    "commanded torque",
+    "forward force commanded before",
+    "sideways force commanded before",
+    "torque commanded before",
+    "time",
+)
+
+
+def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
+    """Test whether the innovations of a fitted model still depend on state, action or time.
+
+    A kernel ridge regression with one smooth term a quantity predicts the residual of trajectories
+    that it was not trained on; the null distribution comes from shuffling the transitions.
+
+    Parameters
+    ----------
+    mode : Mode
+        A fitted model.
+    seed : int
+        Of the shuffling and the folds.
+
+    Returns
+    -------
+    Unexplained or None
+        Where the structure is strongest; None if there is none beyond chance.
+    """
+    rng = np.random.default_rng(seed)
+    problem = mode.problem
+    n = problem.segments.n
+    tests = len(problem.scene.dynamic)
+    chosen = np.sort(rng.permutation(n)[:_MOST])
+    places = trajectories(mode).cells.places
+    innovations = mode.whitened_residual()[chosen]
+    groups = problem.segments.trajectory[chosen]
+    best: Unexplained | None = None
+    for i, body in enumerate(problem.scene.moving):
+        if body.kinematic:
+            continue
+        features = _features(mode, i)[chosen]
+        own = np.flatnonzero(places // len(STATE) == i)
+        y = innovations[:, own] - innovations[:, own].mean(axis=0)
+        kernels = _kernels(features)
+        smoother = _cross_validated(kernels.sum(axis=0), groups, rng)
+        shares = _explained(smoother, y)
+        null = np.array(
+            [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
+        )
+        at = int(np.argmax(shares))
+        p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * tests
+        if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE:
+            continue
+        if best is None or shares[at] > best.share:
+            dimension = STATE[places[own[at]] % len(STATE)]
+            best = _describe(body.name, dimension, kernels, y[:, at], shares[at], p_value)
+    return best
+
+
+def _features(mode: Mode, body: int) -> Array:
+    """State and action at each start, in the body's frame, shape (transition, feature)."""
+    segments = mode.problem.segments
+    x, y, theta, vx, vy, omega = segments.start[:, body].T
+    fx, fy, torque = segments.actions[:, :, body].mean(axis=1).T
+    gx, gy, torque_before = segments.inputs[:, 0, body, 3:6].T
+    c, s = np.cos(theta), np.sin(theta)
+    time = segments.step.astype(float)
+    return np.stack(
+        [
+            x, y, c, s, c * vx + s * vy, c * vy - s * vx, omega, np.hypot(vx, vy),
+            c * fx + s * fy, c * fy - s * fx, torque,
+            c * gx + s * gy, c * gy - s * gx, torque_before, time,
+        ],
+        axis=1,
+    )  # fmt: skip
+
+
+def _kernels(features: Array) -> Array:
+    """One Gaussian kernel a quantity, on ranks scaled to unit range, shape (feature, n, n)."""
+    order = np.argsort(np.argsort(features, axis=0), axis=0) / max(len(features) - 1, 1)
+    varies = np.ptp(features, axis=0) > 1e-9
+    order = np.where(varies, order, 0.0)
+    difference = order.T[:, :, None] - order.T[:, None, :]
+    kernels = np.exp(-0.5 * (difference / 0.2) ** 2)
+    kernels[~varies] = 0.0
+    return kernels / max(int(varies.sum()), 1)
+
+
+def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
+    """Matrix that predicts each transition from those of other trajectories."""
+    smoother = np.zeros_like(kernel)
+    names = rng.permutation(np.unique(groups))
+    for held in np.array_split(names, min(_FOLDS, len(names))):
+        out = np.isin(groups, held)
+        inner = kernel[np.ix_(~out, ~out)] + _RIDGE * np.eye(int((~out).sum()))
+        smoother[np.ix_(out, ~out)] = np.linalg.solve(inner, kernel[np.ix_(~out, out)]).T
+    return smoother
+
+
+def _explained(smoother: Array, y: Array) -> Array:
+    """Share of variance predicted, per column."""
+    size = np.maximum((y**2).sum(axis=0), 1e-300)
+    return np.asarray(1.0 - ((y - smoother @ y) ** 2).sum(axis=0) / size)
+
+
+def _describe(
+    body: str, dimension: str, kernels: Array, y: Array, share: float, p_value: float
+) -> Unexplained:
+    weights = np.linalg.solve(kernels.sum(axis=0) + _RIDGE * np.eye(len(y)), y)
+    parts = np.array([np.var(kernel @ weights) for kernel in kernels])
+    name = FEATURES[int(np.argmax(parts))]
+    return Unexplained(
+        body=body,
+        dimension=dimension,
+        depends_on=name,
+        share=float(share),
+        p_value=min(1.0, p_value),
+        sentence=(
+            f"the error of {dimension} of {body} still depends on its {name}:"
+            f" {share:.0%} of it could be predicted, and nothing in the catalogue does so"
+        ),
+    )

@@ -1,0 +1,123 @@
+"""Forecasts of several intervals from filtered states, and the error that noise alone makes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.model import Problem, TrajectoryNoise
+from pbrl_ppl.state import STATE
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+#: Rows after which a filter knows a state about as well as it ever will.
+_SETTLED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Errors at the end of forecasts, and what noise alone would make of them.
+
+    Parameters
+    ----------
+    error : ndarray
+        Measured minus predicted, shape (start, cell), SI units; NaN where not measured.
+    variance : ndarray
+        Expected square of it from the noise of measurements, shape (start, cell).
+    dimension : ndarray of int
+        State dimension of each cell, shape (cell,).
+    """
+
+    error: Array
+    variance: Array
+    dimension: Ints
+
+    def rmse(self) -> dict[str, float]:
+        """Root mean square error of each measured state dimension, in its unit."""
+        return self._by_dimension(self.error**2)
+
+    def floor(self) -> dict[str, float]:
+        """The same of the noise alone."""
+        return self._by_dimension(np.where(np.isfinite(self.error), self.variance, np.nan))
+
+    def _by_dimension(self, square: Array) -> dict[str, float]:
+        result = {}
+        for d in np.unique(self.dimension):
+            own = square[:, self.dimension == d]
+            if np.isfinite(own).any():
+                result[STATE[d]] = float(np.sqrt(np.nanmean(own)))
+        return result
+
+
+def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
+    """States given what was measured up to them, shape (trajectory, time, body, 6), SI units."""
+    noise = _noise(problem)
+    cells, segments = noise.cells, problem.segments
+    residual = cells.of_residual(problem.residual(phi))
+    deviation = noise.filtered(residual[None], sigma)[1][0]
+    states = problem.data.smoothed_states.copy()
+    flat = states.reshape(*states.shape[:2], -1)
+    flat[segments.trajectory[:, None], segments.step[:, None] + 1, cells.places] += deviation
+    # nothing comes before a trajectory's first row: it is as measured, or as estimated there
+    start = problem.data.history.dataset["start"].to_numpy()[:, 0].reshape(len(flat), -1)
+    first = start[:, cells.places]
+    flat[:, 0, cells.places] = np.where(np.isfinite(first), first, flat[:, 0, cells.places])
+    return cells.completed(problem.scene, states)
+
+
+def forecast(problem: Problem, phi: Array, sigma: Array, intervals: int) -> Forecast:
+    """Predict several intervals from filtered states all along the trajectories.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories.
+    phi, sigma : ndarray
+        Parameters and noise parameters, shapes (p,) and (parameter,).
+    intervals : int
+        How far.
+    """
+    noise = _noise(problem)
+    cells, segments = noise.cells, problem.segments
+    begins = np.flatnonzero(noise.first)
+    lengths = np.diff(np.append(begins, segments.n))
+    starts = []
+    for begin, length in zip(begins, lengths, strict=True):
+        if length >= intervals:
+            first = min(_SETTLED, length - intervals)
+            rows = np.arange(first, length - intervals + 1, max(1, intervals // 2))
+            starts.append(begin + rows)
+    at = np.concatenate(starts)
+    trajectory, step = segments.trajectory[at], segments.step[at]
+    every = at[:, None] + np.arange(intervals)
+    states = filtered_states(problem, phi, sigma)[trajectory, step]
+    inputs = problem.inputs[every, 0]
+    ends = cells.of(problem.one_world(phi, states, inputs)[:, -1])
+    observed = problem.data.history.dataset["observed"].to_numpy()
+    error = cells.wrapped(cells.of(observed[trajectory, step + intervals]) - ends)
+    covariance = _spread(noise, sigma, at, step)
+    for i in range(intervals):
+        slope = noise.slope[every[:, i]]
+        covariance = slope @ covariance @ slope.transpose(0, 2, 1)
+    variance = np.diagonal(covariance, axis1=1, axis2=2) + cells.errors(sigma) ** 2
+    return Forecast(error, variance, cells.places % len(STATE))
+
+
+def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array:
+    """Covariance of the filtered states before these transitions, shape (start, cell, cell)."""
+    after = noise.gains(sigma)[2][at - 1]
+    variance = np.where(noise.wide[at] > 0, noise.wide[at], noise.cells.errors(sigma) ** 2)
+    # an estimate of what was not measured is no better than the filter's, soon after
+    later = np.diagonal(after, axis1=1, axis2=2)
+    variance = np.where(noise.wide[at] > 0, later, variance)
+    first = variance[:, :, None] * np.eye(variance.shape[1])
+    return np.where((step == 0)[:, None, None], first, after)
+
+
+def _noise(problem: Problem) -> TrajectoryNoise:
+    if problem.trajectories is None:
+        raise TypeError("forecast: the problem is not one of whole trajectories")
+    return problem.trajectories

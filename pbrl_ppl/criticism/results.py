@@ -1,0 +1,222 @@
+"""What the loop finds, as plain results: candidates, effects added, tests, errors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An effect that the model lacks, and how strongly the residual asks for it.
+
+    Parameters
+    ----------
+    effect, body : str
+        What, and on which body.
+    sentence : str
+        What it means in words.
+    statistic : float
+        Score statistic S; chi-squared with ``dof`` degrees of freedom if the effect is absent.
+    dof : int
+        Number of the signature's columns: the effect's parameters, less those that are scanned, and
+        one where all are.
+    p_value : float
+        Probability of a statistic at least as large by chance, corrected for the number of
+        candidates.
+    estimate : dict of str to float
+        First estimate of each parameter, from the signature alone.
+    units : dict of str to str
+        Unit of each parameter.
+    identifiable : float
+        Share of the signature (0 to 1) that the declared parameters cannot absorb.
+    looks : int
+        At how many places, thresholds or times it was tried; the p-value pays for them.
+    detectable : dict of str to float
+        Smallest size of each parameter that these data would show (nine times of ten, at a p-value
+        of 0.01), the others being nothing; infinite where they would not show any.
+    """
+
+    effect: str
+    body: str
+    sentence: str
+    statistic: float
+    dof: int
+    p_value: float
+    estimate: Mapping[str, float]
+    units: Mapping[str, str]
+    identifiable: float
+    looks: int = 1
+    detectable: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ResidualTest:
+    """Test of what a model leaves, for a reader.
+
+    Parameters
+    ----------
+    name : str
+        What was tested.
+    p_value : float
+        Probability of a result as large by chance, if nothing is missing.
+    size : float
+        How much there is, as ``sentence`` says.
+    passed : bool
+        Whether there is nothing, or too little to matter.
+    sentence : str
+        The result in words.
+    """
+
+    name: str
+    p_value: float
+    size: float
+    passed: bool
+    sentence: str
+
+
+@dataclass(frozen=True)
+class Acceleration:
+    """Unexplained acceleration of each velocity: what a step adds beyond the model.
+
+    Parameters
+    ----------
+    before, after : dict of str to float
+        Standard deviation under the declared and the revised model, m/s^2 and rad/s^2.
+    relative_before, relative_after : dict of str to float
+        The same over the root mean square acceleration of the bodies.
+    certain_after : dict of str to bool
+        Whether what the revised model leaves is not nothing.
+    """
+
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    relative_before: Mapping[str, float]
+    relative_after: Mapping[str, float]
+    certain_after: Mapping[str, bool]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """Posterior summary of one parameter: mean, sd and 94 % highest-density interval."""
+
+    mean: float
+    sd: float
+    hdi: tuple[float, float]
+    unit: str
+
+
+@dataclass(frozen=True)
+class Added:
+    """An effect that was added to the model, with its posterior and what it gained.
+
+    Parameters
+    ----------
+    effect, body, sentence : str
+        What, on which body, and what it means in words.
+    statistic, p_value : float
+        Of the round in which it was found.
+    parameters : dict of str to Estimate
+        Posterior of each of its parameters.
+    not_separable_from : tuple of str
+        Effects that would explain these data as well.
+    elpd_difference, elpd_difference_se : float
+        Gain of log predictive density on held-out transitions, and its standard error.
+    """
+
+    effect: str
+    body: str
+    sentence: str
+    statistic: float
+    p_value: float
+    parameters: Mapping[str, Estimate]
+    not_separable_from: tuple[str, ...]
+    elpd_difference: float
+    elpd_difference_se: float
+
+
+@dataclass(frozen=True)
+class Numerical:
+    """Engine substeps declared and used, and how far doubling the declared ones moves results."""
+
+    substeps_declared: int
+    substeps_used: int
+    shift_in_noise_units: float
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors on held-out data.
+
+    Parameters
+    ----------
+    one_step_rmse : dict of str to float
+        Root mean square error one interval ahead, per state dimension, in its unit.
+    rollout_rmse : dict of str to float
+        The same at the end of a rollout of several intervals.
+    normalised_rmse : float
+        Root mean square of the residual in units of the noise: 1 is as good as can be.
+    elpd : float
+        Log predictive density, summed over held-out transitions.
+    """
+
+    one_step_rmse: Mapping[str, float]
+    rollout_rmse: Mapping[str, float]
+    normalised_rmse: float
+    elpd: float
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """One held-out trajectory: measured, and predicted from its first state.
+
+    Parameters
+    ----------
+    body : str
+        The body shown.
+    time : ndarray
+        Seconds since the start, shape (time,).
+    names, units : tuple of str
+        State dimensions shown, and their units.
+    measured, before, after : ndarray
+        Shape (time, state); measured is NaN where missing.
+    """
+
+    body: str
+    time: Array
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    measured: Array
+    before: Array
+    after: Array
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """Structure that remains in the residual after all that the catalogue explains.
+
+    Parameters
+    ----------
+    body, dimension : str
+        Where it is strongest.
+    depends_on : str
+        The quantity it depends on most.
+    share : float
+        Share of that residual's variance that a flexible regression predicts (0 to 1).
+    p_value : float
+        Of a permutation test.
+    sentence : str
+        The same in words.
+    """
+
+    body: str
+    dimension: str
+    depends_on: str
+    share: float
+    p_value: float
+    sentence: str

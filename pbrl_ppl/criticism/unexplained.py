@@ -1,0 +1,109 @@
+"""Unexplained acceleration: what a step adds beyond the model, beside what the bodies do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from pbrl_ppl.model import TrajectoryNoise
+from pbrl_ppl.modes import Mode, profile_sigma
+from pbrl_ppl.state import STATE
+
+Array = NDArray[np.float64]
+
+#: Chance of calling nothing something.
+FALSE_ALARM = 1e-3
+#: A share of the bodies' own acceleration that matters.
+MATTERS = 0.01
+#: What counts as no noise, as a share of its prior's median.
+_NOTHING = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Left:
+    """Unexplained acceleration of a model, shape (velocity,) each.
+
+    Parameters
+    ----------
+    names : tuple of str
+        Velocities.
+    size : ndarray
+        Standard deviation, m/s^2 and rad/s^2.
+    relative : ndarray
+        The same over the root mean square acceleration of the bodies.
+    p_value : ndarray
+        Of the likelihood ratio against none.
+    """
+
+    names: tuple[str, ...]
+    size: Array
+    relative: Array
+    p_value: Array
+
+    @property
+    def certain(self) -> NDArray[np.bool_]:
+        """Which are more than chance brings."""
+        return np.asarray(self.p_value * len(self.names) < FALSE_ALARM)
+
+    @property
+    def worst(self) -> float:
+        """Largest relative one among those that are certain; 0 without any."""
+        return float(np.where(self.certain, self.relative, 0.0).max(initial=0.0))
+
+    @property
+    def square(self) -> float:
+        """Sum of squares of the relative ones that are certain."""
+        return float((np.where(self.certain, self.relative, 0.0) ** 2).sum())
+
+
+def unexplained_acceleration(mode: Mode) -> Left:
+    """Size of the acceleration that the model of a mode leaves unexplained."""
+    noise = trajectories(mode)
+    cells, k = noise.cells, len(noise.cells.sensors)
+    segments = mode.problem.segments
+    change = segments.observed[:, 0] - segments.start
+    dt = mode.problem.scene.time_step
+    typical = []
+    for d in cells.rates:
+        own = cells.places[cells.places % len(STATE) == d] // len(STATE)
+        typical.append(np.sqrt(np.mean((change[:, own, d] / dt) ** 2)))
+    relative = mode.sigma[k:] / np.maximum(typical, 1e-300)
+    names = tuple(STATE[d] for d in cells.rates)
+    return Left(names, mode.sigma[k:], relative, _p_values(mode, k))
+
+
+def _p_values(mode: Mode, k: int) -> Array:
+    """Likelihood-ratio test of each acceleration against none, the other noises free.
+
+    At the edge of what a variance may be: half a chi-squared with one degree of freedom.
+    """
+    problem = mode.problem
+    residual = problem.residual(mode.phi)
+    median = problem.noise_prior[0]
+
+    def best(sigma: Array) -> float:
+        return float(problem.log_density(residual, sigma, mode.phi).sum())
+
+    here, p_values = best(mode.sigma), np.empty(len(mode.sigma) - k)
+    for i in range(len(p_values)):
+        held = {k + i: _NOTHING * median[k + i]}
+        without = profile_sigma(problem, residual, mode.phi, held)
+        p_values[i] = 0.5 * chi2.sf(max(2 * (here - best(without)), 0.0), 1)
+    return p_values
+
+
+def trajectories(mode: Mode) -> TrajectoryNoise:
+    """The noise along trajectories of a mode's problem.
+
+    Raises
+    ------
+    TypeError
+        If its likelihood is of single transitions.
+    """
+    noise = mode.problem.trajectories
+    if noise is None:
+        raise TypeError("the mode is one of single transitions, expected one of trajectories")
+    return noise

@@ -1,0 +1,186 @@
+"""Kalman filter of linearised trajectories: whitening, and its adjoint, which is the smoother.
+
+The deviation ``d`` of a state from where it was linearised moves by ``d' = F d - r + w`` and is
+measured as ``y = d + e``. Measured cells are taken in one by one (their noises are independent), so
+that missing ones are simply left out. See B. D. O. Anderson and J. B. Moore, Optimal Filtering
+(1979), chapter 6, and G. J. Bierman, Fixed interval smoothing with discrete measurements (1973).
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def gains(
+    slope: Array, first: Ints, seen: Bools, begin: Array, sensor: Array, step: Array
+) -> tuple[Array, Array, Array]:
+    """Gain and standard deviation of every innovation; they do not depend on what was measured.
+
+    Parameters
+    ----------
+    slope : ndarray
+        F, shape (transition, cell, cell), transitions of a trajectory one after the other.
+    first : ndarray
+        Whether a transition is its trajectory's first, shape (transition,).
+    seen : ndarray
+        Whether a cell was measured at the transition's end, shape (transition, cell).
+    begin : ndarray
+        Variance of the state before each first transition, shape (transition, cell).
+    sensor : ndarray
+        Variance of a measurement, shape (cell,).
+    step : ndarray
+        Covariance of what a step adds, shape (cell, cell).
+
+    Returns
+    -------
+    gain : ndarray
+        Shape (transition, cell, cell): ``gain[k, i]`` is what cell i's innovation moves.
+    scale : ndarray
+        Standard deviation of each cell's innovation, shape (transition, cell); 1 where not seen.
+    covariance : ndarray
+        Of the state after each transition's measurements, shape (transition, cell, cell).
+    """
+    n, d = seen.shape
+    gain, scale = np.zeros((n, d, d)), np.ones((n, d))
+    covariance = np.empty((n, d, d))
+    p, moved = np.zeros((d, d)), np.zeros((d, d))
+    for k in range(n):
+        if first[k]:
+            for a in range(d):
+                for b in range(d):
+                    p[a, b] = begin[k, a] if a == b else 0.0
+        own = slope[k]
+        for a in range(d):  # moved = F p
+            for b in range(d):
+                total = 0.0
+                for c in range(d):
+                    total += own[a, c] * p[c, b]
+                moved[a, b] = total
+        for a in range(d):  # p = moved F' + step
+            for b in range(a + 1):
+                total = step[a, b]
+                for c in range(d):
+                    total += moved[a, c] * own[b, c]
+                p[a, b] = total
+                p[b, a] = total
+        for i in range(d):
+            if seen[k, i]:
+                variance = p[i, i] + sensor[i]
+                scale[k, i] = np.sqrt(variance)
+                for a in range(d):
+                    gain[k, i, a] = p[a, i] / variance
+                for a in range(d):
+                    share = gain[k, i, a] * variance
+                    for b in range(a + 1):
+                        p[a, b] -= share * gain[k, i, b]
+                for a in range(d):
+                    for b in range(a):
+                        p[b, a] = p[a, b]
+        covariance[k] = p
+    return gain, scale, covariance
+
+
+@numba.njit(cache=True, nogil=True)
+def innovations(
+    slope: Array,
+    first: Ints,
+    seen: Bools,
+    gain: Array,
+    scale: Array,
+    residual: Array,
+    begin: Array,
+    measured: Array,
+) -> tuple[Array, Array]:
+    """Innovations over their standard deviations, and filtered deviations.
+
+    Parameters
+    ----------
+    slope, first, seen, gain, scale : ndarray
+        As of :func:`gains`.
+    residual : ndarray
+        Linearised minus predicted state at each transition's end, r, shape (set, transition, cell).
+    begin : ndarray
+        Deviation before each first transition, shape (transition, cell).
+    measured : ndarray
+        y at each transition's end, shape (transition, cell).
+
+    Returns
+    -------
+    white, filtered : ndarray
+        Shape (set, transition, cell); an innovation is 0 where nothing was seen.
+    """
+    sets, n, d = residual.shape
+    white, filtered = np.zeros((sets, n, d)), np.empty((sets, n, d))
+    state, moved = np.zeros(d), np.zeros(d)
+    for j in range(sets):
+        for k in range(n):
+            if first[k]:
+                state[:] = begin[k]
+            for a in range(d):
+                total = -residual[j, k, a]
+                for b in range(d):
+                    total += slope[k, a, b] * state[b]
+                moved[a] = total
+            for i in range(d):
+                if seen[k, i]:
+                    innovation = measured[k, i] - moved[i]
+                    white[j, k, i] = innovation / scale[k, i]
+                    for a in range(d):
+                        moved[a] += gain[k, i, a] * innovation
+            state[:] = moved
+            filtered[j, k] = state
+    return white, filtered
+
+
+@numba.njit(cache=True)
+def adjoint(
+    slope: Array, last: Ints, seen: Bools, gain: Array, scale: Array, weighted: Array
+) -> tuple[Array, Array, Array]:
+    """Reverse pass: what a sum of innovations says of each step before it.
+
+    With ``weighted = white``, it is Bierman's smoother: the smoothed deviation after a transition
+    is ``filtered - covariance @ after``.
+
+    Parameters
+    ----------
+    slope, seen, gain, scale : ndarray
+        As of :func:`gains`.
+    last : ndarray
+        Whether a transition is its trajectory's last, shape (transition,).
+    weighted : ndarray
+        Derivative of the sum by each white innovation, shape (transition, cell).
+
+    Returns
+    -------
+    before, residual, after : ndarray
+        Derivative by the state before the transition, by its prediction (which is minus that by the
+        residual) and by the state after its measurements, shape (transition, cell) each.
+    """
+    n, d = seen.shape
+    before, residual, after = np.zeros((n, d)), np.zeros((n, d)), np.zeros((n, d))
+    state = np.zeros(d)
+    for k in range(n - 1, -1, -1):
+        if last[k]:
+            state[:] = 0.0
+        after[k] = state
+        for i in range(d - 1, -1, -1):
+            if seen[k, i]:
+                total = weighted[k, i] / scale[k, i]
+                for a in range(d):
+                    total += gain[k, i, a] * state[a]
+                state[i] -= total
+        residual[k] = state
+        moved = np.zeros(d)
+        for a in range(d):
+            for b in range(d):
+                moved[a] += slope[k, b, a] * state[b]
+        state[:] = moved
+        before[k] = state
+    return before, residual, after

@@ -1,0 +1,244 @@
+"""Smoothed states of trajectories, where transitions are linearised: an iterated Kalman smoother.
+
+See B. M. Bell, The iterated Kalman smoother as a Gauss-Newton method (1994).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import History, hung_bodies
+from pbrl_ppl.model.problem import Problem
+from pbrl_ppl.model.trajectory_noise import Cells, TrajectoryNoise
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE, THETA
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+#: Medians of the noise parameters' priors, as shares of what the states do in a step, and the
+#: priors' log-scale.
+SENSOR_SHARE, STEP_SHARE, SPREAD = 0.1, 0.01, 2.0
+#: A state that was not measured may be this many times as large as any that is estimated.
+_FAR = 10.0
+#: Error of measuring what does not move at all (m, rad, m/s, rad/s).
+_EXACT = 1e-6
+#: Smoothing ends with a round that moves no state by more than this, in standard deviations.
+_SETTLED, _ROUNDS = 0.05, 4
+#: Engine steps an interval that a slope is taken with, at most.
+_SUBSTEPS = 10
+#: A position's velocity is so many places on.
+_RATE = 3
+
+
+def along_trajectories(
+    problem: Problem, phi: Array, sigma: Array | None = None, cells: Cells | None = None
+) -> Problem:
+    """The problem with the likelihood of whole trajectories, linearised at smoothed states.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of any horizon and noise.
+    phi : ndarray
+        Where to linearise, shape (p,).
+    sigma : ndarray, optional
+        Noise parameters to smooth with, shape (parameter,): errors of measuring each state
+        dimension, then unexplained accelerations. Without it, a guess from what one step leaves.
+    cells : Cells, optional
+        Coordinates and noise parameters of the training data, where these are others.
+
+    Returns
+    -------
+    Problem
+        Of horizon 1, its noise a :class:`TrajectoryNoise`.
+    """
+    history = problem.data.history
+    states = first_states(history)
+    if cells is None:
+        cells = cells_of(problem.scene, history)
+        medians = tuple(noise_medians(cells, history, states).tolist())
+        problem = problem.with_noise(prior=(medians, SPREAD), scalar=False, trajectories=None)
+    data = replace(problem.data, horizon=1, states=states, columns=cells.columns)
+    problem = problem.on(data)
+    if sigma is None:
+        sigma = _guess(problem, cells, phi)
+    noise = _sloped(problem, cells, phi, sigma, cells.errors(sigma))
+    return smoothed(problem.with_noise(trajectories=noise), phi, sigma)
+
+
+def single_transitions(problem: Problem) -> Problem:
+    """The problem with the likelihood of single transitions (Eq. 11), as a search begins with."""
+    data = replace(problem.data, states=None, columns=None)
+    return problem.on(data).with_noise(prior=None)
+
+
+def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
+    """The same problem, linearised anew about the states smoothed at phi and sigma."""
+    for _ in range(_ROUNDS):
+        noise = problem.noise.trajectories
+        if noise is None:
+            raise TypeError("smoothed: this problem is not one of whole trajectories")
+        cells = noise.cells
+        residual = cells.of_residual(problem.residual(phi))
+        before, after = noise.smoothed(residual, sigma)
+        spread = np.sqrt(np.median(np.diagonal(noise.gains(sigma)[2], axis1=1, axis2=2), axis=0))
+        states = _moved(problem, cells, noise.first, before, after)
+        problem = replace(problem, data=replace(problem.data, states=states))
+        problem = problem.with_noise(trajectories=_sloped(problem, cells, phi, sigma, spread))
+        if (np.sqrt(np.mean(after**2, axis=0)) < _SETTLED * spread).all():
+            break
+    return problem
+
+
+def first_states(history: History) -> Array:
+    """States as measured, gaps interpolated, shape (trajectory, time, body, 6); no angle jumps."""
+    states: Array = history.dataset["start"].to_numpy().copy()
+    rows = history.dataset["n_rows"].to_numpy()
+    for trajectory, n in enumerate(rows):
+        for body in range(states.shape[2]):
+            for d in range(len(STATE)):
+                values = states[trajectory, :n, body, d]
+                known = np.flatnonzero(np.isfinite(values))
+                if len(known):
+                    level = np.unwrap(values[known]) if d == THETA else values[known]
+                    values[:] = np.interp(np.arange(n), known, level)
+    return np.asarray(np.nan_to_num(states))
+
+
+def cells_of(scene: Scene, history: History) -> Cells:
+    """Unknown coordinates of a scene's bodies, and the noise parameters of a recording."""
+    observed = history.dataset["observed"].to_numpy()
+    measured = np.isfinite(observed).any(axis=(0, 1))
+    with np.errstate(invalid="ignore"):
+        low = np.where(measured, np.fmin.reduce(observed, axis=(0, 1)), 0.0)
+        high = np.where(measured, np.fmax.reduce(observed, axis=(0, 1)), 0.0)
+    still = measured & (high == low)
+    still[:, _RATE:] |= still[:, :_RATE]
+    free = np.array([[not body.kinematic] * len(STATE) for body in scene.moving])
+    for i, moving in enumerate(scene.moving):
+        if moving.name in hung_bodies(scene) and measured[i, THETA]:
+            free[i] = [d % _RATE == THETA for d in range(len(STATE))]
+    places = np.flatnonzero(free)
+    body, dimension = np.divmod(places, len(STATE))
+    sensed = free & measured & ~still
+    sensors = np.flatnonzero(sensed.any(axis=0))
+    rates = np.flatnonzero((free & ~still).any(axis=0)[_RATE:]) + _RATE
+    sensor = np.full(len(places), -1)
+    for i, (b, d) in enumerate(zip(body, dimension, strict=True)):
+        if sensed[b, d]:
+            sensor[i] = np.searchsorted(sensors, d)
+    push, pushed = [], []
+    dt = scene.time_step
+    for b in range(len(scene.moving)):
+        for j, d in enumerate(rates):
+            if free[b, d] and not still[b, d]:
+                row = np.where((body == b) & (dimension == d), dt, 0.0)
+                push.append(row + np.where((body == b) & (dimension == d - _RATE), dt**2 / 2, 0.0))
+                pushed.append(len(sensors) + j)
+    return Cells(
+        places,
+        tuple(int(d) for d in np.unique(dimension)),
+        sensor,
+        np.full(len(places), _EXACT),
+        np.array(push).reshape(-1, len(places)),
+        np.array(pushed, dtype=np.intp),
+        tuple(int(d) for d in sensors),
+        tuple(int(d) for d in rates),
+    )
+
+
+def noise_medians(cells: Cells, history: History, states: Array) -> Array:
+    """Medians of the noise parameters' priors, from how much the states change in a step."""
+    change = np.diff(states, axis=1)
+    real = np.isfinite(history.dataset["clock"].to_numpy()[:, 1:])
+    typical = np.zeros(len(STATE))
+    for d in range(len(STATE)):
+        own = np.flatnonzero(cells.places % len(STATE) == d)
+        if len(own):
+            values = change[real][:, cells.places[own] // len(STATE), d]
+            typical[d] = np.sqrt(np.mean(values**2))
+    dt = float(history.dataset.attrs["time_step"])
+    sensors = SENSOR_SHARE * typical[list(cells.sensors)]
+    steps = STEP_SHARE * typical[list(cells.rates)] / dt
+    return np.asarray(np.maximum(np.concatenate([sensors, steps]), 1e-9))
+
+
+def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
+    """Noise parameters to begin with, from the residuals of single steps at measured states."""
+    residual = cells.of_residual(problem.residual(phi))
+    size = np.sqrt(np.nanmedian(residual**2, axis=0)) / 0.67
+    by_dimension = {
+        d: float(np.sqrt(np.mean(size[cells.places % len(STATE) == d] ** 2))) for d in cells.columns
+    }
+    dt = problem.scene.time_step
+    guess = [by_dimension[d] / np.sqrt(2) for d in cells.sensors]
+    guess += [by_dimension[d] / np.sqrt(2) / dt for d in cells.rates]
+    return np.maximum(guess, problem.noise_prior[0] * 0.01)
+
+
+def _moved(problem: Problem, cells: Cells, first: Bools, before: Array, after: Array) -> Array:
+    """Linearised states, moved by the smoothed deviations."""
+    segments = problem.segments
+    states = problem.data.smoothed_states.copy()
+    flat = states.reshape(*states.shape[:2], -1)
+    at = segments.trajectory[:, None], segments.step[:, None] + 1, cells.places
+    flat[at] += after
+    begin = segments.trajectory[first, None], segments.step[first, None], cells.places
+    flat[begin] += before[first]
+    return cells.completed(problem.scene, states)
+
+
+def _sloped(
+    problem: Problem, cells: Cells, phi: Array, sigma: Array, steps: Array
+) -> TrajectoryNoise:
+    """Linearise the transitions about the problem's states by central differences."""
+    segments = problem.segments
+    d, n = len(cells.places), segments.n
+    moved = np.tile(segments.start, (2 * d, 1, 1, 1))
+    flat = moved.reshape(2 * d, n, -1)
+    for i, place in enumerate(cells.places):
+        flat[2 * i, :, place] += steps[i]
+        flat[2 * i + 1, :, place] -= steps[i]
+    moved = cells.completed(problem.scene, moved).reshape(2 * d * n, *segments.start.shape[1:])
+    inputs = np.tile(problem.inputs, (2 * d, 1, 1, 1))
+    # the slope of what a fine engine does is that of what a coarse one does, all but exactly
+    rough = problem.with_physics(substeps=min(_SUBSTEPS, problem.physics.substeps))
+    ends = cells.of(rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
+    slope = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
+    return linearised(problem, cells, np.nan_to_num(slope), sigma)
+
+
+def linearised(problem: Problem, cells: Cells, slope: Array, sigma: Array) -> TrajectoryNoise:
+    """The noise along a problem's trajectories, from the slopes at its states.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its data hold the states.
+    cells : Cells
+        Coordinates and noise parameters.
+    slope : ndarray
+        Derivative of the next state by the state, shape (transition, cell, cell).
+    sigma : ndarray
+        Noise parameters at which the states were smoothed, shape (parameter,).
+    """
+    segments, states = problem.segments, problem.data.smoothed_states
+    trajectory, step = segments.trajectory, segments.step
+    observed = problem.data.history.dataset["observed"].to_numpy()
+    deviation = cells.wrapped(cells.of(observed) - cells.of(states))
+    end, begin = deviation[trajectory, step + 1], deviation[trajectory, step]
+    far = _FAR * np.abs(cells.of(states)).max(axis=(0, 1)) + 1.0
+    return TrajectoryNoise(
+        cells=cells,
+        slope=np.ascontiguousarray(slope),
+        first=step == 0,
+        seen=np.isfinite(end),
+        measured=np.nan_to_num(end),
+        begin=np.nan_to_num(begin),
+        wide=np.where(np.isfinite(begin), 0.0, far**2),
+        sigma=np.asarray(sigma, dtype=float),
+    )

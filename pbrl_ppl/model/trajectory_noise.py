@@ -1,0 +1,266 @@
+"""Noise along trajectories: errors of measured states, and what a step adds, told apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import fill_hinges
+from pbrl_ppl.model.kalman import adjoint, gains, innovations
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import THETA
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Cells:
+    """Unknown coordinates of the bodies' states, and which noise parameter each is subject to.
+
+    Parameters
+    ----------
+    places : ndarray of int
+        Where an array of shape (body * 6,) holds them, shape (cell,).
+    columns : tuple of int
+        State dimensions that occur.
+    sensor : ndarray of int
+        Which noise parameter is the error of measuring a cell; -1 where ``fixed`` is.
+    fixed : ndarray
+        Standard deviation of measuring a cell where it is no parameter, shape (cell,).
+    push : ndarray
+        What a unit of an unexplained acceleration adds to the cells in a step, one row a body and
+        velocity, shape (push, cell).
+    pushed : ndarray of int
+        Which noise parameter is the acceleration of each row, shape (push,).
+    sensors, rates : tuple of int
+        State dimensions that the noise parameters are about: of measurements, of accelerations.
+    """
+
+    places: Ints
+    columns: tuple[int, ...]
+    sensor: Ints
+    fixed: Array
+    push: Array
+    pushed: Ints
+    sensors: tuple[int, ...]
+    rates: tuple[int, ...]
+
+    def errors(self, sigma: Array) -> Array:
+        """Standard deviation of measuring each cell, shape (cell,)."""
+        return np.where(self.sensor >= 0, sigma[self.sensor], self.fixed)
+
+    def of(self, values: Array) -> Array:
+        """The cells of values of shape (..., body, 6), shape (..., cell)."""
+        return np.asarray(values.reshape(*values.shape[:-2], -1)[..., self.places])
+
+    def completed(self, scene: Scene, states: Array) -> Array:
+        """Put hung bodies of states (..., body, 6) where their hinges hold them, in place."""
+        free = np.zeros((len(scene.moving), 6), dtype=bool)
+        free.reshape(-1)[self.places] = True
+        hung = np.array([not body.kinematic for body in scene.moving])[:, None] & ~free
+        if hung.any():
+            states[..., hung] = np.nan
+            fill_hinges(states.reshape(-1, 1, *states.shape[-2:]), scene)
+        return states
+
+    def wrapped(self, difference: Array) -> Array:
+        """Differences of cells, shape (..., cell), angles wrapped to (-pi, pi]."""
+        angle = self.places % 6 == THETA
+        return np.where(angle, np.pi - np.mod(np.pi - difference, 2 * np.pi), difference)
+
+    def of_residual(self, residual: Array) -> Array:
+        """The cells of a residual (..., transition, 1, body, state): (..., transition, cell)."""
+        body, place = self.in_residual
+        return np.ascontiguousarray(residual[..., 0, body, place])
+
+    @property
+    def in_residual(self) -> tuple[Ints, Ints]:
+        """Body and place among the columns of each cell."""
+        body, dimension = np.divmod(self.places, 6)
+        return body, np.searchsorted(self.columns, dimension)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrajectoryNoise:
+    """Two noises of transitions that are linearised along their trajectories.
+
+    Neighbouring transitions share a measured state, so their residuals are correlated. Whitened
+    along the trajectory they are the innovations of a Kalman filter. The noise parameters are the
+    standard deviations of a measurement, R, one a measured state dimension, followed by those of an
+    unexplained acceleration, held over an interval, Q, one a velocity.
+
+    Parameters
+    ----------
+    cells : Cells
+        Coordinates of the state.
+    slope : ndarray
+        Derivative F of the next state by the state, shape (transition, cell, cell).
+    first : ndarray of bool
+        Whether a transition is its trajectory's first, shape (transition,).
+    seen : ndarray of bool
+        Whether a cell was measured at the transition's end, shape (transition, cell).
+    measured : ndarray
+        Measured minus linearised state at the transition's end, shape (transition, cell).
+    begin : ndarray
+        The same before the transition, for the first of a trajectory; 0 where not measured.
+    wide : ndarray
+        Variance of that where it was not measured, 0 elsewhere, shape (transition, cell).
+    sigma : ndarray
+        Noise parameters at which it was linearised, shape (parameter,).
+    """
+
+    cells: Cells
+    slope: Array
+    first: Bools
+    seen: Bools
+    measured: Array
+    begin: Array
+    wide: Array
+    sigma: Array
+    _known: dict[bytes, tuple[Array, Array, Array, Array]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    def gains(self, sigma: Array) -> tuple[Array, Array, Array, Array]:
+        """Gain, scale and covariance of a filter at noise parameters, and the log of the scale.
+
+        The first three are as of :func:`kalman.gains`; the last is summed, shape (transition,).
+        """
+        key = np.ascontiguousarray(sigma).tobytes()
+        known = self._known.get(key)
+        if known is None:
+            if len(self._known) > 3:
+                self._known.clear()
+            step = (self.cells.push.T * sigma[self.cells.pushed] ** 2) @ self.cells.push
+            sensor = self.cells.errors(sigma) ** 2
+            gain, scale, after = gains(
+                self.slope, self.first, self.seen, self._begin(sigma), sensor, step
+            )
+            known = self._known[key] = gain, scale, after, np.log(scale).sum(axis=1)
+        return known
+
+    def whiten(self, residual: Array, sigma: Array) -> Array:
+        """Innovations over their standard deviations.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Linearised minus predicted states, shape (..., transition, 1, body, state).
+        sigma : ndarray
+            Noise parameters, shape (parameter,) or (..., parameter) with the same leading axes.
+
+        Returns
+        -------
+        ndarray
+            Shape (..., transition, cell), dimensionless; 0 where nothing was measured.
+        """
+        return self.whitened(residual, sigma)[0]
+
+    def whitened(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """As :meth:`whiten`, with the logarithm of the standard deviations.
+
+        The latter is summed over the cells, shape (..., transition) as that of sigma leads.
+        """
+        cells = self.cells.of_residual(residual)
+        lead = cells.shape[:-2]
+        rows = cells.reshape(-1, *cells.shape[-2:])
+        if sigma.ndim == 1:
+            return self.filtered(rows, sigma)[0].reshape(cells.shape), self.gains(sigma)[3]
+        sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
+        own, which = np.unique(sigmas, axis=0, return_inverse=True)
+        white, log_scale = np.empty_like(rows), np.empty(rows.shape[:-1])
+        for i, row in enumerate(own):
+            mine = which.ravel() == i
+            white[mine], log_scale[mine] = self.filtered(rows[mine], row)[0], self.gains(row)[3]
+        return white.reshape(cells.shape), log_scale.reshape(cells.shape[:-1])
+
+    def filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """White innovations and filtered deviations of cells' residuals (set, transition, cell)."""
+        gain, scale, *_ = self.gains(sigma)
+        white, state = innovations(
+            self.slope, self.first, self.seen, gain, scale, residual, self.begin, self.measured
+        )
+        return white, state
+
+    def of_cells(self, nu: float | Array | None, shape: tuple[int, ...]) -> float | Array | None:
+        """Degrees of freedom of each innovation, of those of residuals of this shape."""
+        if not isinstance(nu, np.ndarray) or nu.ndim == 0:
+            return nu
+        return self.cells.of_residual(np.broadcast_to(nu, shape))
+
+    def log_scale(self, sigma: Array) -> Array:
+        """Logarithm of the innovations' standard deviations, summed, shape (transition,)."""
+        return self.gains(sigma)[3]
+
+    def smoothed(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """Smoothed deviations before and after each transition, shape (transition, cell) each."""
+        white, filtered = self.filtered(residual[None], sigma)
+        before, _, after = self.pulled(white[0], sigma)
+        return (
+            self.begin - self._begin(sigma) * before,
+            filtered[0] - np.einsum("kab,kb->ka", self.gains(sigma)[2], after),
+        )
+
+    def pulled(self, weighted: Array, sigma: Array) -> tuple[Array, Array, Array]:
+        """Derivatives of a sum of white innovations, see :func:`kalman.adjoint`."""
+        gain, scale, *_ = self.gains(sigma)
+        last = np.append(self.first[1:], True)
+        pulled: tuple[Array, Array, Array] = adjoint(
+            self.slope, last, self.seen, gain, scale, weighted
+        )
+        return pulled
+
+    def foreseen(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """Mean and covariance of each measurement, as deviations, given those before it.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Shape (transition, cell).
+        sigma : ndarray
+            Shape (parameter,).
+
+        Returns
+        -------
+        mean, covariance : ndarray
+            Shapes (transition, cell) and (transition, cell, cell).
+        """
+        after, filtered = self.gains(sigma)[2], self.filtered(residual[None], sigma)[1][0]
+        first = self.first[:, None]
+        state = np.where(first, self.begin, np.roll(filtered, 1, axis=0))
+        begin = self._begin(sigma)[:, :, None] * np.eye(len(self.cells.places))
+        known = np.where(first[..., None], begin, np.roll(after, 1, axis=0))
+        step = (self.cells.push.T * sigma[self.cells.pushed] ** 2) @ self.cells.push
+        covariance = self.slope @ known @ self.slope.transpose(0, 2, 1) + step
+        return (
+            np.einsum("kab,kb->ka", self.slope, state) - residual,
+            covariance + np.diag(self.cells.errors(sigma) ** 2),
+        )
+
+    def random(
+        self, predicted: Array, linearised: Array, sigma: Array, rng: np.random.Generator
+    ) -> Array:
+        """Draw measured next states, given those before (Eq. 13), shape of ``predicted``.
+
+        Parameters
+        ----------
+        predicted, linearised : ndarray
+            States, shape (transition, 1, body, state).
+        sigma : ndarray
+            Noise parameters, shape (parameter,).
+        """
+        mean, covariance = self.foreseen(self.cells.of_residual(linearised - predicted), sigma)
+        factor = np.linalg.cholesky(covariance)
+        drawn = mean + np.einsum("kab,kb->ka", factor, rng.standard_normal(mean.shape))
+        result = linearised.copy()
+        body, dimension = np.divmod(self.cells.places, 6)
+        result[:, 0, body, np.searchsorted(self.cells.columns, dimension)] += drawn
+        return result
+
+    def _begin(self, sigma: Array) -> Array:
+        """Variance of the state before each transition that is its trajectory's first."""
+        return np.where(self.wide > 0, self.wide, self.cells.errors(sigma) ** 2)

@@ -1,0 +1,74 @@
+"""The recording and the linearisation of whole trajectories, as a posterior file holds them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import History
+from pbrl_ppl.model import Problem, TrajectoryNoise, cells_of, linearised
+
+Array = NDArray[np.float64]
+
+#: Variables of the recording have these before their names, and before their dimensions'.
+_PREFIX = "recorded_"
+
+
+def recording(problem: Problem) -> xr.Dataset:
+    """What a problem of whole trajectories needs beside its segments; empty for other ones."""
+    noise = problem.trajectories
+    if noise is None:
+        return xr.Dataset()
+    dataset = problem.data.history.dataset
+    kept = dataset.rename(
+        {name: f"{_PREFIX}{name}" for name in (*dataset.dims, *dataset.data_vars)}
+    )
+    kept = kept.drop_vars([name for name in kept.coords if name not in kept.dims])
+    dims = (f"{_PREFIX}trajectory", f"{_PREFIX}time", f"{_PREFIX}body", f"{_PREFIX}state")
+    kept["smoothed"] = (dims, problem.data.smoothed_states)
+    kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
+    kept["linearised_at"] = (("noise_parameter",), noise.sigma)
+    return kept.assign_attrs({})
+
+
+def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Problem:
+    """A problem with the whole trajectories that a posterior's constant data hold, if they do."""
+    if "smoothed" not in given:
+        return problem
+    names = [str(name) for name in given.data_vars if str(name).startswith(_PREFIX)]
+    back = {
+        name: str(name).removeprefix(_PREFIX)
+        for name in (*names, *given.dims)
+        if str(name).startswith(_PREFIX)
+    }
+    dataset = given[names].rename(back)
+    scene = problem.scene
+    dataset = dataset.assign_coords(
+        kinematic=("body", [body.kinematic for body in scene.moving])
+    ).assign_attrs(time_step=scene.time_step, data_sha256=data_sha256)
+    history = History(dataset)
+    cells = cells_of(scene, history)
+    states = given["smoothed"].to_numpy()
+    data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
+    noise: TrajectoryNoise = linearised(
+        problem.on(data), cells, given["slope"].to_numpy(), given["linearised_at"].to_numpy()
+    )
+    return problem.on(data).with_noise(trajectories=noise, scalar=False)
+
+
+def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
+    """One recording after the other; empty where there are none."""
+    if "smoothed" not in new:
+        return xr.Dataset()
+    by_transition = ["slope"]
+    whole = [str(name) for name in new.data_vars if f"{_PREFIX}trajectory" in new[name].dims]
+    result = xr.Dataset({"linearised_at": new["linearised_at"]})
+    for names, dim in ((by_transition, "transition"), (whole, f"{_PREFIX}trajectory")):
+        parts = [given[names].reset_coords(drop=True) for given in (held, new)]
+        parts = [part.drop_vars([dim], errors="ignore") for part in parts]
+        result = result.merge(xr.concat(parts, dim, join="outer"))
+    result["smoothed"] = result["smoothed"].fillna(0.0)
+    return result

@@ -1,0 +1,207 @@
+"""Likelihood of whole trajectories: whitening, smoothing, derivatives, simulated data."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytensor.tensor as pt
+import pytest
+from pytensor import function
+from scipy.stats import multivariate_normal
+
+from pbrl_ppl.history import History
+from pbrl_ppl.model import (
+    Problem,
+    along_trajectories,
+    build_model,
+    physics_model,
+    simulated_trajectories,
+    smoothed,
+    with_measurements,
+)
+from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
+from pbrl_ppl.scene import Body, Scene, Shape
+from tests.helpers.histories import simulated_history
+
+PUCK = Scene(
+    time_step=0.1,
+    substeps=2,
+    bodies=(
+        Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}, effects=("linear_drag",)),
+    ),
+)
+TRUTH = {"mass": 2.0, "linear_drag_coefficient": 0.8}
+PHI = np.array([2.0, 0.8])
+#: Errors of measuring x, y, theta, vx, vy, omega, and unexplained accelerations.
+NOISE = np.array([2e-3, 2e-3, 4e-3, 1e-2, 1e-2, 2e-2, 0.3, 0.3, 0.5])
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    history = simulated_history(PUCK, TRUTH, seed=1, trajectories=3, intervals=4, substeps=2)
+    return along_trajectories(Problem.of(PUCK, history, _effects()), PHI, NOISE)
+
+
+def _effects():
+    from pbrl_ppl.effects import attach
+
+    return attach(PUCK, ())
+
+
+def dense(noise, sigma) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the first trajectory's measurements after the first, given a flat start."""
+    n = int(np.flatnonzero(noise.first)[1])
+    d = len(noise.cells.places)
+    step = (noise.cells.push.T * sigma[noise.cells.pushed] ** 2) @ noise.cells.push
+    r = np.diag(noise.cells.errors(sigma) ** 2)
+    # residuals e' - F e + w of neighbours share the error e of a measured state
+    whole = np.zeros((n * d, n * d))
+    for k in range(n):
+        f, own = noise.slope[k], slice(k * d, (k + 1) * d)
+        whole[own, own] = r + f @ r @ f.T + step
+        if k + 1 < n:
+            then = slice((k + 1) * d, (k + 2) * d)
+            whole[own, then] = -r @ noise.slope[k + 1].T
+            whole[then, own] = whole[own, then].T
+    return whole, np.arange(n)
+
+
+def test_whitening_is_that_of_the_whole_covariance(problem) -> None:
+    """DESIGN section 7: R + F R F' + Q with itself, -R F' with its successor."""
+    noise = problem.trajectories
+    covariance, own = dense(noise, NOISE)
+    residual = noise.cells.of_residual(problem.residual(PHI))[own]
+    begin = np.where(
+        noise.first[own][:, None], noise.begin[own], np.roll(noise.measured, 1, 0)[own]
+    )
+    # z' - f(s) - F (z - s), with z' = s' + y'
+    equation = noise.measured[own] + residual - np.einsum("kab,kb->ka", noise.slope[own], begin)
+    expected = multivariate_normal(np.zeros(len(covariance)), covariance).logpdf(equation.ravel())
+    density = problem.log_density(problem.residual(PHI), NOISE)[own].sum()
+    np.testing.assert_allclose(density, expected, rtol=1e-9)
+
+
+def test_what_was_not_measured_is_left_out(problem) -> None:
+    """A cell that is missing is one of a very large error, but for its own density."""
+    dataset = problem.data.history.dataset.copy()
+    observed = dataset["observed"].values.copy()
+    observed[:, 2, 0, [0, 3]] = np.nan
+    dataset["observed"] = dataset["observed"].copy(data=observed)
+    gaps = problem.with_data(history=History(dataset), states=None)
+    gaps = along_trajectories(gaps, PHI, NOISE, problem.trajectories.cells)
+    noise, whole = gaps.trajectories, problem.trajectories
+    assert (~noise.seen).sum() == 6
+    covariance, own = dense(whole, NOISE)
+    vague = covariance.copy()
+    d = len(whole.cells.places)
+    huge = 10.0
+    jitter = np.zeros((len(own) * d, 2))
+    for j, cell in enumerate((0, 3)):  # measured at the second transition's end
+        jitter[d + cell, j] = 1.0
+        jitter[2 * d : 3 * d, j] = -whole.slope[2][:, cell]
+    vague += huge**2 * jitter @ jitter.T
+    residual = whole.cells.of_residual(problem.residual(PHI))[own]
+    begin = np.where(
+        whole.first[own][:, None], whole.begin[own], np.roll(whole.measured, 1, 0)[own]
+    )
+    equation = whole.measured[own] + residual - np.einsum("kab,kb->ka", whole.slope[own], begin)
+    expected = multivariate_normal(np.zeros(len(vague)), vague).logpdf(equation.ravel())
+    expected += np.log(huge**2 * 2 * np.pi)
+    seen = np.where(noise.seen, whole.measured, 0.0)
+    fixed = replace(whole, seen=noise.seen, measured=seen)
+    value = problem.with_noise(start=fixed).log_density(problem.residual(PHI), NOISE)[own].sum()
+    np.testing.assert_allclose(value, expected, rtol=1e-6)
+
+
+def test_smoothed_states_are_the_likeliest(problem) -> None:
+    """No state is moved once the smoother has settled, and the fit of all is a minimum there."""
+    settled = smoothed(problem, PHI, NOISE)
+    noise = settled.trajectories
+    before, after = noise.smoothed(noise.cells.of_residual(settled.residual(PHI)), NOISE)
+    assert np.abs(np.vstack([before[noise.first], after]) / noise.cells.errors(NOISE)).max() < 0.05
+    # a puck with drag is linear: there is one answer, wherever smoothing began
+    moved = replace(problem.data, states=problem.data.states + 1e-3)
+    again = smoothed(replace(problem, data=moved), PHI, NOISE)
+    difference = (again.data.states - settled.data.states)[..., :3]
+    assert np.abs(difference).max() < 1e-4
+
+
+def test_derivative_is_that_of_differences(problem) -> None:
+    noise = problem.trajectories
+    residual, sigma = pt.tensor4("residual"), pt.vector("sigma")
+    tail = pt.vector("tail")
+    weights = np.random.default_rng(2).normal(size=problem.segments.n)
+    total = (TrajectoryDensityOp(noise)(residual, sigma, tail) * weights).sum()
+    value = function([residual, sigma, tail], total)
+    slopes = function([residual, sigma, tail], pt.grad(total, [residual, sigma]))
+    rng = np.random.default_rng(3)
+    at = problem.residual(PHI) + 1e-3 * rng.normal(size=problem.residual(PHI).shape)
+    for nu in (0.0, 0.2):
+        tails = np.array([nu])
+        by_residual, by_sigma = slopes(at, NOISE, tails)
+        for _ in range(5):
+            step = 1e-6 * rng.normal(size=at.shape)
+            change = value(at + step, NOISE, tails) - value(at - step, NOISE, tails)
+            np.testing.assert_allclose(2 * (by_residual * step).sum(), change, rtol=1e-4)
+            step = 1e-6 * NOISE * rng.normal(size=len(NOISE))
+            change = value(at, NOISE + step, tails) - value(at, NOISE - step, tails)
+            np.testing.assert_allclose(2 * (by_sigma * step).sum(), change, rtol=1e-4)
+
+
+def test_the_model_is_the_problem(problem) -> None:
+    model = build_model(problem)
+    assert [variable.name for variable in model.free_RVs] == [
+        "mass", "linear_drag_coefficient", "sigma", "unexplained_acceleration",
+    ]  # fmt: skip
+    point = {
+        "mass": PHI[:1], "linear_drag_coefficient": PHI[1:],
+        "sigma": NOISE[:6], "unexplained_acceleration": NOISE[6:],
+    }  # fmt: skip
+    value = model.compile_logp(vars=model.observed_RVs)(
+        {model.rvs_to_values[v].name: np.log(point[v.name]) for v in model.free_RVs}
+    )
+    np.testing.assert_allclose(value, problem.log_density(problem.residual(PHI), NOISE).sum())
+
+
+def test_draws_of_the_model_have_its_covariance(problem) -> None:
+    """Posterior predictive draws: mean and covariance of a measurement, given those before."""
+    noise = problem.trajectories
+    rng = np.random.default_rng(4)
+    drawn = np.array([problem.next_states(problem.predict(PHI), NOISE, rng) for _ in range(4000)])
+    mean, covariance = noise.foreseen(noise.cells.of_residual(problem.residual(PHI)), NOISE)
+    cells = drawn[:, :, 0, 0] - problem.observations.values[:, 0, 0]
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    # 72 means and 72 variances of 4000 draws: 5 standard errors, chance of a false alarm 1e-4
+    assert (np.abs(cells.mean(axis=0) - mean) < 5 * sd / np.sqrt(4000)).all()
+    ratio = cells.var(axis=0) / sd**2
+    assert (np.abs(ratio - 1) < 5 * np.sqrt(2 / 4000)).all()
+
+
+def test_simulated_trajectories_have_both_noises(problem) -> None:
+    """Innovations of simulated data at the truth are standard normal and white."""
+    rng = np.random.default_rng(5)
+    white = []
+    for _ in range(40):
+        made = with_measurements(problem, simulated_trajectories(problem, PHI, NOISE, rng))
+        made = smoothed(made, PHI, NOISE)
+        white.append(made.whitened(PHI, NOISE).reshape(3, 4, 6))
+    z = np.array(white)
+    # 2880 cells: sd of the mean square 0.026, of a correlation over 2160 pairs 0.022; 4 of each
+    assert abs((z**2).mean() - 1) < 0.105
+    assert abs((z[:, :, 1:] * z[:, :, :-1]).mean()) < 0.086
+
+
+def test_what_never_moves_has_no_noise() -> None:
+    """A fall seen as x = 0: its error is given, and no noise parameter is inferred from it."""
+    history = simulated_history(PUCK, TRUTH, seed=1, trajectories=3, intervals=4, substeps=2)
+    frame = history.to_dataframe().assign(x=0.0, vx=0.0)
+    still = physics_model(PUCK, History.from_dataframe(frame, PUCK), trajectories=True)
+    noise = still.problem.noise_variables
+    assert noise["sigma"] == ("y", "theta", "vy", "omega")
+    assert noise["unexplained_acceleration"] == ("vy", "omega")
+
+
+@pytest.mark.parametrize("options", [{"horizon": 2}, {"sigma": "scalar"}])
+def test_options_that_do_not_go_together_are_refused(options) -> None:
+    history = simulated_history(PUCK, TRUTH, seed=1, trajectories=2, intervals=4, substeps=2)
+    with pytest.raises(ValueError, match="trajectories"):
+        physics_model(PUCK, history, trajectories=True, **options)
