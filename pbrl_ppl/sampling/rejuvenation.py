@@ -71,7 +71,7 @@ def rejuvenate(
         progress(f"moving {len(phi)} draws: round {turn + 1}, correlation {left:.2f}")
         if left < _FORGOTTEN:
             break
-    every = np.ones(len(problem.observations.columns))
+    every = np.ones(len(problem.noise_prior[0]))
     return mover.phi(mover.u), np.exp(mover.noise) * every, float(np.mean(rates))
 
 

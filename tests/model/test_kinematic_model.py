@@ -5,7 +5,7 @@ import pytest
 
 from pbrl_ppl.errors import GoalError, HistoryError
 from pbrl_ppl.history import History, from_segments
-from pbrl_ppl.model import StartNoise, Transition, physics_model
+from pbrl_ppl.model import Transition, along_trajectories, physics_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.planning import Action, ActionSet, Dynamics, Goal, plan
 from pbrl_ppl.posterior import load_posterior, problem_of, save_posterior
@@ -51,12 +51,14 @@ def test_restitution_is_recovered(problem) -> None:
     assert sd < 0.02
 
 
-def test_its_path_has_no_start_noise(problem) -> None:
-    f = problem.sensitivity(np.array([R]), 1e-3 * NOISE)
-    assert (f[:, :, :6] == 0.0).all()
-    assert np.abs(f[:, :, 6:]).max() > 0.5
-    seen = problem.observations.measured.reshape(problem.segments.n, -1)
-    assert np.isfinite(StartNoise.of(f, seen, NOISE).log_det).all()
+def test_its_path_has_no_noise(problem) -> None:
+    whole = along_trajectories(problem, np.array([R]))
+    cells = whole.trajectories.cells
+    assert (cells.places // 6 == 1).all()  # the block's
+    own = whole.data.history.dataset["start"].to_numpy()[:, :, 0, :3]
+    np.testing.assert_array_equal(whole.data.states[:, :, 0, :3], own)
+    density = whole.log_density(whole.residual(np.array([R])), whole.trajectories.sigma)
+    assert np.isfinite(density).all()
 
 
 def test_a_posterior_file_holds_its_path(problem, hits, tmp_path) -> None:

@@ -14,7 +14,7 @@ from scipy.special import logsumexp
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import FitError, ParameterError, PosteriorError, RefitWarning
-from pbrl_ppl.model import ParameterLibrary, StartNoise, physics_model, sigma_prior
+from pbrl_ppl.model import ParameterLibrary, physics_model, sigma_prior
 from pbrl_ppl.posterior import learned_library, library_probabilities, problem_of
 from pbrl_ppl.posterior import save_posterior as save
 from pbrl_ppl.posterior.store import az, convergence, draws, from_groups, group, load_posterior
@@ -299,8 +299,8 @@ def test_refused_fits(apartment, monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.modes.library_choice._MOST", 10)
     with pytest.raises(FitError, match=r"2 combinations of parameter sets.*give some"):
         quick(model)
-    with pytest.raises(ValueError, match="drop noise"):
-        physics_model(scene, history, library=library, noise=StartNoise(*(np.zeros((1, 1)),) * 3))
+    with pytest.raises(ValueError, match="trajectories is given with horizon or library"):
+        physics_model(scene, history, library=library, trajectories=True)
     near = tuple(replace(body, pose=(0.5 * i, 0.0, 0.0)) for i, body in enumerate(scene.bodies))
     jointed = scene.replace(bodies=near, joints=(Joint("distance", ("a", "b"), known=False),))
     with pytest.raises(ParameterError, match="is to be inferred, and a library is of bodies"):

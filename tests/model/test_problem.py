@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach, catalogue
-from pbrl_ppl.model import Problem, StartNoise
+from pbrl_ppl.model import Problem, along_trajectories, single_transitions
 from pbrl_ppl.model import data as data_module
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
@@ -36,9 +36,7 @@ def problem() -> Problem:
 
 def test_other_noise_keeps_the_engine_and_the_checked_data(problem, checks) -> None:
     engine, rough, segments = problem.simulator, problem.coarse.simulator, problem.segments
-    cells = segments.n, 2 * 6
-    start = StartNoise(np.ones(cells), np.tile(np.eye(12), (segments.n, 1, 1)), np.zeros(cells[0]))
-    for other in (problem.with_noise(start=start), problem.with_noise(nu=4.0, scalar=True)):
+    for other in (problem.with_noise(prior=((1.0,) * 6, 2.0)), problem.with_noise(nu=4.0)):
         assert other.simulator is engine
         assert other.coarse.simulator is rough
         assert other.segments is segments
@@ -74,12 +72,20 @@ def test_other_data_keep_the_engine_where_its_parts_are_the_same(problem) -> Non
     assert [len(each.bodies) for each in meeting.simulator.parts] == [2]
 
 
-def test_start_noise_is_of_its_own_segments(problem) -> None:
-    n = problem.segments.n
-    start = StartNoise(np.ones((n, 12)), np.tile(np.eye(12), (n, 1, 1)), np.zeros(n))
-    noisy = problem.with_noise(start=start, nu=4.0)
-    assert noisy.with_data(horizon=2).noise.start is None
-    assert noisy.with_data(horizon=2).noise.nu == 4.0
+def test_noise_along_trajectories_is_of_its_own_data(problem) -> None:
+    phi = problem.layout.to_vector(TRUTH)
+    whole = along_trajectories(problem.with_noise(nu=4.0), phi)
+    assert whole.trajectories is not None
+    assert whole.simulator is problem.simulator
+    for other in (whole.with_data(states=None), whole.with_data(history=problem.data.history)):
+        assert other.trajectories is None
+        assert other.noise.nu == 4.0
+    # other noise and other physics keep it, with the smoothed states that it is about
+    for other in (whole.with_noise(nu=None), whole.with_physics(substeps=10)):
+        assert other.trajectories is whole.trajectories
+        assert other.segments is whole.segments
+    assert single_transitions(whole).trajectories is None
+    np.testing.assert_array_equal(single_transitions(whole).segments.start, problem.segments.start)
 
 
 def test_what_was_computed_does_not_travel(problem) -> None:

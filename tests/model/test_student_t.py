@@ -91,7 +91,7 @@ def test_outliers_mislead_a_gaussian_only(scene, clean, spoilt) -> None:
     assert off[None] > 2 * off[NU]
 
 
-def test_scalar_sigma_and_start_noise_are_allowed(scene, clean) -> None:
+def test_scalar_sigma_is_allowed(scene, clean) -> None:
     problem = physics_model(scene, clean, nu=NU, sigma="scalar").problem
     mode = find_mode(problem, seed=1)
     assert np.ptp(mode.sigma) == 0

@@ -8,6 +8,7 @@ import pytest
 from pytensor import function
 from scipy.stats import multivariate_normal
 
+from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.model import (
     Problem,
@@ -38,13 +39,7 @@ NOISE = np.array([2e-3, 2e-3, 4e-3, 1e-2, 1e-2, 2e-2, 0.3, 0.3, 0.5])
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     history = simulated_history(PUCK, TRUTH, seed=1, trajectories=3, intervals=4, substeps=2)
-    return along_trajectories(Problem.of(PUCK, history, _effects()), PHI, NOISE)
-
-
-def _effects():
-    from pbrl_ppl.effects import attach
-
-    return attach(PUCK, ())
+    return along_trajectories(Problem.of(PUCK, history, attach(PUCK)), PHI, NOISE)
 
 
 def dense(noise, sigma) -> tuple[np.ndarray, np.ndarray]:
@@ -108,7 +103,8 @@ def test_what_was_not_measured_is_left_out(problem) -> None:
     expected += np.log(huge**2 * 2 * np.pi)
     seen = np.where(noise.seen, whole.measured, 0.0)
     fixed = replace(whole, seen=noise.seen, measured=seen)
-    value = problem.with_noise(start=fixed).log_density(problem.residual(PHI), NOISE)[own].sum()
+    gaps = problem.with_noise(trajectories=fixed)
+    value = gaps.log_density(problem.residual(PHI), NOISE)[own].sum()
     np.testing.assert_allclose(value, expected, rtol=1e-6)
 
 

@@ -18,8 +18,7 @@ from pbrl_ppl.errors import (
     RefitWarning,
 )
 from pbrl_ppl.history import History
-from pbrl_ppl.model import StartNoise, build_model, physics_model
-from pbrl_ppl.modes import find_mode, with_start_noise
+from pbrl_ppl.model import along_trajectories, build_model, physics_model
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import problem_of
 from pbrl_ppl.posterior.store import (
@@ -245,7 +244,7 @@ def test_reproducible_and_the_same_from_a_file(parts, first, one, tmp_path, monk
 
 
 def test_old_files_have_no_prior_of_the_noise(parts, first, one) -> None:
-    attrs = {k: v for k, v in first.attrs.items() if k not in ("sigma_prior", "start_noise")}
+    attrs = {k: v for k, v in first.attrs.items() if k != "sigma_prior"}
     again = quiet(update, from_groups(groups(first), attrs), parts[2].select([0, 1]), seed=5)
     np.testing.assert_array_equal(draws(again)["mass"], draws(one)["mass"])
     problem = problem_of(from_groups(groups(first), attrs))
@@ -398,30 +397,28 @@ def test_refused_posteriors(parts, first) -> None:
         update(from_groups(held, dict(first.attrs) | {"scene": other.to_toml()}), new)
 
 
-def test_start_noise_is_refused(parts) -> None:
-    scene, a, b, _ = parts
-    problem = physics_model(scene, a.select(range(5))).problem
-    mode = find_mode(problem, seed=1)
-    noisy = with_start_noise(problem, mode)
-    assert isinstance(noisy.noise.start, StartNoise)
-    idata = quiet(fit, build_model(noisy), seed=1, start=mode, **(QUICK | {"draws": 60, "tune": 9}))
-    with pytest.raises(PosteriorError, match="noise in the measured start states"):
-        update(idata, b.select([0]))
-    # a file of an older version does not say so, but its likelihoods do
-    attrs = {k: v for k, v in idata.attrs.items() if k != "start_noise"}
+def test_other_likelihoods_are_refused(parts, first) -> None:
+    """A file of an older version, with noise that is no more, does not say so; its numbers do."""
+    held = groups(first)
+    likelihood = held["log_likelihood"] + 0.1
     with pytest.raises(PosteriorError, match="start noise, other effects or another version"):
-        update(from_groups(groups(idata), attrs), b.select([0]))
+        update(
+            from_groups(held | {"log_likelihood": likelihood}, first.attrs),
+            parts[2].select([0]),
+        )
 
 
-def test_start_noise_joins_the_parts_that_are_moved(parts) -> None:
-    """It mixes the bodies' residuals: all parameters are one block, none is left where it was."""
+def test_trajectories_join_the_parts_that_are_moved(parts) -> None:
+    """They mix the bodies' residuals: all parameters are one block, none is left where it was."""
     scene, a, _, _ = parts
     problem = physics_model(scene, a.select(range(5))).problem
-    mode = find_mode(problem, seed=1)
-    noisy = with_start_noise(problem, mode)
-    phi, sigma = mode.draws(np.random.default_rng(1), 40), np.tile(mode.sigma, (40, 1))
+    phi = problem.layout.to_vector(PUCKS)
+    noisy = along_trajectories(problem, phi)
+    rng = np.random.default_rng(1)
+    phis = phi * np.exp(0.01 * rng.normal(size=(40, len(phi))))
+    sigma = noisy.trajectories.sigma * np.exp(0.01 * rng.normal(size=(40, 9)))
     assert len(problem.simulator.parts) == 2
-    (whole,) = _Mover(noisy, phi, sigma).parts
+    (whole,) = _Mover(noisy, phis, sigma).parts
     np.testing.assert_array_equal(whole.places, np.arange(problem.layout.size))
 
 
