@@ -24,6 +24,7 @@ with warnings.catch_warnings():  # Box2D's generated wrapper warns on import und
 
 STEP = 0.001  # s
 NORMAL_GRAVITY = 9.81  # m/s^2
+RING = 12  # points of a ring of contact
 # Box2D's tolerances are compiled in (b2_linearSlop 0.005, b2_velocityThreshold 1 length unit per
 # second, below which nothing bounces). With the centimetre as unit of length they are 0.05 mm and
 # 1 cm/s, too small to matter here.
@@ -88,6 +89,7 @@ class Effects:
     inertia_scale: float = 1.0
     pivot_friction: float = 0.0  # N m, Coulomb torque in the hinge
     pivot_damping: float = 0.0  # N m s
+    sliding_friction: tuple[float, float] = (0.0, 0.0)  # mu, radius of the ring of contact (m)
     actuator_delay: float = 0.0  # share of the interval by which the command is late
     dead_zone: float = 0.0  # N
     mass_change: tuple[float, float, float] = (1.0, 0.0, 0.0)  # factor, from trajectory, from s
@@ -95,6 +97,10 @@ class Effects:
     sensor_bias: tuple[float, ...] = (0.0,) * 6  # m, m, rad, m/s, m/s, rad/s
     heavy_tails: float = 0.0  # reciprocal of the degrees of freedom of the noise
     # Outside pbrl_ppl's catalogue:
+    saturation: float = math.inf  # N, the largest force that the actuator has
+    anisotropic_gain: tuple[float, float] = (1.0, 1.0)  # of the force along the world's x and y
+    spring: tuple[float, float, float] = (0.0, 0.0, 0.0)  # N/m, to an anchor x, y (m)
+    magnus_force: float = 0.0  # kg, F = c omega x v
     stiction_patch: float = 0.0  # extra isotropic Coulomb friction of the floor where x > 0
     time_varying_gain: tuple[float, float] = (0.0, 1.0)  # force times 1 + a sin(2 pi t / period)
 
@@ -211,13 +217,16 @@ def rollout(
             inertia = setup.inertia * effects.inertia_scale * mass / setup.mass
             body.massData = Box2D.b2MassData(mass=mass, center=(0, 0), I=inertia * CM**2)
             wrench = before[i if j < effects.actuator_delay * steps else i + 1]
-            x, _, theta, vx, vy, omega = state()
+            x, y, theta, vx, vy, omega = state()
             v, turn = complex(vx, vy), cmath.exp(1j * theta)
-            force, torque = total_wrench(effects, wrench, turn, v, omega, (i * steps + j) * STEP)
+            time = (i * steps + j) * STEP
+            force, torque = total_wrench(effects, wrench, complex(x, y), turn, v, omega, time)
             v += force / mass * STEP
             omega += torque / inertia * STEP
             if effects.stiction_patch and x > 0:
                 v *= 1 - min(1.0, effects.stiction_patch * NORMAL_GRAVITY * STEP / (abs(v) or 1.0))
+            if effects.sliding_friction[0]:
+                v, omega = rub(*effects.sliding_friction, mass, inertia, v, omega)
             if setup.wheel is not None:
                 v, omega = roll(setup.wheel, mass, inertia, turn, v, omega)
             body.linearVelocity = (v.real * CM, v.imag * CM)
@@ -234,16 +243,28 @@ def rollout(
 
 
 def total_wrench(
-    effects: Effects, wrench: np.ndarray, turn: complex, v: complex, omega: float, time: float
+    effects: Effects,
+    wrench: np.ndarray,
+    place: complex,
+    turn: complex,
+    v: complex,
+    omega: float,
+    time: float,
 ) -> tuple[complex, float]:
     """Return the force (N) and the torque (N m) on the body: the commanded ones and the effects."""
     amplitude, period = effects.time_varying_gain
     force = complex(wrench[0], wrench[1]) * cmath.exp(1j * effects.actuator_rotation)
     force *= abs(force) >= effects.dead_zone
+    force *= min(1.0, effects.saturation / (abs(force) or 1.0))
+    force = complex(
+        effects.anisotropic_gain[0] * force.real, effects.anisotropic_gain[1] * force.imag
+    )
     force *= 1 + amplitude * math.sin(2 * math.pi * time / period)
     torque = float(wrench[2]) + cross(turn * complex(*effects.push_offset), force)
     force -= (effects.linear_drag + effects.quadratic_drag * abs(v)) * v
     force += complex(*effects.constant_force) + turn * complex(*effects.body_force)
+    force -= effects.spring[0] * (place - complex(*effects.spring[1:]))
+    force += effects.magnus_force * omega * 1j * v
     torque += effects.constant_torque - (effects.angular_drag + effects.pivot_damping) * omega
     return force, torque
 
@@ -269,6 +290,28 @@ def roll(
             wanted = min(max(impulse[k] - effective_mass * speed, -limit), limit)
             v += (wanted - impulse[k]) / mass * axis
             omega += (wanted - impulse[k]) * lever / inertia
+            impulse[k] = wanted
+    return v, omega
+
+
+def rub(
+    mu: float, radius: float, mass: float, inertia: float, v: complex, omega: float
+) -> tuple[complex, float]:
+    """Return the velocities after dry friction on a ring about the centre over one step.
+
+    Points of the ring share the weight. At each the impulse that stops it, at most its share of
+    mu m g dt; solved as in `roll`.
+    """
+    arms = [radius * cmath.exp(2j * math.pi * k / RING) for k in range(RING)]
+    effective_mass = 1 / (1 / mass + radius**2 / inertia)
+    limit = mu * mass * NORMAL_GRAVITY * STEP / RING
+    impulse = [0j] * RING
+    for _ in range(10):
+        for k, arm in enumerate(arms):
+            wanted = impulse[k] - effective_mass * (v + 1j * omega * arm)
+            wanted *= min(1.0, limit / (abs(wanted) or limit))
+            v += (wanted - impulse[k]) / mass
+            omega += cross(arm, wanted - impulse[k]) / inertia
             impulse[k] = wanted
     return v, omega
 

@@ -174,12 +174,44 @@ def test_body_force_turns_with_the_body():
     [
         ({"actuator_rotation": 0.12}, cmath.exp(0.12j)),
         ({"time_varying_gain": (0.3, 0.4)}, 1 + 0.3 * 2 / math.pi),  # mean over half a period
+        ({"saturation": 2.0}, 2.0 / abs(complex(4.0, 1.0))),
+        ({"anisotropic_gain": (1.5, 1.5)}, 1.5),
     ],
 )
 def test_effect_on_the_command(effects, gain):
     got = end_of(PUCK, np.zeros(6), 0.2, wrench=(4.0, 1.0, 0.0), **effects)
     expected = complex(4.0, 1.0) * gain * 0.2 / 2.0
     np.testing.assert_allclose(got[3:], [expected.real, expected.imag, 0.0], rtol=1e-3, atol=1e-6)
+
+
+def test_gains_are_of_the_axes_of_the_world():
+    got = end_of(
+        PUCK, [0, 0, 0.7, 0, 0, 0], 0.2, wrench=(4.0, 1.0, 0.0), anisotropic_gain=(1.2, 0.5)
+    )
+    np.testing.assert_allclose(got[3:], [0.48, 0.05, 0.0], rtol=1e-3, atol=1e-6)
+
+
+def test_spring_swings_the_body_about_its_anchor():
+    w = math.sqrt(3.0 / 2.0)
+    got = end_of(PUCK, [1.5, 0.5, 0, 0, 0, 0], 1.0, spring=(3.0, 0.5, 0.5))
+    expected = [0.5 + math.cos(w), 0.5, 0.0, -w * math.sin(w), 0.0, 0.0]
+    np.testing.assert_allclose(got, expected, atol=2e-3)
+
+
+def test_magnus_force_turns_the_velocity():
+    got = end_of(PUCK, [0, 0, 0, 1.0, 0, 2.0], 0.5, magnus_force=0.4)
+    angle = 0.4 * 2.0 / 2.0 * 0.5
+    np.testing.assert_allclose(got[3:5], [math.cos(angle), math.sin(angle)], atol=2e-3)
+
+
+def test_sliding_friction_stops_sliding_and_turning_and_holds():
+    ring = {"sliding_friction": (0.1, 0.15)}
+    slides = end_of(PUCK, [0, 0, 0, 1.0, 0, 0], 0.4, **ring)
+    np.testing.assert_allclose(slides[3:], [1 - 0.1 * G * 0.4, 0, 0], atol=1e-3)
+    turns = end_of(PUCK, [0, 0, 0, 0, 0, 10.0], 0.2, **ring)
+    np.testing.assert_allclose(turns[5], 10 - 0.1 * 2.0 * G * 0.15 * 0.2 / INERTIA, rtol=1e-3)
+    held = end_of(PUCK, np.zeros(6), 0.5, wrench=(0.9 * 0.1 * 2.0 * G, 0.0, 0.0), **ring)
+    np.testing.assert_allclose(held, 0.0, atol=1e-5)
 
 
 def test_push_offset_and_inertia_scale():

@@ -1,0 +1,189 @@
+"""One case from data to row: the oracle and the loop on the same data."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import signal
+import threading
+import time
+import traceback
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pbrl_ppl as pp
+from attribution.cases import Case
+from attribution.oracle import Oracle, ask, true_parameters
+from pbrl_ppl.criticism import revise
+
+#: Parameters of which more than one value is the truth: any number between two trajectories.
+_AMBIGUOUS = {("mass_change", "trajectory")}
+#: Seconds after which a case is given up.
+LONGEST = 1800
+#: Changes of what a row means make cached ones useless.
+_FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came of a case.
+
+    Parameters
+    ----------
+    name, kind, body : str
+        Of the case.
+    effect : str, optional
+        What is hidden.
+    truth : dict of str to float
+        Its parameters.
+    oracle : Oracle, optional
+        Whether the data show it.
+    findings : dict, optional
+        As in ``report.json``, and the stages with their seconds; None if the case failed.
+    error : str, optional
+        Why it failed.
+    seconds : float
+        What it took.
+    sources : str
+        Hash of the package's files that it was made with.
+    """
+
+    name: str
+    kind: str
+    body: str
+    effect: str | None = None
+    truth: dict[str, float] = field(default_factory=dict)
+    oracle: Oracle | None = None
+    findings: dict[str, Any] | None = None
+    error: str | None = None
+    seconds: float = 0.0
+    sources: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """The loop's, or ``failed``."""
+        return "failed" if self.findings is None else str(self.findings["verdict"])
+
+    @property
+    def added(self) -> list[dict[str, Any]]:
+        """Effects that the loop added, the one that gained most first."""
+        return [] if self.findings is None else list(self.findings["added"])
+
+    @property
+    def open(self) -> bool:
+        """Whether the loop says that something remains."""
+        return self.findings is not None and self.findings["unexplained"] is not None
+
+    @property
+    def detected(self) -> bool:
+        """Whether the oracle sees the effect in the data."""
+        return self.oracle is not None and self.oracle.detects
+
+    def within(self) -> list[bool]:
+        """Of each parameter of the right effect, if it was named: is the truth in the interval."""
+        return [
+            estimate["hdi"][0] <= self.truth[name] <= estimate["hdi"][1]
+            for one in self.added
+            if one["effect"] == self.effect
+            for name, estimate in one["parameters"].items()
+            if (self.effect, name) not in _AMBIGUOUS
+        ]
+
+
+def run_case(case: Case, seed: int, draws: int | None = None) -> Row:
+    """Make a case's data, ask the oracle, run the loop; a failure is a row that says so.
+
+    A case that takes too long is one.
+    """
+    begin = time.perf_counter()
+    known: dict[str, Any] = {"name": case.name, "kind": case.kind, "body": case.body}
+    try:
+        known |= {"effect": case.effect, "truth": true_parameters(case), "sources": sources()}
+        with warnings.catch_warnings(), _limited(case.name):
+            warnings.simplefilter("ignore")
+            train, test = case.histories(seed)
+            if case.effect is not None:
+                known["oracle"] = ask(case, train, seed)
+            known["findings"] = _loop(case, train, test, seed, draws)
+    except Exception as error:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        where = f"{Path(place.filename).name}:{place.lineno}"
+        known["error"] = f"{type(error).__name__}: {error} ({where})"
+    return Row(**known, seconds=time.perf_counter() - begin)
+
+
+@contextmanager
+def _limited(name: str) -> Iterator[None]:
+    """Stop what takes too long, where the system lets us: in a process's main thread."""
+    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "SIGALRM"):
+        yield
+        return
+
+    def stop(number: int, frame: object) -> None:
+        raise TimeoutError(
+            f"no end after {LONGEST} s; see where with --only {name} --workers 1 --verbose"
+        )
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(LONGEST)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def _loop(
+    case: Case, train: pp.History, test: pp.History, seed: int, draws: int | None
+) -> dict[str, Any]:
+    """What the loop finds, with the seconds at which each of its stages began."""
+    begin = time.perf_counter()
+    stages: list[tuple[float, str]] = []
+    found = revise(
+        case.scene,
+        train,
+        test,
+        catalogue=case.catalogue,
+        seed=seed,
+        draws=draws if case.draws is None else case.draws,
+        progress=lambda stage: stages.append((time.perf_counter() - begin, stage)),
+    )
+    return found.to_dict() | {"stages": stages, "loop_seconds": time.perf_counter() - begin}
+
+
+def sources() -> str:
+    """Hash of the package's files: the loop may change between two runs of one version."""
+    digest = hashlib.sha256()
+    folder = Path(pp.__file__).parent
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def cache_path(folder: Path, case: Case, seed: int, draws: int | None) -> Path:
+    """Where the row of a case is kept: its name, and a hash of version and settings."""
+    catalogue = [effect.name for effect in case.catalogue]
+    scene = case.scene.to_toml()
+    settings = (_FORMAT, pp.__version__, case, case.setup, scene, catalogue, seed, draws)
+    return folder / f"{case.name}-{hashlib.sha256(repr(settings).encode()).hexdigest()[:12]}.json"
+
+
+def save(row: Row, path: Path) -> None:
+    """Write a row; a failure is not kept, for it may be cured."""
+    if row.error is None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        partial = path.with_suffix(".partial")
+        partial.write_text(json.dumps(asdict(row)))
+        partial.replace(path)
+
+
+def load(path: Path) -> Row | None:
+    """Read a row, if it is there."""
+    if not path.is_file():
+        return None
+    kept = json.loads(path.read_text())
+    return Row(**kept | {"oracle": kept["oracle"] and Oracle(**kept["oracle"])})

@@ -1,0 +1,83 @@
+"""The oracle: knows what is hidden, and says whether the data show it at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import chi2
+
+import pbrl_ppl as pp
+from attribution.cases import OUTSIDE, Case
+from attribution.outside import OUTSIDE_EFFECTS, parameters_of
+from pbrl_ppl.criticism.resolution import with_enough_substeps
+from pbrl_ppl.effects import Attached, attach
+from pbrl_ppl.model import Problem
+from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.parameters import inside
+
+#: Chance alone gives what the oracle calls detected less often than this.
+CERTAIN = 1e-4
+
+
+@dataclass(frozen=True)
+class Oracle:
+    """Likelihood-ratio test of the effect that is hidden, its size free.
+
+    Parameters
+    ----------
+    statistic : float
+        Twice the gain in log-likelihood from adding it to the declared model.
+    p_value : float
+        With as many degrees of freedom as it has parameters.
+    """
+
+    statistic: float
+    p_value: float
+
+    @property
+    def detects(self) -> bool:
+        """Whether the data show the effect to one who knows it."""
+        return self.p_value < CERTAIN
+
+
+def true_effect(case: Case) -> pp.Effect:
+    """The effect that is hidden in a case's data."""
+    if case.kind == OUTSIDE:
+        return OUTSIDE_EFFECTS[str(case.effect)]
+    (effect,) = (each for each in pp.catalogue if each.name == case.effect)
+    return effect
+
+
+def true_parameters(case: Case) -> dict[str, float]:
+    """What is hidden, as the effect's own parameters."""
+    if case.value is None:
+        return {}
+    return parameters_of(true_effect(case), case.value)
+
+
+def ask(case: Case, train: pp.History, seed: int) -> Oracle:
+    """Fit the declared model with the hidden effect and without, and compare the likelihoods."""
+    problem = Problem.of(case.scene, train, attach(case.scene))
+    found = find_mode(problem, seed=seed)
+    without = with_enough_substeps(trajectory_mode(problem, found.phi), lambda stage: None)
+    added = true_effect(case).on(case.scene.moving[0].name)
+    gain = _log_likelihood(_with(without, added, true_parameters(case))) - _log_likelihood(without)
+    statistic = max(0.0, 2 * gain)
+    return Oracle(statistic, float(chi2.sf(statistic, len(added.effect.parameters))))
+
+
+def _with(mode: Mode, added: Attached, values: dict[str, float]) -> Mode:
+    """Mode with the effect in the model, sought from the truth."""
+    problem = mode.problem.with_physics(effects=(*mode.problem.physics.effects, added))
+    labels = problem.layout.labels
+    phi = np.array([prior.centre for prior in problem.layout.priors])
+    phi[[labels.index(label) for label in mode.problem.layout.labels]] = mode.phi
+    for name, value in values.items():
+        phi[labels.index(f"{added.effect.name}_{name}[{added.body}]")] = value
+    return trajectory_mode(problem, inside(problem.layout.priors, phi), mode.sigma)
+
+
+def _log_likelihood(mode: Mode) -> float:
+    residual = mode.problem.residual(mode.phi)
+    return float(mode.problem.log_density(residual, mode.sigma, mode.phi).sum())

@@ -1,0 +1,102 @@
+"""Rows and scores for a reader: the table, a case told in full, and JSON."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from rich.table import Table
+
+from attribution.cases import KINDS
+from attribution.one_case import Row
+from attribution.scores import outcome
+
+_CANDIDATES = 6
+
+
+def table(rows: list[Row]) -> Table:
+    """One row a case, what the oracle saw beside what the loop said."""
+    shown = Table("case", "oracle's p", "verdict", "added", "outcome", "in interval", "s")
+    kind = None
+    for row in sorted(rows, key=lambda row: (KINDS.index(row.kind), row.name)):
+        if kind not in (None, row.kind):
+            shown.add_section()
+        kind = row.kind
+        within = row.within()
+        shown.add_row(
+            row.name,
+            _oracle(row),
+            row.error or row.verdict + ", something remains" * (row.open and bool(row.added)),
+            ", ".join(map(_name, row.added)),
+            outcome(row),
+            f"{sum(within)}/{len(within)}" if within else "",
+            f"{row.seconds:.0f}",
+        )
+    return shown
+
+
+def _oracle(row: Row) -> str:
+    if row.oracle is None:
+        return ""
+    return f"{row.oracle.p_value:.0e}" + " not detected" * (not row.oracle.detects)
+
+
+def _name(added: dict[str, Any]) -> str:
+    others = " or ".join(added["not_separable_from"])
+    return f"{added['effect']} (or {others})" if others else str(added["effect"])
+
+
+def score_table(scores: dict[str, float | int | None]) -> Table:
+    """Scores in one column."""
+    shown = Table("score", "value")
+    for name, value in scores.items():
+        text = "no cases" if value is None else f"{value:.3g}" if name != "seconds" else f"{value}"
+        shown.add_row(name, text)
+    return shown
+
+
+def plain(row: Row) -> dict[str, Any]:
+    """A row for JSON; its findings in short."""
+    short = {
+        "verdict": row.verdict,
+        "outcome": outcome(row),
+        "added": row.added,
+        "unexplained": row.findings and row.findings["unexplained"],
+        "small": row.findings and row.findings["small"],
+    }
+    rest = {key: value for key, value in asdict(row).items() if key != "findings"}
+    return rest | {"detected": row.detected} | short
+
+
+def told(row: Row) -> str:
+    """A case in full: stages, candidates, tests, what was added and what remains."""
+    lines = [f"== {row.name}: {row.verdict} ({outcome(row)}), {row.seconds:.0f} s"]
+    if row.effect is not None:
+        lines.append(f"hidden: {row.effect} {row.truth}")
+    if row.oracle is not None:
+        lines.append(f"oracle: statistic {row.oracle.statistic:.1f}, p = {row.oracle.p_value:.1e}")
+    found = row.findings
+    if found is None:
+        return "\n".join([*lines, f"failed: {row.error}"])
+    lines += [f"{second:6.1f} s  {stage}" for second, stage in found["stages"]]
+    lines.append(f"{found['loop_seconds']:6.1f} s  done")
+    lines.append(f"engine: {found['numerical']}")
+    for one in found["candidates"][:_CANDIDATES]:
+        lines.append(
+            f"candidate {one['effect']}: S = {one['statistic']:.1f}, {one['dof']} df,"
+            f" p = {one['p_value']:.1e}, identifiable {one['identifiable']:.2g}, {one['estimate']}"
+        )
+    for one in row.added:
+        estimates = {name: (e["mean"], e["hdi"]) for name, e in one["parameters"].items()}
+        lines.append(f"added {_name(one)}: {estimates}, elpd +{one['elpd_difference']:.1f}")
+    if found["small"]:
+        lines.append(f"too small to matter: {found['small']}")
+    lines += [
+        f"test {'passed' if test['passed'] else 'FAILED'}: {test['name']},"
+        f" p = {test['p_value']:.1e}: {test['sentence']}"
+        for test in found["tests"]
+    ]
+    lines.append(f"unexplained acceleration: {found['unexplained_acceleration']}")
+    if found["unexplained"] is not None:
+        lines.append(f"remains: {found['unexplained']['sentence']}")
+    return "\n".join(lines)
