@@ -1,0 +1,157 @@
+"""Posteriors of whole trajectories: from a file, brought up to date, and planned with."""
+
+import json
+import warnings
+
+import numpy as np
+import pytest
+
+import pbrl_ppl as pp
+from pbrl_ppl.errors import ConvergenceWarning
+from pbrl_ppl.history import History
+from pbrl_ppl.model import along_trajectories, physics_model, simulated_trajectories
+from pbrl_ppl.planning import Dynamics
+from pbrl_ppl.posterior import convergence, group, parameter_draws, problem_of
+from pbrl_ppl.posterior.store import scalars
+from pbrl_ppl.scene import Body, Scene, Shape
+from tests.helpers.histories import simulated_history
+
+SCENE = Scene(
+    time_step=0.1,
+    substeps=4,
+    bodies=(
+        Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}, effects=("linear_drag",)),
+    ),
+)
+PHI = np.array([2.0, 0.8])
+#: Errors of measuring x, y, theta, vx, vy, omega, and unexplained accelerations.
+NOISE = np.array([2e-3, 2e-3, 4e-3, 1e-2, 1e-2, 2e-2, 0.3, 0.3, 0.5])
+QUICK = {"draws": 300, "tune": 200, "chains": 2, "cores": 1, "progress": False}
+
+
+def quiet(function, *arguments, **options):
+    """Few draws, on purpose."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return function(*arguments, **options)
+
+
+@pytest.fixture(scope="module")
+def both() -> History:
+    """Fourteen trajectories with both noises, some of them shorter."""
+    truth = {"mass": PHI[0], "linear_drag_coefficient": PHI[1]}
+    design = simulated_history(SCENE, truth, seed=1, trajectories=14, intervals=5, noise=0.0)
+    problem = physics_model(SCENE, design, trajectories=True).problem
+    measured = simulated_trajectories(problem, PHI, NOISE, np.random.default_rng(2))
+    dataset = design.dataset.copy()
+    dataset["observed"] = dataset["observed"].copy(data=measured)
+    rows = History(dataset).to_dataframe()
+    short = (rows["trajectory"] % 3 == 2) & (rows["step"] > 3)
+    last = (rows["trajectory"] % 3 == 2) & (rows["step"] == 3)
+    rows.loc[last, ["force_x", "force_y", "torque"]] = np.nan
+    return History.from_dataframe(rows[~short], SCENE)
+
+
+@pytest.fixture(scope="module")
+def first(both):
+    """The posterior of the first twelve."""
+    model = physics_model(SCENE, both.select(range(12)), trajectories=True)
+    return quiet(pp.fit, model, seed=3, **QUICK)
+
+
+@pytest.fixture(scope="module")
+def whole(both):
+    """The posterior of all."""
+    return quiet(pp.fit, physics_model(SCENE, both, trajectories=True), seed=4, **QUICK)
+
+
+def test_the_truth_is_in_the_posterior(first) -> None:
+    """Eleven numbers within 4 standard deviations, noises by their logarithms: 7e-4."""
+    problem = problem_of(first)
+    phi, sigma = parameter_draws(problem, first)
+    log_off = np.log(sigma / NOISE)
+    z = np.hstack([(phi - PHI) / phi.std(axis=0), log_off / log_off.std(axis=0)]).mean(axis=0)
+    assert (np.abs(z) < 4).all(), z
+
+
+def test_a_file_holds_the_problem(first, tmp_path) -> None:
+    pp.save_posterior(first, tmp_path / "puck.nc")
+    idata = pp.load_posterior(tmp_path / "puck.nc")
+    problem, here = problem_of(idata), problem_of(first)
+    assert problem.trajectories is not None
+    assert problem.noise_variables == here.noise_variables
+    np.testing.assert_array_equal(problem.noise_prior[0], here.noise_prior[0])
+    stored = group(idata, "log_likelihood")["next_state"].values.reshape(600, -1)[::150]
+    phi, sigma = (each[::150] for each in parameter_draws(problem, idata))
+    for each in (problem, here):
+        np.testing.assert_allclose(each.log_density(each.residual(phi), sigma), stored, rtol=1e-9)
+    # what was measured, not what was smoothed
+    np.testing.assert_array_equal(group(idata, "observed_data")["next_state"].values, here.measured)
+    # and it can be smoothed anew elsewhere
+    again = along_trajectories(problem, PHI, NOISE, problem.trajectories.cells)
+    assert again.segments.n == 12 * 5 - 4 * 2
+    assert np.isfinite(again.log_density(again.residual(PHI), NOISE)).all()
+
+
+def test_units_and_names_are_in_the_file(first) -> None:
+    posterior = group(first, "posterior")
+    assert posterior["unexplained_acceleration"].dims == ("chain", "draw", "velocity")
+    assert list(posterior["velocity"].values) == ["vx", "vy", "omega"]
+    assert posterior["unexplained_acceleration"].attrs["units"] == "m/s^2, of omega rad/s^2"
+
+
+def agree(idata, other) -> None:
+    """Means of 11 numbers within 4 Monte Carlo errors: false alarm 7e-4.
+
+    The linearisations differ: of the first data's mode, or of all data's.
+    """
+    ess = [convergence(each)[1] for each in (idata, other)]
+    for name, b in scalars(other).items():
+        a = scalars(idata)[name]
+        error = float(b.std()) * np.sqrt(sum(1 / each[name] for each in ess))
+        assert abs(float(a.mean() - b.mean())) < 4 * error, name
+
+
+@pytest.mark.parametrize("way", ["reweighted", "moved"])
+def test_an_update_is_the_fit_of_all(both, first, whole, way, monkeypatch) -> None:
+    monkeypatch.setattr("pbrl_ppl.sampling.updating._MOVE", 0.01 if way == "reweighted" else 1.0)
+    monkeypatch.setattr("pbrl_ppl.sampling.updating.MIN_ESS", 0)
+    new = quiet(pp.update, first, both.select([12, 13]), seed=5)
+    (entry,) = json.loads(new.attrs["updates"])
+    assert (entry["did"], entry["transitions"]) == (way, 10)
+    agree(new, whole)
+    problem = problem_of(new)
+    assert problem.data.history.n_trajectories == 14
+    # the file's own problem has the stored likelihoods
+    phi, sigma = parameter_draws(problem, new)
+    stored = group(new, "log_likelihood")["next_state"].values.reshape(len(phi), -1)
+    some = slice(None, None, 150)
+    np.testing.assert_allclose(
+        problem.log_density(problem.residual(phi[some]), sigma[some]), stored[some], rtol=1e-9
+    )
+    np.testing.assert_array_equal(
+        problem.measured, physics_model(SCENE, both, trajectories=True).problem.measured
+    )
+
+
+def test_a_plan_expects_steps_noise_and_not_the_sensors(first) -> None:
+    """Accelerations held over the interval: dt^2 / 2 in the pose, dt in the velocity."""
+    dynamics = Dynamics.of(first, 3, seed=1)
+    states = np.zeros((3, 20_000, 1, 6))
+    noisy = dynamics.noisy(states, np.random.default_rng(6))
+    _, sigma = parameter_draws(problem_of(first), first)
+    chosen = np.random.default_rng(1).choice(len(sigma), 3, replace=False)
+    dt = SCENE.time_step
+    steps = sigma[chosen, 6:]
+    # 18 standard deviations of 20 000 draws, 5 standard errors: false alarm 1e-5
+    spread = noisy[:, :, 0].std(axis=1)
+    expected = np.hstack([dt**2 / 2 * steps, dt * steps])
+    assert (np.abs(spread / expected - 1) < 5 * np.sqrt(0.5 / 20_000)).all()
+    # pose and velocity move together, and the axes apart from each other
+    np.testing.assert_allclose(noisy[..., :3], dt / 2 * noisy[..., 3:], rtol=1e-12)
+    across = np.mean(noisy[..., 3] * noisy[..., 4], axis=(1, 2))
+    assert (np.abs(across) < 5 * expected[:, 3] * expected[:, 4] / np.sqrt(20_000)).all()
+    # the sensors' error is more than all of that in x and y
+    assert (sigma[chosen, :2] > spread[:, :2]).all()
+    one = dynamics.single()
+    assert one.noisy(states[:1], np.random.default_rng(7)).shape == (1, 20_000, 1, 6)
