@@ -81,16 +81,18 @@ def results(
         yield row
 
 
-def watched(rows: Iterator[Row], total: int, workers: int, verbose: bool) -> list[Row]:
-    """Collect rows, telling progress and the time left; Ctrl-C keeps those that are done."""
+def watched(rows: Iterator[Row], total: int, kept: int, verbose: bool) -> list[Row]:
+    """Collect rows, telling progress and the time left; Ctrl-C keeps those that are done.
+
+    The first ``kept`` of the ``total`` rows come from the cache, at once.
+    """
     done: list[Row] = []
-    begin, made = time.monotonic(), 0
+    begin = time.monotonic()
     try:
         for row in rows:
             done.append(row)
-            # a row of the cache comes at once
-            made += time.monotonic() - begin > 0.5 * row.seconds / workers
-            left = (total - len(done)) * (time.monotonic() - begin) / max(made, 1)
+            a_row = (time.monotonic() - begin) / max(len(done) - kept, 1)
+            left = (total - len(done)) * a_row
             say(
                 f"{len(done)}/{total} {row.name}: {row.error or row.verdict}, {row.seconds:.0f} s;"
                 f" about {_duration(left)} left"
@@ -167,7 +169,7 @@ def main() -> None:
     rows = watched(
         results(cases, executor, options.seed, options.draws, options.cache),
         len(cases),
-        options.workers,
+        kept,
         options.verbose,
     )
     executor.shutdown(wait=False, cancel_futures=True)

@@ -197,7 +197,7 @@ def test_an_interrupted_run_keeps_what_is_done(attribution, row, monkeypatch) ->
 
     said = []
     monkeypatch.setattr(benchmark, "say", said.append)
-    done = benchmark.watched(rows(), 5, workers=1, verbose=False)
+    done = benchmark.watched(rows(), 5, kept=0, verbose=False)
     assert [each.verdict for each in done] == ["adequate"]
     assert said[0].startswith("1/5 made up: adequate, 10 s; about")
     assert said[1].startswith("interrupted: 1 of 5")

@@ -39,22 +39,23 @@ def _bias(*sizes: float) -> tuple[Hidden, ...]:
     return tuple((0.0, 0.0, 0.0, v, -0.5 * v, 2 * v) for v in sizes)
 
 
-_LOAD = tuple((factor, 0.0, 1.5) for factor in (1.03, 1.12, 1.4))  # in each trajectory, after 1.5 s
+_LOAD = tuple((factor, 0.0, 1.5) for factor in (1.01, 1.08, 1.4))  # in each trajectory, after 1.5 s
+# Small ones are about five times what a score test shows nine times of ten on these data.
 #: The same on any body that is pushed about.
 _ANYWHERE: dict[str, tuple[Hidden, ...]] = {
-    "actuator_rotation": (0.01, 0.04, 0.15),
-    "actuator_delay": (0.05, 0.15, 0.4),
-    "inertia_scale": (1.05, 1.2, 1.5),
+    "actuator_rotation": (0.005, 0.03, 0.15),
+    "actuator_delay": (0.03, 0.12, 0.4),
+    "inertia_scale": (1.01, 1.08, 1.5),
     "mass_change": _LOAD,
-    "sensor_bias": _bias(0.005, 0.02, 0.08),
+    "sensor_bias": _bias(0.01, 0.03, 0.08),
 }
-_GAIN = ((1.03, 1.0), (1.1, 1.0), (1.3, 1.0))
+_GAIN = ((1.01, 1.0), (1.05, 1.0), (1.3, 1.0))
 
 CART = Kind(
     setup=mh.CART,
     scene=pp.Scene.load(_MODELS / "shopping_cart" / "scene.toml"),
     catalogued={
-        "linear_drag": (0.05, 0.4, 2.0),
+        "linear_drag": (0.1, 0.5, 2.0),
         "quadratic_drag": (0.03, 0.2, 1.0),
         "angular_drag": (0.03, 0.2, 1.2),
         "constant_force": ((0.1, -0.05), (0.4, -0.2), (1.5, -0.8)),
@@ -87,14 +88,14 @@ PUCK = Kind(
         ),
     ),
     catalogued={
-        "linear_drag": (0.02, 0.12, 0.6),
-        "quadratic_drag": (0.01, 0.08, 0.4),
-        "angular_drag": (0.0005, 0.003, 0.02),
-        "constant_force": ((0.03, -0.015), (0.12, -0.06), (0.5, -0.25)),
-        "body_force": ((0.03, 0.015), (0.12, 0.06), (0.5, 0.25)),
+        "linear_drag": (0.006, 0.06, 0.6),
+        "quadratic_drag": (0.002, 0.03, 0.4),
+        "angular_drag": (0.0004, 0.003, 0.02),
+        "constant_force": ((0.016, -0.008), (0.1, -0.05), (0.5, -0.25)),
+        "body_force": ((0.016, 0.008), (0.1, 0.05), (0.5, 0.25)),
         "constant_torque": (0.0005, 0.004, 0.02),
-        "push_offset": ((-0.001, 0.0008), (-0.005, 0.004), (-0.02, 0.015)),
-        "sliding_friction": ((0.002, 0.1), (0.01, 0.1), (0.05, 0.1)),
+        "push_offset": ((-0.0004, 0.0003), (-0.003, 0.002), (-0.02, 0.015)),
+        "sliding_friction": ((0.0008, 0.1), (0.006, 0.1), (0.05, 0.1)),
         "dead_zone": (1.0, 2.0, 3.5),
         "hidden_obstacle": ((1.8, 0.0, 0.1), (1.8, 0.0, 0.2), (1.8, 0.0, 0.4)),
         **_ANYWHERE,
@@ -102,8 +103,8 @@ PUCK = Kind(
     outside={
         "saturation": (8.0, 5.0, 2.7),
         "anisotropic_gain": _GAIN,
-        "spring": ((0.02, 1.0, -0.5), (0.1, 1.0, -0.5), (0.5, 1.0, -0.5)),
-        "magnus_force": (0.006, 0.03, 0.15),
+        "spring": ((0.01, 1.0, -0.5), (0.07, 1.0, -0.5), (0.5, 1.0, -0.5)),
+        "magnus_force": (0.01, 0.04, 0.15),
     },
 )
 

@@ -535,6 +535,34 @@ def test_command_interrupted(
 # the real thing
 
 
+def test_whole_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two replications: each noise is drawn, simulated along trajectories, fitted and ranked."""
+    monkeypatch.setattr(replication, "_AGAIN", 0)
+    quick = QUICK | {"draws": 50, "tune": 50}
+    prior = {"mass": {"mu": 0.7, "sigma": 0.3}}
+    body = Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}, prior=prior)
+    scene = Scene(time_step=0.1, substeps=2, bodies=(body,))
+    history = simulated_history(scene, {"mass": 2.0}, seed=1, trajectories=3, intervals=3)
+    result = calibrate(scene, history, trajectories=True, replications=2, cores=1, **quick)
+    assert not result.failures
+    names = [f"sigma[{d}]" for d in ("x", "y", "theta", "vx", "vy", "omega")]
+    names += [f"unexplained_acceleration[{d}]" for d in ("vx", "vy", "omega")]
+    assert list(result.dataset["parameter"].values) == ["mass[puck]", *names, "log_likelihood"]
+    assert (result.dataset["ess"] > 2).all()
+    truth = result.dataset["truth"].values
+    assert (truth[:, :-1] > 0).all()
+    assert (truth[0] != truth[1]).all()
+    # what was simulated is the design's, all but its numbers
+    problem = physics_model(scene, history, trajectories=True).problem
+    (one,), _ = draw_truths(problem, 1, seed=1)
+    again = simulated(problem, one.values)
+    assert again.noise_prior[0] == pytest.approx(problem.noise_prior[0])
+    np.testing.assert_array_equal(again.data.history.dataset["observed"].values, one.values)
+    off = again.whitened(one.phi, one.sigma)
+    # 54 innovations: their mean square has sd 0.19, and the first of each trajectory is exact
+    assert 0.2 < np.mean(off**2) < 1.8
+
+
 @pytest.mark.slow
 def test_processes_give_the_same_numbers(puck: tuple[Scene, History]) -> None:
     options = {**QUICK, "replications": 2, "sigma": "scalar"}
