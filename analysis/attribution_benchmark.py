@@ -34,7 +34,7 @@ from attribution.words import plain, score_table, table, told
 from rich.console import Console
 
 #: Seconds that a case takes a worker, before any has been timed.
-SECONDS_A_CASE = 60.0
+SECONDS_A_CASE = 100.0
 #: Cases after which a worker starts anew: compiled models add up in its memory.
 CASES_A_WORKER = 20
 _WIDTH = 170

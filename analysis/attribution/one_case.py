@@ -23,7 +23,7 @@ from pbrl_ppl.criticism import revise
 #: Parameters of which more than one value is the truth: any number between two trajectories.
 _AMBIGUOUS = {("mass_change", "trajectory")}
 #: Seconds after which a case is given up.
-LONGEST = 1800
+LONGEST = 3600
 #: Changes of what a row means make cached ones useless.
 _FORMAT = 1
 
