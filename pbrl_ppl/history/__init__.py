@@ -1,5 +1,6 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
+from pbrl_ppl.history.derived import derived_velocities, measured_alone
 from pbrl_ppl.history.files import write_atomically
 from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
@@ -8,10 +9,12 @@ from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
 __all__ = [
     "History",
     "Segments",
+    "derived_velocities",
     "fill_hinges",
     "from_segments",
     "hung_bodies",
     "lever",
+    "measured_alone",
     "segment_rows",
     "write_atomically",
 ]

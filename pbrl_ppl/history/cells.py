@@ -19,6 +19,8 @@ from pbrl_ppl.state import STATE, WRENCH
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
+#: Nothing that a body does is larger than this, in SI units.
+_LARGEST = 1e9
 _INTEGER = re.compile(r"(-?(?:0|[1-9]\d{0,17}))(?:\.0*)?")
 
 
@@ -161,11 +163,13 @@ def _numbers(column: pd.Series, name: str, line: Ints, trajectory: Sequence[Any]
                 f"history row {line[row]}: {name} is {str(cell)!r} in trajectory "
                 f"{trajectory[row]}; expected a number or an empty cell; correct it"
             )
-    infinite = np.flatnonzero(np.isinf(values))
-    if infinite.size:
-        row = int(infinite[0])
+    limit = np.inf if name in ("time", "step") else _LARGEST
+    absurd = np.flatnonzero(np.isinf(values) | (np.abs(values) > limit))
+    if absurd.size:
+        row = int(absurd[0])
         raise HistoryError(
             f"history row {line[row]}: {name} is {values[row]} in trajectory {trajectory[row]}; "
-            "expected a finite number; empty the cell if it was not measured"
+            f"expected a finite number of at most {_LARGEST:g}; empty the cell if it was not"
+            " measured"
         )
     return values

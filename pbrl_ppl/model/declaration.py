@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, measured_alone
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import Observations, next_state_logp, next_state_random
 from pbrl_ppl.model.noise import Noise
@@ -27,6 +27,9 @@ from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
 from pbrl_ppl.parameters import Block, Layout
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE
+
+#: Dimensions of the two noises along trajectories.
+_NOISE_DIMS = {"sigma": "sensor", ACCELERATION: "velocity"}
 
 
 def physics_model(
@@ -116,6 +119,8 @@ def physics_model(
         )
     if trajectories and sigma == "scalar":
         raise ValueError("sigma is 'scalar', expected 'per_dimension' with trajectories")
+    if trajectories:
+        history = measured_alone(history)
     longest = int(history.dataset["n_rows"].max()) - 1
     if horizon > longest:
         raise HistoryError(
@@ -238,13 +243,11 @@ def _noise(problem: Problem) -> Any:
         return pt.ones(len(median)) * scalar
     if problem.trajectories is None:
         return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
-    split = len(problem.trajectories.cells.sensors)
-    mu = np.log(median)
-    sensor = pm.LogNormal("sigma", mu=mu[:split], sigma=spread, dims="sensor")
-    if split == len(mu):
-        return sensor
-    step = pm.LogNormal(ACCELERATION, mu=mu[split:], sigma=spread, dims="velocity")
-    return pt.concatenate([sensor, step])
+    parts, mu = [pt.zeros(0)], np.log(median)
+    for name, own in problem.noise_variables.items():
+        parts.append(pm.LogNormal(name, mu=mu[: len(own)], sigma=spread, dims=_NOISE_DIMS[name]))
+        mu = mu[len(own) :]
+    return pt.concatenate(parts)
 
 
 def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
@@ -327,8 +330,7 @@ def _coords(problem: Problem) -> dict[str, Any]:
 def _noise_coords(problem: Problem) -> dict[str, Any]:
     if problem.trajectories is None:
         return {}
-    names = map(list, problem.noise_variables.values())
-    return dict(zip(("sensor", "velocity"), names, strict=True))
+    return {_NOISE_DIMS[name]: list(own) for name, own in problem.noise_variables.items()}
 
 
 def _dim(problem: Problem, block: Block) -> str:

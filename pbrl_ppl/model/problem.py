@@ -217,10 +217,11 @@ class Problem:
         if self.trajectories is None:
             return {"sigma": self.observations.names}
         cells = self.trajectories.cells
-        return {
+        names = {
             "sigma": tuple(STATE[d] for d in cells.sensors),
             ACCELERATION: tuple(STATE[d] for d in cells.rates),
         }
+        return {name: own for name, own in names.items() if own}
 
     def named(self, phi: Array, sigma: Array) -> dict[str, Array]:
         """The model's variables at phi, shape (..., p), and sigma, shape (..., parameter)."""

@@ -124,7 +124,9 @@ def cells_of(scene: Scene, history: History) -> Cells:
             free[i] = [d % _RATE == THETA for d in range(len(STATE))]
     places = np.flatnonzero(free)
     body, dimension = np.divmod(places, len(STATE))
-    sensed = free & measured & ~still
+    stated = dict(scene.noise)
+    given = np.array([name in stated for name in STATE])
+    sensed = free & measured & ~still & ~given
     sensors = np.flatnonzero(sensed.any(axis=0))
     rates = np.flatnonzero((free & ~still).any(axis=0)[_RATE:]) + _RATE
     sensor = np.full(len(places), -1)
@@ -143,7 +145,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
         places,
         tuple(int(d) for d in np.unique(dimension)),
         sensor,
-        np.full(len(places), _EXACT),
+        np.array([stated.get(STATE[d], _EXACT) for d in dimension]),
         np.array(push).reshape(-1, len(places)),
         np.array(pushed, dtype=np.intp),
         tuple(int(d) for d in sensors),

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, derived_velocities, measured_alone
 from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, scene_of
 from pbrl_ppl.state import STATE
@@ -45,6 +45,16 @@ def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
             " what was recorded since"
         )
     return done
+
+
+def as_recorded(idata: Any, history: History) -> History:
+    """The history without velocities that were left out of the posterior's as computed."""
+    given = group(idata, "constant_data")
+    if "recorded_observed" not in given:
+        return history
+    held = given["recorded_observed"].to_numpy()
+    left_out = ~np.isfinite(held).any(axis=(0, 1))
+    return measured_alone(history, left_out & derived_velocities(history))
 
 
 def check_history(idata: Any, history: History) -> None:
@@ -91,6 +101,6 @@ def check_engine(idata: Any, problem: Problem) -> None:
     if not off < _SAME:
         raise PosteriorError(
             f"update: the posterior's likelihoods are not what this engine gives (half of them are"
-            f" off by {off:.2g} or more): it was made with start noise, other effects or another"
+            f" off by {off:.2g} or more): it was made with other effects or another"
             " version; fit all data anew"
         )

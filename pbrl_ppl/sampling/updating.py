@@ -34,7 +34,12 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.sampling.fitting import fit
 from pbrl_ppl.sampling.rejuvenation import rejuvenate
-from pbrl_ppl.sampling.update_checks import check_engine, check_history, checked_log
+from pbrl_ppl.sampling.update_checks import (
+    as_recorded,
+    check_engine,
+    check_history,
+    checked_log,
+)
 
 Array = NDArray[np.float64]
 
@@ -118,6 +123,7 @@ def update(
     """
     effects = tuple(effects)
     done = checked_log(idata, history)
+    history = as_recorded(idata, history)
     check_history(idata, history)
     problem = problem_of(idata, effects, history)
     check_engine(idata, problem)

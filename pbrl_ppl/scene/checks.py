@@ -10,6 +10,7 @@ from numbers import Real
 from typing import Any
 
 from pbrl_ppl.errors import SceneError
+from pbrl_ppl.state import STATE
 
 Point = tuple[float, float]
 
@@ -124,6 +125,16 @@ def known_parameters(value: object, where: str) -> tuple[tuple[str, float], ...]
             raise SceneError(f"{where}: known {name} is {number}, expected between 0 and 1")
         known[name] = number
     return tuple((name, known[name]) for name in PARAMETER_NAMES if name in known)
+
+
+def stated_noise(value: object) -> tuple[tuple[str, float], ...]:
+    """Return the errors of measuring that are given, in the order of the state."""
+    noise: dict[str, float] = {}
+    for name, item in _items(value, "[noise]"):
+        if name not in STATE:
+            raise SceneError(f'unknown key "{name}" in [noise]{nearest(name, STATE)}')
+        noise[name] = positive(item, f"[noise]: {name}")
+    return tuple((name, noise[name]) for name in STATE if name in noise)
 
 
 def index_probabilities(

@@ -16,11 +16,23 @@ import numpy as np
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import toml as scene_toml
-from pbrl_ppl.scene.checks import PARAMETER_NAMES, Point, finite, located, nearest, positive, vector
+from pbrl_ppl.scene.checks import (
+    PARAMETER_NAMES,
+    Point,
+    finite,
+    located,
+    nearest,
+    positive,
+    stated_noise,
+    vector,
+)
 from pbrl_ppl.scene.parts import WORLD, Body, Joint, Wall
 from pbrl_ppl.scene.shape import Shape
 
 __all__ = ["PARAMETER_NAMES", "WORLD", "Body", "Joint", "Point", "Scene", "Shape", "Wall"]
+
+#: Engine steps a sample, at most: more take longer than anyone waits, for no gain.
+MOST_SUBSTEPS = 10_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,6 +55,9 @@ class Scene:
         Immovable segments.
     joints : tuple of Joint
         Hinges and distance joints.
+    noise : tuple of (str, float)
+        Standard deviation of measuring a state dimension where it is known (m, rad, m/s, rad/s),
+        for the likelihood of whole trajectories, which infers the others; a dict will do.
 
     Raises
     ------
@@ -63,6 +78,7 @@ class Scene:
     substeps: int = 10
     walls: tuple[Wall, ...] = ()
     joints: tuple[Joint, ...] = ()
+    noise: tuple[tuple[str, float], ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "gravity", vector(self.gravity, 2, "[world]: gravity"))
@@ -74,6 +90,11 @@ class Scene:
         steps: Any = self.substeps
         if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
             raise SceneError(f"[world]: substeps is {steps!r}, expected a whole number from 1 up")
+        if steps > MOST_SUBSTEPS:
+            raise SceneError(
+                f"[world]: substeps is {steps}, expected at most {MOST_SUBSTEPS}; a shorter"
+                " time_step, or fewer of them"
+            )
         object.__setattr__(self, "substeps", int(steps))
         for key, kind in (("bodies", Body), ("walls", Wall), ("joints", Joint)):
             parts = tuple(getattr(self, key))
@@ -81,6 +102,7 @@ class Scene:
                 if not isinstance(part, kind):
                     raise SceneError(f"scene: {key} holds {part!r}, expected a {kind.__name__}")
             object.__setattr__(self, key, parts)
+        object.__setattr__(self, "noise", stated_noise(self.noise))
         self._check_bodies()
         self._check_joints()
 
@@ -177,7 +199,11 @@ class Scene:
     def to_toml(self) -> str:
         """Return TOML text from which `from_toml` builds an equal scene."""
         world = ("gravity", "normal_gravity", "time_step", "substeps")
-        sections = [("[world]", {key: getattr(self, key) for key in world})]
+        sections: list[tuple[str, dict[str, Any]]] = [
+            ("[world]", {key: getattr(self, key) for key in world})
+        ]
+        if self.noise:
+            sections.append(("[noise]", dict(self.noise)))
         for body in self.bodies:
             table = dict(vars(body), shape=vars(body.shape), known=dict(body.known))
             table["prior"] = {name: dict(hyper) for name, hyper in body.prior}

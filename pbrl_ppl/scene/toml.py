@@ -10,12 +10,14 @@ from typing import Any
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene.checks import nearest
+from pbrl_ppl.state import STATE
 
 Table = dict[str, Any]
 
 KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "the file": (("world",), ("body", "wall", "joint")),
+    "the file": (("world",), ("noise", "body", "wall", "joint")),
     "[world]": (("time_step",), ("gravity", "normal_gravity", "substeps")),
+    "[noise]": ((), STATE),
     "body": (
         ("name", "shape"),
         ("wheel", "static", "kinematic", "known", "prior", "effects", "pose"),
@@ -28,7 +30,7 @@ KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 
 
 def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
-    """Return ``[world]``, and for each array of tables where a table is and the table.
+    """Return ``[world]`` with the noise, and for each array where a table is and the table.
 
     Raises
     ------
@@ -41,6 +43,8 @@ def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
         raise SceneError(f"not TOML: {error}") from None
     _check_keys(document, "the file", *KEYS["the file"])
     _check_keys(document["world"], "[world]", *KEYS["[world]"])
+    noise = document.get("noise", {})
+    _check_keys(noise, "[noise]", *KEYS["[noise]"])
     arrays: dict[str, list[tuple[str, Table]]] = {}
     for key in ("body", "wall", "joint"):
         arrays[key] = list(_tables(document, key))
@@ -48,7 +52,7 @@ def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
             _check_keys(table, where, *KEYS[key])
             if key == "body":
                 _check_keys(table["shape"], f"shape of {where}", *KEYS["shape"])
-    return document["world"], arrays
+    return {**document["world"], "noise": noise}, arrays
 
 
 def write(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> str:

@@ -1,0 +1,111 @@
+"""Recognition of velocity columns that were computed from the positions of the same log."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from pbrl_ppl.history.history import History
+from pbrl_ppl.state import STATE, THETA
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+#: Samples on either side that a smoother may have looked at.
+_REACH = 8
+#: A velocity is computed if positions predict it better than their noise would let them, were it
+#: measured by itself: this share of that noise's variance, or less, is left over.
+_SHARE = 0.5
+#: The same where the positions have no noise: a share of the velocity's own variance.
+_EXACT = 1e-8
+#: Windows a coefficient of the regression, at least.
+_ENOUGH = 4
+
+
+def measured_alone(history: History, columns: Bools | None = None) -> History:
+    """Return the history without derived velocities: they stay as states to start from.
+
+    Parameters
+    ----------
+    history : History
+        What was recorded.
+    columns : ndarray of bool, optional
+        Which not to count as measured, shape (body, state); :func:`derived_velocities` by default.
+    """
+    columns = derived_velocities(history) if columns is None else columns
+    if not columns.any():
+        return history
+    observed = history.dataset["observed"]
+    return History(history.dataset.assign(observed=observed.where(~columns)))
+
+
+def derived_velocities(history: History) -> Bools:
+    """Which velocities are linear in the positions around them, and so no measurements.
+
+    A velocity with a noise of its own cannot be predicted from noisy positions with weights w more
+    closely than ``|w|^2 s^2``, s being the positions' noise; a difference quotient or a smoother
+    can. That noise is known without a model: the mean of two neighbouring velocities differs from
+    the difference quotient between them by noise alone.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+
+    Returns
+    -------
+    ndarray of bool
+        Shape (body, state); positions are never derived.
+    """
+    observed = history.dataset["observed"].to_numpy()
+    rows = history.dataset["n_rows"].to_numpy()
+    dt = float(history.dataset.attrs["time_step"])
+    result = np.zeros(observed.shape[2:], dtype=bool)
+    for body in range(len(result)):
+        for d in range(3, len(STATE)):
+            series = []
+            for trajectory, n in enumerate(rows):
+                position, rate = observed[trajectory, :n, body, [d - 3, d]]
+                if np.isfinite(position).all() and np.isfinite(rate).all():
+                    unwrapped = np.unwrap(position) if d - 3 == THETA else position
+                    series.append((unwrapped, rate))
+            result[body, d] = _is_derived(series, dt)
+    return result
+
+
+def _is_derived(series: list[tuple[Floats, Floats]], dt: float) -> bool:
+    """Whether rates follow from positions, of trajectories without gaps."""
+    width = 2 * _REACH + 1
+    windows, middle = [], []
+    for position, rate in series:
+        if len(position) < width:
+            continue
+        own = np.lib.stride_tricks.sliding_window_view(position, width)
+        windows.append(np.delete(own - own[:, [_REACH]], _REACH, axis=1))
+        middle.append(rate[_REACH:-_REACH])
+    if not windows:
+        return False
+    x, y = np.concatenate(windows), np.concatenate(middle)
+    if len(x) < _ENOUGH * width or not np.any(y):
+        return False
+    weights = np.linalg.lstsq(x, y, rcond=None)[0]
+    left = float(((y - x @ weights) ** 2).sum() / (len(x) - len(weights)))
+    spread = weights @ weights + weights.sum() ** 2  # the middle position's noise is in all columns
+    noise = float(spread) * _position_noise(series, dt)
+    return left < max(_SHARE * noise, _EXACT * float(y.var()))
+
+
+def _position_noise(series: list[tuple[Floats, Floats]], dt: float) -> float:
+    """Variance of positions, from what kinematics leave of measured rates.
+
+    Second differences take off what a smooth acceleration leaves. Of those, independent noises of
+    positions (in units of ``dt``) and rates have variance ``20 A + B`` and covariance at lag one
+    ``-15 A - B / 4``.
+    """
+    square = product = 0.0
+    n = m = 0
+    for position, rate in series:
+        off = np.diff(np.diff(position) / dt - (rate[1:] + rate[:-1]) / 2, 2)
+        square, n = square + float(off @ off), n + len(off)
+        product, m = product + float(off[1:] @ off[:-1]), m + max(len(off) - 1, 0)
+    return max(0.0, -(square / max(n, 1) + 4 * product / max(m, 1)) / 40) * dt**2
