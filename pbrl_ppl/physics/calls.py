@@ -19,6 +19,7 @@ from numba.extending import intrinsic
 from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.effects import Law
+from pbrl_ppl.errors import EffectError
 
 #: The engine's functions in use, each by the name of its address.
 Functions = namedtuple(
@@ -173,5 +174,11 @@ _LAWS: dict[Law, Any] = {}
 def law_address(law: Law) -> int:
     """Compile an effect's law to a C function, once, and give its address."""
     if law not in _LAWS:
-        _LAWS[law] = numba.cfunc(types.void(_DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES))(law)
+        try:
+            _LAWS[law] = numba.cfunc(types.void(_DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES))(law)
+        except numba.core.errors.NumbaError as error:
+            raise EffectError(
+                f"the law {law.__name__} cannot be compiled: use plain arithmetic and math alone"
+                f" ({' '.join(str(error).split())[:200]})"
+            ) from None
     return int(_LAWS[law].address)

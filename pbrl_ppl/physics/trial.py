@@ -1,0 +1,145 @@
+"""Trial of a user's own effect, in plain Python, before it runs inside a fit."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.effects import (
+    Clock,
+    Command,
+    Disc,
+    Effect,
+    Force,
+    Noise,
+    Properties,
+    Sensor,
+    Structure,
+)
+from pbrl_ppl.errors import EffectError
+from pbrl_ppl.history import History
+from pbrl_ppl.physics.properties import COLUMNS
+from pbrl_ppl.scene import Body, Scene
+
+Array = NDArray[np.float64]
+
+#: A trial that takes longer (s) hangs.
+PATIENCE = 10.0
+#: Parameter values drawn from the prior, beside the null value.
+_DRAWS = 4
+
+
+def try_effect(effect: Effect, scene: Scene, history: History, patience: float = PATIENCE) -> None:
+    """Run what an effect is made of once, at measured states and values from its prior.
+
+    Compiled into the rollout, a law that raises would stop half way without a word, and one that
+    hangs could not be interrupted.
+
+    Parameters
+    ----------
+    effect : Effect
+        To try.
+    scene, history : Scene and History
+        What it would act on.
+    patience : float
+        Time limit (s).
+
+    Raises
+    ------
+    EffectError
+        If it raises, gives what is not a finite number, or does not return in time.
+    """
+    outcome: list[Exception | None] = []
+
+    def run() -> None:
+        try:
+            _try(effect, scene, history)
+        except Exception as error:
+            outcome.append(error)
+        else:
+            outcome.append(None)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(patience)
+    if not outcome:
+        raise EffectError(
+            f"effect {effect.name} did not return within {patience:g} s when it was tried once; is"
+            " there a loop in it that does not end?"
+        )
+    error = outcome[0]
+    if isinstance(error, EffectError):
+        raise error
+    if error is not None:
+        raise EffectError(
+            f"effect {effect.name} raised {type(error).__name__} when it was tried:"
+            f" {error}; mend it, or leave it out of the catalogue"
+        ) from error
+
+
+def _try(effect: Effect, scene: Scene, history: History) -> None:
+    bodies = [body for body in scene.dynamic if effect.applies(scene, body)]
+    rng = np.random.default_rng(0)
+    drawn = np.array([parameter.prior.sample(rng, _DRAWS) for parameter in effect.parameters])
+    values = np.vstack([effect.null, drawn.T])
+    for body in bodies:
+        if effect.scan is not None:
+            looks = np.asarray(effect.scan(scene, history, body), dtype=float)
+            if looks.ndim != 2 or looks.shape[1] != len(effect.parameters):
+                raise EffectError(
+                    f"effect {effect.name}: scan gave shape {looks.shape}, expected"
+                    f" (look, {len(effect.parameters)})"
+                )
+        state = _middle(history, body)
+        for row in values:
+            result = _applied(effect, state, row)
+            if not np.isfinite(result).all():
+                shown = ", ".join(
+                    f"{parameter.name} = {value:.3g}"
+                    for parameter, value in zip(effect.parameters, row, strict=True)
+                )
+                raise EffectError(
+                    f"effect {effect.name} gives what is not a finite number on {body.name} at"
+                    f" {shown}; mend its law or narrow its prior"
+                )
+
+
+def _middle(history: History, body: Body) -> Array:
+    """A measured state of a body, 0 where there is none, shape (6,)."""
+    states = history.dataset["start"].sel(body=body.name).to_numpy().reshape(-1, 6)
+    whole = states[np.isfinite(states).all(axis=1)]
+    return np.asarray(whole[len(whole) // 2] if len(whole) else np.zeros(6))
+
+
+def _applied(effect: Effect, state: Array, parameters: Array) -> Array:
+    """What the effect makes of a state at values of its parameters, as one array."""
+    stage: Any = effect.stage
+    named = {
+        parameter.name: np.array([[value]])
+        for parameter, value in zip(effect.parameters, parameters, strict=True)
+    }
+    if isinstance(stage, Force | Command):
+        wrench = np.array([1.0, -0.5, 0.2])
+        command = wrench.copy()
+        if isinstance(stage, Command):
+            command = np.concatenate([wrench, 0.5 * wrench, [0.4, 0.5]])
+        stage.law(state.copy(), command, parameters.copy(), wrench)
+        return wrench
+    if isinstance(stage, Properties):
+        ones = {name: np.ones((1, 1)) for name in (*COLUMNS, "moment_per_mass")}
+        clock = Clock(np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 1)))
+        stage.modify(ones, named, clock)
+        return np.concatenate([np.ravel(value) for value in ones.values()])
+    if isinstance(stage, Sensor):
+        flat = {name: value[0] for name, value in named.items()}
+        measured = stage.measure(state[None].copy(), flat)
+        return np.concatenate([np.ravel(measured), np.ravel(stage.invert(measured, flat))])
+    if isinstance(stage, Structure):
+        discs: tuple[Disc, ...] = stage.discs(named)
+        return np.concatenate([np.ravel([disc.x, disc.y, disc.radius]) for disc in discs])
+    if isinstance(stage, Noise):
+        return np.ravel(np.asarray(stage.tail(named), dtype=float))
+    raise EffectError(f"effect {effect.name}: {stage!r} is no stage")
