@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.scan import Look, looks
+from pbrl_ppl.criticism.scan import Look, looks, roughly
 from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, posterior_steps
@@ -114,7 +114,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
     """
     problem, p = mode.problem, len(mode.phi)
     priors = problem.layout.priors
-    wide = problem.with_physics(effects=(*problem.physics.effects, *candidates))
+    wide = roughly(problem.with_physics(effects=(*problem.physics.effects, *candidates)))
     # declared parameters come first in both layouts, block by block, so look each one up
     labels = wide.layout.labels
     declared = [labels.index(label) for label in problem.layout.labels]
@@ -128,7 +128,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
             null[place] = parameter.null
             places.append(place)
         columns.append(places)
-    new = [place for places in columns for place in places]
+    new = [*declared, *(place for places in columns for place in places)]
     lower, upper = (bound[new] for bound in wide.layout.bounds)
     begin = np.array([1e-3 * min(wide.layout.priors[place].sigma, 1.0) for place in new])
 
@@ -138,10 +138,9 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
         return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
     derivative, _ = posterior_steps(predict, null[new], lower, upper, begin)
-    derivative = np.vstack([derivative, np.zeros((p, len(new)))])
     residual = np.concatenate([mode.whitened_residual().ravel(), -prior_residual(priors, mode.phi)])
-    slopes = _prior_slopes(problem, mode.phi)
-    jacobian = np.vstack([-mode.jacobian, np.diag(slopes)])
+    jacobian = np.vstack([derivative[:, :p], np.diag(_prior_slopes(problem, mode.phi))])
+    derivative = np.vstack([derivative[:, p:], np.zeros((p, len(new) - p))])
     edges = np.cumsum([0, *map(len, columns)])
     split = [derivative[:, a:b] for a, b in pairwise(edges)]
     return residual, jacobian, split
@@ -230,7 +229,7 @@ def _signature(
         units={parameter.name: parameter.unit for parameter in effect.parameters},
         identifiable=evidence.share,
         looks=n_looks,
-        detectable=_detectable(names, evidence.unit, n_looks * n_candidates),
+        detectable=_detectable(names, evidence.unit, max(1, n_looks) * n_candidates),
     )
     return Signature(attached, candidate, log_p, evidence.basis, evidence.direction)
 

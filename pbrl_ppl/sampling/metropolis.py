@@ -24,8 +24,6 @@ Array = NDArray[np.float64]
 TARGET_ACCEPTANCE = 0.234
 #: The first guess of a covariance counts as much as this many steps.
 _GUESS = 300
-#: Steps a round of a block whose moves cost nothing to speak of.
-_CHEAP = 5
 _LARGEST_BETA = float(np.log(0.95))
 
 
@@ -44,15 +42,15 @@ class Gaussian:
         Places of the block's d entries in the vector of all variables, shape (d,).
     mean, covariance : ndarray
         First guess, shapes (d,) and (d, d).
-    cheap : bool
-        Whether moves cost nothing to speak of, as those of the noise do: then there is no need to
-        look ahead.
+    cheap : int
+        Steps a round where they cost nothing to speak of, as those of the noise do: then there is
+        no need to look ahead.
     """
 
     places: NDArray[np.intp]
     mean: Array
     covariance: Array
-    cheap: bool = False
+    cheap: int = 0
     factor: Array = field(init=False)
     log_scale: float = field(init=False)
     log_beta: float = float(np.log(0.6))
@@ -268,7 +266,7 @@ class AdaptiveMetropolis(ArrayStepShared):
                 shift = self.jumps.shift(q) if self.tune else 0.0
             for block in self.blocks:
                 if self.rough is None or block.cheap or self.tune:
-                    for _ in range(_CHEAP if block.cheap else self.inner):
+                    for _ in range(block.cheap or self.inner):
                         q, here, rate = block.move(q, here, near, self.rng, self.tune, shift)
                         rates.append(rate)
                     continue

@@ -19,6 +19,9 @@ from pbrl_ppl.sampling.metropolis import Gaussian
 
 Array = NDArray[np.float64]
 
+#: Steps of the noise a round. Along trajectories there are two noises, one of which may vanish.
+_CHEAP, _CHEAP_ALONG = 5, 15
+
 
 def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
     """Blocks from the Laplace approximation: one a part of the scene, and one for the noise."""
@@ -48,7 +51,8 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
                 block_diag(only.covariance, noise[2]),
             )
         ]
-    return [*blocks, Gaussian(*noise, cheap=True)]
+    cheap = _CHEAP if problem.trajectories is None else _CHEAP_ALONG
+    return [*blocks, Gaussian(*noise, cheap=cheap)]
 
 
 def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
