@@ -41,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     int
         0; 1 for a calibration that failed or a goal that was not reached; 2 for bad usage or bad
-        input, with one message on stderr; 130 if interrupted.
+        input, with one message on stderr; 3 for a loop without a verdict; 130 if interrupted.
     """
     try:
         with warnings_in_a_line():

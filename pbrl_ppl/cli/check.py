@@ -22,16 +22,34 @@ def check(
         Path, typer.Argument(metavar="HISTORY", help="Measured history (.csv, .parquet, .nc).")
     ],
     estimate_velocities: Velocities = False,
+    prior: Annotated[
+        bool, typer.Option(help="Whether to compare the data with draws from the prior.")
+    ] = True,
 ) -> None:
-    """Read a scene and a history, and show what is in them and what is missing."""
+    """Read a scene and a history: what is in them, what is missing, whether the prior fits."""
     with interruptible():
         declared, loaded = load_files(scene, history, estimate_velocities)
+        import numpy as np
+
+        from pbrl_ppl.history import derived_velocities
         from pbrl_ppl.physics import check_history
+        from pbrl_ppl.state import STATE
 
         check_history(declared, loaded, loaded.segments(1))
         console = Console(highlight=False)
         console.print(_contents(declared, loaded))
         console.print(_cells(loaded))
+        derived = derived_velocities(loaded)
+        if derived.any():
+            names = [STATE[d] for d in np.flatnonzero(derived.any(axis=0))]
+            console.print(f"{', '.join(names)}: computed from positions, no measurements")
+        if prior:
+            from pbrl_ppl.criticism import prior_predictive_check
+            from pbrl_ppl.model import physics_model
+
+            said = prior_predictive_check(physics_model(declared, loaded), draws=100).sentences
+            for sentence in said or ("the declared priors could have made data like these",):
+                console.print(f"prior: {sentence}", soft_wrap=True)
 
 
 def _contents(scene: Scene, history: History) -> Table:

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
 
-#: Exit codes: a failed calibration or a goal that was not reached; bad input as for bad usage; an
-#: interrupt as the shell has it.
-FAILED, BAD_INPUT, INTERRUPTED = 1, 2, 130
+#: Exit codes: a failed calibration or a goal that was not reached; bad input as for bad usage; no
+#: verdict, for the chains have not converged; an interrupt as the shell has it.
+FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.toml).")]
 Velocities = Annotated[
@@ -41,6 +41,20 @@ def load_files(scene: Path, history: Path, estimate_velocities: bool) -> tuple[S
     from pbrl_ppl.history import History
 
     return declared, History.load(history, declared, estimate_velocities=estimate_velocities)
+
+
+def stated_noise(scene: Scene, given: list[str]) -> Scene:
+    """The scene with errors of measuring from options such as ``x=0.002``."""
+    noise: dict[str, float | str] = dict(scene.noise)
+    for item in given:
+        name, _, value = item.partition("=")
+        try:
+            noise[name.strip()] = float(value)
+        except ValueError:
+            raise typer.BadParameter(
+                f"{item!r} is not NAME=VALUE, such as x=0.002", param_hint="--noise"
+            ) from None
+    return scene.replace(noise=noise)
 
 
 def check_free(path: Path, overwrite: bool) -> None:

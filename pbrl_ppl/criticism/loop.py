@@ -11,18 +11,27 @@ import numpy as np
 from pbrl_ppl.criticism import findings
 from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut
+from pbrl_ppl.criticism.histories import checked_histories, named
 from pbrl_ppl.criticism.misfit import Misfit, find_misfit
+from pbrl_ppl.criticism.prior_check import prior_predictive_check
 from pbrl_ppl.criticism.resolution import shift, with_enough_substeps
-from pbrl_ppl.criticism.results import Acceleration, Added, Candidate, Estimate, Numerical
+from pbrl_ppl.criticism.results import (
+    Acceleration,
+    Added,
+    Candidate,
+    Estimate,
+    Numerical,
+    ResidualTest,
+)
 from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.criticism.selection import Selection, Step
-from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
+from pbrl_ppl.criticism.unexplained import MATTERS, Left, unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.physics import try_effect
 from pbrl_ppl.posterior import compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import fit
@@ -30,10 +39,14 @@ from pbrl_ppl.scene import Scene
 
 #: Effects added at most.
 MOST_ADDED = 5
-#: Names are not to be trusted if more than this share of what was missing (of its square) remains.
-LARGE_REMAINDER = 0.1
+#: Share of what was missing (of its square) that may remain if names are to be trusted: where what
+#: remains matters, and where it does not, for no recorded machine is exact. With more than the last
+#: there are no names to be had.
+LARGE_REMAINDER, LARGE_IF_SMALL, HOPELESS = 0.1, 0.2, 0.5
 #: Draws kept of each chain, and tuning draws at least.
 DRAWS, LEAST_TUNE = 300, 100
+#: Draws from the prior, of which some must reach what was measured.
+PRIOR_DRAWS = 100
 #: Chains with a larger R-hat or fewer effective draws give no verdict.
 WORST_RHAT, LEAST_ESS = 1.05, 100.0
 
@@ -85,9 +98,18 @@ def revise(
     catalogue = tuple(catalogue)
     if test is None:
         train, test = train.split(0.25, seed)
+    if substeps is not None:
+        scene.replace(substeps=substeps)  # it is checked there
+    train, test, derived = checked_histories(scene, train, test)
+    if derived.any():
+        say(f"taking {named(scene, derived)} for computed from positions, which count alone")
     loop = _Loop(scene, train, HeldOut(test, seed), seed, say)
-    loop.check()
+    for effect in catalogue:
+        if effect not in full_catalogue:
+            try_effect(effect, scene, train)
     selection = Selection(scene, catalogue, say)
+    say("looking whether the prior could have made the data")
+    prior = _prior_test(scene, train, catalogue, seed)
     say("fitting the declared model")
     declared = loop.declared_mode(attach(scene, (), catalogue), substeps)
     say("scoring what the model might lack")
@@ -108,12 +130,13 @@ def revise(
     say("testing what is left")
     before, left = unexplained_acceleration(declared), unexplained_acceleration(current)
     horizon = loop.held_out.rollout_horizon(scene.time_step)
-    misfit = find_misfit(current, left, horizon=horizon, seed=seed)
-    if added and misfit.unexplained is not None and not _explained(before, left):
+    misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(prior)
+    remains = _remains(before, left) if added and misfit.unexplained is not None else 0.0
+    if remains > (HOPELESS if left.worst < MATTERS else LARGE_REMAINDER):
         # part of a misfit goes to whatever is there: no name is to be had from that
         say("no effect of the catalogue explains what is missing")
         added, current, left = [], declared, before
-        misfit = find_misfit(current, left, horizon=horizon, seed=seed)
+        misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(prior)
     say("sampling the posterior of the declared model")
     posterior = loop.posterior(declared, draws)
     revised = posterior
@@ -121,13 +144,13 @@ def revise(
         say("sampling the posterior of the revised model")
         revised = loop.posterior(current, draws)
     say("comparing errors on held-out data")
-    models = _Models(declared, current, posterior, revised, before, left)
+    models = _Models(declared, current, posterior, revised, before, left, remains > LARGE_IF_SMALL)
     return loop.findings(models, first, added, misfit, tuple(selection.small))
 
 
 @dataclass(frozen=True, eq=False)
 class _Models:
-    """The declared and the revised model: modes, posteriors, what they leave."""
+    """The declared and the revised model: modes, posteriors, what they leave, whether too much."""
 
     declared: Mode
     revised: Mode
@@ -135,11 +158,29 @@ class _Models:
     after: Any
     left_before: Left
     left_after: Left
+    open: bool
 
 
-def _explained(before: Left, after: Left) -> bool:
-    """Whether what was added explains nearly all of what was missing."""
-    return after.square <= LARGE_REMAINDER * before.square
+def _prior_test(
+    scene: Scene, train: History, catalogue: tuple[Effect, ...], seed: int
+) -> ResidualTest:
+    """Whether the declared prior could have made the data, as a test."""
+    problem = Problem.of(scene, train, attach(scene, (), catalogue), threads=2)
+    checked = prior_predictive_check(build_model(problem), draws=PRIOR_DRAWS, seed=seed)
+    share = float(checked.dataset["share_beyond"].max())
+    said = checked.sentences
+    return ResidualTest(
+        "prior",
+        float("nan"),
+        share,
+        not said,
+        "; ".join(said) or "the declared priors could have made data like these",
+    )
+
+
+def _remains(before: Left, after: Left) -> float:
+    """Share of what was missing, of its square, that remains."""
+    return after.square / before.square if before.square > 0 else 0.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,22 +192,6 @@ class _Loop:
     held_out: HeldOut
     seed: int
     say: Callable[[str], None]
-
-    def check(self) -> None:
-        """See that the test history is of the same scene, and can be used.
-
-        Raises
-        ------
-        HistoryError
-            If it is not.
-        """
-        names = [body.name for body in self.scene.moving]
-        for history in (self.train, self.held_out.history):
-            if list(history.bodies) != names:
-                raise HistoryError(
-                    f"history: it is of {', '.join(history.bodies)}, the scene has"
-                    f" {', '.join(names)}; load it with this scene"
-                )
 
     def declared_mode(self, effects: tuple[Attached, ...], substeps: int | None) -> Mode:
         """Mode of the declared model along trajectories, the engine's error small."""
@@ -200,7 +225,7 @@ class _Loop:
             for mode, posterior in ((declared, models.before), (revised, models.after))
         ]
         verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
-        if misfit.unexplained is not None and not steps:
+        if misfit.unexplained is not None and (models.open or not steps):
             verdict = findings.UNEXPLAINED
         if not all(map(_converged, (models.before, models.after))):
             verdict = findings.NOT_CONVERGED

@@ -40,6 +40,13 @@ class Misfit:
     tests: tuple[ResidualTest, ...]
     unexplained: Unexplained | None
 
+    def with_test(self, test: ResidualTest) -> Misfit:
+        """The same with one test more; what it says is where the structure is if no other fails."""
+        unexplained = self.unexplained
+        if unexplained is None and not test.passed:
+            unexplained = Unexplained("", "", "nothing that was recorded", 0.0, 0.0, test.sentence)
+        return Misfit((*self.tests, test), unexplained)
+
 
 def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfit:
     """Test what a fitted model leaves of the data that it was fitted to.

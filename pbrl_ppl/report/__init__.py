@@ -4,7 +4,7 @@ from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
 from pbrl_ppl.report.loop import Loop, check_folder, close_loop
 from pbrl_ppl.report.scene_plots import animate_plan
 from pbrl_ppl.report.style import png
-from pbrl_ppl.report.words import verdict_in_words
+from pbrl_ppl.report.words import unseen_in_words, verdict_in_words
 
 __all__ = [
     "Loop",
@@ -14,5 +14,6 @@ __all__ = [
     "plot_calibration",
     "plot_prior_check",
     "png",
+    "unseen_in_words",
     "verdict_in_words",
 ]

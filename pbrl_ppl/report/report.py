@@ -24,6 +24,7 @@ from pbrl_ppl.report.words import (
     odds,
     plain,
     quantity,
+    unseen_in_words,
     verdict_in_words,
 )
 
@@ -62,6 +63,7 @@ def render(findings: Findings) -> str:
     return environment.from_string(template).render(
         findings=findings,
         verdict=verdict_in_words(findings),
+        unseen=unseen_in_words(findings),
         posterior=_posterior_rows(findings, table),
         units=UNITS,
         shown=parameters,

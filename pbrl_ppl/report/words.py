@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
+from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Candidate, Findings
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -32,7 +32,8 @@ def verdict_in_words(findings: Findings) -> str:
         beside = f" {small.capitalize()} is present, and changes predictions by less than 1 %."
         return (
             "Nothing was found missing: what the declared model leaves passed all tests of"
-            f" measurement noise.{beside if small else ''}"
+            " measurement noise (an unexplained acceleration, whiteness, forecasts, dependence on"
+            f" state, command and time).{beside if small else ''}"
         )
     if findings.verdict == UNEXPLAINED and not found:
         return f"Something is missing that no effect in the catalogue explains: {rest}."
@@ -44,6 +45,28 @@ def verdict_in_words(findings: Findings) -> str:
     if len(findings.added) > 1:
         return f"{len(findings.added)} things were missing: {found}."
     return f"Something was missing: {found}."
+
+
+def unseen_in_words(findings: Findings) -> str:
+    """Say how small an effect must be for these data not to show it; nothing of those added."""
+    there = {(added.effect, added.body) for added in findings.added}
+    sizes = []
+    for candidate in findings.candidates:
+        if (candidate.effect, candidate.body) in there:
+            continue
+        for name, size in candidate.detectable.items():
+            amount = "of any size" if not np.isfinite(size) else _below(candidate, name, size)
+            which = plain(candidate.effect)
+            if len(candidate.detectable) > 1:
+                which = f"{which} ({plain(name)})"
+            if len(findings.scene.dynamic) > 1:
+                which = f"{which} of the {plain(candidate.body)}"
+            sizes.append(f"{which} {amount}")
+    return f"These data would not show: {'; '.join(sizes)}." if sizes else ""
+
+
+def _below(candidate: Candidate, name: str, size: float) -> str:
+    return f"below {quantity(size, candidate.units[name])}"
 
 
 def plain(name: str) -> str:

@@ -79,6 +79,8 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     assert captured.out.splitlines() == [
         "Something was missing: a force against the motion that grows with the speed (linear drag)"
         " on the cart.",
+        "These data would not show: quadratic drag below 0.0200 kg/m; constant force (force x)"
+        " below 0.0200 N; constant force (force y) below 0.0200 N; inertia scale below 0.0200.",
         "report: a/out/report.html",
     ]
     stages = [line.partition("] ")[2] for line in captured.err.splitlines()]
@@ -105,6 +107,41 @@ def test_close_loop_options(calls: list[Any], capsys: pytest.CaptureFixture[str]
     assert "has content already" in capsys.readouterr().err
     assert len(calls) == 1
     assert main([*argv, "--overwrite"]) == 0
+
+
+@pytest.mark.usefixtures("files")
+def test_close_loop_states_the_noise(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+    argv = ["close-loop", "scene.toml", "train.csv", "-o", "out", "-q", "--overwrite"]
+    assert main([*argv, "--noise", "x=0.002", "--noise", "omega=0.1"]) == 0
+    assert calls[0][0].noise == (("x", 0.002), ("omega", 0.1))
+    assert main([*argv, "--noise", "x"]) == 2
+    assert "NAME=VALUE" in capsys.readouterr().err
+    assert main([*argv, "--noise", "omga=0.1"]) == 2
+    assert 'did you mean "omega"' in capsys.readouterr().err
+    assert main([*argv, "--noise", "x=-1"]) == 2
+    assert "expected more than 0" in capsys.readouterr().err
+    assert len(calls) == 1
+
+
+@pytest.mark.usefixtures("files", "calls")
+def test_close_loop_without_a_verdict_exits_with_3(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stuck = Loop(made_up("not-converged"))
+    monkeypatch.setattr(report, "close_loop", lambda *args, **options: stuck)
+    assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 3
+    assert "No verdict" in capsys.readouterr().out
+    assert Path("out/report.html").exists()  # what there is may be looked at
+
+
+@pytest.mark.usefixtures("files")
+def test_absurd_numbers_are_refused_at_once(capsys: pytest.CaptureFixture[str]) -> None:
+    text = Path("train.csv").read_text()
+    Path("train.csv").write_text(text.replace("puck,2,", "puck,1e300,"))
+    assert "history row 4: x is 1e+300" in fails(capsys, "check", "scene.toml", "train.csv")
+    Path("train.csv").write_text(text)
+    argv = ("close-loop", "scene.toml", "train.csv", "-o", "out", "--substeps", "100000000")
+    assert "expected at most 10000" in fails(capsys, *argv)
 
 
 @pytest.mark.usefixtures("files")

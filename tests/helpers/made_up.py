@@ -73,7 +73,18 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Findings:
     found = verdict == "effects-added"
     grown = {d: r * (3.0 if d in ("vx", "vy") else 1.1) for d, r in noise.items()}
     candidates = tuple(
-        Candidate(effect, "cart", sentence, s, dof, p, estimate, units, share)
+        Candidate(
+            effect,
+            "cart",
+            sentence,
+            s,
+            dof,
+            p,
+            estimate,
+            units,
+            share,
+            detectable=dict.fromkeys(estimate, 0.02),
+        )
         for effect, sentence, s, dof, p, estimate, units, share in (
             (
                 "linear_drag",

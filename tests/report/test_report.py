@@ -107,9 +107,8 @@ def test_page_of_an_added_effect() -> None:
 
 def test_page_where_nothing_is_missing() -> None:
     text = page("adequate").text
-    assert (
-        "Nothing is missing: the declared model explains the data up to measurement noise." in text
-    )
+    assert "Nothing was found missing: what the declared model leaves passed all tests of" in text
+    assert "These data would not show: linear drag below 0.0200 kg/s; quadratic drag below" in text
     assert "chance alone brings one that close in 37 % of all cases" in text
     assert "fell by" not in text and "After" not in text
     assert "Where it remains" not in text
@@ -118,8 +117,16 @@ def test_page_where_nothing_is_missing() -> None:
 def test_page_where_something_is_unexplained() -> None:
     text = page("unexplained").text
     assert "Something is missing that no effect in the catalogue explains: its omega is off" in text
-    assert "In omega of the cart, depending most on omega, which predicts 34 %" in text
-    assert "once in 500 times (p = 0.0020)" in text
+    assert "In omega of the cart: its omega is off in a way that depends on omega" in text
+    assert "(p = 0.0020)" in text
+    assert "an acceleration of 0.2 rad/s² in omega is left" in text
+    assert "These data would not show" not in text
+
+
+def test_a_verdict_without_converged_chains_is_none() -> None:
+    findings = made_up("not-converged")
+    assert verdict_in_words(findings).startswith("No verdict: the chains have not converged.")
+    assert "No verdict" in page("not-converged").text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -322,6 +329,9 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "numerical",
         "added",
         "candidates",
+        "small",
+        "tests",
+        "unexplained_acceleration",
         "unexplained",
         "error",
         "identifiability",
@@ -353,6 +363,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "estimate",
         "identifiable",
         "looks",
+        "detectable",
     ]
     assert list(got["error"]) == ["before", "after", "noise_floor"]
     assert got["error"]["before"]["normalised_rmse"] == 2.4

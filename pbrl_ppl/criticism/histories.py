@@ -1,0 +1,67 @@
+"""Checks of the two histories before anything is fitted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import History, derived_velocities, measured_alone
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE
+
+
+def checked_histories(
+    scene: Scene, train: History, test: History
+) -> tuple[History, History, NDArray[np.bool_]]:
+    """Both histories without velocities that were computed from positions, and which those are.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene.
+    train, test : History
+        What is fitted, and what is judged by.
+
+    Returns
+    -------
+    train, test : History
+        With what was measured alone.
+    derived : ndarray of bool
+        What counts as computed, shape (body, state).
+
+    Raises
+    ------
+    HistoryError
+        If they are of other bodies, another time step or other measured dimensions.
+    """
+    names = [body.name for body in scene.moving]
+    for which, history in (("training", train), ("test", test)):
+        if list(history.bodies) != names:
+            raise HistoryError(
+                f"{which} history: it is of {', '.join(history.bodies)}, the scene has"
+                f" {', '.join(names)}; load it with this scene"
+            )
+        step = float(history.dataset.attrs["time_step"])
+        if not np.isclose(step, scene.time_step):
+            raise HistoryError(
+                f"{which} history: it has a row each {step:g} s, the scene each"
+                f" {scene.time_step:g} s; load it with this scene"
+            )
+    derived = derived_velocities(train)
+    train, test = measured_alone(train, derived), measured_alone(test, derived)
+    known, asked = (
+        np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
+        for history in (train, test)
+    )
+    if (asked & ~known).any():
+        raise HistoryError(
+            f"test history measures {named(scene, asked & ~known)}, which the training history does"
+            " not; leave those columns empty, or measure them in both"
+        )
+    return train, test, derived
+
+
+def named(scene: Scene, columns: NDArray[np.bool_]) -> str:
+    """Name columns, shape (body, state), for a message."""
+    return ", ".join(f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(columns))
