@@ -45,8 +45,16 @@ say = partial(print, file=sys.stderr, flush=True)
 def begin_worker() -> None:
     """Leave Ctrl-C to the process that stops the workers, and start chains as anywhere else."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, end_worker)
     # a spawned process would spawn its chains too, and each would load PyMC anew
     multiprocessing.set_start_method(None, force=True)
+
+
+def end_worker(number: int, frame: object) -> None:
+    """End the chains that a worker has begun, and the worker: they would wait for it for ever."""
+    for child in multiprocessing.active_children():
+        child.terminate()
+    os._exit(1)
 
 
 def results(
