@@ -246,7 +246,10 @@ def rollout(  # type: ignore[no-untyped-def]
                 out[item] = scratch
             if state == _TOUCHED:
                 break
-            total += weights[level] * (scratch - out[item])  # exact for what does not change
-        if state == _FREE:
-            out[item] += total
+            total += weights[level] * scratch
+        if state == _FREE and len(counts) > 1:
+            for i in range(k):
+                if world.kinematic[i]:  # the weights' sum is 1 but for rounding
+                    total[:, i] = out[item, :, i]
+            out[item] = total
     return last

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -261,8 +260,9 @@ class Simulator:
         kinks = any(body.wheel for body in self.scene.moving) or self._properties.patches
         runs = (2 if kinks else 3) if self.extrapolate else 1
         counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
-        weights = [math.prod(n / (n - other) for other in counts if other != n) for n in counts]
-        return np.array(counts, dtype=np.int64), np.array(weights)
+        powers = np.vander(1.0 / np.array(counts), increasing=True).T
+        weights = np.linalg.solve(powers, np.eye(len(counts))[0])
+        return np.array(counts, dtype=np.int64), weights
 
     @cached_property
     def _commands(self) -> tuple[NDArray[Any], ...]:
@@ -311,9 +311,11 @@ class Simulator:
                     out[item] = states
                 if touched:
                     break
-                total += weight * (states - out[item])
+                total += weight * states
             else:
-                out[item] += total
+                given_path = [body.kinematic for body in self.scene.moving]
+                total[:, given_path] = out[item][:, given_path]  # but for rounding it is so
+                out[item] = total
 
     def _run_compiled(
         self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array

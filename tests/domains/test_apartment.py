@@ -9,6 +9,7 @@ from pbrl_ppl.model import build_layout
 from pbrl_ppl.physics import Simulator, overlap
 from tests.helpers.places import MODELS
 
+pytestmark = pytest.mark.one_stack  # nothing is fitted here
 FOLDER = MODELS / "apartment"
 TABLE, CART = "kitchen_table", "shopping_cart"
 

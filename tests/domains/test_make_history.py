@@ -16,6 +16,7 @@ from tests.helpers.places import RECORDED, ROOT
 
 pytest.importorskip("Box2D", reason="Box2D makes the histories; install the extra `test`")
 
+pytestmark = pytest.mark.one_stack  # nothing is fitted here
 CART_FOLDER, PENDULUM_FOLDER = ROOT / "models/shopping_cart", ROOT / "models/pendulum"
 NULL_DATA = RECORDED / "cart-null"
 STATE = ["x", "y", "theta", "vx", "vy", "omega"]

@@ -52,6 +52,7 @@ TABLE, COUCH = 1, 2
 # -- parameters that are known: fast ---------------------------------------------------------------
 
 
+@pytest.mark.one_stack
 def test_a_plan_pushes_the_table_away_if_it_can_be_moved(namo):
     model = pp.Dynamics.known(namo.SCENE, BELIEVED, threads=1)
     plan = pp.plan(model, {}, namo.GOAL, namo.pushes())
@@ -61,6 +62,7 @@ def test_a_plan_pushes_the_table_away_if_it_can_be_moved(namo):
     assert way(states, TABLE) > 0.5
 
 
+@pytest.mark.one_stack
 def test_who_knows_that_the_table_is_bolted_down_pushes_the_couch(namo):
     truth = {name: list(of.values()) for name, of in namo.TRUTH.items()}
     plan = pp.plan(pp.Dynamics.known(namo.SCENE, truth, threads=1), {}, namo.GOAL, namo.pushes())
@@ -71,12 +73,14 @@ def test_who_knows_that_the_table_is_bolted_down_pushes_the_couch(namo):
     assert way(states, TABLE) < 0.02
 
 
+@pytest.mark.one_stack
 def test_a_push_that_ends_in_the_cell_it_began_in_is_no_dead_end(namo):
     model = pp.Dynamics.known(namo.SCENE, BELIEVED, threads=1)
     actions = replace(namo.pushes(), durations=(0.3,))
     assert pp.plan(model, {}, namo.GOAL, actions).reached
 
 
+@pytest.mark.one_stack
 def test_where_no_cell_is_fine_enough_nothing_is_left_to_try(namo):
     weak = pp.ActionSet((pp.Action("robot", (0.0, 0.0)),))
     plan = pp.plan(pp.Dynamics.known(namo.SCENE, BELIEVED, threads=1), {}, namo.GOAL, weak)
@@ -87,6 +91,7 @@ def test_where_no_cell_is_fine_enough_nothing_is_left_to_try(namo):
 # -- pictures --------------------------------------------------------------------------------------
 
 
+@pytest.mark.one_stack
 def test_bodies_are_drawn_where_they_are(namo):
     axes = Figure().add_subplot()
     states = namo.World(0).states
@@ -101,6 +106,7 @@ def test_bodies_are_drawn_where_they_are(namo):
     assert len(axes.lines) == len(namo.SCENE.walls)
 
 
+@pytest.mark.one_stack
 def test_only_what_moved_has_a_track(namo):
     axes = Figure().add_subplot()
     states = np.stack([namo.World(0).states] * 3)

@@ -11,6 +11,7 @@ from pbrl_ppl.model import data as data_module
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 
+pytestmark = pytest.mark.one_stack  # plain numpy
 PUCKS = Scene(time_step=0.1, bodies=tuple(Body(name, Shape.circle(0.2)) for name in "ab"))
 TRUTH = {"mass": [2.0, 3.0], "r": [0.2, 0.2], "mu_c": [0.3, 0.3]}
 

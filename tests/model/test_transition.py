@@ -8,6 +8,7 @@ from pbrl_ppl.model import Transition
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.worlds import G
 
+pytestmark = pytest.mark.one_stack  # plain numpy
 PUCK = Shape.circle(0.1)
 
 

@@ -8,6 +8,7 @@ from pbrl_ppl.planning import Action, ActionSet, Dynamics, plan
 from pbrl_ppl.scene import Scene, Shape
 from tests.helpers.worlds import BY_NAME, body
 
+pytestmark = pytest.mark.one_stack  # nothing is fitted here
 MASS = 2.0
 FORCES = ((2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0), (0.0, 0.0))
 PUSHES = ActionSet(tuple(Action("puck", force, 0.0, "world") for force in FORCES))

@@ -34,6 +34,7 @@ def test_draws_hedge_between_two_places_of_the_wheel(benchmark) -> None:
     assert draws.mean() >= mode.mean() + 0.2
 
 
+@pytest.mark.one_stack
 def test_modes_are_mirror_images(benchmark) -> None:
     """The range finder sees the same of both, so the posterior is symmetric; the turn differs."""
     scene = benchmark.free_cart()
@@ -46,6 +47,7 @@ def test_modes_are_mirror_images(benchmark) -> None:
     assert abs(one - other)[..., 5].max() > 0.1
 
 
+@pytest.mark.one_stack
 def test_one_draws_plan_leads_all_around_a_wall() -> None:
     """By itself, the search under all draws takes twice as many nodes to find the wall's end."""
     puck = pp.Body("puck", pp.Shape.circle(0.3), known={"r": 0.0, "mu_c": 0.0})
