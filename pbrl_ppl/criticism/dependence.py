@@ -6,7 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.criticism.results import Unexplained
-from pbrl_ppl.criticism.unexplained import trajectories
+from pbrl_ppl.criticism.unexplained import (
+    MATTERS_IN_A_STEP,
+    in_a_step,
+    of_an_innovation,
+    trajectories,
+)
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
@@ -67,6 +72,7 @@ def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
     places = trajectories(mode).cells.places
     innovations = mode.whitened_residual()[chosen]
     groups = problem.segments.trajectory[chosen]
+    relative = of_an_innovation(mode) / np.maximum(in_a_step(mode), 1e-300)
     best: Unexplained | None = None
     for i, body in enumerate(problem.scene.moving):
         if body.kinematic:
@@ -81,8 +87,9 @@ def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
             [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
         )
         at = int(np.argmax(shares))
+        size = np.sqrt(max(float(shares[at]), 0.0)) * relative[own[at]]
         p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * tests
-        if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE:
+        if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE or size < MATTERS_IN_A_STEP:
             continue
         if best is None or shares[at] > best.share:
             dimension = STATE[places[own[at]] % len(STATE)]

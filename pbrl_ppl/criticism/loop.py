@@ -25,7 +25,7 @@ from pbrl_ppl.criticism.results import (
 )
 from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.criticism.selection import Selection, Step
-from pbrl_ppl.criticism.unexplained import MATTERS, Left, unexplained_acceleration
+from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
@@ -39,10 +39,9 @@ from pbrl_ppl.scene import Scene
 
 #: Effects added at most.
 MOST_ADDED = 5
-#: Share of what was missing (of its square) that may remain if names are to be trusted: where what
-#: remains matters, and where it does not, for no recorded machine is exact. With more than the last
-#: there are no names to be had.
-LARGE_REMAINDER, LARGE_IF_SMALL, HOPELESS = 0.1, 0.2, 0.5
+#: With more than this share of what was missing (of its square) left there are no names to be had;
+#: where what remains is small (a share of the bodies' acceleration), more may.
+LARGE_REMAINDER, SMALL, LARGE_IF_SMALL = 0.2, 0.01, 0.5
 #: Draws kept of each chain, and tuning draws at least.
 DRAWS, LEAST_TUNE = 300, 100
 #: Draws from the prior, of which some must reach what was measured.
@@ -132,7 +131,7 @@ def revise(
     horizon = loop.held_out.rollout_horizon(scene.time_step)
     misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(prior)
     remains = _remains(before, left) if added and misfit.unexplained is not None else 0.0
-    if remains > (HOPELESS if left.worst < MATTERS else LARGE_REMAINDER):
+    if remains > (LARGE_IF_SMALL if left.worst < SMALL else LARGE_REMAINDER):
         # part of a misfit goes to whatever is there: no name is to be had from that
         say("no effect of the catalogue explains what is missing")
         added, current, left = [], declared, before
@@ -144,13 +143,13 @@ def revise(
         say("sampling the posterior of the revised model")
         revised = loop.posterior(current, draws)
     say("comparing errors on held-out data")
-    models = _Models(declared, current, posterior, revised, before, left, remains > LARGE_IF_SMALL)
+    models = _Models(declared, current, posterior, revised, before, left)
     return loop.findings(models, first, added, misfit, tuple(selection.small))
 
 
 @dataclass(frozen=True, eq=False)
 class _Models:
-    """The declared and the revised model: modes, posteriors, what they leave, whether too much."""
+    """The declared and the revised model: modes, posteriors, what they leave."""
 
     declared: Mode
     revised: Mode
@@ -158,7 +157,6 @@ class _Models:
     after: Any
     left_before: Left
     left_after: Left
-    open: bool
 
 
 def _prior_test(
@@ -225,7 +223,8 @@ class _Loop:
             for mode, posterior in ((declared, models.before), (revised, models.after))
         ]
         verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
-        if misfit.unexplained is not None and (models.open or not steps):
+        # names that leave an acceleration unexplained are the nearest there are at best
+        if misfit.unexplained is not None and not (steps and misfit.predicts):
             verdict = findings.UNEXPLAINED
         if not all(map(_converged, (models.before, models.after))):
             verdict = findings.NOT_CONVERGED

@@ -11,12 +11,22 @@ from scipy.stats import chi2
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import ResidualTest, Unexplained
-from pbrl_ppl.criticism.unexplained import FALSE_ALARM, MATTERS, Left, trajectories
+from pbrl_ppl.criticism.unexplained import (
+    FALSE_ALARM,
+    MATTERS,
+    MATTERS_IN_A_STEP,
+    Left,
+    in_a_step,
+    of_an_innovation,
+    trajectories,
+)
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 
+#: Names of tests, of which all a model is good for depends.
+ACCELERATION, FORECASTS = "unexplained acceleration", "forecasts"
 #: Lags of the test of whiteness (Ljung, System Identification, chapter 16).
 _LAGS = 5
 #: A share of the innovations' variance that matters.
@@ -39,6 +49,11 @@ class Misfit:
 
     tests: tuple[ResidualTest, ...]
     unexplained: Unexplained | None
+
+    @property
+    def predicts(self) -> bool:
+        """Whether steps and forecasts are as good as noise lets them be."""
+        return all(test.passed for test in self.tests if test.name in (ACCELERATION, FORECASTS))
 
     def with_test(self, test: ResidualTest) -> Misfit:
         """The same with one test more; what it says is where the structure is if no other fails."""
@@ -119,9 +134,7 @@ def _acceleration(left: Left) -> ResidualTest:
             " own is"
         )
     p_value = float(min(1.0, left.p_value[worst] * len(left.names)))
-    return ResidualTest(
-        "unexplained acceleration", p_value, float(left.relative[worst]), passed, sentence
-    )
+    return ResidualTest(ACCELERATION, p_value, float(left.relative[worst]), passed, sentence)
 
 
 def _whiteness(mode: Mode) -> ResidualTest:
@@ -129,7 +142,8 @@ def _whiteness(mode: Mode) -> ResidualTest:
     noise = trajectories(mode)
     white, first = mode.whitened_residual(), noise.first
     number = np.cumsum(first)
-    statistic, count, worst = 0.0, 0, (0.0, 0, 0)
+    statistic, count, worst, size = 0.0, 0, (0.0, 0, 0), 0.0
+    share = of_an_innovation(mode) / np.maximum(in_a_step(mode), 1e-300)
     for lag in range(1, _LAGS + 1):
         same = number[lag:] == number[:-lag]
         later, earlier = white[lag:][same], white[:-lag][same]
@@ -142,8 +156,9 @@ def _whiteness(mode: Mode) -> ResidualTest:
         place = int(np.argmax(np.abs(correlation) * enough))
         if abs(correlation[place]) > abs(worst[0]):
             worst = (float(correlation[place]), lag, place)
+        size = max(size, float((np.abs(correlation) * share * enough).max(initial=0.0)))
     p_value = float(chi2.sf(statistic, max(count, 1)))
-    passed = p_value > FALSE_ALARM or worst[0] ** 2 < _SHARE
+    passed = p_value > FALSE_ALARM or worst[0] ** 2 < _SHARE or size < MATTERS_IN_A_STEP
     place = noise.cells.places[worst[2]]
     body = mode.problem.scene.moving[place // len(STATE)].name
     sentence = "errors of one interval say nothing of those of the next"
@@ -177,4 +192,4 @@ def _forecasts(mode: Mode, horizon: int) -> ResidualTest:
         sentence = (
             f"after {seconds:g} s the error of {name} is {worst:.1f} times what noise alone makes"
         )
-    return ResidualTest("forecasts", p_value, worst, passed, sentence)
+    return ResidualTest(FORECASTS, p_value, worst, passed, sentence)

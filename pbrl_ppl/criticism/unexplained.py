@@ -17,7 +17,10 @@ Array = NDArray[np.float64]
 #: Chance of calling nothing something.
 FALSE_ALARM = 1e-3
 #: A share of the bodies' own acceleration that matters.
-MATTERS = 0.01
+MATTERS = 0.0015
+#: An error that comes back is one of measuring as well, and those of real sensors are larger: the
+#: share of what a step changes that matters.
+MATTERS_IN_A_STEP = 0.01
 #: What counts as no noise, as a share of its prior's median.
 _NOTHING = 1e-3
 
@@ -73,6 +76,22 @@ def unexplained_acceleration(mode: Mode) -> Left:
     relative = mode.sigma[k:] / np.maximum(typical, 1e-300)
     names = tuple(STATE[d] for d in cells.rates)
     return Left(names, mode.sigma[k:], relative, _p_values(mode, k))
+
+
+def in_a_step(mode: Mode) -> Array:
+    """What the bodies' accelerations do to each cell in a step, root mean square, shape (cell,)."""
+    cells, segments = trajectories(mode).cells, mode.problem.segments
+    dt = mode.problem.scene.time_step
+    change = segments.observed[:, 0] - segments.start
+    body, dimension = np.divmod(cells.places, len(STATE))
+    velocity = np.where(dimension < 3, dimension + 3, dimension)
+    typical = np.sqrt(np.mean(change[:, body, velocity] ** 2, axis=0))
+    return np.asarray(np.where(dimension < 3, dt * typical, typical))
+
+
+def of_an_innovation(mode: Mode) -> Array:
+    """Typical standard deviation of each cell's innovations, in its unit, shape (cell,)."""
+    return np.asarray(np.median(trajectories(mode).gains(mode.sigma)[1], axis=0))
 
 
 def _p_values(mode: Mode, k: int) -> Array:

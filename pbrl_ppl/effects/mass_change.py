@@ -15,7 +15,7 @@ _LOOKS = 20
 
 def _modify(properties: Any, parameters: Any, clock: Any) -> None:
     # the interval in which it happens has its share of it
-    loaded = clock.after(parameters["time"]) * (clock.trajectory >= parameters["trajectory"])
+    loaded = clock.after(parameters["time"]) * (clock.trajectory > parameters["trajectory"] - 0.5)
     properties["mass"] = properties["mass"] * (1.0 + (parameters["factor"] - 1.0) * loaded)
 
 

@@ -37,11 +37,13 @@ def verdict_in_words(findings: Findings) -> str:
         )
     if findings.verdict == UNEXPLAINED and not found:
         return f"Something is missing that no effect in the catalogue explains: {rest}."
-    if findings.verdict == UNEXPLAINED or left is not None:
+    if findings.verdict == UNEXPLAINED:
         return (
-            f"Part of what was missing is {found}. Something is still missing that no effect in"
-            f" the catalogue explains: {rest}."
+            "Something is missing that no effect in the catalogue explains. The nearest that it has"
+            f" is {found}; with that added, {rest}."
         )
+    if left is not None:
+        return f"Something was missing: {found}. A pattern remains that nothing explains: {rest}."
     if len(findings.added) > 1:
         return f"{len(findings.added)} things were missing: {found}."
     return f"Something was missing: {found}."
