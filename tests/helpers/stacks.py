@@ -34,9 +34,10 @@ def file(generation: str) -> Path:
     return DATA / f"puck-pymc{generation}.nc"
 
 
-def fitted() -> Any:
+def fitted(draws: int = 500, tune: int = 500) -> Any:
     """The puck's posterior on the running generation."""
-    return fit(physics_model(SCENE, history(1)), seed=3, draws=500, chains=2, progress=False)
+    model = physics_model(SCENE, history(1))
+    return fit(model, seed=3, draws=draws, tune=tune, chains=2, progress=False)
 
 
 if __name__ == "__main__":

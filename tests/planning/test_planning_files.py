@@ -34,8 +34,9 @@ def test_both_stacks_plan_alike(generation: str) -> None:
         np.testing.assert_allclose(found[column], there[column], atol=1e-9)
 
 
+@pytest.mark.filterwarnings("ignore:the chains have not converged")  # few draws, on purpose
 def test_a_fresh_process_with_the_file_plans_as_memory_does(tmp_path: Path) -> None:
-    idata = fitted()
+    idata = fitted(draws=100, tune=100)
     here = planned(idata)
     save_posterior(idata, tmp_path / "puck.nc")
     arguments = [str(tmp_path / "puck.nc"), *COMMAND, "--draws", "8", "-o", str(tmp_path / "p.csv")]
@@ -102,7 +103,7 @@ def test_an_unreachable_goal_ends_with_code_1_and_the_best(tmp_path, capsys) -> 
     path, out = tmp_path / "actions.toml", tmp_path / "plan.csv"
     path.write_text('[[action]]\nbody = "puck"\nforce = [4, 0]\nframe = "world"\n')
     backwards = ["--start", "0,0,0", "--goal", "-2,0,-", "--actions", str(path), "--quiet"]
-    command = ["plan", str(file("5")), *backwards, "-o", str(out), "--nodes", "20000"]
+    command = ["plan", str(file("5")), *backwards, "-o", str(out), "--nodes", "4000"]
     assert main(command) == 1
     assert "the goal is not reached" in capsys.readouterr().out
     assert out.exists()

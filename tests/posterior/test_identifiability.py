@@ -18,7 +18,7 @@ from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 
 CONTACT = {"r": 0.2, "mu_c": 0.3}
-QUICK = {"draws": 500, "tune": 300, "chains": 2, "cores": 1, "progress": False}
+QUICK = {"draws": 300, "tune": 200, "chains": 2, "cores": 1, "progress": False}
 
 
 def _gain(state, command, parameters, wrench):

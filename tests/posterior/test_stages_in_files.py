@@ -1,6 +1,7 @@
 """Effects of every stage in a posterior file: what they look at comes back with it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.planning import Dynamics, plan
 from pbrl_ppl.posterior import load_posterior, problem_of, save_posterior
-from pbrl_ppl.sampling import fit, update
+from pbrl_ppl.sampling import fit, fitting, update
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 
@@ -75,11 +76,14 @@ def test_a_loaded_file_predicts_as_the_fit(history, idata, tmp_path) -> None:
     assert np.abs(loaded.predict(moved) - loaded.predict(phi)).max() > 1e-3
 
 
-def test_an_update_numbers_its_trajectories_on(idata) -> None:
+def test_an_update_numbers_its_trajectories_on(idata, monkeypatch) -> None:
     """A load taken up in the fifth trajectory is still there in what is recorded since."""
     since = recorded(STAGES, seed=2, trajectories=1)
     problem = problem_of(idata, history=since)
     assert problem.inputs[..., 6].min() == 8.0
+    # few draws, also where the update fits anew
+    few = replace(fitting.METHODS["metropolis"], draws=60, tune=20)
+    monkeypatch.setattr(fitting, "METHODS", {"metropolis": few})
     with pytest.warns(UserWarning):
         result = update(idata, since, seed=1)
     assert json.loads(result.attrs["updates"])[-1]["transitions"] == since.n_transitions
