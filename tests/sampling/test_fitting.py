@@ -44,6 +44,7 @@ UNITS = ("kg", "m", "m", "rad", "1", "1")
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 QUICK = {"draws": 200, "tune": 200, "chains": 2, "cores": 1, "progress": False}
+SHORT = QUICK | {"draws": 100, "tune": 100}
 
 
 @pytest.fixture(scope="module")
@@ -400,7 +401,7 @@ def test_a_parameter_at_its_bound_is_named(model) -> None:
         idata = fit(
             physics_model(scene.replace(bodies=(small,)), model.problem.data.history),
             seed=1,
-            **QUICK,
+            **SHORT,
         )
     assert any("w_x[cart]" in each for each in json.loads(idata.attrs["warnings"]))
 
@@ -413,7 +414,7 @@ def test_a_parameter_that_the_data_say_nothing_about_is_named(model) -> None:
         warnings.catch_warnings(),
     ):
         warnings.simplefilter("ignore", ConvergenceWarning)
-        fit(physics_model(scene, model.problem.data.history), seed=1, **QUICK)
+        fit(physics_model(scene, model.problem.data.history), seed=1, **SHORT)
 
 
 def test_unknown_method(model) -> None:
@@ -443,7 +444,7 @@ def test_methods_agree(puck, method) -> None:
     mode = find_mode(puck.problem, seed=1)
     deviation = float(np.sqrt(mode.covariance[0, 0]))
     options = {"draws": 300, "chains": 2, "cores": 1, "progress": False}
-    if method == "paper":
+    if method in ("paper", "demetropolisz"):
         options |= {"tune": 500, "thin": 4}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
