@@ -30,6 +30,10 @@ _MOST = 1500
 FEATURES = (
     "position x",
     "position y",
+    "velocity x",
+    "velocity y",
+    "commanded force x",
+    "commanded force y",
     "orientation (cosine)",
     "orientation (sine)",
     "forward speed",
@@ -79,7 +83,8 @@ def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
             continue
         features = _features(mode, i)[chosen]
         own = np.flatnonzero(places // len(STATE) == i)
-        y = innovations[:, own] - innovations[:, own].mean(axis=0)
+        y, names, of = _in_both_frames(innovations[:, own], places[own] % len(STATE), features)
+        y = y - y.mean(axis=0)
         kernels = _kernels(features)
         smoother = _cross_validated(kernels.sum(axis=0), groups, rng)
         shares = _explained(smoother, y)
@@ -87,14 +92,27 @@ def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
             [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
         )
         at = int(np.argmax(shares))
-        size = np.sqrt(max(float(shares[at]), 0.0)) * relative[own[at]]
+        size = np.sqrt(max(float(shares[at]), 0.0)) * relative[own[of[at]]]
         p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * tests
         if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE or size < MATTERS_IN_A_STEP:
             continue
         if best is None or shares[at] > best.share:
-            dimension = STATE[places[own[at]] % len(STATE)]
-            best = _describe(body.name, dimension, kernels, y[:, at], shares[at], p_value)
+            best = _describe(body.name, names[at], kernels, y[:, at], shares[at], p_value)
     return best
+
+
+def _in_both_frames(
+    y: Array, dimension: NDArray[np.intp], features: Array
+) -> tuple[Array, list[str], list[int]]:
+    """Innovations in the world's frame, then velocities' in the body's; their names and columns."""
+    names, of = [STATE[d] for d in dimension], list(range(len(dimension)))
+    velocities = [names.index(name) for name in ("vx", "vy") if name in names]
+    if len(velocities) < 2:
+        return y, names, of
+    c, s = (features[:, FEATURES.index(f"orientation ({part})")] for part in ("cosine", "sine"))
+    x, y_ = y[:, velocities].T
+    turned = np.stack([c * x + s * y_, c * y_ - s * x], axis=1)
+    return np.hstack([y, turned]), [*names, "forward speed", "sideways speed"], [*of, *velocities]
 
 
 def _features(mode: Mode, body: int) -> Array:
@@ -107,7 +125,7 @@ def _features(mode: Mode, body: int) -> Array:
     time = segments.step.astype(float)
     return np.stack(
         [
-            x, y, c, s, c * vx + s * vy, c * vy - s * vx, omega, np.hypot(vx, vy),
+            x, y, vx, vy, fx, fy, c, s, c * vx + s * vy, c * vy - s * vx, omega, np.hypot(vx, vy),
             c * fx + s * fy, c * fy - s * fx, torque,
             c * gx + s * gy, c * gy - s * gx, torque_before, time,
         ],

@@ -13,7 +13,9 @@ from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
     Candidate,
+    Correlations,
     Errors,
+    Growth,
     Numerical,
     ResidualTest,
     Rollout,
@@ -63,6 +65,10 @@ class Findings:
         Tests of what the model after revision leaves.
     acceleration : Acceleration
         What a step adds beyond the model, before and after.
+    correlations : Correlations
+        Of the innovations of the model after revision.
+    growth : Growth
+        Of the errors of its forecasts.
     small : tuple of Candidate
         Effects that are certain, and change predictions by less than 1 %; they were not added.
     identifiability : Identifiability or None
@@ -89,6 +95,8 @@ class Findings:
     provenance: Mapping[str, Any]
     tests: tuple[ResidualTest, ...]
     acceleration: Acceleration
+    correlations: Correlations
+    growth: Growth
     small: tuple[Candidate, ...] = ()
     identifiability: Identifiability | None = None
     loo: Comparison | None = None

@@ -258,6 +258,8 @@ class _Loop:
             },
             tests=misfit.tests,
             acceleration=_acceleration(models.left_before, models.left_after),
+            correlations=misfit.correlations,
+            growth=misfit.growth,
             small=small,
             identifiability=identify(models.after, mode=revised),
             loo=compare(models.before, models.after),

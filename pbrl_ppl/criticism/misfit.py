@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.criticism.results import ResidualTest, Unexplained
+from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import (
     FALSE_ALARM,
     MATTERS,
-    MATTERS_IN_A_STEP,
     Left,
-    in_a_step,
-    of_an_innovation,
     trajectories,
 )
 from pbrl_ppl.modes import Mode
@@ -27,12 +25,10 @@ Array = NDArray[np.float64]
 
 #: Names of tests, of which all a model is good for depends.
 ACCELERATION, FORECASTS = "unexplained acceleration", "forecasts"
-#: Lags of the test of whiteness (Ljung, System Identification, chapter 16).
-_LAGS = 5
-#: A share of the innovations' variance that matters.
-_SHARE = 0.02
 #: Forecasts may be this many times worse than noise alone makes them.
 _WORSE = 1.5
+#: Lengths of forecasts that a picture shows, at most.
+_LENGTHS = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +41,16 @@ class Misfit:
         In the order of the report.
     unexplained : Unexplained or None
         Where it is strongest; None where all tests are passed.
+    correlations : Correlations
+        Of innovations.
+    growth : Growth
+        Of forecasts' errors.
     """
 
     tests: tuple[ResidualTest, ...]
     unexplained: Unexplained | None
+    correlations: Correlations
+    growth: Growth
 
     @property
     def predicts(self) -> bool:
@@ -60,7 +62,7 @@ class Misfit:
         unexplained = self.unexplained
         if unexplained is None and not test.passed:
             unexplained = Unexplained("", "", "nothing that was recorded", 0.0, 0.0, test.sentence)
-        return Misfit((*self.tests, test), unexplained)
+        return replace(self, tests=(*self.tests, test), unexplained=unexplained)
 
 
 def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfit:
@@ -78,10 +80,12 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
         Of permutations.
     """
     dependence = find_dependence(mode, seed=seed)
+    of_correlation, correlations = correlation_tests(mode)
+    of_forecasts, growth = _forecasts(mode, horizon)
     tests = (
         _acceleration(left),
-        _whiteness(mode),
-        _forecasts(mode, horizon),
+        *of_correlation,
+        of_forecasts,
         ResidualTest(
             "dependence on state, command and time",
             1.0 if dependence is None else dependence.p_value,
@@ -94,7 +98,7 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
     )
     failed = [test for test in tests if not test.passed]
     if not failed:
-        return Misfit(tests, None)
+        return Misfit(tests, None, correlations, growth)
     if dependence is None:
         first = failed[0]
         noise = trajectories(mode)
@@ -107,7 +111,7 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
             p_value=first.p_value,
             sentence=first.sentence,
         )
-    return Misfit(tests, dependence)
+    return Misfit(tests, dependence, correlations, growth)
 
 
 def _where(mode: Mode, left: Left, places: NDArray[np.intp]) -> tuple[str, str]:
@@ -137,44 +141,14 @@ def _acceleration(left: Left) -> ResidualTest:
     return ResidualTest(ACCELERATION, p_value, float(left.relative[worst]), passed, sentence)
 
 
-def _whiteness(mode: Mode) -> ResidualTest:
-    """Portmanteau test of the innovations' correlation with those before them, of each cell."""
-    noise = trajectories(mode)
-    white, first = mode.whitened_residual(), noise.first
-    number = np.cumsum(first)
-    statistic, count, worst, size = 0.0, 0, (0.0, 0, 0), 0.0
-    share = of_an_innovation(mode) / np.maximum(in_a_step(mode), 1e-300)
-    for lag in range(1, _LAGS + 1):
-        same = number[lag:] == number[:-lag]
-        later, earlier = white[lag:][same], white[:-lag][same]
-        seen = noise.seen[lag:][same] & noise.seen[:-lag][same]
-        n = seen.sum(axis=0)
-        enough = n > 2 * _LAGS
-        correlation = (later * earlier * seen).sum(axis=0) / np.maximum(n, 1)
-        statistic += float((n * correlation**2)[enough].sum())
-        count += int(enough.sum())
-        place = int(np.argmax(np.abs(correlation) * enough))
-        if abs(correlation[place]) > abs(worst[0]):
-            worst = (float(correlation[place]), lag, place)
-        size = max(size, float((np.abs(correlation) * share * enough).max(initial=0.0)))
-    p_value = float(chi2.sf(statistic, max(count, 1)))
-    passed = p_value > FALSE_ALARM or worst[0] ** 2 < _SHARE or size < MATTERS_IN_A_STEP
-    place = noise.cells.places[worst[2]]
-    body = mode.problem.scene.moving[place // len(STATE)].name
-    sentence = "errors of one interval say nothing of those of the next"
-    if not passed:
-        sentence = (
-            f"the error of {STATE[place % len(STATE)]} of {body} is correlated with itself"
-            f" {worst[1]} interval{'s' * (worst[1] > 1)} later ({worst[0]:.2f})"
-        )
-    return ResidualTest("whiteness", p_value, abs(worst[0]), passed, sentence)
-
-
-def _forecasts(mode: Mode, horizon: int) -> ResidualTest:
+def _forecasts(mode: Mode, horizon: int) -> tuple[ResidualTest, Growth]:
     """Whether errors grow with the length of a forecast as noise alone makes them."""
     noise = trajectories(mode)
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
-    told = forecast(mode.problem, mode.phi, mode.sigma, min(horizon, int(lengths.max())))
+    longest = min(horizon, int(lengths.max()))
+    steps = np.unique(np.geomspace(1, longest, min(longest, _LENGTHS)).round().astype(int))
+    every = [forecast(mode.problem, mode.phi, mode.sigma, int(n)) for n in steps]
+    told = every[-1]
     worst, p_value, name = 0.0, 1.0, ""
     for d in np.unique(told.dimension):
         own = told.dimension == d
@@ -186,10 +160,14 @@ def _forecasts(mode: Mode, horizon: int) -> ResidualTest:
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), chance, STATE[d]
     passed = p_value > FALSE_ALARM or worst < _WORSE
-    seconds = horizon * mode.problem.scene.time_step
+    dt = mode.problem.scene.time_step
+    seconds = longest * dt
     sentence = f"forecasts of {seconds:g} s are as good as noise lets them be"
     if not passed:
         sentence = (
             f"after {seconds:g} s the error of {name} is {worst:.1f} times what noise alone makes"
         )
-    return ResidualTest(FORECASTS, p_value, worst, passed, sentence)
+    growth = Growth(
+        steps * dt, tuple(each.rmse() for each in every), tuple(each.floor() for each in every)
+    )
+    return ResidualTest(FORECASTS, p_value, worst, passed, sentence), growth

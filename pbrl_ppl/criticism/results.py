@@ -80,6 +80,48 @@ class ResidualTest:
     sentence: str
 
 
+@dataclass(frozen=True, eq=False)
+class Correlations:
+    """Correlations of innovations, for a picture.
+
+    Parameters
+    ----------
+    cells : tuple of str
+        What was measured: state dimension and body.
+    own : ndarray
+        With those 1, 2, ... intervals before, shape (lag, cell).
+    pairs : ndarray
+        Pairs that each was taken over, shape (lag, cell).
+    commands : tuple of str
+        Commands that vary.
+    driven : ndarray
+        With commands 0, 1, ... intervals before, shape (lag, command, cell).
+    """
+
+    cells: tuple[str, ...]
+    own: Array
+    pairs: Array
+    commands: tuple[str, ...]
+    driven: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Growth:
+    """Growth of forecasts' errors with their length, for a picture.
+
+    Parameters
+    ----------
+    seconds : ndarray
+        Lengths (s), shape (length,).
+    error, floor : tuple of dict
+        Root mean square error of each state dimension, and that of noise alone, one each length.
+    """
+
+    seconds: Array
+    error: tuple[Mapping[str, float], ...]
+    floor: tuple[Mapping[str, float], ...]
+
+
 @dataclass(frozen=True)
 class Acceleration:
     """Unexplained acceleration of each velocity: what a step adds beyond the model.

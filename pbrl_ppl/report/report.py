@@ -15,6 +15,7 @@ from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.report.effect_plots import HARDLY, MOST_CANDIDATES, plot_added, plot_candidates
 from pbrl_ppl.report.error_plots import plot_errors, plot_residuals, plot_rollout
 from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
+from pbrl_ppl.report.residual_plots import plot_correlations, plot_growth
 from pbrl_ppl.report.style import UNITS, png
 from pbrl_ppl.report.words import (
     chance,
@@ -40,6 +41,8 @@ def render(findings: Findings) -> str:
         "rollout": plot_rollout(findings),
         "errors": plot_errors(findings),
         "residuals": plot_residuals(findings),
+        "correlations": plot_correlations(findings),
+        "growth": plot_growth(findings),
         "trace": plot_trace(findings, parameters),
         "rank": plot_rank(findings, parameters),
     }

@@ -11,8 +11,10 @@ from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
     Candidate,
+    Correlations,
     Errors,
     Estimate,
+    Growth,
     Numerical,
     ResidualTest,
     Rollout,
@@ -175,6 +177,18 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Findings:
         provenance={"seed": 1, "versions": {"pymc": "5.28"}, "data_sha256": "ab" * 32},
         tests=made_up_tests(verdict),
         acceleration=made_up_acceleration(verdict),
+        correlations=Correlations(
+            ("vx of cart", "omega of cart"),
+            0.1 * rng.normal(size=(5, 2)),
+            np.full((5, 2), 200),
+            ("force_x on cart", "torque on cart"),
+            0.1 * rng.normal(size=(6, 2, 2)),
+        ),
+        growth=Growth(
+            np.array([0.1, 0.5, 1.0]),
+            tuple({"x": 0.01 * i, "omega": 0.02 * i} for i in (1, 2, 4)),
+            tuple({"x": 0.01 * i, "omega": 0.02 * i} for i in (1, 1.5, 2)),
+        ),
     )
 
 

@@ -82,7 +82,7 @@ def test_page_stands_alone(verdict: str) -> None:
     assert "url(" not in PAGES[verdict] and "@import" not in PAGES[verdict]
     assert "://" not in PAGES[verdict]
     assert len([tag for tag in got.tags if tag == "img"]) == (
-        7 if verdict == "effects-added" else 6
+        9 if verdict == "effects-added" else 8
     )
 
 
@@ -216,9 +216,12 @@ def test_added_effects_with_a_rest() -> None:
     )
     remains = made_up("unexplained").unexplained
     some = replace(findings, verdict="unexplained", unexplained=remains)
-    assert verdict_in_words(some).startswith(f"Part of what was missing is {DRAG}")
-    assert "Something is still missing" in verdict_in_words(some)
-    assert "Something is still missing" in Page(render(some)).text
+    assert verdict_in_words(some).startswith("Something is missing that no effect in the")
+    assert f"The nearest that it has is {DRAG}" in verdict_in_words(some)
+    assert "with that added, its omega is off" in Page(render(some)).text
+    noted = replace(some, verdict="effects-added")
+    assert verdict_in_words(noted).startswith(f"Something was missing: {DRAG}")
+    assert "A pattern remains that nothing explains: its omega is off" in verdict_in_words(noted)
 
 
 def test_odd_findings_still_make_a_page() -> None:

@@ -1,0 +1,161 @@
+"""Correlation of innovations with those before them, and with commands.
+
+The residual tests of L. Ljung, System Identification (1999), chapter 16. An innovation's variance
+is one, so that of a correlation over n pairs is 1 / n if nothing is missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from pbrl_ppl.criticism.results import Correlations, ResidualTest
+from pbrl_ppl.criticism.unexplained import (
+    FALSE_ALARM,
+    MATTERS_IN_A_STEP,
+    in_a_step,
+    of_an_innovation,
+    trajectories,
+)
+from pbrl_ppl.modes import Mode
+from pbrl_ppl.state import STATE, WRENCH
+
+Array = NDArray[np.float64]
+
+#: Lags of either test.
+LAGS = 5
+#: A share of the innovations' variance that matters.
+_SHARE = 0.02
+#: Pairs that a correlation needs.
+_PAIRS = 10
+
+
+@dataclass(frozen=True, eq=False)
+class _Correlation:
+    """Correlations and numbers of pairs, shape (lag, series, cell)."""
+
+    values: Array
+    pairs: Array
+
+    @property
+    def p_value(self) -> float:
+        """Of the sum of squares, chi-squared if nothing is missing."""
+        enough = self.pairs > _PAIRS
+        statistic = float((self.pairs * self.values**2)[enough].sum())
+        return float(chi2.sf(statistic, max(int(enough.sum()), 1)))
+
+    def worst(self, share: Array) -> tuple[int, int, int]:
+        """Where the largest is, of those of enough pairs; weights are of the cells."""
+        size = np.where(self.pairs > _PAIRS, np.abs(self.values), 0.0) * share
+        lag, series, cell = np.unravel_index(int(np.argmax(size)), size.shape)
+        return int(lag), int(series), int(cell)
+
+    def matters(self, share: Array) -> bool:
+        """Whether any is large against what a step changes, and against the noise."""
+        large = (self.values**2 > _SHARE) & (np.abs(self.values) * share > MATTERS_IN_A_STEP)
+        return bool((large & (self.pairs > _PAIRS)).any())
+
+
+def correlation_tests(mode: Mode) -> tuple[tuple[ResidualTest, ...], Correlations]:
+    """Test whiteness over lags, and correlation with present and past commands.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of whole trajectories.
+
+    Returns
+    -------
+    tests : tuple of ResidualTest
+        Of whiteness, and of commands where there are any.
+    correlations : Correlations
+        For a picture.
+    """
+    noise = trajectories(mode)
+    white, seen = mode.whitened_residual(), noise.seen
+    number = np.cumsum(noise.first.astype(np.intp))
+    share = of_an_innovation(mode) / np.maximum(in_a_step(mode), 1e-300)
+    scene, places = mode.problem.scene, noise.cells.places
+    cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
+    own = _lagged(white, seen, number, None)
+    tests = [_whiteness(own, share, cells)]
+    commands, names = _commands(mode)
+    driven = None
+    if names:
+        driven = _lagged(white, seen, number, commands)
+        tests.append(_driven(driven, share, cells, names))
+    return tuple(tests), Correlations(
+        tuple(cells),
+        own.values[:, 0],
+        own.pairs[:, 0],
+        tuple(names),
+        np.zeros((0, 0, len(cells))) if driven is None else driven.values,
+    )
+
+
+def _lagged(
+    white: Array, seen: NDArray[np.bool_], number: NDArray[np.intp], series: Array | None
+) -> _Correlation:
+    """Correlation with series some intervals before, or of each cell with itself."""
+    values, pairs = [], []
+    for lag in range(1, LAGS + 1) if series is None else range(LAGS + 1):
+        end = len(number) - lag
+        same = number[lag:] == number[:end]
+        later, counts = white[lag:][same], seen[lag:][same]
+        if series is None:
+            earlier = white[:end][same][:, None]
+            counts = (counts & seen[:end][same])[:, None]
+            later = later[:, None]
+        else:
+            earlier = series[:end][same][:, :, None]
+            later, counts = later[:, None], np.broadcast_to(counts[:, None], later[:, None].shape)
+        n = np.broadcast_to(counts, np.broadcast_shapes(counts.shape, earlier.shape)).sum(axis=0)
+        values.append((later * earlier * counts).sum(axis=0) / np.maximum(n, 1))
+        pairs.append(n)
+    return _Correlation(np.array(values), np.array(pairs))
+
+
+def _commands(mode: Mode) -> tuple[Array, list[str]]:
+    """Commanded wrenches that vary, standardised, shape (transition, series), and their names."""
+    segments, scene = mode.problem.segments, mode.problem.scene
+    columns, names = [], []
+    for i, body in enumerate(scene.moving):
+        for j, name in enumerate(WRENCH):
+            values = segments.actions[:, 0, i, j]
+            spread = values.std()
+            if not body.kinematic and spread > 1e-9 * max(float(np.abs(values).max()), 1e-300):
+                columns.append((values - values.mean()) / spread)
+                names.append(f"{name} on {body.name}")
+    return np.array(columns).reshape(len(columns), -1).T, names
+
+
+def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTest:
+    p_value = own.p_value
+    passed = p_value > FALSE_ALARM or not own.matters(share)
+    lag, _, cell = own.worst(np.ones(len(cells)) if passed else share)
+    worst = float(own.values[lag, 0, cell])
+    sentence = "errors of one interval say nothing of those of the next"
+    if not passed:
+        sentence = (
+            f"the error of {cells[cell]} is correlated with itself"
+            f" {lag + 1} interval{'s' * (lag > 0)} later ({worst:.2f})"
+        )
+    return ResidualTest("whiteness", p_value, abs(worst), passed, sentence)
+
+
+def _driven(driven: _Correlation, share: Array, cells: list[str], names: list[str]) -> ResidualTest:
+    p_value = driven.p_value
+    passed = p_value > FALSE_ALARM or not driven.matters(share)
+    lag, series, cell = driven.worst(np.ones(len(cells)) if passed else share)
+    worst = float(driven.values[lag, series, cell])
+    sentence = "errors say nothing of present and past commands"
+    if not passed:
+        when = f"{lag} interval{'s' * (lag > 1)} before" if lag else "of the same interval"
+        sentence = (
+            f"the error of {cells[cell]} is correlated with {names[series].replace('_', ' ')}"
+            f" {when} ({worst:.2f})"
+        )
+    return ResidualTest("correlation with commands", p_value, abs(worst), passed, sentence)
