@@ -100,8 +100,8 @@ def test_nuts_agrees_with_the_default_sampler() -> None:
     options = {"chains": 2, "cores": 1, "progress": False, "start": mode, "seed": 3}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # few draws, on purpose
-        nuts = fit(model, method="nuts", draws=250, tune=200, **options)
-        default = fit(model, draws=1000, tune=300, **options)
+        nuts = fit(model, method="nuts", draws=150, tune=150, **options)
+        default = fit(model, draws=600, tune=200, **options)
     assert nuts.attrs["method"] == "nuts"
     assert int(group(nuts, "sample_stats")["diverging"].sum()) == 0
     ours, theirs = group(default, "posterior"), group(nuts, "posterior")
