@@ -180,7 +180,7 @@ def test_the_plan_s_draw_is_the_most_probable() -> None:
             posterior[block.name].values[where] = table[place, which]
     chosen = Dynamics.of(idata)
     np.testing.assert_array_equal(chosen.phi[0], table[:, 1])
-    np.testing.assert_allclose(chosen._noise[0][0], median * np.exp(-(spread**2)))
+    np.testing.assert_allclose(chosen._noise.sigma[0], median * np.exp(-(spread**2)))
 
 
 def test_the_plan_knows_an_anchor_s_prior_by_its_index() -> None:

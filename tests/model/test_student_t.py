@@ -58,7 +58,7 @@ def test_the_model_s_density_is_the_same(scene, clean) -> None:
     problem = physics_model(scene, clean, nu=NU).problem
     predicted = problem.predict(problem.layout.to_vector(CART))[..., problem.observations.columns]
     value, mean = (pt.as_tensor(each) for each in (problem.observations.values, predicted))
-    found = next_state_logp(value, mean, np.array(NOISE), problem.observations, None, NU).eval()
+    found = next_state_logp(value, mean, np.array(NOISE), problem.observations, NU).eval()
     residual = problem.residual(problem.layout.to_vector(CART))
     np.testing.assert_allclose(found, problem.log_density(residual, np.array(NOISE)))
 
@@ -66,7 +66,7 @@ def test_the_model_s_density_is_the_same(scene, clean) -> None:
 def test_draws_have_the_distribution() -> None:
     """10,000 draws; a false alarm one time in a thousand, at a fixed seed."""
     drawn = next_state_random(
-        np.zeros((10_000, 1, 1, 1)), np.array([2.0]), None, np.random.default_rng(1), nu=NU
+        np.zeros((10_000, 1, 1, 1)), np.array([2.0]), np.random.default_rng(1), nu=NU
     )
     assert kstest(drawn.ravel() / 2.0, student(NU).cdf).pvalue > 1e-3
 
