@@ -45,7 +45,7 @@ def sample(
             thin=2,
         )
         trace = pm.sample(
-            **({"draws": 1000, "tune": 1000, "cores": 1, "random_seed": 4} | options),
+            **({"draws": 600, "tune": 500, "cores": 1, "random_seed": 4} | options),
             chains=chains,
             step=step,
             progressbar=False,
@@ -101,7 +101,7 @@ def rough_gaussian(q: np.ndarray) -> float:
 def test_a_bad_look_ahead_is_put_right() -> None:
     """The draws are exact whatever the cheap posterior is."""
     guess = {"mean": MEAN, "covariance": COVARIANCE}
-    found = sample(gaussian(), **guess, rough=rough_gaussian, draws=2000)["x"]
+    found = sample(gaussian(), **guess, rough=rough_gaussian, draws=1200)["x"]
     for i in range(3):
         check(found[..., i], MEAN[i])
         check((found[..., i] - MEAN[i]) ** 2, COVARIANCE[i, i])
@@ -120,7 +120,7 @@ def test_a_good_look_ahead_gives_nearly_independent_draws() -> None:
 def test_blocks_that_depend_on_each_other() -> None:
     """Correlated variables in blocks of their own: slower, and still exact."""
     blocks = [block(MEAN[:1], COVARIANCE[:1, :1]), block(MEAN[1:], COVARIANCE[1:, 1:], first=1)]
-    found = sample(gaussian(), blocks=blocks, draws=2000)["x"]
+    found = sample(gaussian(), blocks=blocks, draws=1200)["x"]
     for i in range(3):
         check(found[..., i], MEAN[i])
     check((found[..., 0] - MEAN[0]) * (found[..., 1] - MEAN[1]), COVARIANCE[0, 1])
@@ -172,7 +172,7 @@ def test_jumps_weigh_hills_that_no_walk_connects() -> None:
     )
     options = {"mean": np.zeros(3), "covariance": 0.09 * np.eye(3)}
     start = {"x": np.zeros(3)}
-    draws = sample(model, **options, jumps=Jumps(hills), draws=2000, initvals=start)["x"]
+    draws = sample(model, **options, jumps=Jumps(hills), draws=1200, initvals=start)["x"]
     check((draws.mean(axis=-1) > 4.0).astype(float), 0.7)
     stuck = sample(model, **options, chains=1, initvals=start)["x"]
     assert stuck.max() < 4.0
