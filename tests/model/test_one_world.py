@@ -12,7 +12,14 @@ from pbrl_ppl.criticism import prior_predictive_check
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import Problem, build_layout, physics_model
+from pbrl_ppl.model import (
+    ACCELERATION,
+    Problem,
+    along_trajectories,
+    build_layout,
+    build_model,
+    physics_model,
+)
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Simulator
 from pbrl_ppl.posterior import evaluate, from_groups, group, problem_of
@@ -74,11 +81,14 @@ def within_the_noise(problem: Problem, mass, sigma, next_state) -> None:
 
 def posterior_of(model, phi):
     """Draws (n, 1) of the mass, each with the recorded noise."""
-    variables = {
-        "mass": (("chain", "draw", "mass_body"), phi.reshape(1, -1, 1)),
-        "sigma": (("chain", "draw", "state"), np.full((1, len(phi), 6), 0.002)),
-    }
-    coords = {name: list(model.coords[name]) for name in ("mass_body", "state")}
+    variables = {"mass": (("chain", "draw", "mass_body"), phi.reshape(1, -1, 1))}
+    dims = {"sigma": "state"}
+    if model.problem.trajectories is not None:
+        dims = {"sigma": "sensor", ACCELERATION: "velocity"}
+    for name, dim in dims.items():
+        of = len(model.problem.noise_variables[name])
+        variables[name] = (("chain", "draw", dim), np.full((1, len(phi), of), 0.002))
+    coords = {name: list(model.coords[name]) for name in ("mass_body", *dims.values())}
     return from_groups({"posterior": xr.Dataset(variables, coords)}, {})
 
 
@@ -121,16 +131,16 @@ def test_calibration_s_data_collide(model) -> None:
 
 def test_held_out_errors_are_of_one_world(model) -> None:
     phi = np.array([TOO_LIGHT])
-    mode = Mode(
-        model.problem, phi, np.full(6, 0.002), np.zeros((0, 1)), np.eye(1), log_posterior=0.0
-    )
+    whole = along_trajectories(model.problem, np.array([TRUE]))
+    sigma = np.full(len(whole.trajectories.sigma), 0.002)
+    mode = Mode(whole, phi, sigma, np.zeros((0, 1)), np.eye(1), log_posterior=0.0)
     held = HeldOut(model.problem.data.history, seed=1)
     expected = of_one_world(model.problem, phi)
     shown = held.rollout(mode, mode)
     assert shown.body == "a"  # which the other stops
     np.testing.assert_allclose(shown.before[1], expected[0, 0, A], atol=1e-9)
     off = model.problem.observations.residual(expected)[:, -1]
-    errors = held.errors(mode, mode, posterior_of(model, phi), rollout=1)
+    errors = held.errors(mode, mode, posterior_of(build_model(whole), phi), rollout=1)
     for i, name in enumerate(STATE):
         found = errors.one_step_rmse[name]
         assert found == pytest.approx(np.sqrt((off[..., i] ** 2).mean()), rel=1e-6), name
