@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
@@ -42,8 +43,8 @@ MOST_ADDED = 5
 #: With more than this share of what was missing (of its square) left there are no names to be had;
 #: where what remains is small (a share of the bodies' acceleration), more may.
 LARGE_REMAINDER, SMALL, LARGE_IF_SMALL = 0.2, 0.01, 0.5
-#: Draws kept of each chain, and tuning draws at least.
-DRAWS, LEAST_TUNE = 300, 100
+#: Draws kept of each chain, those where that is not enough, and tuning draws at least.
+DRAWS, MORE_DRAWS, LEAST_TUNE = 300, 1000, 100
 #: Draws from the prior, of which some must reach what was measured.
 PRIOR_DRAWS = 100
 #: Chains with a larger R-hat or fewer effective draws give no verdict.
@@ -77,7 +78,7 @@ def revise(
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws kept of each chain; 300 by default.
+        Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
     progress : callable, optional
         Told the name of each stage.
 
@@ -199,12 +200,19 @@ class _Loop:
 
     def posterior(self, mode: Mode, draws: int | None) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
-        draws = DRAWS if draws is None else draws
         model = build_model(mode.problem.with_physics(threads=1))
-        tune = max(LEAST_TUNE, 5 * draws // 8)
-        fitted = fit(model, seed=self.seed, draws=draws, tune=tune, start=mode, progress=False)
-        if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
-            raise KeyboardInterrupt
+        for n in (DRAWS, MORE_DRAWS) if draws is None else (draws,):
+            tune = max(LEAST_TUNE, 5 * n // 8)
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always")
+                fitted = fit(model, seed=self.seed, draws=n, tune=tune, start=mode, progress=False)
+            if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
+                raise KeyboardInterrupt
+            if _converged(fitted):
+                break
+            self.say(f"the chains have not converged after {n} draws each")
+        for warning in caught:  # of the last
+            warnings.warn(warning.message, stacklevel=2)
         return fitted
 
     def findings(

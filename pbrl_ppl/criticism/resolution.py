@@ -19,13 +19,15 @@ def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
     The engine's error is all but the same at neighbouring parameters, so it is looked at where the
     model was fitted with fewer.
     """
-    begin = substeps = mode.problem.physics.substeps
-    while shift(mode, substeps) > SMALL_SHIFT and substeps < MOST_SUBSTEPS:
-        substeps *= 2
-    if substeps == begin:
-        return mode
-    say(f"using {substeps} engine steps an interval")
-    return trajectory_mode(mode.problem.with_physics(substeps=substeps), mode.phi, mode.sigma)
+    while True:  # a better engine leaves less noise, against which its own error shows again
+        begin = substeps = mode.problem.physics.substeps
+        while shift(mode, substeps) > SMALL_SHIFT and substeps < MOST_SUBSTEPS:
+            substeps *= 2
+        if substeps == begin:
+            return mode
+        say(f"using {substeps} engine steps an interval")
+        finer = mode.problem.with_physics(substeps=substeps)
+        mode = trajectory_mode(finer, mode.phi, mode.sigma)
 
 
 def shift(mode: Mode, substeps: int | None = None) -> float:

@@ -72,7 +72,8 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
     Returns
     -------
     list of Signature
-        Smallest p-value first; of equal ones, the earlier in the catalogue.
+        Smallest p-value first; of equal ones, the earlier in the catalogue. Effects of the noise
+        stage come last.
     """
     if not candidates:
         return []
@@ -97,7 +98,11 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
             return _signature(attached, evidence, values, 1, len(candidates))
         return _best_look(attached, looks(mode, attached), q, left, len(candidates))
 
-    return sorted(map(score, candidates), key=lambda signature: signature.log_p)
+    # the noise's shape is never what is missing as long as an effect might be
+    def order(signature: Signature) -> tuple[bool, float]:
+        return _of_noise(signature.attached), signature.log_p
+
+    return sorted(map(score, candidates), key=order)
 
 
 def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Array, list[Array]]:

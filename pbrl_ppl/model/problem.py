@@ -149,6 +149,12 @@ class Problem:
         if not met.any():
             return self
         off = abs(self.observations.wrapped((states - self.predict(phi))[..., columns]))
+        if self.trajectories is not None:  # the noise of measuring; what is not measured has none
+            sensors, every = self.trajectories.cells.sensors, sigma
+            sigma = np.full((len(phi), len(columns)), np.inf)
+            for i, d in enumerate(columns):
+                if d in sensors:
+                    sigma[:, i] = every[:, sensors.index(d)]
         matters = np.any(~(off <= _SAME * sigma[:, None, None, None]), axis=(2, 3, 4))
         names = [body.name for body in self.scene.moving]
         own = [

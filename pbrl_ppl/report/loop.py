@@ -176,7 +176,7 @@ def close_loop(
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws kept of each chain; 300 by default.
+        Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
     progress : callable, optional
         Told the name of each stage.
 
