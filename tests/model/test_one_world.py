@@ -146,6 +146,14 @@ def test_held_out_errors_are_of_one_world(model) -> None:
         assert found == pytest.approx(np.sqrt((off[..., i] ** 2).mean()), rel=1e-6), name
 
 
+def test_whole_trajectories_are_joined_where_they_collide(model) -> None:
+    """At noise parameters of which there are more than state dimensions."""
+    whole = along_trajectories(model.problem, np.array([TRUE]))
+    sigma = np.full((1, len(whole.trajectories.sigma)), 0.002)
+    assert whole.joined(np.array([[TRUE]]), sigma) is whole
+    assert whole.joined(np.array([[TOO_LIGHT]]), sigma).physics.together == ("a", "b")
+
+
 def test_what_has_not_met_is_predicted_as_the_likelihood_has_it(model) -> None:
     problem = model.problem
     data = problem.segments.start, problem.segments.actions
