@@ -201,3 +201,41 @@ def test_options_that_do_not_go_together_are_refused(options) -> None:
     history = simulated_history(PUCK, TRUTH, seed=1, trajectories=2, intervals=4, substeps=2)
     with pytest.raises(ValueError, match="trajectories"):
         physics_model(PUCK, history, trajectories=True, **options)
+
+
+@pytest.mark.parametrize("stated", [("x", "omega"), ("x", "y", "theta", "vx", "vy", "omega")])
+def test_a_stated_noise_is_not_inferred(problem, stated) -> None:
+    truth = dict(zip(("x", "y", "theta", "vx", "vy", "omega"), NOISE, strict=False))
+    scene = PUCK.replace(noise={name: truth[name] for name in stated})
+    history = problem.data.history
+    known = along_trajectories(Problem.of(scene, history, attach(scene)), PHI)
+    free = [name for name in truth if name not in stated]
+    assert list(known.noise_variables.get("sigma", ())) == free
+    sigma = np.array([*(truth[name] for name in free), *NOISE[6:]])
+    np.testing.assert_array_equal(known.trajectories.cells.errors(sigma), NOISE[:6])
+    # linearised where all are inferred, the density is the same
+    same = known.trajectories.cells
+    states = replace(problem, noise=replace(problem.noise, trajectories=problem.trajectories))
+    noise = replace(states.trajectories, cells=same)
+    there = states.with_noise(trajectories=noise)
+    residual = problem.residual(PHI)
+    np.testing.assert_allclose(
+        there.log_density(residual, sigma), problem.log_density(residual, NOISE), rtol=1e-12
+    )
+    model = build_model(known)
+    assert ("sigma" in [variable.name for variable in model.free_RVs]) == bool(free)
+    assert np.isfinite(model.compile_logp()(model.initial_point()))
+
+
+def test_computed_velocities_are_left_out_of_the_model() -> None:
+    history = simulated_history(PUCK, TRUTH, seed=1, trajectories=6, intervals=40, substeps=2)
+    frame = history.to_dataframe()
+    for rows in frame.groupby("trajectory").groups.values():
+        for position, rate in (("x", "vx"), ("y", "vy"), ("theta", "omega")):
+            angles = np.unwrap(frame.loc[rows, position])
+            frame.loc[rows, rate] = np.gradient(angles, PUCK.time_step)
+    computed = History.from_dataframe(frame, PUCK)
+    problem = physics_model(PUCK, computed, trajectories=True).problem
+    assert problem.noise_variables["sigma"] == ("x", "y", "theta")
+    eq_11 = physics_model(PUCK, computed).problem
+    assert len(eq_11.noise_variables["sigma"]) == 6  # the paper's likelihood takes what it is given
