@@ -64,7 +64,7 @@ def test_a_part_is_asked_again_when_its_parameters_change() -> None:
 @pytest.fixture(scope="module")
 def model() -> pm.Model:
     """120 transitions: enough that an engine run costs more than a sampler's own work."""
-    scene = cart_scene(known={"r": 0.2, "mu_c": 0.3}).replace(substeps=20)
+    scene = cart_scene(known={"r": 0.2, "mu_c": 0.3}).replace(substeps=12)
     history = simulated_history(scene, CART, seed=7, trajectories=6, intervals=20)
     return physics_model(scene, history)
 

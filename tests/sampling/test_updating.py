@@ -279,8 +279,9 @@ def test_a_cart(sigma) -> None:
     scene = cart_scene(known=KNOWN).replace(substeps=4)
     both = simulated_history(scene, CART, seed=9, trajectories=12, intervals=10)
     options = {"horizon": 2} if sigma == "scalar" else {"nu": 4.0}
+    short = QUICK | {"draws": 600, "tune": 200}
     first, whole = (
-        quiet(fit, physics_model(scene, h, sigma=sigma, **options), seed=1, **QUICK)
+        quiet(fit, physics_model(scene, h, sigma=sigma, **options), seed=1, **short)
         for h in (both.select(range(11)), both)
     )
     idata = quiet(update, first, both.select([11]), seed=11, progress=False)
