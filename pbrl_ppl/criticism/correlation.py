@@ -129,7 +129,7 @@ def _commands(mode: Mode) -> tuple[Array, list[str]]:
             if not body.kinematic and spread > 1e-9 * max(float(np.abs(values).max()), 1e-300):
                 columns.append((values - values.mean()) / spread)
                 names.append(f"{name} on {body.name}")
-    return np.array(columns).reshape(len(columns), -1).T, names
+    return np.array(columns).reshape(len(columns), segments.n).T, names
 
 
 def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTest:
