@@ -86,7 +86,8 @@ def correlation_tests(mode: Mode) -> tuple[tuple[ResidualTest, ...], Correlation
     driven = None
     if names:
         driven = _lagged(white, seen, number, commands)
-        tests.append(_driven(driven, share, cells, names))
+        p_value = _driven_by_chance(white, seen, number, commands)
+        tests.append(_driven(driven, p_value, share, cells, names))
     return tuple(tests), Correlations(
         tuple(cells),
         own.values[:, 0],
@@ -146,8 +147,35 @@ def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTes
     return ResidualTest("whiteness", p_value, abs(worst), passed, sentence)
 
 
-def _driven(driven: _Correlation, share: Array, cells: list[str], names: list[str]) -> ResidualTest:
-    p_value = driven.p_value
+def _driven_by_chance(
+    white: Array, seen: NDArray[np.bool_], number: NDArray[np.intp], commands: Array
+) -> float:
+    """Chance of so much regression of errors on commands of several lags.
+
+    Commands that are held are correlated over lags, so their correlations with errors are not
+    independent of each other: what regression on all of them explains is chi-squared.
+    """
+    lagged = []
+    for lag in range(LAGS + 1):
+        before = np.roll(commands, lag, axis=0)
+        before[:lag] = 0.0
+        lagged.append(np.where((number == np.roll(number, lag))[:, None], before, 0.0))
+    x = np.hstack(lagged)
+    statistic, count = 0.0, 0
+    for cell in range(white.shape[1]):
+        own = seen[:, cell]
+        if own.sum() <= _PAIRS * x.shape[1] // 2:
+            continue
+        u, size, _ = np.linalg.svd(x[own], full_matrices=False)
+        u = u[:, size > 1e-6 * size.max(initial=0.0)]
+        statistic += float(((u.T @ white[own, cell]) ** 2).sum())
+        count += u.shape[1]
+    return float(chi2.sf(statistic, max(count, 1)))
+
+
+def _driven(
+    driven: _Correlation, p_value: float, share: Array, cells: list[str], names: list[str]
+) -> ResidualTest:
     passed = p_value > FALSE_ALARM or not driven.matters(share)
     lag, series, cell = driven.worst(np.ones(len(cells)) if passed else share)
     worst = float(driven.values[lag, series, cell])
