@@ -3,140 +3,160 @@
 from dataclasses import replace
 
 import numpy as np
-import pandas as pd
 import pytest
-from scipy.stats import kstest
+from scipy.stats import chi2, kstest
 
 from pbrl_ppl.criticism.score import inseparable, rank_candidates, twins
 from pbrl_ppl.effects import attach, candidates, catalogue
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import find_mode, with_start_noise
-from pbrl_ppl.scene import Body, Scene, Shape
-from tests.helpers.histories import COLUMNS
-from tests.helpers.places import ROOT
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE
+from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
+from tests.helpers.histories import NOISE
+from tests.helpers.places import MODELS
 
 EFFECTS = {effect.name: effect for effect in catalogue}
 
-#: What the Box2D generator hides in a cart's history, and how the catalogue describes it.
+#: What the Box2D generator hides in a free puck's 120 transitions, and how the catalogue describes
+#: it: some five to ten times the smallest that shows.
 HIDDEN = {
-    "linear_drag": ({"linear_drag": 2.0}, {"coefficient": 2.0}),
-    "quadratic_drag": ({"quadratic_drag": 1.5}, {"coefficient": 1.5}),
-    "angular_drag": ({"angular_drag": 0.8}, {"coefficient": 0.8}),
-    "constant_force": ({"constant_force": (1.0, -1.5)}, {"force_x": 1.0, "force_y": -1.5}),
-    "body_force": ({"body_force": (1.2, 0.8)}, {"force_x": 1.2, "force_y": 0.8}),
-    "constant_torque": ({"constant_torque": 0.4}, {"torque": 0.4}),
-    "push_offset": ({"push_offset": (0.05, -0.06)}, {"offset_x": 0.05, "offset_y": -0.06}),
-    "actuator_rotation": ({"actuator_rotation": 0.12}, {"angle": 0.12}),
-    "inertia_scale": ({"inertia_scale": 1.3}, {"scale": 1.3}),
+    "linear_drag": (0.06, {"coefficient": 0.06}),
+    "quadratic_drag": (0.03, {"coefficient": 0.03}),
+    "angular_drag": (0.003, {"coefficient": 0.003}),
+    "constant_force": ((0.1, -0.05), {"force_x": 0.1, "force_y": -0.05}),
+    "body_force": ((0.1, 0.05), {"force_x": 0.1, "force_y": 0.05}),
+    "constant_torque": (0.004, {"torque": 0.004}),
+    "push_offset": ((-0.003, 0.002), {"offset_x": -0.003, "offset_y": 0.002}),
+    "actuator_rotation": (0.03, {"angle": 0.03}),
+    "inertia_scale": (1.08, {"scale": 1.08}),
+    "sliding_friction": ((0.006, 0.1), {"mu": 0.006}),
+    "actuator_delay": (0.12, {"share": 0.12}),
+    "dead_zone": (2.0, {"threshold": 2.0}),
+    "mass_change": ((1.08, 4, 0.0), {"factor": 1.08, "trajectory": 3.5}),
+    "hidden_obstacle": ((1.8, 0.0, 0.2), {}),
+    "sensor_bias": ((0, 0, 0, 0.03, -0.015, 0.06), {"vx": 0.03, "vy": -0.015, "omega": 0.06}),
 }
-QUICK = {"angular_drag", "push_offset"}
+#: And in a cart's 360, whose wheel's friction bends what an effect does.
+ON_A_CART = {
+    "angular_drag": (0.8, {"coefficient": 0.8}),
+    "constant_force": ((1.0, -1.5), {"force_x": 1.0, "force_y": -1.5}),
+    "push_offset": ((0.05, -0.06), {"offset_x": 0.05, "offset_y": -0.06}),
+}
 
 
-def mode_of(scene, history, horizon=1, initial=None):
-    problem = Problem.of(scene, history, attach(scene), horizon=horizon, threads=2)
-    mode = find_mode(problem, seed=3, initial=initial)
-    for _ in range(2):
-        mode = find_mode(with_start_noise(mode.problem, mode), initial=mode.phi)
-    return mode
-
-
-def ranked(scene, history, **options):
-    mode = mode_of(scene, history, **options)
+def ranked(scene, history):
+    mode = fitted(scene, history)
     return rank_candidates(mode, candidates(scene, mode.problem.physics.effects))
 
 
-@pytest.fixture(scope="module")
-def cart():
-    return Scene.load(ROOT / "models" / "shopping_cart" / "scene.toml")
+def off(candidate, truth):
+    """Error of a first estimate, as a share of the size."""
+    error = [candidate.estimate[name] - value for name, value in truth.items()]
+    return np.linalg.norm(error) / np.linalg.norm(list(truth.values()))
 
 
-@pytest.mark.parametrize(
-    "name", [n if n in QUICK else pytest.param(n, marks=pytest.mark.slow) for n in HIDDEN]
-)
-def test_the_hidden_effect_comes_first_with_its_size(name, cart, make_history):
+@pytest.mark.parametrize("name", HIDDEN)
+def test_the_hidden_effect_comes_first_with_its_size(name, make_history) -> None:
     hidden, truth = HIDDEN[name]
-    train, _ = make_history.simulate(seed=21, **hidden)
-    best = ranked(cart, History.from_dataframe(train, cart))[0].candidate
+    train, _ = box2d(make_history, 21, near=name == "hidden_obstacle", **{name: hidden})
+    best = ranked(BOX, train)[0].candidate
+    assert best.effect == name
+    assert best.p_value < 1e-5
+    # Over seeds 21 to 25 the size was off by at most 12 %, the dead zone's, which is one of those
+    # that were looked at, by 26 %: noise, for the statistics are 30 to 300.
+    if truth:
+        assert off(best, truth) < (0.3 if name == "dead_zone" else 0.15)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ON_A_CART)
+def test_it_does_on_a_cart_whose_wheel_rubs(name, make_history) -> None:
+    hidden, truth = ON_A_CART[name]
+    train, _ = make_history.simulate(seed=21, **{name: hidden})
+    best = ranked(Scene.load(MODELS / "shopping_cart" / "scene.toml"), train)[0].candidate
     assert best.effect == name
     assert best.p_value < 1e-6
-    # One linear step from the null value, at the kinked mode of a model that lacks the effect: over
-    # seeds 21 to 24 the size was off by 1 to 37 %. The refit's estimate is tested in test_revision.
-    size = np.linalg.norm(list(truth.values()))
-    error = np.linalg.norm([best.estimate[key] - value for key, value in truth.items()])
-    assert error < 0.5 * size
+    # off by 0.1 to 7 %: the unexplained acceleration is no smaller than what is missing
+    assert off(best, truth) < 0.15
 
 
-def test_clean_data_of_another_engine_yields_no_name(cart, make_history):
-    train, _ = make_history.simulate(seed=22)
+def test_clean_data_of_another_engine_yields_no_name(make_history) -> None:
+    train, _ = box2d(make_history, 22)
     # corrected p-values: a false alarm in one clean history of a hundred, at a fixed seed
-    assert ranked(cart, History.from_dataframe(train, cart))[0].candidate.p_value > 0.01
+    found = ranked(BOX, train)
+    assert min(one.candidate.p_value for one in found) > 0.01
+    # and what was not found would have been, were it there: a fifth of what is hidden above
+    smallest = {one.candidate.effect: one.candidate.detectable for one in found}
+    assert smallest["linear_drag"]["coefficient"] < 0.06
+    assert smallest["constant_force"]["force_x"] < 0.1
 
 
-@pytest.fixture(scope="module")
-def puck():
-    body = Body("puck", Shape.circle(0.2), known={"r": 0.1, "mu_c": 0.3})
-    return Scene(time_step=0.1, bodies=(body,), normal_gravity=9.81, substeps=4)
+@pytest.mark.slow
+def test_clean_data_of_a_cart_yields_no_name(make_history) -> None:
+    train, _ = make_history.simulate(seed=22)
+    found = ranked(Scene.load(MODELS / "shopping_cart" / "scene.toml"), train)
+    assert min(one.candidate.p_value for one in found) > 0.01  # a false alarm in one of a hundred
 
 
-def frictionless_history(scene, rng, n=60, mass=2.0, drag=0.0, push=True):
-    """Independent transitions of a free body in closed form, every state measured with noise."""
-    dt, noise = scene.time_step, np.array([0.002, 0.002, 0.004, 0.01, 0.01, 0.02])
-    rows = []
-    for i in range(n):
-        start = rng.normal(size=6)
-        force = rng.normal(size=2) * (5.0 if push else 0.0)
-        rate = drag / mass
-        velocity = start[3:5]
-        if drag:
-            limit = force / drag
-            after = limit + (velocity - limit) * np.exp(-rate * dt)
-            moved = limit * dt + (velocity - limit) * (1 - np.exp(-rate * dt)) / rate
-        else:
-            after = velocity + force / mass * dt
-            moved = velocity * dt + 0.5 * force / mass * dt**2
-        end = np.array([*(start[:2] + moved), start[2] + dt * start[5], *after, start[5]])
-        for step, state in enumerate((start, end)):
-            measured = state + noise * rng.normal(size=6)
-            action = [*force, 0.0] if step == 0 else [np.nan] * 3
-            rows.append([i, step, step * dt, "puck", *measured, *action])
-    return History.from_dataframe(pd.DataFrame(rows, columns=COLUMNS), scene)
+def test_heavy_tails_are_scored_and_named_after_what_moves_bodies(make_history) -> None:
+    train, _ = box2d(make_history, 21, heavy_tails=0.4)
+    found = ranked(BOX, train)
+    assert found[-1].candidate.effect == "heavy_tails"
+    assert found[-1].candidate.p_value < 1e-6
+    assert min(one.candidate.p_value for one in found[:-1]) > 0.01  # 1 % false alarms
 
 
-def test_statistic_is_chi_squared_if_nothing_is_missing(puck):
+@pytest.mark.slow
+def test_statistic_is_chi_squared_if_nothing_is_missing() -> None:
+    """200 recordings of ten intervals with noise on every state, of a law in closed form."""
+    degrees = {"constant_force": 2, "actuator_rotation": 1, "constant_torque": 1, "push_offset": 2}
+    # the sensors' noise is stated, which saves half of the time; test_misfit infers it
+    disc = Disc(scene=DISC.replace(substeps=40, noise=dict(zip(STATE, NOISE, strict=True))))
     rng = np.random.default_rng(5)
-    uncorrected = []
-    for _ in range(40):
-        mode = mode_of(puck, frictionless_history(puck, rng), initial=np.array([2.0]))
-        (signature,) = rank_candidates(mode, [EFFECTS["constant_force"].on("puck")])
-        uncorrected.append(np.exp(signature.log_p))
-    # a Kolmogorov-Smirnov test at 0.1 %, at a fixed seed
-    assert kstest(uncorrected, "uniform").pvalue > 0.001
+    tried = [EFFECTS[name].on("puck") for name in degrees]
+    found = {name: [] for name in degrees}
+    for _ in range(200):
+        for one in rank_candidates(disc.mode(rng), tried):
+            found[one.candidate.effect].append(one.candidate.statistic)
+    for name, statistics in found.items():
+        # a Kolmogorov-Smirnov test at 0.1 % of each of four, at a fixed seed
+        assert kstest(statistics, chi2(degrees[name]).cdf).pvalue > 0.001, name
 
 
-def test_drag_cannot_have_the_wrong_sign(puck):
+def test_one_sided_statistics_are_half_as_likely() -> None:
+    """Drag is above zero or not there: under none, half of the statistics are zero."""
+    disc = Disc(scene=DISC.replace(substeps=40, noise=dict(zip(STATE, NOISE, strict=True))))
+    rng = np.random.default_rng(6)
+    tried = [EFFECTS["linear_drag"].on("puck")]
+    found = [rank_candidates(disc.mode(rng), tried)[0] for _ in range(60)]
+    p = np.exp([one.log_p for one in found])
+    assert 13 <= (p == 1).sum() <= 47  # binomial, a false alarm in 1e-5
+    # those that are not are uniform below a half: Kolmogorov-Smirnov at 0.1 %
+    assert kstest(2 * p[p < 1], "uniform").pvalue > 0.001
+
+
+def test_drag_cannot_have_the_wrong_sign() -> None:
     # a body that is pushed along by its own motion: no drag explains that
-    history = frictionless_history(puck, np.random.default_rng(6), drag=-1.0)
-    (signature,) = rank_candidates(
-        mode_of(puck, history, initial=np.array([2.0])), [EFFECTS["linear_drag"].on("puck")]
-    )
+    disc = Disc(drag=-0.2)
+    mode = fitted(DISC, disc.frame(np.random.default_rng(6)))
+    (signature,) = rank_candidates(mode, [EFFECTS["linear_drag"].on("puck")])
     assert signature.candidate.statistic == 0.0
     assert signature.candidate.p_value == 1.0
 
 
-def test_an_effect_without_a_trace_is_not_identifiable(puck):
-    history = frictionless_history(puck, np.random.default_rng(7), push=False)
-    mode = mode_of(puck, history, initial=np.array([2.0]))
-    (signature,) = rank_candidates(mode, [EFFECTS["push_offset"].on("puck")])
+def test_an_effect_without_a_trace_is_not_identifiable() -> None:
+    frame = Disc().frame(np.random.default_rng(7)).assign(force_x=0.0, force_y=0.0)
+    (signature,) = rank_candidates(fitted(DISC, frame), [EFFECTS["push_offset"].on("puck")])
     assert signature.candidate.identifiable == 0.0
     assert signature.candidate.statistic == 0.0
     assert signature.candidate.p_value == 1.0
 
 
-def test_drags_of_a_single_pendulum_are_twins(make_history):
-    scene = Scene.load(ROOT / "models" / "pendulum" / "scene.toml")
-    train, _ = make_history.simulate(seed=9, setup=make_history.PENDULUM, pivot_damping=0.02)
-    found = ranked(scene, History.from_dataframe(train, scene), horizon=10)
+def test_drags_of_a_single_pendulum_are_twins(make_history) -> None:
+    scene = Scene.load(MODELS / "pendulum" / "scene.toml")
+    setup = replace(make_history.PENDULUM, n_intervals=40)
+    train, _ = make_history.simulate(seed=9, setup=setup, pivot_damping=0.02)
+    found = ranked(scene, train)
     by_name = {each.attached.effect.name: each for each in found}
     assert twins(by_name["pivot_damping"], by_name["angular_drag"])
     assert twins(by_name["pivot_damping"], by_name["linear_drag"])
@@ -145,14 +165,19 @@ def test_drags_of_a_single_pendulum_are_twins(make_history):
     assert found[0].attached.effect.name in ("pivot_damping", "angular_drag", "linear_drag")
 
 
-def test_no_candidates_no_ranking(puck):
-    history = frictionless_history(puck, np.random.default_rng(8), n=10)
-    assert rank_candidates(mode_of(puck, history, initial=np.array([2.0])), []) == []
+def test_no_candidates_no_ranking() -> None:
+    assert rank_candidates(Disc().mode(np.random.default_rng(8)), []) == []
 
 
-def test_a_declared_effect_is_no_candidate(cart):
-    declared = replace(cart.bodies[0], effects=("linear_drag",))
-    scene = cart.replace(bodies=(declared,))
+def test_a_declared_effect_is_no_candidate() -> None:
+    scene = BOX.with_effects("puck", "linear_drag")
     names = [one.effect.name for one in candidates(scene, attach(scene))]
     assert "linear_drag" not in names
     assert "quadratic_drag" in names
+
+
+def test_a_declared_effect_leaves_nothing_to_find(make_history) -> None:
+    scene = BOX.with_effects("puck", "linear_drag")
+    train, _ = box2d(make_history, 21, linear_drag=0.06)
+    history = History.from_dataframe(train, scene)
+    assert ranked(scene, history)[0].candidate.p_value > 0.01  # 1 % false alarms

@@ -1,0 +1,98 @@
+"""What is left is tested: each test is calibrated on clean data, and sees what it is there for.
+
+The clean data are of a law in closed form, made of recordings with noise on every state.
+"""
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from pbrl_ppl.criticism.misfit import ACCELERATION, FORECASTS, find_misfit
+from pbrl_ppl.criticism.unexplained import FALSE_ALARM, MATTERS, unexplained_acceleration
+from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
+
+WHITENESS, COMMANDS = "whiteness", "correlation with commands"
+DEPENDENCE = "dependence on state, command and time"
+#: Chance that each fails on clean data, as stated; the permutation test has a level of its own.
+RATES = {ACCELERATION: FALSE_ALARM, WHITENESS: FALSE_ALARM, COMMANDS: FALSE_ALARM,
+         FORECASTS: FALSE_ALARM, DEPENDENCE: 0.01}  # fmt: skip
+#: Engine steps that leave nothing of an engine's error.
+FINE = DISC.replace(substeps=40)
+
+
+def misfit(mode, seed=0):
+    return find_misfit(mode, unexplained_acceleration(mode), horizon=10, seed=seed)
+
+
+def failed(mode):
+    return {test.name for test in misfit(mode).tests if not test.passed}
+
+
+@pytest.mark.slow
+def test_each_fails_on_clean_data_no_more_often_than_it_says() -> None:
+    rng = np.random.default_rng(5)
+    failures = dict.fromkeys(RATES, 0)
+    for i in range(100):
+        if i % 20 == 0:  # five sets of commands, which are held for up to three intervals
+            disc = Disc(intervals=12, scene=FINE, hold=1 + i // 20 % 3, seed=i)
+        for test in misfit(disc.mode(rng), seed=i).tests:
+            failures[test.name] += not test.passed
+    for name, count in failures.items():
+        # more failures than this come by chance in one of a thousand
+        assert count <= binom.isf(0.001, 100, RATES[name]), (name, count)
+
+
+def test_clean_data_of_another_engine_pass(make_history) -> None:
+    found = misfit(fitted(BOX, box2d(make_history, 3)[0]))
+    assert found.unexplained is None
+    assert found.predicts
+    assert {test.name for test in found.tests} == set(RATES)
+
+
+def test_a_disturbance_without_memory_is_an_acceleration() -> None:
+    """It is independent of all there is: that it is there is all that can be said."""
+    rng = np.random.default_rng(7)
+    disc = Disc(8, 15, FINE)
+    size = 0.3  # m/s^2
+    mode = disc.mode(rng, size * rng.normal(size=disc.pushes.shape))
+    left = unexplained_acceleration(mode)
+    assert ACCELERATION in failed(mode)
+    assert WHITENESS not in failed(mode)
+    # 240 steps of each velocity, of which the noise of the speed hides little: 20 % is 4 sd
+    np.testing.assert_allclose(left.size[:2], size, rtol=0.2)
+    assert left.worst > 10 * MATTERS
+
+
+def test_a_disturbance_that_lasts_is_correlated_with_itself() -> None:
+    rng = np.random.default_rng(8)
+    disc = Disc(8, 15, FINE)
+    drawn = 0.3 * rng.normal(size=disc.pushes.shape)
+    for k in range(1, disc.intervals):
+        drawn[:, k] = 0.9 * drawn[:, k - 1] + np.sqrt(1 - 0.9**2) * drawn[:, k]
+    found = misfit(disc.mode(rng, drawn))
+    assert {ACCELERATION, WHITENESS} <= {test.name for test in found.tests if not test.passed}
+    assert found.unexplained is not None
+
+
+def test_a_late_command_is_an_error_that_follows_commands(make_history) -> None:
+    mode = fitted(BOX, box2d(make_history, 3, actuator_delay=0.4)[0])
+    found = misfit(mode)
+    names = {test.name for test in found.tests if not test.passed}
+    assert {ACCELERATION, COMMANDS, DEPENDENCE} <= names
+    assert "command" in found.unexplained.depends_on
+    assert not found.predicts
+
+
+def test_a_spring_that_is_not_in_the_scene_fails_all_that_look_at_states(make_history) -> None:
+    train, _ = box2d(make_history, 3, trajectories=12, intervals=30, spring=(0.5, 1.0, -0.5))
+    mode = fitted(BOX, train)
+    found = misfit(mode)
+    names = {test.name for test in found.tests if not test.passed}
+    assert {ACCELERATION, WHITENESS, FORECASTS, DEPENDENCE} <= names
+    assert found.unexplained.body == "puck"
+    assert found.unexplained.depends_on.startswith("position")
+
+
+def test_same_seed_same_tests(make_history) -> None:
+    mode = fitted(BOX, box2d(make_history, 3)[0])
+    assert misfit(mode, seed=2).tests == misfit(mode, seed=2).tests
