@@ -151,8 +151,10 @@ class Problem:
         off = abs(self.observations.wrapped((states - self.predict(phi))[..., columns]))
         if self.trajectories is not None:  # the noise of measuring; what is not measured has none
             sensors, every = self.trajectories.cells.sensors, sigma
+            stated = dict(self.scene.noise)
             sigma = np.full((len(phi), len(columns)), np.inf)
             for i, d in enumerate(columns):
+                sigma[:, i] = stated.get(STATE[d], np.inf)
                 if d in sensors:
                     sigma[:, i] = every[:, sensors.index(d)]
         matters = np.any(~(off <= _SAME * sigma[:, None, None, None]), axis=(2, 3, 4))
