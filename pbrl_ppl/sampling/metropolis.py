@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 #: Best acceptance rate of a random walk in many dimensions (Roberts, Gelman and Gilks, 1997).
 TARGET_ACCEPTANCE = 0.234
+#: Best step of a random walk in one dimension, in standard deviations.
+_ALONE = 2.4
 #: The first guess of a covariance counts as much as this many steps.
 _GUESS = 300
 _LARGEST_BETA = float(np.log(0.95))
@@ -33,7 +35,8 @@ class Gaussian:
 
     Two proposals take turns at random: a random walk, which finds its way anywhere, and a
     Crank-Nicolson step that is reversible for this Gaussian (Rudolf and Sprungk, 2018), which makes
-    large moves where the posterior is close to one. Mean, covariance and both step sizes learn as
+    large moves where the posterior is close to one; a cheap block walks along one entry as often as
+    along all. Mean, covariance and both step sizes learn as
     in algorithm 4 of Andrieu and Thoms (2008).
 
     Parameters
@@ -99,15 +102,23 @@ class Gaussian:
         rate : float
             With what probability the proposal was accepted.
         """
+        alone = bool(self.cheap) and bool(rng.uniform() < 0.5)
         walk = shift is not None or bool(rng.uniform() < 0.5)
         moved = q.copy()
-        moved[self.places], correction = self.propose(q[self.places], walk, rng)
+        correction: Any = 0.0
+        if alone:  # where one entry may vanish and others not, no common step suits all
+            i = int(rng.integers(len(self.places)))
+            step = _ALONE * np.sqrt(self.covariance[i, i])
+            moved[self.places[i]] += step * rng.standard_normal()
+        else:
+            moved[self.places], correction = self.propose(q[self.places], walk, rng)
         there = float(density(moved))
         rate = _rate(there - here + correction)
         if rng.uniform() < rate:
             q, here = moved, there
         if tune:
-            self.learn(q[self.places] - (0.0 if shift is None else shift), rate, walk)
+            place = q[self.places] - (0.0 if shift is None else shift)
+            self.learn(place, rate, None if alone else walk)
         return q, here, rate
 
     def lengthen(self, change: float, walk: bool) -> None:
@@ -117,11 +128,12 @@ class Gaussian:
         else:
             self.log_beta = min(self.log_beta + change, _LARGEST_BETA)
 
-    def learn(self, x: Array, rate: float, walk: bool) -> None:
-        """Adapt mean, covariance and step size to the chain's place and acceptance rate."""
+    def learn(self, x: Array, rate: float, walk: bool | None) -> None:
+        """Adapt mean and covariance to the chain's place, and a kind of move to its acceptance."""
         self.seen += 1
         gain = 1.0 / (self.seen + _GUESS)
-        self.lengthen((rate - TARGET_ACCEPTANCE) * self.seen**-0.6, walk)
+        if walk is not None:
+            self.lengthen((rate - TARGET_ACCEPTANCE) * self.seen**-0.6, walk)
         off = x - self.mean
         self.mean = self.mean + gain * off
         self.covariance = self.covariance + gain * (np.outer(off, off) - self.covariance)
