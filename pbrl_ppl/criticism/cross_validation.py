@@ -58,7 +58,7 @@ def cross_validated(mode: Mode, fold: Ints) -> Array:
     result = np.empty(fold.max() + 1)
     for f in range(len(result)):
         own = fold == f
-        rows = jacobian[own].reshape(-1, p) * scale
+        rows = jacobian[own].reshape(own.sum() * cells, p) * scale
         pull = rows.T @ residual[own].ravel()
         rest = precision - rows.T @ rows
         # what is known of one direction is known from this fold alone: the prior is not much

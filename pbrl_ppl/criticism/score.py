@@ -234,14 +234,15 @@ def _signature(
         units={parameter.name: parameter.unit for parameter in effect.parameters},
         identifiable=evidence.share,
         looks=n_looks,
-        detectable=_detectable(names, evidence.unit, max(1, n_looks) * n_candidates),
+        # of what is scanned there is no size without a place
+        detectable=_detectable(names, evidence.unit, n_candidates) if effect.scan is None else {},
     )
     return Signature(attached, candidate, log_p, evidence.basis, evidence.direction)
 
 
 def _detectable(names: Sequence[str], unit: Array, tried: int) -> dict[str, float]:
     """Size of each parameter that a score test at 0.01, corrected, shows nine times of ten."""
-    if len(unit) != len(names):  # scanned: there is no size without a place
+    if len(unit) != len(names):  # of the noise
         return {}
     needed = norm.isf(0.005 / tried) + norm.isf(0.1)
     with np.errstate(divide="ignore"):
