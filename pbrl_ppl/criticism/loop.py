@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism import findings
 from pbrl_ppl.criticism.findings import Findings
@@ -94,8 +95,28 @@ def revise(
     EffectError
         If the scene declares an unknown effect.
     """
-    say = progress or (lambda stage: None)
-    catalogue = tuple(catalogue)
+    # matrices are small: threads of linear algebra only get in each other's way
+    with threadpool_limits(1, "blas"):
+        return _revised(
+            scene, train, test, tuple(catalogue), seed, substeps, draws, progress or _silent
+        )
+
+
+def _silent(stage: str) -> None:
+    """Take no notice of a stage."""
+
+
+def _revised(
+    scene: Scene,
+    train: History,
+    test: History | None,
+    catalogue: tuple[Effect, ...],
+    seed: int,
+    substeps: int | None,
+    draws: int | None,
+    say: Callable[[str], None],
+) -> Findings:
+    """Go through the stages of :func:`revise`."""
     if test is None:
         train, test = train.split(0.25, seed)
     if substeps is not None:

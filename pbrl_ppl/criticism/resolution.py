@@ -9,7 +9,7 @@ import numpy as np
 from pbrl_ppl.modes import Mode, trajectory_mode
 
 #: A doubling of the substeps may move innovations by this share of their noise.
-SMALL_SHIFT = 0.05
+SMALL_SHIFT = 0.1
 MOST_SUBSTEPS = 640
 
 

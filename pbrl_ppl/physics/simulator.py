@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
@@ -260,9 +261,9 @@ class Simulator:
         kinks = any(body.wheel for body in self.scene.moving) or self._properties.patches
         runs = (2 if kinks else 3) if self.extrapolate else 1
         counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
-        powers = np.vander(1.0 / np.array(counts), increasing=True).T
-        weights = np.linalg.solve(powers, np.eye(len(counts))[0])
-        return np.array(counts, dtype=np.int64), weights
+        # in closed form: a solver's last digits differ between machines
+        weights = [math.prod(n / (n - other) for other in counts if other != n) for n in counts]
+        return np.array(counts, dtype=np.int64), np.array(weights)
 
     @cached_property
     def _commands(self) -> tuple[NDArray[Any], ...]:
