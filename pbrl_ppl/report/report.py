@@ -20,6 +20,7 @@ from pbrl_ppl.report.style import UNITS, png
 from pbrl_ppl.report.words import (
     chance,
     change,
+    digits_of,
     joined,
     number,
     odds,
@@ -72,6 +73,7 @@ def render(findings: Findings) -> str:
         shown=parameters,
         added={(added.effect, added.body) for added in findings.added},
         best=_largest_fall(findings),
+        digits_of=digits_of,
         good={"r_hat": GOOD_R_HAT, "ess": GOOD_ESS},
         hardly=HARDLY,
         most=MOST_CANDIDATES,

@@ -10,6 +10,9 @@ from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Candidate, 
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
+#: A size in SI units beyond which nothing is: what the data would show from here on, they never do.
+_NEVER = 1e6
+
 
 def verdict_in_words(findings: Findings) -> str:
     """Say the verdict in a sentence or two, for a reader who knows no statistics."""
@@ -57,7 +60,7 @@ def unseen_in_words(findings: Findings) -> str:
         if (candidate.effect, candidate.body) in there:
             continue
         for name, size in candidate.detectable.items():
-            amount = "of any size" if not np.isfinite(size) else _below(candidate, name, size)
+            amount = "of any size" if size > _NEVER else _below(candidate, name, size)
             which = plain(candidate.effect)
             if len(candidate.detectable) > 1:
                 which = f"{which} ({plain(name)})"
@@ -93,9 +96,23 @@ def number(value: float | None, digits: int = 3) -> str:
     return f"{value:,.{max(places, 0)}f}".replace("-", "−")
 
 
-def quantity(value: float, unit: str) -> str:
+def digits_of(low: float, high: float) -> int:
+    """Significant digits that tell the ends of an interval apart, at least three.
+
+    Examples
+    --------
+    >>> digits_of(2.81, 3.19), digits_of(1.1987, 1.2013)
+    (3, 5)
+    """
+    width = abs(high - low)
+    if not np.isfinite(width) or width == 0:
+        return 3
+    return int(min(max(3, np.ceil(np.log10(max(abs(low), abs(high)) / width)) + 2), 9))
+
+
+def quantity(value: float, unit: str, digits: int = 3) -> str:
     """Write a number with its unit, which is "1" where there is none."""
-    return f"{number(value)} {unit.removesuffix('1')}".rstrip()
+    return f"{number(value, digits)} {unit.removesuffix('1')}".rstrip()
 
 
 def chance(p_value: float) -> str:
