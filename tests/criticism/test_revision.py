@@ -21,7 +21,7 @@ from tests.helpers.places import load
 # a posterior of few draws is enough to test a verdict, and says that it is one
 pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
 #: Of each of four chains: about 250 effective ones, where a verdict needs 100.
-DRAWS = 100
+DRAWS = 150
 
 
 def without(*names: str) -> tuple[pp.Effect, ...]:

