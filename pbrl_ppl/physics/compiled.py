@@ -78,7 +78,7 @@ def _near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-unt
 
 
 @numba.njit(nogil=True, cache=True)
-def _act(  # type: ignore[no-untyped-def]
+def act(  # type: ignore[no-untyped-def]
     state, interval, commands, command_parameters, forces, force_parameters, begin, end, signal,
     previous, command, wrench,
 ):  # fmt: skip
@@ -162,7 +162,7 @@ def _transition(  # type: ignore[no-untyped-def]
                 wrench[i, w] = inputs[h, i, w]
         for s in range(substeps):
             if acting:
-                _act(
+                act(
                     state, inputs[h], commands, command_parameters, forces, force_parameters,
                     s / substeps, (s + 1) / substeps, signal, previous, command, wrench,
                 )  # fmt: skip
@@ -194,9 +194,9 @@ def _transition(  # type: ignore[no-untyped-def]
 @numba.njit(nogil=True, cache=True)
 def rollout(  # type: ignore[no-untyped-def]
     fn, world, given, commands, forces, start, inputs, time_step, normal_gravity, counts, weights,
-    first, last, out,
+    items, out,
 ):  # fmt: skip
-    """Predict items ``first`` to ``last`` of proposals x transitions into ``out``.
+    """Predict ``items``, of proposals x transitions, into ``out``.
 
     ``given`` holds the arrays of an `EngineInput` but the indices; ``start`` is (1 or proposal,
     transition, body, 6). ``out`` has shape (proposal * transition, H, body, 6). The transition is
@@ -204,7 +204,8 @@ def rollout(  # type: ignore[no-untyped-def]
     which cancels the leading errors; where shapes came close the finest run stands alone: a
     collision's time is no smooth function of the substep.
 
-    Returns the item at which the engine diverged (its world is then of no more use), or ``last``.
+    Returns the place among the items at which the engine diverged (its world is then of no more
+    use), or their number.
     """
     bodies, joints, discs, command_parameters, force_parameters = given
     n, horizon = len(inputs), inputs.shape[1]
@@ -218,7 +219,8 @@ def rollout(  # type: ignore[no-untyped-def]
     )  # fmt: skip
     proposal = -1
     state = _TOUCHED  # what an earlier call left behind is unknown
-    for item in range(first, last):
+    for place in range(len(items)):
+        item = items[place]
         p, t = item // n, item % n
         properties = bodies[p, t * horizon : (t + 1) * horizon] if timed else bodies[p]
         if p != proposal:
@@ -241,7 +243,7 @@ def rollout(  # type: ignore[no-untyped-def]
                     break
                 before = _TOUCHED  # contacts in the order of a new world: once more from there
             if state == _LOST:
-                return item
+                return place
             if level == 0:
                 out[item] = scratch
             if state == _TOUCHED:
@@ -252,4 +254,4 @@ def rollout(  # type: ignore[no-untyped-def]
                 if world.kinematic[i]:  # the weights' sum is 1 but for rounding
                     total[:, i] = out[item, :, i]
             out[item] = total
-    return last
+    return len(items)

@@ -8,6 +8,7 @@ from queue import SimpleQueue
 
 import numpy as np
 
+from pbrl_ppl.physics.lockstep import free_body
 from pbrl_ppl.physics.pointers import pointers
 from pbrl_ppl.physics.world import World
 
@@ -20,7 +21,7 @@ class Engine:
 
     def renew(self, world: World) -> None:
         """Take another world."""
-        self.world, self.pointers = world, pointers(world)
+        self.world, self.pointers, self.free = world, pointers(world), free_body(world)
 
 
 def share_out(run: Callable[[Engine, int, int], None], engines: list[Engine], n: int) -> None:

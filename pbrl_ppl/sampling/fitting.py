@@ -15,7 +15,7 @@ import pymc as pm
 from pbrl_ppl.model import Problem, build_model, single_transitions
 from pbrl_ppl.modes import Mode, choose_from_library, find_mode, trajectory_mode, weigh
 from pbrl_ppl.posterior import complete, group
-from pbrl_ppl.sampling.emulator import emulate
+from pbrl_ppl.sampling.emulation import emulate
 from pbrl_ppl.sampling.equal_wheels import evened_logp
 from pbrl_ppl.sampling.fit_checks import DEFAULT, checked_problem
 from pbrl_ppl.sampling.meeting import as_in, joined_model, model_of_draws

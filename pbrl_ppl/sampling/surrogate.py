@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pymc as pm
 from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
 
-from pbrl_ppl.model import Problem
+from pbrl_ppl.model import Problem, whiten
+from pbrl_ppl.sampling.emulator import Emulator
 from pbrl_ppl.sampling.equal_wheels import evened_logp
 from pbrl_ppl.sampling.starts import blank_point
 
 Array = NDArray[np.float64]
-Residual = Callable[[Array], Array]
 
 #: Where the exact posterior's tails are the heavier, a chain would stick: this covers them.
 _FLATTER = 0.9
@@ -72,17 +70,41 @@ class Surrogate:
         The exact problem.
     unpack : Unpack
         Of the problem's model.
-    residual : callable
+    emulator : Emulator
         From phi, shape (p,), to residuals as of :meth:`Problem.residual`.
     """
 
-    def __init__(self, problem: Problem, unpack: Unpack, residual: Residual) -> None:
-        self.problem, self.unpack, self.residual = problem, unpack, residual
+    def __init__(self, problem: Problem, unpack: Unpack, emulator: Emulator) -> None:
+        self.problem, self.unpack, self.emulator = problem, unpack, emulator
+        # white residuals are then linear in the polynomials' terms, given the noise
+        gaussian = problem.noise.nu is None and not problem.tails
+        self._linear = gaussian and len(emulator.parts) == 1
+        self._noise, self._form, self._first = b"", np.zeros((0, 0)), (np.zeros(0), 0.0)
 
     def __call__(self, q: Array) -> float:
         """Log-density at the sampler's vector."""
         phi, sigma, prior = self.unpack(q)
         if not np.isfinite(prior):
             return -np.inf
-        density = self.problem.log_density(self.residual(phi), sigma, phi)
-        return prior + _FLATTER * float(density.sum())
+        return prior + _FLATTER * self._likelihood(phi, sigma)
+
+    def _likelihood(self, phi: Array, sigma: Array) -> float:
+        """Log-likelihood; a quadratic form where the noise is that of the call before."""
+        noise = sigma.tobytes()
+        if self._linear and noise == self._noise:
+            phi_before, before = self._first
+            if not self._form.size:
+                basis = self.emulator.basis
+                white = whiten(basis, sigma, self.problem.trajectories)
+                if self.problem.trajectories is not None:  # what was measured is in each of them
+                    white[1:] -= whiten(0.0 * basis[0], sigma, self.problem.trajectories)
+                flat = white.reshape(len(white), -1)
+                self._form = flat @ flat.T
+            told, told_before = (self.emulator.terms(x, 0) for x in (phi, phi_before))
+            return float(
+                before - 0.5 * (told @ self._form @ told - told_before @ self._form @ told_before)
+            )
+        density = self.problem.log_density(self.emulator(phi), sigma, phi)
+        value = float(density.sum())
+        self._noise, self._form, self._first = noise, np.zeros((0, 0)), (phi, value)
+        return value

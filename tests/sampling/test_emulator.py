@@ -6,12 +6,12 @@ import numpy as np
 import pymc as pm
 import pytest
 
-from pbrl_ppl.model import physics_model
-from pbrl_ppl.modes import find_mode
+from pbrl_ppl.model import physics_model, single_transitions
+from pbrl_ppl.modes import find_mode, trajectory_mode
 from pbrl_ppl.posterior.store import az, group
-from pbrl_ppl.sampling import emulator as emulator_module
-from pbrl_ppl.sampling import fit, fitting
-from pbrl_ppl.sampling.emulator import Emulator, emulate
+from pbrl_ppl.sampling import emulation, fit, fitting
+from pbrl_ppl.sampling.emulation import emulate
+from pbrl_ppl.sampling.emulator import Emulator
 from pbrl_ppl.sampling.starts import gaussian_blocks
 from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
 from tests.helpers.carts import CART, cart_scene
@@ -76,7 +76,7 @@ def test_it_follows_the_engine_over_the_posterior(model) -> None:
     assert found is not None
     rough = Surrogate(model.problem, unpack, found)
     logp = model.compile_logp()
-    wide = emulator_module.explore(blocks, rough, blocks[0].mean, 2000, np.random.default_rng(4))
+    wide = emulation.explore(blocks, rough, blocks[0].mean, 2000, np.random.default_rng(4))
     off = []
     for q in wide[::40]:
         phi, sigma, prior = unpack(q)
@@ -127,3 +127,27 @@ def test_looking_ahead_changes_nothing_but_the_speed(model, monkeypatch) -> None
                 errors.append(az.mcse(moment.to_dataset(name=name))[name])
             gap, error = abs(means[0] - means[1]), np.hypot(*errors)
             assert (gap < 4 * error).all(), (name, power, gap.values, error.values)
+
+
+@pytest.mark.parametrize("trajectories", [False, True])
+def test_a_quadratic_form_stands_for_the_density_at_the_same_noise(trajectories) -> None:
+    """White residuals are linear in the polynomials' terms, measured deviations or not."""
+    scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
+    history = simulated_history(scene, CART, seed=7, trajectories=3, intervals=6)
+    model = physics_model(scene, history, trajectories=trajectories)
+    problem = model.problem
+    mode = find_mode(single_transitions(problem), seed=1)
+    problem = problem if not trajectories else trajectory_mode(problem, mode.phi).problem
+    mode = trajectory_mode(problem, mode.phi) if trajectories else mode
+    phi = mode.draws(np.random.default_rng(1), 60)
+    told = Emulator(problem, phi, problem.residual(phi), 1)
+    q = np.zeros(3)
+
+    def unpack(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
+        return phi[int(q[0])], mode.sigma * np.exp(q[1]), -1.5
+
+    rough = Surrogate(problem, unpack, told)
+    for number, louder in [(0, 0.0), (1, 0.0), (2, 0.0), (2, 0.1), (3, 0.1), (4, 0.1), (0, 0.0)]:
+        q[:] = number, louder, 0.0
+        density = problem.log_density(told(phi[number]), unpack(q)[1], phi[number]).sum()
+        assert rough(q) == pytest.approx(-1.5 + 0.9 * density, rel=1e-9)

@@ -1,0 +1,261 @@
+"""The contact-free rollout: transitions of one body side by side, in the engine's own arithmetic.
+
+A body that touches nothing needs no collision search: positions, forces and the solver's clamped
+impulses are a few lines, which the compiler vectorises over transitions. They are those of
+Chipmunk's ``cpSpaceStep``, in its order, so that the results agree to rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.physics import lockstep_solver as solver
+from pbrl_ppl.physics.compiled import act
+from pbrl_ppl.physics.lockstep_solver import (
+    AX,
+    AY,
+    COEF,
+    FX,
+    FY,
+    II,
+    JX_MAX,
+    JY_MAX,
+    LANES,
+    LINK_ROWS,
+    MI,
+    POINT_ROWS,
+    PX,
+    PY,
+    ROWS,
+    T_MAX,
+    VX,
+    VY,
+    WC,
+    WS,
+    WX,
+    WY,
+    A,
+    C,
+    L,
+    S,
+    T,
+    W,
+    X,
+    Y,
+)
+from pbrl_ppl.physics.properties import COLUMN, JOINT_COLUMNS
+from pbrl_ppl.physics.world import DIVERGED, RING, World
+
+_MASS, _MOMENT, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _TORQUE, _DAMPING, _MU, _RADIUS = (
+    COLUMN[name]
+    for name in (
+        "mass", "moment", "w_x", "w_y", "w_theta", "mu_x", "mu_y", "pivot_torque", "pivot_damping",
+        "patch_mu", "patch_radius",
+    )
+)  # fmt: skip
+_A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
+
+
+class FreeBody(NamedTuple):
+    """What the contact-free rollout must know of a world with one moving body."""
+
+    wheel: bool
+    pivot: bool
+    iterations: int
+    gravity: NDArray[np.float64]  # (2,)
+    link_joint: NDArray[np.int64]
+    link_rod: NDArray[np.bool_]
+    link_first: NDArray[np.bool_]  # whether the body is the joint's first
+    link_pose: NDArray[np.float64]  # (link, 4): x, y, cos and sin of what holds it
+    ring: NDArray[np.float64]  # (point, 2): none without friction under the body
+    radius: float
+    obstacles: NDArray[np.float64]  # (obstacle, 5), without the discs
+
+
+def free_body(world: World) -> FreeBody | None:
+    """Describe a world for the contact-free rollout; None where several bodies move."""
+    if len(world.bodies) != 1 or world.kinematic.any():
+        return None
+    body = world.bodies[0]
+    holders = [
+        link.constraint.b if link.constraint.a is body else link.constraint.a
+        for link in world.links
+    ]
+    poses = [(*h.position, math.cos(h.angle), math.sin(h.angle)) for h in holders]
+    return FreeBody(
+        wheel=bool(world.wheels),
+        pivot=bool(world.pivots),
+        iterations=world.iterations,
+        gravity=np.array(world.space.gravity, dtype=float),
+        link_joint=np.array([link.joint for link in world.links], dtype=np.int64),
+        link_rod=np.array([link.rod for link in world.links], dtype=bool),
+        link_first=np.array([link.constraint.a is body for link in world.links], dtype=bool),
+        link_pose=np.array(poses, dtype=float).reshape(-1, 4),
+        ring=np.array(RING if world.patches else (), dtype=float).reshape(-1, 2),
+        radius=float(world.radii[0]),
+        obstacles=world.obstacles[: len(world.obstacles) - len(world.discs)].copy(),
+    )
+
+
+@numba.njit(nogil=True, cache=True)
+def _set_properties(z, links, free, i, row, joints, normal_gravity, step):  # type: ignore[no-untyped-def]
+    """Give lane ``i`` its numbers for an interval; what is stored in joints stays."""
+    z[MI + i], z[II + i] = 1.0 / row[_MASS], 1.0 / row[_MOMENT]
+    if free.wheel:
+        load = row[_MASS] * normal_gravity
+        z[WX + i], z[WY + i] = row[_W_X], row[_W_Y]
+        z[WC + i], z[WS + i] = math.cos(row[_W_THETA]), math.sin(row[_W_THETA])
+        z[JX_MAX + i], z[JY_MAX + i] = row[_MU_X] * load * step, row[_MU_Y] * load * step
+    if free.pivot:
+        z[T_MAX + i] = row[_TORQUE] * step
+        z[COEF + i] = 1.0 - math.exp(-row[_DAMPING] * step * z[II + i])
+    for j in range(len(free.link_joint)):
+        own, joint, pose = links[j], joints[free.link_joint[j]], free.link_pose[j]
+        near, far = (joint[_A_X], joint[_A_Y]), (joint[_B_X], joint[_B_Y])
+        if not free.link_first[j]:
+            near, far = far, near
+        own[AX + i], own[AY + i] = near
+        own[PX + i] = pose[0] + pose[2] * far[0] - pose[3] * far[1]
+        own[PY + i] = pose[1] + pose[3] * far[0] + pose[2] * far[1]
+        own[L + i] = joint[_LENGTH]
+
+
+@numba.njit(nogil=True, cache=True)
+def _lose(z, touched):  # type: ignore[no-untyped-def]
+    """Mark the lanes that have diverged."""
+    for i in range(LANES):
+        speed = abs(z[VX + i]) + abs(z[VY + i]) + abs(z[W + i])
+        touched[i] |= not speed < DIVERGED  # also true of NaN
+
+
+@numba.njit(nogil=True, cache=True)
+def _watch(z, radius, obstacles, discs, touched):  # type: ignore[no-untyped-def]
+    """Mark the lanes whose body comes near an obstacle."""
+    for j in range(len(obstacles)):
+        a_x, a_y, size = obstacles[j, 0], obstacles[j, 1], obstacles[j, 4]
+        d_x, d_y = obstacles[j, 2] - a_x, obstacles[j, 3] - a_y
+        length = d_x * d_x + d_y * d_y
+        scale, reach = 1.0 / length if length > 0.0 else 0.0, radius + size
+        for i in range(LANES):
+            x, y = z[X + i] - a_x, z[Y + i] - a_y
+            t = (x * d_x + y * d_y) * scale
+            t = 0.0 if t < 0.0 else t
+            t = 1.0 if t > 1.0 else t
+            x, y = x - t * d_x, y - t * d_y
+            touched[i] |= x * x + y * y <= reach * reach
+    for j in range(discs.shape[1]):
+        for i in range(LANES):
+            x, y, reach = z[X + i] - discs[i, j, 0], z[Y + i] - discs[i, j, 1], discs[i, j, 2]
+            reach = radius + reach if reach > 0.0 else -1.0
+            touched[i] |= (x * x + y * y <= reach * reach) & (reach > 0.0)
+
+
+@numba.njit(nogil=True, cache=True)
+def _substep(z, links, points, free, slowing, patch_radius, step):  # type: ignore[no-untyped-def]
+    """One step of the engine."""
+    sliding = len(free.ring) > 0
+    solver.turn(z, step)
+    if sliding:  # by the velocities before, at the heading after
+        solver.place_patch(z, points, free.ring, slowing, patch_radius, step)
+    for j in range(len(links)):
+        solver.place_link(z, links[j], free.link_rod[j], step)
+    solver.accelerate(z, free.gravity, step)
+    if free.wheel:
+        solver.begin_wheel(z)
+    for j in range(len(links)):
+        solver.begin_link(z, links[j], free.link_rod[j])
+    if free.pivot:
+        solver.begin_pivot(z)
+    if sliding:
+        solver.begin_patch(z, points)
+    for _ in range(free.iterations):
+        if free.wheel:
+            solver.solve_wheel(z)
+        for j in range(len(links)):
+            solver.solve_link(z, links[j], free.link_rod[j])
+        if free.pivot:
+            solver.solve_pivot(z)
+        if sliding:
+            solver.solve_patch(z, points)
+
+
+@numba.njit(nogil=True, cache=True)
+def rollout(  # type: ignore[no-untyped-def]
+    free, given, commands, forces, start, inputs, time_step, normal_gravity, counts, weights,
+    first, last, out, left,
+):  # fmt: skip
+    """Predict items ``first`` to ``last`` as `compiled.rollout` does, and mark those it cannot.
+
+    ``left``, shape (last - first,), says which items come near something, or are lost: the engine
+    is for them.
+    """
+    bodies, joints, discs, command_parameters, force_parameters = given
+    n, horizon = len(inputs), inputs.shape[1]
+    timed = bodies.shape[1] > 1
+    acting = len(commands[0]) + len(forces[0]) > 0
+    watch = len(free.obstacles) + discs.shape[1] > 0
+    z, rows = np.zeros(ROWS), (X, Y, A, VX, VY, W)
+    links = np.zeros((len(free.link_joint), LINK_ROWS))
+    points = np.zeros((len(free.ring), POINT_ROWS))
+    slowing, patch_radius = np.zeros(LANES), np.zeros(LANES)
+    own_discs = np.zeros((LANES, discs.shape[1], 3))
+    touched = np.zeros(LANES, dtype=np.bool_)
+    state, signal = np.empty((1, 6)), np.empty(8)
+    previous, command, wrench = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 3))
+    for begin in range(first, last, LANES):
+        width = min(LANES, last - begin)
+        touched[:] = False
+        for level in range(len(counts)):
+            substeps, weight = counts[level], weights[level]
+            step = time_step / substeps
+            z[:], links[:], points[:] = 0.0, 0.0, 0.0
+            for i in range(LANES):
+                item = begin + min(i, width - 1)  # lanes to spare repeat the last
+                p, t = item // n, item % n
+                for d in range(6):
+                    z[rows[d] + i] = start[p if len(start) > 1 else 0, t, 0, d]
+                own_discs[i] = discs[p]
+            for h in range(horizon):
+                for i in range(LANES):
+                    item = begin + min(i, width - 1)
+                    p, t = item // n, item % n
+                    row = bodies[p, t * horizon + h if timed else 0, 0]
+                    if timed or h == 0:
+                        _set_properties(z, links, free, i, row, joints[p], normal_gravity, step)
+                        slowing[i], patch_radius[i] = row[_MU] * normal_gravity, row[_RADIUS]
+                    z[C + i], z[S + i] = math.cos(z[A + i]), math.sin(z[A + i])
+                    for w in range(2):
+                        z[(FX, FY)[w] + i] = inputs[t, h, 0, w] * z[MI + i]
+                    z[T + i] = inputs[t, h, 0, 2] * z[II + i]
+                for s in range(substeps):
+                    if acting:
+                        for i in range(width):
+                            p, t = (begin + i) // n, (begin + i) % n
+                            for d in range(6):
+                                state[0, d] = z[rows[d] + i]
+                            act(
+                                state, inputs[t, h], commands, command_parameters[p], forces,
+                                force_parameters[p], s / substeps, (s + 1) / substeps, signal,
+                                previous, command, wrench,
+                            )  # fmt: skip
+                            z[FX + i] = wrench[0, 0] * z[MI + i]
+                            z[FY + i] = wrench[0, 1] * z[MI + i]
+                            z[T + i] = wrench[0, 2] * z[II + i]
+                    _substep(z, links, points, free, slowing, patch_radius, step)
+                    _lose(z, touched)
+                    if watch:
+                        _watch(z, free.radius, free.obstacles, own_discs, touched)
+                for i in range(width):
+                    at = out[begin + i, h, 0]
+                    for d in range(6):
+                        value = z[rows[d] + i]
+                        if len(counts) == 1:
+                            at[d] = value
+                        else:
+                            at[d] = weight * value + (at[d] if level else 0.0)
+        left[begin - first : begin - first + width] = touched[:width]

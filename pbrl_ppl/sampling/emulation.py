@@ -1,0 +1,69 @@
+"""Emulators fitted to engine runs that are drawn from the posterior."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pbrl_ppl.modes import Mode
+from pbrl_ppl.sampling.emulator import Emulator, monomials
+from pbrl_ppl.sampling.metropolis import Gaussian, explore
+from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+
+#: Degrees to try; engine runs a coefficient, at least and at most; rounds of each.
+_DEGREES, _A_COEFFICIENT, _LEAST, _MOST, _ROUNDS = (1, 2), 4, 100, 400, 4
+#: How far off (standard deviation) the log-likelihood may be: half of the moves still pass.
+_CLOSE = 1.0
+#: Steps of the exploring chain between two runs.
+_APART = 20
+
+
+def emulate(
+    mode: Mode, unpack: Unpack, blocks: list[Gaussian], seed: int | np.random.Generator
+) -> Emulator | None:
+    """Fit an emulator to runs drawn from the posterior, as the one before it has that.
+
+    Parameters
+    ----------
+    mode : Mode
+        The first runs are drawn from its Laplace approximation.
+    unpack : Unpack
+        Of the problem's model.
+    blocks : list of Gaussian
+        Together they hold every entry of the sampler's vector; they learn the posterior's shape.
+    seed : int or Generator
+        Of the draws.
+
+    Returns
+    -------
+    Emulator or None
+        None where the log-likelihood of polynomials stays far from the engine's.
+    """
+    rng = np.random.default_rng(seed)
+    problem = mode.problem.with_physics(threads=max(mode.problem.physics.threads, 2))
+    q = np.empty(sum(len(block.places) for block in blocks))
+    for block in blocks:
+        q[block.places] = block.mean
+    widest = max(len(part.places) for part in problem.simulator.parts)
+    close = _CLOSE * np.sqrt(len(problem.simulator.parts))  # each part is judged alone
+    for degree in _DEGREES:
+        runs = max(_LEAST, _A_COEFFICIENT * monomials(np.zeros(widest), degree).size)
+        if runs > _MOST:
+            break
+        phi = mode.draws(rng, runs)
+        residual = problem.residual(phi)
+        for _ in range(_ROUNDS):
+            good = np.isfinite(residual).all(axis=(1, 2, 3, 4))
+            if good.sum() < 0.5 * runs:
+                break
+            emulator = Emulator(problem, phi[good], residual[good], degree)
+            cheap = Surrogate(problem, unpack, emulator)
+            chain = explore(blocks, cheap, q, _APART * runs, rng)[_APART - 1 :: _APART]
+            drawn = [unpack(point)[:2] for point in chain]
+            phi, sigma = (np.array(column) for column in zip(*drawn, strict=True))
+            residual = problem.residual(phi)
+            told = np.array([emulator(point).copy() for point in phi])
+            exact = problem.log_density(residual, sigma, phi).sum(axis=-1)
+            off = problem.log_density(told, sigma, phi).sum(axis=-1) - exact
+            if np.isfinite(off).all() and off.std() < close:
+                return Emulator(problem, phi, residual, degree)
+    return None

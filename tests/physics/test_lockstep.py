@@ -1,0 +1,141 @@
+"""The contact-free rollout says what the engine says, whatever a lone body hangs in or drags."""
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.effects import attach
+from pbrl_ppl.model import build_layout
+from pbrl_ppl.physics import Simulator, calls, lockstep
+from pbrl_ppl.physics.world import World
+from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from tests.helpers.engines import ARM, BOX, proposals
+from tests.helpers.worlds import BY_NAME, G
+
+pytestmark = pytest.mark.skipif(
+    not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
+)
+
+POST = Body("post", Shape.circle(0.05), static=True, pose=(3.0, -2.0, 0.7))
+
+
+def pendulum(*, body_first: bool, holder: str = "world") -> Scene:
+    ends = [("arm", (0.0, 0.18)), (holder, (0.3, 0.1))]
+    (a, anchor_a), (b, anchor_b) = ends if body_first else ends[::-1]
+    bodies = (Body("arm", ARM), *([POST] if holder == "post" else []))
+    hinge = Joint("hinge", (a, b), anchor_a, anchor_b)
+    return Scene(time_step=0.05, substeps=12, gravity=(0.3, -G), bodies=bodies, joints=(hinge,))
+
+
+def tethered(*, body_first: bool) -> Scene:
+    names, anchors = ("box", "world"), ((0.2, 0.1), (1.5, 0.4))
+    if not body_first:
+        names, anchors = names[::-1], anchors[::-1]
+    rod = Joint("distance", names, *anchors)
+    box = Body("box", BOX, wheel=True, pose=(0.0, 0.0, 0.0))
+    return Scene(time_step=0.1, normal_gravity=G, bodies=(box,), joints=(rod,))
+
+
+def cart(*effects: str, walls: bool = False) -> Scene:
+    around = (Wall((-1.0, -9.0), (-1.0, 9.0)), Wall((-9, 2), (9, 2)))
+    box = Body("box", BOX, wheel=True, effects=effects)
+    return Scene(time_step=0.1, normal_gravity=G, bodies=(box,), walls=around if walls else ())
+
+
+SCENES = {
+    "hinge": pendulum(body_first=False),
+    "hinge, body first": pendulum(body_first=True),
+    "hinge on a post": pendulum(body_first=False, holder="post"),
+    "rod": tethered(body_first=False),
+    "rod, body first": tethered(body_first=True),
+    "wheel": cart(),
+    "walls": cart(walls=True),
+    "patch": cart("sliding_friction", "linear_drag"),
+    "payload": cart("mass_change", "actuator_delay"),
+    "disc": cart("hidden_obstacle"),
+}
+PIVOT = tuple(BY_NAME[name] for name in ("pivot_friction", "pivot_damping"))
+
+
+def case(name: str) -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
+    """A simulator, parameters, starts and inputs of a scene."""
+    scene = SCENES[name]
+    attached = attach(scene, PIVOT if "hinge" in name else ())
+    layout = build_layout(scene, attached)
+    phi = proposals(layout, 3)
+    labels = list(layout.labels)
+    for label, values in {
+        "sliding_friction_mu[box]": (0.05, 0.2, 0.4),
+        "sliding_friction_radius[box]": (0.2, 0.3, 0.1),
+        "hidden_obstacle_radius[box]": (0.1, 0.5, 0.3),
+        "mass_change_trajectory[box]": (0.5, 1.5, 2.5),
+        "mass_change_time[box]": (0.05, 0.13, 0.2),
+    }.items():
+        if label in labels:
+            phi[:, labels.index(label)] = values
+    rng = np.random.default_rng(8)
+    start = rng.normal(0, [0.8, 0.8, 1, 2, 2, 1], (40, 1, 6))
+    start[7, 0, 5] = 80.0  # more than half a radian in a substep
+    actions = rng.normal(0, [12, 12, 2], (40, 3, 1, 3))
+    if "hinge" in name:
+        actions *= 0.02
+        start = on_hinge(scene, start)
+    elif "rod" in name:
+        start[..., :2] *= 0.2
+    inputs = np.concatenate([actions, 0.5 * actions, np.zeros_like(actions)], axis=-1)
+    inputs[..., 6] = np.arange(40)[:, None, None] % 4  # the trajectory, and when it begins and ends
+    inputs[..., 7:] = 0.1 * (np.arange(3)[:, None, None] + np.arange(2))
+    return Simulator(scene, layout, attached), phi, start, inputs
+
+
+def on_hinge(scene: Scene, start: np.ndarray) -> np.ndarray:
+    """States that hang in the hinge, whatever their angle."""
+    held, x, y = (3.0, -2.0), 0.3, 0.1
+    if POST in scene.bodies:
+        c, s = np.cos(0.7), np.sin(0.7)
+        held = (3.0 + c * x - s * y, -2.0 + s * x + c * y)
+    else:
+        held = (x, y)
+    theta, omega = start[:, 0, 2], start[:, 0, 5]
+    start[:, 0, 0], start[:, 0, 1] = held[0] + 0.18 * np.sin(theta), held[1] - 0.18 * np.cos(theta)
+    start[:, 0, 3] = omega * 0.18 * np.cos(theta)
+    start[:, 0, 4] = omega * 0.18 * np.sin(theta)
+    return start
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_it_agrees_with_the_engine(name) -> None:
+    simulator, phi, start, inputs = case(name)
+    got = simulator(phi, start, inputs)
+    reference = Simulator(simulator.scene, simulator.layout, simulator.effects, path="plain")
+    expected = reference(phi, start, inputs)
+    assert np.isfinite(expected).all()
+    # friction that lets a body slide, or not, is decided by the last digits now and then
+    off = np.abs(got - expected) / (1.0 + np.abs(expected))
+    assert np.quantile(off, 0.99) < 1e-11
+    assert off.max() < (1e-6 if name == "patch" else 1e-9)
+
+
+@pytest.mark.parametrize("name", ["wheel", "walls", "patch", "hinge"])
+def test_lanes_do_not_depend_on_each_other(name) -> None:
+    simulator, phi, start, inputs = case(name)
+    whole = simulator(phi, start, inputs)
+    order = np.random.default_rng(1).permutation(len(start))
+    np.testing.assert_array_equal(simulator(phi, start[order], inputs[order]), whole[:, order])
+    one = np.stack([simulator(phi[1], start[[i]], inputs[[i]])[0] for i in range(10)])
+    np.testing.assert_array_equal(one, whole[1, :10])
+
+
+def test_what_comes_near_something_is_left_to_the_engine() -> None:
+    """Near the walls as the engine has it, and elsewhere as if there were none."""
+    near, phi, start, inputs = case("walls")
+    far = case("wheel")[0]
+    touched = (near(phi, start, inputs) != far(phi, start, inputs)).any(axis=(2, 3, 4))
+    assert 0.1 < touched.mean() < 0.9
+    plain = Simulator(near.scene, near.layout, path="plain")(phi, start, inputs)
+    np.testing.assert_allclose(near(phi, start, inputs), plain, rtol=1e-9, atol=1e-9)
+
+
+def test_only_a_lone_body_is_free() -> None:
+    assert lockstep.free_body(World(SCENES["wheel"])) is not None
+    two = SCENES["wheel"].replace(bodies=(Body("a", BOX), Body("b", BOX)))
+    assert lockstep.free_body(World(two)) is None
