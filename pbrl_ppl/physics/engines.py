@@ -5,23 +5,59 @@ from __future__ import annotations
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from queue import SimpleQueue
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pbrl_ppl.physics import calls, compiled, lockstep
 from pbrl_ppl.physics.lockstep import free_body
 from pbrl_ppl.physics.pointers import pointers
 from pbrl_ppl.physics.world import World
 
+Array = NDArray[np.float64]
+
 
 class Engine:
-    """A world of one thread, and where its C objects are."""
+    """A world of one thread, and where its C objects are.
 
-    def __init__(self, world: World) -> None:
-        self.renew(world)
+    Parameters
+    ----------
+    build : callable
+        Builds a world.
+    """
 
-    def renew(self, world: World) -> None:
-        """Take another world."""
-        self.world, self.pointers, self.free = world, pointers(world), free_body(world)
+    def __init__(self, build: Callable[[], World]) -> None:
+        self._build = build
+        self._renew()
+
+    def _renew(self) -> None:
+        self.world = self._build()
+        self.pointers, self.free = pointers(self.world), free_body(self.world)
+
+    def rollout(self, shared: tuple[Any, ...], first: int, last: int, out: Array) -> None:
+        """Predict the items ``first`` to ``last`` into ``out``, NaN where the engine diverges.
+
+        Parameters
+        ----------
+        shared : tuple
+            What both rollouts take: see `compiled.rollout`.
+        first, last : int
+            Of proposals x transitions.
+        out : ndarray
+            Shape (proposal * transition, H, body, 6).
+        """
+        items = np.arange(first, last)
+        if self.free is not None:
+            left = np.zeros(len(items), dtype=bool)
+            lockstep.rollout(self.free, *shared, first, last, out, left)
+            items = items[left]
+        while len(items):
+            done = compiled.rollout(calls.FUNCTIONS, self.pointers, *shared, items, out)
+            if done < len(items):  # diverged: that world is spoilt, and the item is lost
+                out[items[done]] = np.nan
+                self._renew()
+            items = items[done + 1 :]
 
 
 def share_out(run: Callable[[Engine, int, int], None], engines: list[Engine], n: int) -> None:

@@ -6,7 +6,7 @@ import math
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from pbrl_ppl.effects import Attached, Clock, Command, Force, at_stage, needs_in
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.parameters import Layout, differentiate
-from pbrl_ppl.physics import calls, compiled, lockstep, plain
+from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Engine, share_out
 from pbrl_ppl.physics.inputs import after_recording
 from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput, EngineProperties
@@ -327,17 +327,7 @@ class Simulator:
         )  # fmt: skip
 
         def run(engine: Engine, first: int, last: int) -> None:
-            items = np.arange(first, last)
-            if engine.free is not None:
-                left = np.zeros(len(items), dtype=bool)
-                lockstep.rollout(engine.free, *shared, first, last, out, left)
-                items = items[left]
-            while len(items):
-                done = compiled.rollout(calls.FUNCTIONS, engine.pointers, *shared, items, out)
-                if done < len(items):  # diverged: that world is spoilt, and the item is lost
-                    out[items[done]] = np.nan
-                    engine.renew(self._new_world(choice))
-                items = items[done + 1 :]
+            engine.rollout(shared, first, last, out)
 
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.threads, len(out), steps // _A_THREAD))
@@ -347,5 +337,5 @@ class Simulator:
             while len(self._worlds) > _KEPT:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
-                engines.append(Engine(self._new_world(choice)))
+                engines.append(Engine(partial(self._new_world, choice)))
             share_out(run, engines[:workers], len(out))
