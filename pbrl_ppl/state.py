@@ -1,4 +1,8 @@
-"""Names, units and order of a body's state and of the wrench on it."""
+"""Names, units and order of a body's state and of the wrench on it; differences of angles."""
+
+from typing import Any
+
+import numpy as np
 
 #: A body's state: pose and velocity of its origin in the world frame.
 STATE = ("x", "y", "theta", "vx", "vy", "omega")
@@ -15,3 +19,14 @@ WRENCH_UNITS = ("N", "N", "N m")
 #: What acts in an interval: the wrench, the one before (zero before the first), the trajectory's
 #: number, and the time in it at which the interval begins and ends (s).
 INPUT = (*WRENCH, *(f"previous_{name}" for name in WRENCH), "trajectory", "begin", "end")
+
+
+def wrapped(angle: Any) -> Any:
+    """An angle, or an array of any shape, in (-pi, pi] (rad).
+
+    Examples
+    --------
+    >>> wrapped(np.array([0.5, 2 * np.pi - 0.5, -np.pi])).round(3)
+    array([ 0.5  , -0.5  ,  3.142])
+    """
+    return np.pi - np.mod(np.pi - angle, 2 * np.pi)

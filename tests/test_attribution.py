@@ -180,11 +180,11 @@ def test_what_is_kept_is_not_made_again(attribution, row, monkeypatch, tmp_path)
     monkeypatch.setattr(benchmark, "run_case", quick)
     with ThreadPoolExecutor(1) as executor:
         for _ in range(2):
-            rows = list(benchmark.results(cases, executor, 0, None, tmp_path))
+            rows = list(benchmark.results(cases, executor, 0, None, "laplace", tmp_path))
             assert sorted(each.verdict for each in rows) == ["adequate", "failed"]
         # a failure is tried again; other settings are another case
         assert made == [cases[0].name, cases[1].name, cases[1].name]
-        list(benchmark.results(cases[:1], executor, 1, None, tmp_path))
+        list(benchmark.results(cases[:1], executor, 1, None, "laplace", tmp_path))
     assert len(made) == 4
 
 
@@ -212,7 +212,7 @@ def test_a_dead_worker_is_a_row(attribution, monkeypatch) -> None:
             future.set_exception(RuntimeError("gone"))
             return future
 
-    (only,) = benchmark.results(attribution.cases.all_cases()[:1], Dies(), 0, None, None)
+    (only,) = benchmark.results(attribution.cases.all_cases()[:1], Dies(), 0, None, "laplace", None)
     assert only.verdict == "failed"
     assert "gone" in only.error
     assert "--workers" in only.error

@@ -94,7 +94,7 @@ class Row:
         ]
 
 
-def run_case(case: Case, seed: int, draws: int | None = None) -> Row:
+def run_case(case: Case, seed: int, draws: int | None = None, method: str = "metropolis") -> Row:
     """Make a case's data, ask the oracle, run the loop; a failure is a row that says so.
 
     A case that takes too long is one.
@@ -108,7 +108,7 @@ def run_case(case: Case, seed: int, draws: int | None = None) -> Row:
             train, test = case.histories(seed)
             if case.effect is not None:
                 known["oracle"] = ask(case, train, seed)
-            known["findings"] = _loop(case, train, test, seed, draws)
+            known["findings"] = _loop(case, train, test, seed, draws, method)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}:{place.lineno}"
@@ -138,7 +138,12 @@ def _limited(name: str) -> Iterator[None]:
 
 
 def _loop(
-    case: Case, train: pp.History, test: pp.History, seed: int, draws: int | None
+    case: Case,
+    train: pp.History,
+    test: pp.History,
+    seed: int,
+    draws: int | None,
+    method: str,
 ) -> dict[str, Any]:
     """What the loop finds, with the seconds at which each of its stages began."""
     begin = time.perf_counter()
@@ -150,6 +155,7 @@ def _loop(
         catalogue=case.catalogue,
         seed=seed,
         draws=draws if case.draws is None else case.draws,
+        method=method if case.draws is None else "metropolis",
         progress=lambda stage: stages.append((time.perf_counter() - begin, stage)),
     )
     return found.to_dict() | {"stages": stages, "loop_seconds": time.perf_counter() - begin}
@@ -164,11 +170,11 @@ def sources() -> str:
     return digest.hexdigest()[:12]
 
 
-def cache_path(folder: Path, case: Case, seed: int, draws: int | None) -> Path:
+def cache_path(folder: Path, case: Case, seed: int, draws: int | None, method: str) -> Path:
     """Where the row of a case is kept: its name, and a hash of version and settings."""
     catalogue = [effect.name for effect in case.catalogue]
     scene = case.scene.to_toml()
-    settings = (_FORMAT, pp.__version__, case, case.setup, scene, catalogue, seed, draws)
+    settings = (_FORMAT, pp.__version__, case, case.setup, scene, catalogue, seed, draws, method)
     return folder / f"{case.name}-{hashlib.sha256(repr(settings).encode()).hexdigest()[:12]}.json"
 
 

@@ -47,8 +47,8 @@ def check(
             from pbrl_ppl.criticism import prior_predictive_check
             from pbrl_ppl.model import physics_model
 
-            said = prior_predictive_check(physics_model(declared, loaded), draws=100).sentences
-            for sentence in said or ("the declared priors could have made data like these",):
+            checked = prior_predictive_check(physics_model(declared, loaded), draws=100)
+            for sentence in checked.summary:
                 console.print(f"prior: {sentence}", soft_wrap=True)
 
 

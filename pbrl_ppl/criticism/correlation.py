@@ -16,9 +16,7 @@ from pbrl_ppl.criticism.results import Correlations, ResidualTest
 from pbrl_ppl.criticism.unexplained import (
     FALSE_ALARM,
     MATTERS_IN_A_STEP,
-    in_a_step,
-    of_an_innovation,
-    trajectories,
+    innovations_over_steps,
 )
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE, WRENCH
@@ -74,10 +72,10 @@ def correlation_tests(mode: Mode) -> tuple[tuple[ResidualTest, ...], Correlation
     correlations : Correlations
         For a picture.
     """
-    noise = trajectories(mode)
+    noise = mode.problem.trajectory_noise
     white, seen = mode.whitened_residual(), noise.seen
     number = np.cumsum(noise.first.astype(np.intp))
-    share = of_an_innovation(mode) / np.maximum(in_a_step(mode), 1e-300)
+    share = innovations_over_steps(mode)
     scene, places = mode.problem.scene, noise.cells.places
     cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
     own = _lagged(white, seen, number, None)

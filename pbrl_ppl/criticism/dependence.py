@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.criticism.unexplained import (
     MATTERS_IN_A_STEP,
-    in_a_step,
-    of_an_innovation,
-    trajectories,
+    innovations_over_steps,
 )
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
@@ -73,10 +71,10 @@ def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
     n = problem.segments.n
     tests = len(problem.scene.dynamic)
     chosen = np.sort(rng.permutation(n)[:_MOST])
-    places = trajectories(mode).cells.places
+    places = mode.problem.trajectory_noise.cells.places
     innovations = mode.whitened_residual()[chosen]
     groups = problem.segments.trajectory[chosen]
-    relative = of_an_innovation(mode) / np.maximum(in_a_step(mode), 1e-300)
+    relative = innovations_over_steps(mode)
     best: Unexplained | None = None
     for i, body in enumerate(problem.scene.moving):
         if body.kinematic:

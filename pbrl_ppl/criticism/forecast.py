@@ -54,7 +54,7 @@ class Forecast:
 
 def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
     """States given what was measured up to them, shape (trajectory, time, body, 6), SI units."""
-    noise = _noise(problem)
+    noise = problem.trajectory_noise
     cells, segments = noise.cells, problem.segments
     residual = cells.of_residual(problem.residual(phi))
     deviation = noise.filtered(residual[None], sigma)[1][0]
@@ -80,7 +80,7 @@ def forecast(problem: Problem, phi: Array, sigma: Array, intervals: int) -> Fore
     intervals : int
         How far.
     """
-    noise = _noise(problem)
+    noise = problem.trajectory_noise
     cells, segments = noise.cells, problem.segments
     begins = np.flatnonzero(noise.first)
     lengths = np.diff(np.append(begins, segments.n))
@@ -115,9 +115,3 @@ def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array
     variance = np.where(noise.wide[at] > 0, later, variance)
     first = variance[:, :, None] * np.eye(variance.shape[1])
     return np.where((step == 0)[:, None, None], first, after)
-
-
-def _noise(problem: Problem) -> TrajectoryNoise:
-    if problem.trajectories is None:
-        raise TypeError("forecast: the problem is not one of whole trajectories")
-    return problem.trajectories

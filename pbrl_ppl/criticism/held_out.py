@@ -53,10 +53,7 @@ class HeldOut:
             If they do not measure what the training history measures.
         """
         if mode not in self._problems:
-            trained = mode.problem.trajectories
-            if trained is None:
-                raise TypeError("held out: the mode is not one of whole trajectories")
-            cells = trained.cells
+            cells = mode.problem.trajectory_noise.cells
             measured = cells_of(mode.problem.scene, self.history).sensors
             if not set(measured) <= set(cells.sensors):
                 names = [", ".join(STATE[d] for d in own) for own in (measured, cells.sensors)]
@@ -70,10 +67,9 @@ class HeldOut:
 
     def residuals(self, mode: Mode, unit: Mode) -> dict[str, Array]:
         """Innovations of a mode in units of another's noise, by state dimension."""
-        noise = self.problem(unit).trajectories
+        noise = self.problem(unit).trajectory_noise
         z = self._whitened(mode, unit)
-        dimension = noise.cells.places % len(STATE)  # type: ignore[union-attr]
-        seen = noise.seen  # type: ignore[union-attr]
+        dimension, seen = noise.cells.places % len(STATE), noise.seen
         return {
             STATE[d]: z[:, dimension == d][seen[:, dimension == d]]
             for d in np.unique(dimension)
@@ -91,7 +87,7 @@ class HeldOut:
         pick = np.random.default_rng(self.seed)
         phi, sigma = parameter_draws(mode.problem, posterior)
         chosen = pick.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
-        seen = self.problem(scale).trajectories.seen  # type: ignore[union-attr]
+        seen = self.problem(scale).trajectory_noise.seen
         return Errors(
             one_step_rmse=forecast(problem, mode.phi, mode.sigma, 1).rmse(),
             rollout_rmse=forecast(problem, mode.phi, mode.sigma, rollout).rmse(),
@@ -102,9 +98,8 @@ class HeldOut:
     def noise_floor(self, mode: Mode, rollout: int) -> Errors:
         """Noise floor: errors from the noise of measurements alone, at both ends of a forecast."""
         problem = self.problem(mode)
-        noise = problem.trajectories
-        at_best = -noise.log_scale(mode.sigma).sum()  # type: ignore[union-attr]
-        cells = noise.seen.sum()  # type: ignore[union-attr]
+        noise = problem.trajectory_noise
+        at_best, cells = -noise.log_scale(mode.sigma).sum(), noise.seen.sum()
         return Errors(
             one_step_rmse=forecast(problem, mode.phi, mode.sigma, 1).floor(),
             rollout_rmse=forecast(problem, mode.phi, mode.sigma, rollout).floor(),
@@ -149,8 +144,7 @@ class HeldOut:
 
 def _by_dimension(mode: Mode) -> dict[int, float]:
     """Standard deviation of measuring each state dimension."""
-    noise = mode.problem.trajectories
-    sensors = () if noise is None else noise.cells.sensors
+    sensors = mode.problem.trajectory_noise.cells.sensors
     return dict(zip(sensors, mode.sigma.tolist(), strict=False))
 
 

@@ -61,6 +61,7 @@ def revise(
     seed: int = 0,
     substeps: int | None = None,
     draws: int | None = None,
+    method: str = "metropolis",
     progress: Callable[[str], None] | None = None,
 ) -> Findings:
     """Fit a declared model, trace its residual to missing effects, add them, and compare.
@@ -80,6 +81,8 @@ def revise(
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
         Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
+    method : str
+        Of :func:`pbrl_ppl.fit`, for the posteriors; with ``laplace`` the verdict stands on modes.
     progress : callable, optional
         Told the name of each stage.
 
@@ -98,7 +101,7 @@ def revise(
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
         return _revised(
-            scene, train, test, tuple(catalogue), seed, substeps, draws, progress or _silent
+            scene, train, test, tuple(catalogue), seed, substeps, draws, method, progress or _silent
         )
 
 
@@ -114,6 +117,7 @@ def _revised(
     seed: int,
     substeps: int | None,
     draws: int | None,
+    method: str,
     say: Callable[[str], None],
 ) -> Findings:
     """Go through the stages of :func:`revise`."""
@@ -124,7 +128,7 @@ def _revised(
     train, test, derived = checked_histories(scene, train, test)
     if derived.any():
         say(f"taking {named(scene, derived)} for computed from positions, which count alone")
-    loop = _Loop(scene, train, HeldOut(test, seed), seed, say)
+    loop = _Loop(scene, train, HeldOut(test, seed), seed, method, say)
     for effect in catalogue:
         if effect not in full_catalogue:
             try_effect(effect, scene, train)
@@ -188,13 +192,8 @@ def _prior_test(
     problem = Problem.of(scene, train, attach(scene, (), catalogue), threads=2)
     checked = prior_predictive_check(build_model(problem), draws=PRIOR_DRAWS, seed=seed)
     share = float(checked.dataset["share_beyond"].max())
-    said = checked.sentences
     return ResidualTest(
-        "prior",
-        float("nan"),
-        share,
-        not said,
-        "; ".join(said) or "the declared priors could have made data like these",
+        "prior", float("nan"), share, not checked.sentences, "; ".join(checked.summary)
     )
 
 
@@ -211,6 +210,7 @@ class _Loop:
     train: History
     held_out: HeldOut
     seed: int
+    method: str
     say: Callable[[str], None]
 
     def declared_mode(self, effects: tuple[Attached, ...], substeps: int | None) -> Mode:
@@ -226,7 +226,10 @@ class _Loop:
             tune = max(LEAST_TUNE, 5 * n // 8)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
-                fitted = fit(model, seed=self.seed, draws=n, tune=tune, start=mode, progress=False)
+                fitted = fit(
+                    model, method=self.method, seed=self.seed, draws=n, tune=tune, start=mode,
+                    progress=False,
+                )  # fmt: skip
             if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
                 raise KeyboardInterrupt
             if _converged(fitted):
@@ -247,10 +250,10 @@ class _Loop:
         """Assemble verdict, held-out errors, posteriors and provenance."""
         held_out, declared, revised = self.held_out, models.declared, models.revised
         rollout = held_out.rollout_horizon(self.scene.time_step)
-        errors = [
-            held_out.errors(mode, revised, posterior, rollout)
-            for mode, posterior in ((declared, models.before), (revised, models.after))
-        ]
+        before = held_out.errors(declared, revised, models.before, rollout)
+        after = before
+        if revised is not declared:
+            after = held_out.errors(revised, revised, models.after, rollout)
         verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
         # names that leave an acceleration unexplained are the nearest there are at best
         if misfit.unexplained is not None and not (steps and misfit.predicts):
@@ -266,8 +269,8 @@ class _Loop:
             candidates=tuple(signature.candidate for signature in first),
             added=tuple(_added(step, revised, models.after) for step in steps),
             unexplained=misfit.unexplained,
-            before=errors[0],
-            after=errors[1],
+            before=before,
+            after=after,
             noise_floor=held_out.noise_floor(revised, rollout),
             posterior_before=models.before,
             posterior_after=models.after,

@@ -16,7 +16,6 @@ from pbrl_ppl.criticism.unexplained import (
     FALSE_ALARM,
     MATTERS,
     Left,
-    trajectories,
 )
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
@@ -101,7 +100,7 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
         return Misfit(tests, None, correlations, growth)
     if dependence is None:
         first = failed[0]
-        noise = trajectories(mode)
+        noise = mode.problem.trajectory_noise
         body, dimension = _where(mode, left, noise.cells.places)
         dependence = Unexplained(
             body=body,
@@ -143,7 +142,7 @@ def _acceleration(left: Left) -> ResidualTest:
 
 def _forecasts(mode: Mode, horizon: int) -> tuple[ResidualTest, Growth]:
     """Whether errors grow with the length of a forecast as noise alone makes them."""
-    noise = trajectories(mode)
+    noise = mode.problem.trajectory_noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
     longest = min(horizon, int(lengths.max()))
     steps = np.unique(np.geomspace(1, longest, min(longest, _LENGTHS)).round().astype(int))

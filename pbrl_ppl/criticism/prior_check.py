@@ -78,6 +78,11 @@ class PriorCheck:
             )
         return tuple(found)
 
+    @property
+    def summary(self) -> tuple[str, ...]:
+        """The sentences, or one that says that nothing is wrong."""
+        return self.sentences or ("the declared priors could have made data like these",)
+
 
 def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> PriorCheck:
     """Compare measured changes over a segment with what the prior predicts for them.

@@ -8,15 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached
-from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
 
 #: Looks that are simulated in one call.
 _AT_ONCE = 8
-#: Engine steps an interval that signatures are taken with, at most.
-_SUBSTEPS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +56,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
         return []
     body = problem.scene.body(candidate.body)
     proposed = effect.scan(problem.scene, problem.data.history, body)
-    wide = roughly(problem.with_physics(effects=(*problem.physics.effects, candidate)))
+    wide = problem.with_physics(effects=(*problem.physics.effects, candidate)).rough
     labels = wide.layout.labels
     declared = [labels.index(label) for label in problem.layout.labels]
     own = [
@@ -91,11 +88,6 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
             if np.any(signature):
                 found.append(Look(values, signature, columns))
     return found
-
-
-def roughly(problem: Problem) -> Problem:
-    """The same problem with few engine steps: what an effect does needs no more, nor its slope."""
-    return problem.with_physics(substeps=min(_SUBSTEPS, problem.physics.substeps))
 
 
 def _points(

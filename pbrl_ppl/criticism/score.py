@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.scan import Look, looks, roughly
+from pbrl_ppl.criticism.scan import Look, looks
 from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, posterior_steps
@@ -119,7 +119,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
     """
     problem, p = mode.problem, len(mode.phi)
     priors = problem.layout.priors
-    wide = roughly(problem.with_physics(effects=(*problem.physics.effects, *candidates)))
+    wide = problem.with_physics(effects=(*problem.physics.effects, *candidates)).rough
     # declared parameters come first in both layouts, block by block, so look each one up
     labels = wide.layout.labels
     declared = [labels.index(label) for label in problem.layout.labels]
@@ -144,14 +144,14 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
 
     derivative, _ = posterior_steps(predict, null[new], lower, upper, begin)
     residual = np.concatenate([mode.whitened_residual().ravel(), -prior_residual(priors, mode.phi)])
-    jacobian = np.vstack([derivative[:, :p], np.diag(_prior_slopes(problem, mode.phi))])
+    jacobian = np.vstack([derivative[:, :p], np.diag(prior_slopes(problem, mode.phi))])
     derivative = np.vstack([derivative[:, p:], np.zeros((p, len(new) - p))])
     edges = np.cumsum([0, *map(len, columns)])
     split = [derivative[:, a:b] for a, b in pairwise(edges)]
     return residual, jacobian, split
 
 
-def _prior_slopes(problem: Problem, phi: Array) -> Array:
+def prior_slopes(problem: Problem, phi: Array) -> Array:
     """Derivative of each prior's residual, shape (p,)."""
     step = 1e-6 * np.maximum(np.abs(phi), 1e-3)
     priors = problem.layout.priors

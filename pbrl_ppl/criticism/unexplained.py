@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pbrl_ppl.model import TrajectoryNoise
 from pbrl_ppl.modes import Mode, profile_sigma
 from pbrl_ppl.state import STATE
 
@@ -64,7 +63,7 @@ class Left:
 
 def unexplained_acceleration(mode: Mode) -> Left:
     """Size of the acceleration that the model of a mode leaves unexplained."""
-    noise = trajectories(mode)
+    noise = mode.problem.trajectory_noise
     cells, k = noise.cells, len(noise.cells.sensors)
     segments = mode.problem.segments
     change = segments.observed[:, 0] - segments.start
@@ -78,20 +77,16 @@ def unexplained_acceleration(mode: Mode) -> Left:
     return Left(names, mode.sigma[k:], relative, _p_values(mode, k))
 
 
-def in_a_step(mode: Mode) -> Array:
-    """What the bodies' accelerations do to each cell in a step, root mean square, shape (cell,)."""
-    cells, segments = trajectories(mode).cells, mode.problem.segments
-    dt = mode.problem.scene.time_step
+def innovations_over_steps(mode: Mode) -> Array:
+    """Typical size of each cell's innovations as a share of what a step changes, shape (cell,)."""
+    noise, segments = mode.problem.trajectory_noise, mode.problem.segments
+    cells, dt = noise.cells, mode.problem.scene.time_step
     change = segments.observed[:, 0] - segments.start
     body, dimension = np.divmod(cells.places, len(STATE))
     velocity = np.where(dimension < 3, dimension + 3, dimension)
     typical = np.sqrt(np.mean(change[:, body, velocity] ** 2, axis=0))
-    return np.asarray(np.where(dimension < 3, dt * typical, typical))
-
-
-def of_an_innovation(mode: Mode) -> Array:
-    """Typical standard deviation of each cell's innovations, in its unit, shape (cell,)."""
-    return np.asarray(np.median(trajectories(mode).gains(mode.sigma)[1], axis=0))
+    step = np.where(dimension < 3, dt * typical, typical)
+    return np.asarray(np.median(noise.gains(mode.sigma)[1], axis=0) / np.maximum(step, 1e-300))
 
 
 def _p_values(mode: Mode, k: int) -> Array:
@@ -112,17 +107,3 @@ def _p_values(mode: Mode, k: int) -> Array:
         without = profile_sigma(problem, residual, mode.phi, held)
         p_values[i] = 0.5 * chi2.sf(max(2 * (here - best(without)), 0.0), 1)
     return p_values
-
-
-def trajectories(mode: Mode) -> TrajectoryNoise:
-    """The noise along trajectories of a mode's problem.
-
-    Raises
-    ------
-    TypeError
-        If its likelihood is of single transitions.
-    """
-    noise = mode.problem.trajectories
-    if noise is None:
-        raise TypeError("the mode is one of single transitions, expected one of trajectories")
-    return noise

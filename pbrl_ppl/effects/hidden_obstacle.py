@@ -1,16 +1,27 @@
 """Static obstacle, a disc, that the scene does not show."""
 
+from itertools import combinations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.stages import Disc, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.scene import Body, Scene, Shape
 
-_LOOKS = 60
+Array = NDArray[np.float64]
+
+#: Intervals in which the velocity changes most that are looked at, and discs tried at most.
+_HITS, _LOOKS = 16, 60
+#: Radii of discs that a single hit suggests, as shares of the body's own.
+_SIZES = (0.25, 0.75, 2.0)
+#: Friction turns an impulse from the outline's normal: cosines and sines of what is tried.
+_TURNS = tuple((np.cos(turn), np.sin(turn)) for turn in (0.0, 0.3, -0.3))
+#: A hit agrees with a disc that is so near to where it took place (m, share of the body's radius).
+_NEAR = 0.1
 
 
 def _discs(parameters: Any) -> tuple[Disc, ...]:
@@ -18,21 +29,86 @@ def _discs(parameters: Any) -> tuple[Disc, ...]:
 
 
 def _scan(scene: Scene, history: History, body: Body) -> Any:
-    """Discs that the body runs into head-on where its speed changes most in an interval."""
+    """Discs that several hits agree on, then those that single ones suggest.
+
+    Where the velocity changed by ``dv``, an impulse came along ``-dv``; the change of the angular
+    velocity says how far from the centre it passed, so the place on the outline is known, and the
+    disc's centre is a radius further on.
+    """
     start = history.dataset["start"].sel(body=body.name).to_numpy()
     begin, end = start[:, :-1].reshape(-1, 6), start[:, 1:].reshape(-1, 6)
     seen = np.isfinite(begin).all(axis=1) & np.isfinite(end).all(axis=1)
     begin, end = begin[seen], end[seen]
-    speed = np.linalg.norm(begin[:, 3:5], axis=1)
     change = np.linalg.norm(end[:, 3:5] - begin[:, 3:5], axis=1)
-    order = np.argsort(-change)
-    order = order[speed[order] > 0][:_LOOKS]
-    ahead = begin[order, 3:5] / speed[order, None]
+    order = np.argsort(-change)[:_HITS]
+    order = order[change[order] > 1e-9 * np.abs(begin[:, 3:5]).max(initial=0.0)]
+    point, inward = _hits(body.shape, begin[order], end[order], scene.time_step)
     reach = body.shape.bounding_radius
-    size = 0.25 * reach
-    way = reach + size + 0.5 * speed[order] * scene.time_step
-    place = begin[order, :2] + way[:, None] * ahead
-    return np.column_stack([place, np.full(len(place), size)])
+    found = []
+    for i, j in combinations(range(len(point)), 2):  # point + radius * inward is the same for both
+        apart, turned = point[j] - point[i], inward[i] - inward[j]
+        if turned @ turned < 0.05:
+            continue
+        radius = float(apart @ turned / (turned @ turned))
+        if not 0.0 < radius < 4.0 * reach:
+            continue
+        centre = 0.5 * (point[i] + point[j] + radius * (inward[i] + inward[j]))
+        off = np.linalg.norm(point + radius * inward - centre, axis=1)
+        found.append((int((off < _NEAR * reach).sum()), (*centre, radius)))
+    found.sort(key=lambda agreed: -agreed[0])
+    discs = [disc for count, disc in found[: _LOOKS // 4] if count > 1]
+    for at, way in zip(point, inward, strict=True):
+        for size in _SIZES:
+            for c, s in _TURNS:
+                turned_way = np.array([c * way[0] - s * way[1], s * way[0] + c * way[1]])
+                discs.append((*(at + size * reach * turned_way), size * reach))
+    return np.array(discs[:_LOOKS]).reshape(-1, 3)
+
+
+def _hits(shape: Shape, begin: Array, end: Array, time_step: float) -> tuple[Array, Array]:
+    """Where on a body's outline an impulse took it, and the direction into what gave it.
+
+    Shape (hit, 2) each, m, in the world.
+    """
+    dv = end[:, 3:5] - begin[:, 3:5]
+    size = np.linalg.norm(dv, axis=1)
+    inward = -dv / size[:, None]
+    # between the rows it went on as before until the hit, and as after from there
+    early = (end[:, :2] - begin[:, :2]) / time_step - end[:, 3:5]
+    when = np.clip(-(early * dv).sum(axis=1) / size**2, 0.0, 1.0) * time_step
+    place = begin[:, :2] + when[:, None] * begin[:, 3:5]
+    theta = begin[:, 2] + when * begin[:, 5]
+    # r x J = I d(omega): the impulse's line passes the centre at this distance, to its left
+    offset = shape.unit_moment * (end[:, 5] - begin[:, 5]) / size
+    point = np.empty_like(place)
+    for i, turn in enumerate(theta):
+        c, s = np.cos(turn), np.sin(turn)
+        x, y = inward[i]
+        local = np.array([c * x + s * y, c * y - s * x])
+        p, q = _exit(shape, local, float(offset[i]))
+        point[i] = place[i] + (c * p - s * q, s * p + c * q)
+    return point, inward
+
+
+def _exit(shape: Shape, direction: Array, offset: float) -> Array:
+    """Where a line through a body leaves its outline; it passes the centre at an offset."""
+    side = np.array([-direction[1], direction[0]])
+    if shape.outline is None:
+        radius = shape.bounding_radius
+        offset = min(max(offset, -radius), radius)
+        return np.asarray(offset * side + np.sqrt(radius**2 - offset**2) * direction)
+    corners = np.array(shape.outline)
+    across, along = corners @ side, corners @ direction
+    offset = min(max(offset, across.min()), across.max())
+    best = -np.inf
+    for i in range(len(corners)):
+        low, high = sorted((i - 1, i), key=lambda k: across[k])
+        if across[low] <= offset <= across[high]:
+            width = across[high] - across[low]
+            share = (offset - across[low]) / width if width > 0 else 0.0
+            ends = along[low] + share * (along[high] - along[low])
+            best = max(best, ends, along[high] if width == 0 else -np.inf)
+    return np.asarray(offset * side + best * direction)
 
 
 hidden_obstacle = Effect(

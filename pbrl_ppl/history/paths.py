@@ -8,7 +8,7 @@ import numpy.typing as npt
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.cells import Rows
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, wrapped
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -49,7 +49,7 @@ def path_velocities(poses: Floats, time_step: float) -> Floats:
         Shape (..., time - 1, body, 3): m/s, m/s, rad/s, the shorter way round.
     """
     change = np.diff(poses, axis=-3)
-    change[..., 2] = np.pi - np.mod(np.pi - change[..., 2], 2 * np.pi)
+    change[..., 2] = wrapped(change[..., 2])
     return np.asarray(change / time_step)
 
 

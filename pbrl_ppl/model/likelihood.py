@@ -14,7 +14,7 @@ from scipy.special import gammaln
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import Segments
 from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
-from pbrl_ppl.state import STATE, THETA
+from pbrl_ppl.state import STATE, THETA, wrapped
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -74,7 +74,7 @@ class Observations:
         """Differences of states, shape (..., state), with angles wrapped in place to (-pi, pi]."""
         for i, d in enumerate(self.columns):
             if d == THETA:
-                difference[..., i] = np.pi - np.mod(np.pi - difference[..., i], 2 * np.pi)
+                difference[..., i] = wrapped(difference[..., i])
         return difference
 
     def residual(self, predicted: Array) -> Array:

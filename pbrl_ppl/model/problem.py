@@ -134,6 +134,11 @@ class Problem:
         """The same problem with few engine steps."""
         return replace(self, physics=self.physics.coarse)
 
+    @property
+    def rough(self) -> Problem:
+        """The same problem with few engine steps where it has more: for a change, or a slope."""
+        return replace(self, physics=self.physics.rough)
+
     def joined(self, phi: Array, sigma: Array) -> Problem:
         """The same problem with the bodies in one part that meet in one world; itself if none do.
 
@@ -218,6 +223,19 @@ class Problem:
     def trajectories(self) -> TrajectoryNoise | None:
         """The noise along whole trajectories, if the likelihood is of those."""
         return self.noise.trajectories
+
+    @property
+    def trajectory_noise(self) -> TrajectoryNoise:
+        """The same where it must be of those.
+
+        Raises
+        ------
+        TypeError
+            If the likelihood is of single transitions.
+        """
+        if self.trajectories is None:
+            raise TypeError("the problem is one of single transitions, expected whole trajectories")
+        return self.trajectories
 
     @property
     def noise_variables(self) -> dict[str, tuple[str, ...]]:

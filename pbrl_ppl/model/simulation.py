@@ -32,10 +32,7 @@ def simulated_trajectories(
         Shape (trajectory, time, body, 6), SI units; NaN where the recording has no measurement, and
         everywhere in a trajectory in which the engine diverged.
     """
-    noise = problem.trajectories
-    if noise is None:
-        raise TypeError("simulated trajectories: the problem is one of single transitions")
-    cells, segments = noise.cells, problem.segments
+    cells, segments = problem.trajectory_noise.cells, problem.segments
     observed = problem.data.history.dataset["observed"].to_numpy()
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
@@ -65,9 +62,7 @@ def with_measurements(problem: Problem, observed: Array) -> Problem:
     observed : ndarray
         Shape (trajectory, time, body, 6), SI units, NaN where missing.
     """
-    noise = problem.trajectories
-    if noise is None:
-        raise TypeError("measurements: the problem is one of single transitions")
+    noise = problem.trajectory_noise
     dataset = problem.data.history.dataset.copy()
     start = dataset["start"].to_numpy()
     dataset["observed"] = dataset["observed"].copy(data=observed)

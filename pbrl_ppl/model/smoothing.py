@@ -28,8 +28,6 @@ _FAR = 10.0
 _EXACT = 1e-6
 #: Smoothing ends with a round that moves no state by more than this, in standard deviations.
 _SETTLED, _ROUNDS = 0.05, 4
-#: Engine steps an interval that a slope is taken with, at most.
-_SUBSTEPS = 10
 #: A position's velocity is so many places on.
 _RATE = 3
 
@@ -79,9 +77,7 @@ def single_transitions(problem: Problem) -> Problem:
 def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
     """The same problem, linearised anew about the states smoothed at phi and sigma."""
     for _ in range(_ROUNDS):
-        noise = problem.noise.trajectories
-        if noise is None:
-            raise TypeError("smoothed: this problem is not one of whole trajectories")
+        noise = problem.trajectory_noise
         cells = noise.cells
         residual = cells.of_residual(problem.residual(phi))
         before, after = noise.smoothed(residual, sigma)
@@ -208,8 +204,7 @@ def _sloped(
     moved = cells.completed(problem.scene, moved).reshape(2 * d * n, *segments.start.shape[1:])
     inputs = np.tile(problem.inputs, (2 * d, 1, 1, 1))
     # the slope of what a fine engine does is that of what a coarse one does, all but exactly
-    rough = problem.with_physics(substeps=min(_SUBSTEPS, problem.physics.substeps))
-    ends = cells.of(rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
+    ends = cells.of(problem.rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
     slope = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
     return linearised(problem, cells, np.nan_to_num(slope), sigma)
 

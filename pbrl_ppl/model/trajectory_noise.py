@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.history import fill_hinges
 from pbrl_ppl.model.kalman import adjoint, gains, innovations
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA
+from pbrl_ppl.state import THETA, wrapped
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -70,7 +70,7 @@ class Cells:
     def wrapped(self, difference: Array) -> Array:
         """Differences of cells, shape (..., cell), angles wrapped to (-pi, pi]."""
         angle = self.places % 6 == THETA
-        return np.where(angle, np.pi - np.mod(np.pi - difference, 2 * np.pi), difference)
+        return np.where(angle, wrapped(difference), difference)
 
     def of_residual(self, residual: Array) -> Array:
         """The cells of a residual (..., transition, 1, body, state): (..., transition, cell)."""

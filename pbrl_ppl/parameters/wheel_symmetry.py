@@ -17,6 +17,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.parameters.layout import Layout
 from pbrl_ppl.parameters.priors import Prior
+from pbrl_ppl.state import wrapped
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -61,7 +62,7 @@ class Wheel:
         """Phi, shape (..., p), with this wheel described so many quarter turns on, shape (...)."""
         phi, (angle, x, y) = phi.copy(), self.places
         odd = np.asarray(turns) % 2 == 1
-        phi[..., angle] = _wrapped(phi[..., angle] + np.asarray(turns) * np.pi / 2)
+        phi[..., angle] = wrapped(phi[..., angle] + np.asarray(turns) * np.pi / 2)
         mu_x, mu_y = phi[..., x].copy(), phi[..., y].copy()
         phi[..., x], phi[..., y] = np.where(odd, mu_y, mu_x), np.where(odd, mu_x, mu_y)
         return phi
@@ -262,12 +263,7 @@ def _fold(angle: Array, mu_x: Array, mu_y: Array, period: int) -> tuple[Array, A
         chosen = (chosen + 2) % 4
     swapped = chosen % 2 == 1
     return (
-        _wrapped(theta[chosen, draw]),
+        wrapped(theta[chosen, draw]),
         np.where(swapped, mu_y, mu_x),
         np.where(swapped, mu_x, mu_y),
     )
-
-
-def _wrapped(angle: Array) -> Array:
-    """In (-pi, pi]."""
-    return np.asarray(np.pi - np.mod(np.pi - angle, 2 * np.pi))
