@@ -173,7 +173,7 @@ def test_what_is_kept_is_not_made_again(attribution, row, monkeypatch, tmp_path)
     cases = attribution.cases.all_cases()[:2]
     made = []
 
-    def quick(case, seed, draws):
+    def quick(case, seed, draws, method):
         made.append(case.name)
         return row(case.kind, "adequate" if case is cases[0] else "failed")
 
