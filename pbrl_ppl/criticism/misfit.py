@@ -14,7 +14,6 @@ from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import (
     FALSE_ALARM,
-    MATTERS,
     Left,
 )
 from pbrl_ppl.modes import Mode
@@ -125,8 +124,8 @@ def _where(mode: Mode, left: Left, places: NDArray[np.intp]) -> tuple[str, str]:
 
 def _acceleration(left: Left) -> ResidualTest:
     """Whether a step adds more than the model says."""
-    passed = left.worst < MATTERS
-    worst = int(np.argmax(np.where(left.certain, left.relative, -1.0)))
+    passed = not left.matters.any()
+    worst = int(np.argmax(np.where(left.certain if passed else left.matters, left.relative, -1.0)))
     unit = "rad/s²" if left.names[worst] == "omega" else "m/s²"
     some = bool(left.certain.any())
     sentence = "no acceleration is left unexplained beyond what chance brings"
@@ -136,6 +135,8 @@ def _acceleration(left: Left) -> ResidualTest:
             f" unexplained in each interval, {100 * left.relative[worst]:.2g} % of what the bodies'"
             " own is"
         )
+        if not left.beyond_engine[worst]:
+            sentence += ": engines differ by as much in their steps"
     p_value = float(min(1.0, left.p_value[worst] * len(left.names)))
     return ResidualTest(ACCELERATION, p_value, float(left.relative[worst]), passed, sentence)
 

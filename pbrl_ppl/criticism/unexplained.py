@@ -20,6 +20,9 @@ MATTERS = 0.0015
 #: An error that comes back is one of measuring as well, and those of real sensors are larger: the
 #: share of what a step changes that matters.
 MATTERS_IN_A_STEP = 0.01
+#: What a doubling of the substeps changes is about half of the engine's error, and whatever made
+#: the data may have one too: less than so many times that change is no misfit.
+ENGINES = 3.0
 #: What counts as no noise, as a share of its prior's median.
 _NOTHING = 1e-3
 
@@ -38,17 +41,30 @@ class Left:
         The same over the root mean square acceleration of the bodies.
     p_value : ndarray
         Of the likelihood ratio against none.
+    numerical : ndarray
+        Change of the bodies' accelerations if the substeps are doubled, root mean square, as size.
     """
 
     names: tuple[str, ...]
     size: Array
     relative: Array
     p_value: Array
+    numerical: Array
 
     @property
     def certain(self) -> NDArray[np.bool_]:
         """Which are more than chance brings."""
         return np.asarray(self.p_value * len(self.names) < FALSE_ALARM)
+
+    @property
+    def beyond_engine(self) -> NDArray[np.bool_]:
+        """Which are larger than what engines make of the same model."""
+        return np.asarray(self.size > ENGINES * self.numerical)
+
+    @property
+    def matters(self) -> NDArray[np.bool_]:
+        """Which are certain, beyond the engine's error, and large enough to matter."""
+        return np.asarray(self.certain & self.beyond_engine & (self.relative >= MATTERS))
 
     @property
     def worst(self) -> float:
@@ -74,7 +90,7 @@ def unexplained_acceleration(mode: Mode) -> Left:
         typical.append(np.sqrt(np.mean((change[:, own, d] / dt) ** 2)))
     relative = mode.sigma[k:] / np.maximum(typical, 1e-300)
     names = tuple(STATE[d] for d in cells.rates)
-    return Left(names, mode.sigma[k:], relative, _p_values(mode, k))
+    return Left(names, mode.sigma[k:], relative, _p_values(mode, k), _numerical(mode))
 
 
 def innovations_over_steps(mode: Mode) -> Array:
@@ -87,6 +103,16 @@ def innovations_over_steps(mode: Mode) -> Array:
     typical = np.sqrt(np.mean(change[:, body, velocity] ** 2, axis=0))
     step = np.where(dimension < 3, dt * typical, typical)
     return np.asarray(np.median(noise.gains(mode.sigma)[1], axis=0) / np.maximum(step, 1e-300))
+
+
+def _numerical(mode: Mode) -> Array:
+    """Change of accelerations if the substeps are doubled, root mean square, shape (velocity,)."""
+    problem, cells = mode.problem, mode.problem.trajectory_noise.cells
+    finer = problem.with_physics(substeps=2 * problem.physics.substeps)
+    change = cells.of((finer.predict(mode.phi) - problem.predict(mode.phi))[:, 0])
+    square = np.nanmean(change**2, axis=0) / problem.scene.time_step**2
+    dimension = cells.places % len(STATE)
+    return np.array([np.sqrt(square[dimension == d].mean()) for d in cells.rates])
 
 
 def _p_values(mode: Mode, k: int) -> Array:

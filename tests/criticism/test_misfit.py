@@ -3,12 +3,14 @@
 The clean data are of a law in closed form, made of recordings with noise on every state.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import binom
 
 from pbrl_ppl.criticism.misfit import ACCELERATION, FORECASTS, find_misfit
-from pbrl_ppl.criticism.unexplained import FALSE_ALARM, MATTERS, unexplained_acceleration
+from pbrl_ppl.criticism.unexplained import FALSE_ALARM, MATTERS, Left, unexplained_acceleration
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
 
 WHITENESS, COMMANDS = "whiteness", "correlation with commands"
@@ -61,6 +63,32 @@ def test_a_disturbance_without_memory_is_an_acceleration() -> None:
     # 240 steps of each velocity, of which the noise of the speed hides little: 20 % is 4 sd
     np.testing.assert_allclose(left.size[:2], size, rtol=0.2)
     assert left.worst > 10 * MATTERS
+
+
+def test_what_engines_differ_by_is_no_misfit() -> None:
+    """Half of the engine's error is certain in enough data, and left alone; ten times is not."""
+    sizes = np.array([0.02, 0.02, 0.02])
+    left = Left(("vx", "vy", "omega"), sizes, sizes / 2.0, np.full(3, 1e-9), 0.5 * sizes)
+    assert left.certain.all()
+    assert not left.matters.any()
+    coarse = replace(left, numerical=np.array([0.5, 0.1, 0.5]) * sizes)
+    np.testing.assert_array_equal(coarse.matters, [False, True, False])
+    few = replace(coarse, p_value=np.full(3, 0.1))
+    assert not few.matters.any()
+
+
+def test_the_engines_error_falls_with_its_steps() -> None:
+    """A drag's exponential, in steps whose error is of third order once extrapolated."""
+    disc = Disc(8, 15, FINE.with_effects("puck", "linear_drag"), drag=0.3)
+    mode = disc.mode(np.random.default_rng(7))
+
+    def numerical(substeps: int) -> np.ndarray:
+        problem = mode.problem.with_physics(substeps=substeps)
+        return unexplained_acceleration(replace(mode, problem=problem)).numerical[:2]
+
+    coarse, fine = numerical(4), numerical(8)
+    assert (coarse > 0).all()
+    assert (fine < coarse / 4).all()
 
 
 def test_a_disturbance_that_lasts_is_correlated_with_itself() -> None:
