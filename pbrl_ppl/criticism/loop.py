@@ -14,7 +14,7 @@ from pbrl_ppl.criticism import findings
 from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.criticism.histories import checked_histories, named
-from pbrl_ppl.criticism.misfit import Misfit, find_misfit
+from pbrl_ppl.criticism.misfit import PRIOR, Misfit, find_misfit
 from pbrl_ppl.criticism.prior_check import prior_predictive_check
 from pbrl_ppl.criticism.resolution import shift, with_enough_substeps
 from pbrl_ppl.criticism.results import (
@@ -193,7 +193,7 @@ def _prior_test(
     checked = prior_predictive_check(build_model(problem), draws=PRIOR_DRAWS, seed=seed)
     share = float(checked.dataset["share_beyond"].max())
     return ResidualTest(
-        "prior", float("nan"), share, not checked.sentences, "; ".join(checked.summary)
+        PRIOR, float("nan"), share, not checked.sentences, "; ".join(checked.summary)
     )
 
 

@@ -22,7 +22,7 @@ from pbrl_ppl.state import STATE
 Array = NDArray[np.float64]
 
 #: Names of tests, of which all a model is good for depends.
-ACCELERATION, FORECASTS = "unexplained acceleration", "forecasts"
+ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
 #: Forecasts may be this many times worse than noise alone makes them.
 _WORSE = 1.5
 #: Lengths of forecasts that a picture shows, at most.
@@ -52,8 +52,9 @@ class Misfit:
 
     @property
     def predicts(self) -> bool:
-        """Whether steps and forecasts are as good as noise lets them be."""
-        return all(test.passed for test in self.tests if test.name in (ACCELERATION, FORECASTS))
+        """Whether steps and forecasts are as good as noise lets them be, and the prior could be."""
+        needed = (ACCELERATION, FORECASTS, PRIOR)
+        return all(test.passed for test in self.tests if test.name in needed)
 
     def with_test(self, test: ResidualTest) -> Misfit:
         """The same with one test more; what it says is where the structure is if no other fails."""

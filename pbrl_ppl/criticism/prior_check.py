@@ -67,9 +67,9 @@ class PriorCheck:
                 found.append(
                     f"{state} of {body} changes by up to {float(changes['measured_largest']):.3g}"
                     f" {unit} in {self.seconds:g} s; under the prior 94 % of changes are within"
-                    f" {float(changes['predicted_extent']):.3g} {unit}, and none of {self.draws}"
-                    f" draws from it reaches {100 * share:.0f} % of the measured ones: check units,"
-                    " or the prior's hyper-parameters"
+                    f" {float(changes['predicted_extent']):.3g} {unit}, and {100 * share:.0f} % of"
+                    f" the measured ones lie beyond all of {self.draws} draws from it: check units,"
+                    " of commands too, or the prior's hyper-parameters"
                 )
         if self.diverged > 0.1 * self.draws:
             found.append(
