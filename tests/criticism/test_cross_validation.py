@@ -1,5 +1,6 @@
 """Cross-validation by one Newton step: what refits without each fold say."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -11,6 +12,7 @@ from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, along_trajectories, log_prior
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.modes.laplace import finish
 from pbrl_ppl.scene import Scene
 from tests.helpers.free_puck import DISC, Disc
 
@@ -100,6 +102,29 @@ def test_trajectories_are_folds_and_few_of_them_are_cut() -> None:
         own = runs == run
         assert len(np.unique(segments.trajectory[own])) == 1
         assert (np.diff(segments.step[own]) == 1).all()
+
+
+def test_where_a_climb_ended_near_the_top_changes_nothing() -> None:
+    """A step of one standard deviation off: what one fold alone knew of was once charged for it."""
+    own = mode(DRAGGED)
+    fold = folds(own)
+    expected = cross_validated(own, fold)
+    for direction in own.factor.T:
+        moved = replace(own, phi=own.phi + direction)
+        moved = replace(moved, jacobian=finish(own.problem, moved.phi, own.sigma, 0.0).jacobian)
+        np.testing.assert_allclose(cross_validated(moved, fold), expected, atol=0.1)
+
+
+def test_a_parameter_at_its_bound_is_held_there() -> None:
+    """A drag that data without one would make negative costs no more than none."""
+    still = Disc(trajectories=8, intervals=6, drag=-0.1).frame(np.random.default_rng(6))
+    modes = []
+    for scene in (DISC, DRAGGED):
+        problem = Problem.of(scene, History.from_dataframe(still, scene), attach(scene))
+        modes.append(trajectory_mode(problem, find_mode(problem, seed=1).phi))
+    fold = folds(modes[0])
+    gain = cross_validated(modes[1], fold) - cross_validated(modes[0], fold)
+    assert abs(gain.sum()) < 3.0
 
 
 def test_runs_of_a_trajectory_are_refitted_too() -> None:
