@@ -18,6 +18,7 @@ from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import prior_residual
 
 Array = NDArray[np.float64]
+Ints = NDArray[np.intp]
 
 #: Signatures whose directions agree more than this cannot be told apart.
 PARALLEL = 0.95
@@ -27,6 +28,9 @@ SAME = 0.9999
 DECISIVE = 10.0
 #: Less than this share of a signature left means that the declared parameters absorb it.
 ABSORBED = 1e-3
+#: A direction in which a size as the prior has it does less than this, in units of noise, is of the
+#: engine's rounding.
+_SHOWS = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +97,7 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
         if _of_noise(attached):
             return _tail_score(mode, attached, left, len(candidates))
         if attached in derived:
-            evidence = _evidence(derived[attached], q, left, _side(attached))
+            evidence = _evidence(derived[attached], q, left, _sides(attached), _scales(attached))
             values = np.array(attached.effect.null) + evidence.size
             return _signature(attached, evidence, values, 1, len(candidates))
         return _best_look(attached, looks(mode, attached), q, left, len(candidates))
@@ -176,11 +180,23 @@ def _none(n: int) -> _Evidence:
     return _Evidence(0.0, 0.0, 0.0, np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1))
 
 
-def _evidence(signature: Array, q: Array, residual: Array, side: int = 0) -> _Evidence:
+def _evidence(signature: Array, q: Array, residual: Array, sides: Ints, scales: Array) -> _Evidence:
     """The score statistic of a signature, projected off the declared parameters' directions ``q``.
 
-    ``side`` is 1 (or -1) where a single column can only have a positive (or negative) size.
+    Parameters
+    ----------
+    signature : ndarray
+        Shape (n, columns).
+    q : ndarray
+        Orthonormal, shape (n, p).
+    residual : ndarray
+        Projected already, shape (n,).
+    sides : ndarray of int
+        1 (or -1) where a column can only have a positive (or negative) size, shape (columns,).
+    scales : ndarray
+        Sizes that columns might have, shape (columns,): what those do not show is not seen.
     """
+    signature = signature * scales
     projected = signature - q @ (q.T @ signature)
     total = (signature**2).sum()
     share = float((projected**2).sum() / total) if total > 0 else 0.0
@@ -190,16 +206,17 @@ def _evidence(signature: Array, q: Array, residual: Array, side: int = 0) -> _Ev
     basis, direction = np.zeros((n, 0)), np.zeros(n)
     if share > ABSORBED:
         u, s, vt = np.linalg.svd(projected, full_matrices=False)
-        keep = s > 1e-6 * s.max()
+        keep = (s > 1e-6 * s.max()) & (s > min(_SHOWS, s.max()) * (1 - 1e-9))
         basis = u[:, keep]
-        unit = np.sqrt((projected**2).sum(axis=0))
+        unit = np.sqrt((projected**2).sum(axis=0)) / scales
         coordinates = basis.T @ residual
-        size = vt[keep].T @ (coordinates / s[keep])
+        size = scales * (vt[keep].T @ (coordinates / s[keep]))
         statistic = float(coordinates @ coordinates)
         log_p = float(chi2.logsf(statistic, int(keep.sum())))
-        if side and columns == 1:
+        seen = int(np.argmax(np.abs(vt[0])))
+        if sides[seen] and keep.sum() == 1 and np.abs(vt[0, seen]) > 1 - 1e-6:
             # it can only be on one side of nothing: half the chance, and none on the other side
-            allowed = side * size[0] > 0
+            allowed = sides[seen] * size[seen] > 0
             statistic = statistic if allowed else 0.0
             log_p = log_p + np.log(0.5) if allowed else 0.0
         if statistic > 0:
@@ -207,13 +224,15 @@ def _evidence(signature: Array, q: Array, residual: Array, side: int = 0) -> _Ev
     return _Evidence(statistic, log_p, share, size, basis, direction, unit)
 
 
-def _side(attached: Attached) -> int:
-    """On which side of its null value a single parameter must be; 0 if on any."""
-    if len(attached.effect.parameters) > 1:
-        return 0
-    (parameter,) = attached.effect.parameters
-    lower, upper = parameter.prior.support
-    return int(parameter.null == lower) - int(parameter.null == upper)
+def _sides(attached: Attached) -> Ints:
+    """On which side of its null value each parameter must be; 0 if on any."""
+    supports = [(p.null, *p.prior.support) for p in attached.effect.parameters]
+    return np.array([int(null == low) - int(null == high) for null, low, high in supports])
+
+
+def _scales(attached: Attached) -> Array:
+    """Sizes that an effect's parameters have under their priors."""
+    return np.array([parameter.prior.sigma for parameter in attached.effect.parameters])
 
 
 def _signature(
@@ -228,7 +247,7 @@ def _signature(
         body=attached.body,
         sentence=effect.sentence,
         statistic=evidence.statistic,
-        dof=evidence.size.size,
+        dof=evidence.basis.shape[1] or evidence.size.size,  # directions that are seen
         p_value=float(min(1.0, np.exp(log_p) * n_candidates)),
         estimate=dict(zip(names, values.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
@@ -257,7 +276,10 @@ def _best_look(
     values = np.array(attached.effect.null)
     for look in tried:
         rows = np.pad(look.signature, ((0, len(residual) - len(look.signature)), (0, 0)))
-        found = _evidence(rows, q, residual, 0 if look.columns else 1)
+        columns = list(look.columns)
+        sides = np.zeros(len(columns), dtype=np.intp) if columns else np.ones(1, dtype=np.intp)
+        scales = _scales(attached)[columns] if columns else np.ones(1)
+        found = _evidence(rows, q, residual, sides, scales)
         if found.log_p < best.log_p:
             best, values = found, look.values.copy()
             for column, size in zip(look.columns, found.size, strict=False):
