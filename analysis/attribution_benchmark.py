@@ -94,6 +94,28 @@ def results(
         yield row
 
 
+def in_batches(cases: list[Case], options: argparse.Namespace) -> Iterator[Row]:
+    """Rows of all cases, with new workers from time to time.
+
+    An executor's own ``max_tasks_per_child`` never ends on some versions of Python: all of its
+    workers leave at once, and none comes.
+    """
+    size = CASES_A_WORKER * options.workers
+    for begin in range(0, len(cases), size):
+        executor = ProcessPoolExecutor(
+            options.workers, multiprocessing.get_context("spawn"), initializer=begin_worker
+        )
+        batch = cases[begin : begin + size]
+        try:
+            yield from results(
+                batch, executor, options.seed, options.draws, options.method, options.cache
+            )
+        finally:
+            executor.shutdown(wait=False, cancel_futures=True)
+            for child in multiprocessing.active_children():
+                child.terminate()
+
+
 def watched(rows: Iterator[Row], total: int, kept: int, verbose: bool) -> list[Row]:
     """Collect rows, telling progress and the time left; Ctrl-C keeps those that are done.
 
@@ -171,28 +193,15 @@ def main() -> None:
     kept = 0
     if options.cache:
         settings = options.seed, options.draws, options.method
-        paths = (cache_path(options.cache, case, *settings) for case in cases)
-        kept = sum(path.is_file() for path in paths)
+        made = [cache_path(options.cache, case, *settings).is_file() for case in cases]
+        cases = [cases[i] for i in np.argsort(np.logical_not(made), kind="stable")]
+        kept = sum(made)
     say(
         f"{len(cases)} cases ({', '.join(f'{n} {kind}' for kind, n in kinds.items())}),"
         f" {kept} of them in the cache; about"
         f" {_duration((len(cases) - kept) * SECONDS_A_CASE / options.workers)}"
     )
-    executor = ProcessPoolExecutor(
-        options.workers,
-        multiprocessing.get_context("spawn"),
-        initializer=begin_worker,
-        max_tasks_per_child=CASES_A_WORKER,
-    )
-    rows = watched(
-        results(cases, executor, options.seed, options.draws, options.method, options.cache),
-        len(cases),
-        kept,
-        options.verbose,
-    )
-    executor.shutdown(wait=False, cancel_futures=True)
-    for child in multiprocessing.active_children():
-        child.terminate()
+    rows = watched(in_batches(cases, options), len(cases), kept, options.verbose)
     scores = score(rows)
     console = Console(stderr=options.json == "-", width=None if sys.stdout.isatty() else _WIDTH)
     console.print(table(rows), score_table(scores))
