@@ -44,10 +44,11 @@ def check(
             names = [STATE[d] for d in np.flatnonzero(derived.any(axis=0))]
             console.print(f"{', '.join(names)}: computed from positions, no measurements")
         if prior:
-            from pbrl_ppl.criticism import prior_predictive_check
+            from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
             from pbrl_ppl.model import physics_model
 
-            checked = prior_predictive_check(physics_model(declared, loaded), draws=100)
+            model = physics_model(declared, loaded, horizon=telling_horizon(loaded))
+            checked = prior_predictive_check(model, draws=100)
             for sentence in checked.summary:
                 console.print(f"prior: {sentence}", soft_wrap=True)
 

@@ -2,7 +2,11 @@
 
 from pbrl_ppl.criticism.findings import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
 from pbrl_ppl.criticism.loop import revise
-from pbrl_ppl.criticism.prior_check import PriorCheck, prior_predictive_check
+from pbrl_ppl.criticism.prior_check import (
+    PriorCheck,
+    prior_predictive_check,
+    telling_horizon,
+)
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
@@ -26,4 +30,5 @@ __all__ = [
     "Unexplained",
     "prior_predictive_check",
     "revise",
+    "telling_horizon",
 ]

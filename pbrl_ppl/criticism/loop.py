@@ -15,7 +15,7 @@ from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.criticism.histories import checked_histories, named
 from pbrl_ppl.criticism.misfit import PRIOR, Misfit, find_misfit
-from pbrl_ppl.criticism.prior_check import prior_predictive_check
+from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.resolution import shift, with_enough_substeps
 from pbrl_ppl.criticism.results import (
     Acceleration,
@@ -189,7 +189,9 @@ def _prior_test(
     scene: Scene, train: History, catalogue: tuple[Effect, ...], seed: int
 ) -> ResidualTest:
     """Whether the declared prior could have made the data, as a test."""
-    problem = Problem.of(scene, train, attach(scene, (), catalogue), threads=2)
+    problem = Problem.of(
+        scene, train, attach(scene, (), catalogue), horizon=telling_horizon(train), threads=2
+    )
     checked = prior_predictive_check(build_model(problem), draws=PRIOR_DRAWS, seed=seed)
     share = float(checked.dataset["share_beyond"].max())
     return ResidualTest(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,9 +11,10 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
+from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, prior_predictive_draws
 from pbrl_ppl.posterior import HDI_PROB
-from pbrl_ppl.state import STATE, STATE_UNITS
+from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, wrapped
 
 Array = NDArray[np.float64]
 
@@ -23,6 +25,8 @@ QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
 #: The share inside the interval tells less: all cells share one phi, which may be in a tail.
 MOST_BEYOND = 0.11
 _FEWEST = 50
+#: Changes so many times the errors of measuring say something of the parameters.
+_WELL_BEYOND = 5.0
 _CHUNK = 16
 
 
@@ -159,6 +163,38 @@ def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> Pr
         draws,
         int(draws - good.sum()),
     )
+
+
+def telling_horizon(history: History) -> int:
+    """Intervals in which bodies move well beyond the errors of measuring: often one.
+
+    Where a recording is fast, an interval shows hardly more than noise, of which a prior of the
+    parameters says nothing. The noise is judged by third differences.
+
+    Parameters
+    ----------
+    history : History
+        Its places are looked at, as far as they were measured.
+    """
+    observed = history.dataset["observed"].to_numpy()[..., : len(POSE)]
+    places = observed.transpose(0, 2, 3, 1).reshape(-1, observed.shape[1])
+    angle = np.tile(np.arange(len(POSE)) == THETA, len(places) // len(POSE))
+    longest = int(history.dataset["n_rows"].min()) - 1
+
+    def size(steps: int, order: int) -> Array:
+        change = places
+        for _ in range(order):
+            change = change[:, steps:] - change[:, :-steps]
+            change = np.where(angle[:, None], wrapped(change), change)
+        return np.nan_to_num(np.nanmean(change**2, axis=1)) if change.size else np.zeros(0)
+
+    horizon = 1
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of means of nothing
+        noise = size(1, 3) / 20.0
+        while horizon < longest and (size(horizon, 1) < _WELL_BEYOND**2 * noise).any():
+            horizon = min(2 * horizon, longest)
+    return horizon
 
 
 def _compare(predicted: Array, measured: Array) -> xr.Dataset:

@@ -3,15 +3,21 @@
 import dataclasses
 
 import numpy as np
+import pandas as pd
 import pymc as pm
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism.prior_check import QUANTILES, prior_predictive_check
+from pbrl_ppl.criticism.prior_check import (
+    QUANTILES,
+    prior_predictive_check,
+    telling_horizon,
+)
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.report import plot_prior_check, png
+from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -153,3 +159,29 @@ def test_picture(scene, history) -> None:
     share = float(check.dataset["share_inside"].sel(state="vx").item())
     assert f"{100 * share:.0f} % as expected" in titles[STATE.index("vx")]
     assert len(png(figure)) > 10_000
+
+
+def wave(dt: float, noise: float, turns: float = 0.0) -> History:
+    """A free puck that goes 1 m/s along x for 40 rows, and does not move along y."""
+    rng = np.random.default_rng(3)
+    scene = Scene(time_step=dt, bodies=(Body("puck", Shape.circle(0.1)),))
+    time = dt * np.arange(40)
+    x = time + 0.1 * time**2 + noise * rng.standard_normal(40)
+    theta = np.angle(np.exp(1j * (turns * time + noise * rng.standard_normal(40))))
+    rows = {"trajectory": 0, "time": time, "body": "puck", "x": x, "y": 0.0, "theta": theta}
+    speeds = {"vx": 1.0, "vy": 0.0, "omega": turns}
+    wrench = dict.fromkeys(("force_x", "force_y", "torque"), 0.0)
+    return History.from_dataframe(pd.DataFrame(rows | speeds | wrench), scene)
+
+
+@pytest.mark.parametrize(
+    ("dt", "noise", "turns", "low", "high"),
+    [
+        (0.1, 1e-3, 3.0, 1, 1),  # an interval is 100 times the noise
+        (0.001, 1e-3, 3.0, 4, 16),  # it is as large as the noise
+        (0.1, 0.0, 60.0, 1, 1),  # nothing is beyond no noise, turned often or not
+        (1e-6, 1.0, 3.0, 39, 39),  # nothing shows, whatever the length
+    ],
+)
+def test_prior_is_asked_where_motion_shows(dt, noise, turns, low, high) -> None:
+    assert low <= telling_horizon(wave(dt, noise, turns)) <= high
