@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode
+from pbrl_ppl.parameters import inside
 from pbrl_ppl.sampling.emulator import Emulator, monomials
 from pbrl_ppl.sampling.metropolis import Gaussian, explore
 from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+
+Array = NDArray[np.float64]
 
 #: Degrees to try; engine runs a coefficient, at least and at most; rounds of each.
 _DEGREES, _A_COEFFICIENT, _LEAST, _MOST, _ROUNDS = (1, 2), 4, 100, 400, 4
 #: How far off (standard deviation) the log-likelihood may be: half of the moves still pass.
 _CLOSE = 1.0
+#: Half of the runs are so many times as far from the middle as draws from the posterior.
+_FARTHER = 2.0
 #: Steps of the exploring chain between two runs.
 _APART = 20
 
@@ -49,7 +56,7 @@ def emulate(
         runs = max(_LEAST, _A_COEFFICIENT * monomials(np.zeros(widest), degree).size)
         if runs > _MOST:
             break
-        phi = mode.draws(rng, runs)
+        phi = spread(problem, mode.draws(rng, runs // 2))
         residual = problem.residual(phi)
         for _ in range(_ROUNDS):
             good = np.isfinite(residual).all(axis=(1, 2, 3, 4))
@@ -57,13 +64,23 @@ def emulate(
                 break
             emulator = Emulator(problem, phi[good], residual[good], degree)
             cheap = Surrogate(problem, unpack, emulator)
-            chain = explore(blocks, cheap, q, _APART * runs, rng)[_APART - 1 :: _APART]
-            drawn = [unpack(point)[:2] for point in chain]
-            phi, sigma = (np.array(column) for column in zip(*drawn, strict=True))
+            chain = explore(blocks, cheap, q, _APART * (runs // 2), rng)[_APART - 1 :: _APART]
+            drawn, sigma = (np.array(x) for x in zip(*(unpack(y)[:2] for y in chain), strict=True))
+            phi = spread(problem, drawn)
             residual = problem.residual(phi)
-            told = np.array([emulator(point).copy() for point in phi])
-            exact = problem.log_density(residual, sigma, phi).sum(axis=-1)
-            off = problem.log_density(told, sigma, phi).sum(axis=-1) - exact
+            told = np.array([emulator(point).copy() for point in drawn])
+            exact = problem.log_density(residual[: len(drawn)], sigma, drawn).sum(axis=-1)
+            off = problem.log_density(told, sigma, drawn).sum(axis=-1) - exact
+            good = np.isfinite(residual).all(axis=(1, 2, 3, 4))
             if np.isfinite(off).all() and off.std() < close:
-                return Emulator(problem, phi, residual, degree)
+                return Emulator(problem, phi[good], residual[good], degree)
     return None
+
+
+def spread(problem: Problem, phi: Array) -> Array:
+    """Draws, and as many again farther from their middle, shape (2 n, p).
+
+    Where friction makes a kink, the posterior may go on beyond it where the first runs did not.
+    """
+    centre = phi.mean(axis=0)
+    return np.concatenate([phi, inside(problem.layout.priors, centre + _FARTHER * (phi - centre))])

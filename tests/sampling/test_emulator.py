@@ -88,6 +88,18 @@ def test_it_follows_the_engine_over_the_posterior(model) -> None:
     assert np.isfinite(logp(model.initial_point()))
 
 
+def test_runs_reach_farther_than_the_posterior_and_stay_in_the_support(model) -> None:
+    """A kink beyond the first draws was never seen, and a chain beyond it stood still."""
+    mode = find_mode(model.problem, seed=1)
+    drawn = mode.draws(np.random.default_rng(2), 200)
+    runs = emulation.spread(model.problem, drawn)
+    np.testing.assert_array_equal(runs[:200], drawn)
+    lower, upper = model.problem.layout.supports(runs)
+    assert ((runs >= lower) & (runs <= upper)).all()
+    heaviest = list(model.problem.layout.labels).index("mass[cart]")
+    assert runs[200:, heaviest].std() == pytest.approx(2 * drawn[:, heaviest].std())
+
+
 def test_none_where_no_polynomial_is_close(model, monkeypatch) -> None:
     """An engine that answers at random about the mode cannot be emulated."""
     mode = find_mode(model.problem, seed=1)
