@@ -101,12 +101,9 @@ def revise(
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
         return _revised(
-            scene, train, test, tuple(catalogue), seed, substeps, draws, method, progress or _silent
-        )
-
-
-def _silent(stage: str) -> None:
-    """Take no notice of a stage."""
+            scene, train, test, tuple(catalogue), seed, substeps, draws, method,
+            progress or (lambda stage: None),
+        )  # fmt: skip
 
 
 def _revised(
@@ -134,7 +131,7 @@ def _revised(
             try_effect(effect, scene, train)
     selection = Selection(scene, catalogue, say)
     say("looking whether the prior could have made the data")
-    prior = _prior_test(scene, train, catalogue, seed)
+    prior = _prior_test(scene, train, attach(scene, (), catalogue), seed)
     say("fitting the declared model")
     declared = loop.declared_mode(attach(scene, (), catalogue), substeps)
     say("scoring what the model might lack")
@@ -155,7 +152,10 @@ def _revised(
     say("testing what is left")
     before, left = unexplained_acceleration(declared), unexplained_acceleration(current)
     horizon = loop.held_out.rollout_horizon(scene.time_step)
-    misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(prior)
+    with_added = prior
+    if added and not prior.passed:  # what was missing may be why
+        with_added = _prior_test(scene, train, current.problem.physics.effects, seed)
+    misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(with_added)
     remains = _remains(before, left) if added and misfit.unexplained is not None else 0.0
     if remains > (LARGE_IF_SMALL if left.worst < SMALL else LARGE_REMAINDER):
         # part of a misfit goes to whatever is there: no name is to be had from that
@@ -186,12 +186,10 @@ class _Models:
 
 
 def _prior_test(
-    scene: Scene, train: History, catalogue: tuple[Effect, ...], seed: int
+    scene: Scene, train: History, effects: tuple[Attached, ...], seed: int
 ) -> ResidualTest:
-    """Whether the declared prior could have made the data, as a test."""
-    problem = Problem.of(
-        scene, train, attach(scene, (), catalogue), horizon=telling_horizon(train), threads=2
-    )
+    """Whether the prior of a model with these effects could have made the data, as a test."""
+    problem = Problem.of(scene, train, effects, horizon=telling_horizon(train), threads=2)
     checked = prior_predictive_check(build_model(problem), draws=PRIOR_DRAWS, seed=seed)
     share = float(checked.dataset["share_beyond"].max())
     return ResidualTest(

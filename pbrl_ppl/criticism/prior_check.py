@@ -186,7 +186,9 @@ def telling_horizon(history: History) -> int:
         for _ in range(order):
             change = change[:, steps:] - change[:, :-steps]
             change = np.where(angle[:, None], wrapped(change), change)
-        return np.nan_to_num(np.nanmean(change**2, axis=1)) if change.size else np.zeros(0)
+        if not change.size:
+            return np.zeros(len(places))
+        return np.asarray(np.nan_to_num(np.nanmean(change**2, axis=1)))
 
     horizon = 1
     with warnings.catch_warnings():

@@ -157,6 +157,7 @@ def close_loop(
     seed: int = 0,
     substeps: int | None = None,
     draws: int | None = None,
+    method: str = "metropolis",
     progress: Callable[[str], None] | None = None,
 ) -> Loop:
     """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
@@ -177,6 +178,8 @@ def close_loop(
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
         Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
+    method : str
+        Of :func:`pbrl_ppl.fit`, for the posteriors; with ``laplace`` the verdict stands on modes.
     progress : callable, optional
         Told the name of each stage.
 
@@ -208,6 +211,7 @@ def close_loop(
         seed=seed,
         substeps=substeps,
         draws=draws,
+        method=method,
         progress=progress,
     )
     return Loop(found)

@@ -185,3 +185,12 @@ def wave(dt: float, noise: float, turns: float = 0.0) -> History:
 )
 def test_prior_is_asked_where_motion_shows(dt, noise, turns, low, high) -> None:
     assert low <= telling_horizon(wave(dt, noise, turns)) <= high
+
+
+def test_a_recording_of_three_rows_is_asked_as_it_is() -> None:
+    history = wave(0.1, 1e-3)
+    rows = history.to_dataframe()
+    rows = rows[rows["step"] < 3].assign(torque=[0.0, 0.0, np.nan])
+    scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
+    rows.loc[rows["step"] == 2, ["force_x", "force_y"]] = np.nan
+    assert telling_horizon(History.from_dataframe(rows, scene)) == 1
