@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from pbrl_ppl.model import smoothed
 from pbrl_ppl.modes import Mode, trajectory_mode
 
 #: A doubling of the substeps may move innovations by this share of their noise.
@@ -13,6 +14,8 @@ SMALL_SHIFT = 0.1
 MOST_SUBSTEPS = 640
 #: Linearised elsewhere, the same mode's log-posterior differs by less.
 _BETTER = 5.0
+#: What a step adds if it is next to nothing, as a share of the prior's median.
+_LITTLE = 0.1
 
 
 def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
@@ -27,7 +30,7 @@ def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
         while shift(mode, substeps) > SMALL_SHIFT and substeps < MOST_SUBSTEPS:
             substeps *= 2
         if substeps == begin:
-            fresh = trajectory_mode(mode.problem, mode.phi)
+            fresh = _afresh(mode)
             if fresh.log_posterior < mode.log_posterior + _BETTER:
                 return mode
             mode = fresh
@@ -35,6 +38,15 @@ def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
         say(f"using {substeps} engine steps an interval")
         finer = mode.problem.with_physics(substeps=substeps)
         mode = trajectory_mode(finer, mode.phi, mode.sigma)
+
+
+def _afresh(mode: Mode) -> Mode:
+    """The better of two modes: smoothed anew, and smoothed as if steps added next to nothing."""
+    problem, sigma = mode.problem, mode.sigma.copy()
+    steps = slice(len(problem.trajectory_noise.cells.sensors), None)
+    sigma[steps] = np.minimum(sigma[steps], _LITTLE * problem.noise_prior[0][steps])
+    quiet = trajectory_mode(smoothed(problem, mode.phi, sigma), mode.phi, sigma)
+    return max(trajectory_mode(problem, mode.phi), quiet, key=lambda found: found.log_posterior)
 
 
 def shift(mode: Mode, substeps: int | None = None) -> float:
