@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism.score import prior_slopes
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.parameters import inside, prior_residual
+from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -57,7 +56,7 @@ def cross_validated(mode: Mode, fold: Ints) -> Array:
     jacobian = mode.jacobian.reshape(n, cells, p) * scale
     density = problem.log_density(problem.residual(mode.phi), mode.sigma, mode.phi)
     grams = np.array([_gram(jacobian[fold == f]) for f in range(fold.max() + 1)])
-    slopes = prior_slopes(problem, mode.phi) * scale
+    slopes = prior_slopes(problem.layout.priors, mode.phi) * scale
     whole = np.linalg.inv(mode.covariance / np.outer(scale, scale)) if p else np.eye(0)
     prior = np.diag(np.maximum(slopes**2, np.diag(whole - grams.sum(axis=0))))
     # a climb ends near the top, and what one fold alone knows of would be pulled far from there

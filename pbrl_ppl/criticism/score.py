@@ -13,9 +13,8 @@ from scipy.stats import chi2, norm
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import Look, looks
 from pbrl_ppl.effects import Attached, Noise
-from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, posterior_steps
-from pbrl_ppl.parameters import prior_residual
+from pbrl_ppl.parameters import prior_residual, prior_slopes
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -148,18 +147,11 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
 
     derivative, _ = posterior_steps(predict, null[new], lower, upper, begin)
     residual = np.concatenate([mode.whitened_residual().ravel(), -prior_residual(priors, mode.phi)])
-    jacobian = np.vstack([derivative[:, :p], np.diag(prior_slopes(problem, mode.phi))])
+    jacobian = np.vstack([derivative[:, :p], np.diag(prior_slopes(priors, mode.phi))])
     derivative = np.vstack([derivative[:, p:], np.zeros((p, len(new) - p))])
     edges = np.cumsum([0, *map(len, columns)])
     split = [derivative[:, a:b] for a, b in pairwise(edges)]
     return residual, jacobian, split
-
-
-def prior_slopes(problem: Problem, phi: Array) -> Array:
-    """Derivative of each prior's residual, shape (p,)."""
-    step = 1e-6 * np.maximum(np.abs(phi), 1e-3)
-    priors = problem.layout.priors
-    return (prior_residual(priors, phi + step) - prior_residual(priors, phi - step)) / (2 * step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,7 +198,7 @@ def _evidence(signature: Array, q: Array, residual: Array, sides: Ints, scales: 
     basis, direction = np.zeros((n, 0)), np.zeros(n)
     if share > ABSORBED:
         u, s, vt = np.linalg.svd(projected, full_matrices=False)
-        keep = (s > 1e-6 * s.max()) & (s > min(_SHOWS, s.max()) * (1 - 1e-9))
+        keep = (s > 1e-6 * s.max()) & (s >= min(_SHOWS, s.max()))
         basis = u[:, keep]
         unit = np.sqrt((projected**2).sum(axis=0)) / scales
         coordinates = basis.T @ residual

@@ -60,8 +60,7 @@ def _scan(scene: Scene, history: History, body: Body) -> Any:
     for at, way in zip(point, inward, strict=True):
         for size in _SIZES:
             for c, s in _TURNS:
-                turned_way = np.array([c * way[0] - s * way[1], s * way[0] + c * way[1]])
-                discs.append((*(at + size * reach * turned_way), size * reach))
+                discs.append((*(at + size * reach * _turned(way, c, s)), size * reach))
     return np.array(discs[:_LOOKS]).reshape(-1, 3)
 
 
@@ -83,11 +82,14 @@ def _hits(shape: Shape, begin: Array, end: Array, time_step: float) -> tuple[Arr
     point = np.empty_like(place)
     for i, turn in enumerate(theta):
         c, s = np.cos(turn), np.sin(turn)
-        x, y = inward[i]
-        local = np.array([c * x + s * y, c * y - s * x])
-        p, q = _exit(shape, local, float(offset[i]))
-        point[i] = place[i] + (c * p - s * q, s * p + c * q)
+        local = _exit(shape, _turned(inward[i], c, -s), float(offset[i]))
+        point[i] = place[i] + _turned(local, c, s)
     return point, inward
+
+
+def _turned(vector: Array, c: float, s: float) -> Array:
+    """A vector (2,) turned by an angle of this cosine and sine."""
+    return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
 def _exit(shape: Shape, direction: Array, offset: float) -> Array:

@@ -9,7 +9,14 @@ from pbrl_ppl.parameters.layout import (
     Block,
     Layout,
 )
-from pbrl_ppl.parameters.priors import Prior, box, inside, prior_draws, prior_residual
+from pbrl_ppl.parameters.priors import (
+    Prior,
+    box,
+    inside,
+    prior_draws,
+    prior_residual,
+    prior_slopes,
+)
 from pbrl_ppl.parameters.wheel_symmetry import (
     MIXED,
     Wheel,
@@ -42,6 +49,7 @@ __all__ = [
     "likeliest",
     "prior_draws",
     "prior_residual",
+    "prior_slopes",
     "redescribed",
     "wheels",
 ]

@@ -224,6 +224,12 @@ def prior_residual(priors: Sequence[Prior], phi: Array) -> Array:
     return np.stack(columns, axis=-1) if columns else np.zeros_like(phi)
 
 
+def prior_slopes(priors: Sequence[Prior], phi: Array) -> Array:
+    """Derivative of each prior's residual by its parameter, shape (p,)."""
+    step = 1e-6 * np.maximum(np.abs(phi), 1e-3)
+    return (prior_residual(priors, phi + step) - prior_residual(priors, phi - step)) / (2 * step)
+
+
 def inside(priors: Sequence[Prior], phi: Array) -> Array:
     """Move values just inside their supports, shape (..., p)."""
     lower, upper = box(priors)

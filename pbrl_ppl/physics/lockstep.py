@@ -126,6 +126,13 @@ def _set_properties(z, links, free, i, row, joints, normal_gravity, step):  # ty
 
 
 @numba.njit(nogil=True, cache=True)
+def _set_wrench(z, i, wrench):  # type: ignore[no-untyped-def]
+    """Give lane ``i`` the accelerations of a wrench."""
+    z[FX + i], z[FY + i] = wrench[0] * z[MI + i], wrench[1] * z[MI + i]
+    z[T + i] = wrench[2] * z[II + i]
+
+
+@numba.njit(nogil=True, cache=True)
 def _lose(z, touched):  # type: ignore[no-untyped-def]
     """Mark the lanes that have diverged."""
     for i in range(LANES):
@@ -229,9 +236,7 @@ def rollout(  # type: ignore[no-untyped-def]
                         _set_properties(z, links, free, i, row, joints[p], normal_gravity, step)
                         slowing[i], patch_radius[i] = row[_MU] * normal_gravity, row[_RADIUS]
                     z[C + i], z[S + i] = math.cos(z[A + i]), math.sin(z[A + i])
-                    for w in range(2):
-                        z[(FX, FY)[w] + i] = inputs[t, h, 0, w] * z[MI + i]
-                    z[T + i] = inputs[t, h, 0, 2] * z[II + i]
+                    _set_wrench(z, i, inputs[t, h, 0])
                 for s in range(substeps):
                     if acting:
                         for i in range(width):
@@ -243,9 +248,7 @@ def rollout(  # type: ignore[no-untyped-def]
                                 force_parameters[p], s / substeps, (s + 1) / substeps, signal,
                                 previous, command, wrench,
                             )  # fmt: skip
-                            z[FX + i] = wrench[0, 0] * z[MI + i]
-                            z[FY + i] = wrench[0, 1] * z[MI + i]
-                            z[T + i] = wrench[0, 2] * z[II + i]
+                            _set_wrench(z, i, wrench[0])
                     _substep(z, links, points, free, slowing, patch_radius, step)
                     _lose(z, touched)
                     if watch:

@@ -71,6 +71,13 @@ def accelerate(z, gravity, step):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True)
+def _limited(impulse, most):  # type: ignore[no-untyped-def]
+    """An impulse no larger than ``most`` either way."""
+    impulse = most if impulse > most else impulse
+    return -most if impulse < -most else impulse
+
+
+@numba.njit(nogil=True, cache=True)
 def begin_wheel(z):  # type: ignore[no-untyped-def]
     """Two rods from the wheel along its axes, with the impulses of the substep before."""
     for i in range(LANES):
@@ -95,18 +102,14 @@ def solve_wheel(z):  # type: ignore[no-untyped-def]
         n_x, n_y, along, across = z[NX + i], z[NY + i], z[CX + i], z[CY + i]
         mass, moment, v_x, v_y, w = z[MI + i], z[II + i], z[VX + i], z[VY + i], z[W + i]
         most, old = z[JX_MAX + i], z[JX + i]
-        new = old + (n_x * v_x + n_y * v_y + along * w) * z[MX + i]
-        new = most if new > most else new
-        new = -most if new < -most else new
+        new = _limited(old + (n_x * v_x + n_y * v_y + along * w) * z[MX + i], most)
         z[JX + i] = new
         j = new - old
         v_x -= n_x * j * mass
         v_y -= n_y * j * mass
         w -= moment * along * j
         most, old = z[JY_MAX + i], z[JY + i]
-        new = old + (n_x * v_y - n_y * v_x + across * w) * z[MY + i]
-        new = most if new > most else new
-        new = -most if new < -most else new
+        new = _limited(old + (n_x * v_y - n_y * v_x + across * w) * z[MY + i], most)
         z[JY + i] = new
         j = new - old
         z[VX + i] = v_x + n_y * j * mass
@@ -195,9 +198,7 @@ def solve_pivot(z):  # type: ignore[no-untyped-def]
     """Friction in a hinge: the motor, then the damper."""
     for i in range(LANES):
         most, old, w = z[T_MAX + i], z[TJ + i], z[W + i]
-        new = old + w / z[II + i]
-        new = most if new > most else new
-        new = -most if new < -most else new
+        new = _limited(old + w / z[II + i], most)
         z[TJ + i] = new
         w -= (new - old) * z[II + i]
         change = (z[AIM + i] - w) * z[COEF + i]
@@ -258,8 +259,6 @@ def solve_patch(z, points):  # type: ignore[no-untyped-def]
         for i in range(LANES):
             n_x, n_y, most, old = own[DX + i], own[DY + i], own[R_MAX + i], own[RJ + i]
             v = n_x * z[VX + i] + n_y * z[VY + i] + own[CROSS + i] * z[W + i]
-            new = old - v * own[RM + i]
-            new = most if new > most else new
-            new = -most if new < -most else new
+            new = _limited(old - v * own[RM + i], most)
             own[RJ + i] = new
             _push(z, own, i, n_x * (new - old), n_y * (new - old))

@@ -58,8 +58,8 @@ def emulate(
             break
         phi = spread(problem, mode.draws(rng, runs // 2))
         residual = problem.residual(phi)
+        good = np.isfinite(residual).all(axis=(1, 2, 3, 4))
         for _ in range(_ROUNDS):
-            good = np.isfinite(residual).all(axis=(1, 2, 3, 4))
             if good.sum() < 0.5 * runs:
                 break
             emulator = Emulator(problem, phi[good], residual[good], degree)
