@@ -53,7 +53,14 @@ def test_uniform_acceleration():
     got = end_of(PUCK, np.zeros(6), 0.5, wrench=(4.0, -2.0, 0.02))
     alpha = 0.02 / INERTIA
     expected = [0.25, -0.125, alpha / 8, 1.0, -0.5, alpha / 2]
-    np.testing.assert_allclose(got, expected, rtol=3e-3)
+    np.testing.assert_allclose(got, expected, rtol=1e-4)  # a step of 1 ms is not seen
+
+
+def test_second_order():
+    """Drag from 1 m/s: place and speed agree with each other to the square of the step."""
+    got = end_of(PUCK, [0.0, 0.0, 0.0, 1.0, 0.0, 0.0], 0.1, linear_drag=20.0)
+    assert got[0] == pytest.approx((1 - math.exp(-1.0)) / 10, rel=2e-5)
+    assert got[3] == pytest.approx(math.exp(-1.0), rel=2e-5)
 
 
 @pytest.mark.parametrize(("theta", "mu"), [(0.0, 0.3), (math.pi / 2, 0.5)])
