@@ -91,11 +91,12 @@ def told(row: Row) -> str:
         lines.append(f"added {_name(one)}: {estimates}, elpd +{one['elpd_difference']:.1f}")
     if found["small"]:
         lines.append(f"too small to matter: {found['small']}")
-    lines += [
-        f"test {'passed' if test['passed'] else 'FAILED'}: {test['name']},"
-        f" p = {test['p_value']:.1e}: {test['sentence']}"
-        for test in found["tests"]
-    ]
+    for test in found["tests"]:
+        chance = "" if test["p_value"] is None else f", p = {test['p_value']:.1e}"
+        lines.append(
+            f"test {'passed' if test['passed'] else 'FAILED'}: {test['name']}{chance}:"
+            f" {test['sentence']}"
+        )
     lines.append(f"unexplained acceleration: {found['unexplained_acceleration']}")
     if found["unexplained"] is not None:
         lines.append(f"remains: {found['unexplained']['sentence']}")

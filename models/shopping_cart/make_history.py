@@ -2,8 +2,8 @@
 
     python make_history.py --effect angular_drag=1.2 --seed 5 --out recorded
 
-The step is 1 ms, and forces, floor friction and damping are applied here, not by the engine, so an
-agreement with pbrl_ppl is no tautology. Vectors of the plane are complex numbers: ``a.real`` is
+Forces, floor friction and damping are applied here, not by the engine, so an agreement with
+pbrl_ppl is no tautology. Vectors of the plane are complex numbers: ``a.real`` is
 along x, a turn by an angle is a product with ``exp(1j * angle)``.
 """
 
@@ -22,7 +22,6 @@ with warnings.catch_warnings():  # Box2D's generated wrapper warns on import und
     warnings.simplefilter("ignore", DeprecationWarning)
     import Box2D
 
-STEP = 0.001  # s
 NORMAL_GRAVITY = 9.81  # m/s^2
 RING = 12  # points of a ring of contact
 # Box2D's tolerances are compiled in (b2_linearSlop 0.005, b2_velocityThreshold 1 length unit per
@@ -59,6 +58,7 @@ class Setup:
     gravity: float = 0.0  # in the plane, downwards
     room: float | None = None  # walls at +-room
     time_step: float = 0.1
+    step: float = 0.001  # of the engine
     n_train: int = 12
     n_test: int = 4
     n_intervals: int = 30
@@ -169,7 +169,8 @@ def rollout(
 
     # Box2D kicks, then drifts. With positions held half a step ahead of the velocities that is the
     # leapfrog, of second order; read without it, positions are half a step's way too far.
-    ahead = STEP / 2
+    step = setup.step
+    ahead = step / 2
     x, y, theta = x + ahead * vx, y + ahead * vy, theta + ahead * omega
     if setup.hinge is not None:
         x, y, vx, vy = hang(setup.hinge, theta, omega)
@@ -220,33 +221,33 @@ def rollout(
         return [x - ahead * vx, y - ahead * vy, theta, vx, vy, omega]
 
     states = [measured()]
-    steps = round(setup.time_step / STEP)
+    steps = round(setup.time_step / step)
     before = np.vstack([np.zeros(3), wrenches])
     for i in range(len(wrenches)):
         for j in range(steps):
-            loaded = trajectory >= loaded_from and (i * steps + j) * STEP >= loaded_at
+            loaded = trajectory >= loaded_from and (i * steps + j) * step >= loaded_at
             mass = setup.mass * (factor if loaded else 1.0)
             inertia = setup.inertia * effects.inertia_scale * mass / setup.mass
             body.massData = Box2D.b2MassData(mass=mass, center=(0, 0), I=inertia * CM**2)
             wrench = before[i if j < effects.actuator_delay * steps else i + 1]
             x, y, theta, vx, vy, omega = state()
             v, turn = complex(vx, vy), cmath.exp(1j * theta)
-            time = (i * steps + j) * STEP
+            time = (i * steps + j) * step
             here = (effects, wrench, complex(x, y), turn)
             force, torque = total_wrench(*here, v, omega, time)
             middle = v + force / mass * ahead, omega + torque / inertia * ahead
             force, torque = total_wrench(*here, *middle, time + ahead)
-            v += force / mass * STEP
-            omega += torque / inertia * STEP
+            v += force / mass * step
+            omega += torque / inertia * step
             if effects.stiction_patch and x > 0:
-                v *= 1 - min(1.0, effects.stiction_patch * NORMAL_GRAVITY * STEP / (abs(v) or 1.0))
+                v *= 1 - min(1.0, effects.stiction_patch * NORMAL_GRAVITY * step / (abs(v) or 1.0))
             if effects.sliding_friction[0]:
-                v, omega = rub(*effects.sliding_friction, mass, inertia, v, omega)
+                v, omega = rub(*effects.sliding_friction, step, mass, inertia, v, omega)
             if setup.wheel is not None:
-                v, omega = roll(setup.wheel, mass, inertia, turn, v, omega)
+                v, omega = roll(setup.wheel, step, mass, inertia, turn, v, omega)
             body.linearVelocity = (v.real * CM, v.imag * CM)
             body.angularVelocity = omega
-            world.Step(STEP, 20, 10)
+            world.Step(step, 20, 10)
             if setup.hinge is not None:
                 # The step moves the centre along its tangent; the engine's next solve would project
                 # the old velocity on the new tangent and so lose energy, 2.5 % a second at 5 rad/s.
@@ -291,13 +292,21 @@ def total_wrench(
 
 
 def roll(
-    wheel: Wheel, mass: float, inertia: float, turn: complex, v: complex, omega: float
+    wheel: Wheel,
+    step: float,
+    mass: float,
+    inertia: float,
+    turn: complex,
+    v: complex,
+    omega: float,
 ) -> tuple[complex, float]:
     """Return the velocities after the floor's friction on the wheel over one step.
 
     Along each axis the impulse that stops the wheel's point, at most mu m g dt. The axes are
-    iterated with the clipping on the accumulated impulse, so their order does not matter.
+    iterated with the clipping on the accumulated impulse, so their order does not matter. ``turn``
+    is of the middle of the step; velocities are of its end, when the body has turned on.
     """
+    on = cmath.exp(0.5j * step * omega)
     arm = turn * complex(wheel.x, wheel.y)
     along = turn * cmath.exp(1j * wheel.theta)
     axes = ((along, wheel.mu_x), (1j * along, wheel.mu_y))
@@ -306,8 +315,8 @@ def roll(
         for k, (axis, mu) in enumerate(axes):
             lever = cross(arm, axis)
             effective_mass = 1 / (1 / mass + lever**2 / inertia)
-            speed = dot(v, axis) + omega * lever
-            limit = mu * mass * NORMAL_GRAVITY * STEP
+            speed = dot(v, axis * on) + omega * lever
+            limit = mu * mass * NORMAL_GRAVITY * step
             wanted = min(max(impulse[k] - effective_mass * speed, -limit), limit)
             v += (wanted - impulse[k]) / mass * axis
             omega += (wanted - impulse[k]) * lever / inertia
@@ -316,7 +325,7 @@ def roll(
 
 
 def rub(
-    mu: float, radius: float, mass: float, inertia: float, v: complex, omega: float
+    mu: float, radius: float, step: float, mass: float, inertia: float, v: complex, omega: float
 ) -> tuple[complex, float]:
     """Return the velocities after dry friction on a ring about the centre over one step.
 
@@ -325,7 +334,7 @@ def rub(
     """
     arms = [radius * cmath.exp(2j * math.pi * k / RING) for k in range(RING)]
     effective_mass = 1 / (1 / mass + radius**2 / inertia)
-    limit = mu * mass * NORMAL_GRAVITY * STEP / RING
+    limit = mu * mass * NORMAL_GRAVITY * step / RING
     impulse = [0j] * RING
     for _ in range(10):
         for k, arm in enumerate(arms):

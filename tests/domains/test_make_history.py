@@ -324,3 +324,15 @@ def test_agrees_with_an_independent_recording():
     predicted = np.array([mh.rollout(setup, state[i], wrench[i : i + 1])[1] for i in rows])
     ratio = (state[rows + 1] - predicted).std(axis=0) / truth["noise"]
     assert np.all((ratio > 1.2) & (ratio < 1.75)), ratio
+
+
+def test_a_step_of_a_rolling_cart_is_short_enough():
+    """Friction that holds the wheel on its way, and slips; against ten times shorter steps."""
+    starts = np.random.default_rng(0).normal(0.0, [2, 2, 2, 1.2, 1.2, 0.8], (8, 6))
+    pushes = np.random.default_rng(1).normal(0.0, [12, 12, 2], (8, 1, 3))
+
+    def ends(setup):
+        return [mh.rollout(setup, *each)[1] for each in zip(starts, pushes, strict=True)]
+
+    finer = replace(mh.CART, step=mh.CART.step / 10)
+    np.testing.assert_allclose(ends(mh.CART), ends(finer), atol=0.02 * np.max(mh.CART.noise))

@@ -78,8 +78,7 @@ def test_effects_agree_with_box2d(make_history) -> None:
             ]
         )
         rms = np.sqrt((((got - expected) / NOISE) ** 2).mean(axis=0))
-        # semi-implicit Euler at 1 ms is off by half a step's acceleration in the position
-        assert rms.max() < 0.25, (case, rms)
+        assert rms.max() < 0.002, (case, rms)
 
 
 @pytest.mark.parametrize("effects", [{}, {"pivot_damping": 0.01}, {"pivot_friction": 0.02}])

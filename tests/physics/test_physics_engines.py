@@ -59,9 +59,9 @@ def reach(states: np.ndarray, size: tuple[float, float]) -> np.ndarray:
     return np.maximum(np.abs(places.real), np.abs(places.imag)).max(axis=1)
 
 
-def test_cart_in_a_room_against_box2d(make_history, cart_setup, monkeypatch) -> None:
+def test_cart_in_a_room_against_box2d(make_history, cart_setup) -> None:
     def box2d(setup, step: float, starts, wrenches) -> np.ndarray:
-        monkeypatch.setattr(make_history, "STEP", step)
+        setup = replace(setup, step=step)
         runs = zip(starts, wrenches, strict=True)
         return np.array([make_history.rollout(setup, s, w[None])[-1] for s, w in runs])
 
@@ -85,8 +85,8 @@ def test_cart_in_a_room_against_box2d(make_history, cart_setup, monkeypatch) -> 
         for n in substeps
     ]
     worst = [np.abs(a - b).max(axis=1) for a, b in zip(ours, theirs, strict=True)]
-    # Sliding: both engines are of the first order, so a quarter of the step leaves a quarter. A
-    # step's friction and push, about 2 * (4.4 + 2) m/s^2 * 0.5 ms, is 0.3 of the noise for the two.
+    # Sliding: ours is of the first order, so a quarter of the step leaves a quarter. Half a step's
+    # friction and push, about (4.4 + 2) m/s^2 * 0.5 ms, is 0.3 of the noise.
     free = [w[~hit].max() for w in worst]
     assert free[0] / free[-1] == pytest.approx(4.0, rel=0.15)
     assert free[-1] < 0.5
