@@ -11,7 +11,8 @@ from pbrl_ppl.criticism.cross_validation import cross_validated, folds, standard
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, twins
-from pbrl_ppl.effects import Attached, Effect, Noise, candidates
+from pbrl_ppl.criticism.structure_search import structure_mode
+from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.scene import Scene
@@ -84,15 +85,18 @@ class Selection:
 
     def _refit(self, mode: Mode, signature: Signature) -> Mode:
         """Mode with the candidate in the model, under the same noise structure."""
-        effects = (*mode.problem.physics.effects, signature.attached)
+        attached = signature.attached
+        if isinstance(attached.effect.stage, Structure):
+            estimate = np.array(list(signature.candidate.estimate.values()))
+            return structure_mode(mode, attached, estimate)
+        effects = (*mode.problem.physics.effects, attached)
         problem = mode.problem.with_physics(effects=effects)
         labels = list(problem.layout.labels)
         phi = np.array([prior.centre for prior in problem.layout.priors])
         for label, value in zip(mode.problem.layout.labels, mode.phi, strict=True):
             phi[labels.index(label)] = value
-        effect = signature.attached.effect
         for name, value in signature.candidate.estimate.items():
-            label = f"{effect.name}_{name}[{signature.attached.body}]"
+            label = f"{attached.effect.name}_{name}[{attached.body}]"
             phi[labels.index(label)] = value
         return trajectory_mode(problem, inside(problem.layout.priors, phi), mode.sigma)
 

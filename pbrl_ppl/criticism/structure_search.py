@@ -1,0 +1,127 @@
+"""Mode of a model with an effect that bodies run into: its place is sought without derivatives."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+
+from pbrl_ppl.effects import Attached
+from pbrl_ppl.model import Problem
+from pbrl_ppl.modes import Mode, trajectory_mode
+from pbrl_ppl.parameters import inside
+
+Array = NDArray[np.float64]
+
+#: A body stops within a step of where it touches: with fewer of them places come out far off.
+_SUBSTEPS = 40
+#: Degrees of freedom of the loss: a transition that a guess does not explain pulls little.
+_NU = 4.0
+#: What a step adds, as a share of its prior's median: the engine's own error at contact, and more.
+_ADDED = 0.3
+#: Guesses that are improved, runs of the engine for each, and how far the first ones go (prior sd).
+_GUESSES, _RUNS, _SIDE = 6, 200, 0.05
+#: Places whose losses differ by less are the same.
+_SAME = 1.0
+#: Places from which the other parameters and the noise are fitted, and rounds after the first.
+_PLACES, _ROUNDS = 4, 3
+#: A round that gains less is the last.
+_BETTER = 2.0
+
+
+def structure_mode(mode: Mode, candidate: Attached, estimate: Array) -> Mode:
+    """Fit a model with a structure that bodies run into.
+
+    Derivatives that straddle a collision mislead a climb, and the noise that is needed without the
+    structure hides which hits a place explains. So guesses of the place are improved first, by
+    Nelder and Mead's simplex under Student's loss with little noise; the best are fitted with all
+    parameters, place and fit in turn.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of whole trajectories, of the model that lacks the structure.
+    candidate : Attached
+        The effect; its scan makes the guesses.
+    estimate : ndarray
+        One guess more, shape (q,).
+
+    Returns
+    -------
+    Mode
+        With at least 40 substeps an interval.
+    """
+    physics = mode.problem.physics
+    problem = mode.problem.with_physics(
+        effects=(*physics.effects, candidate), substeps=max(_SUBSTEPS, physics.substeps)
+    )
+    layout = problem.layout
+    phi = np.array([prior.centre for prior in layout.priors])
+    phi[[layout.labels.index(label) for label in mode.problem.layout.labels]] = mode.phi
+    own = [layout.labels.index(f"{name}[{candidate.body}]") for name in candidate.variables]
+    guesses = estimate[None]
+    if candidate.effect.scan is not None:
+        body = problem.scene.body(candidate.body)
+        looks = candidate.effect.scan(problem.scene, problem.data.history, body)
+        guesses = np.vstack([guesses, looks[np.isfinite(looks).all(axis=1)]])
+
+    def fitted(problem: Problem, phi: Array, place: Array, sigma: Array) -> Mode:
+        start = phi.copy()
+        start[own] = place
+        return trajectory_mode(problem, inside(layout.priors, start), sigma)
+
+    def log_posterior(found: Mode) -> float:
+        return found.log_posterior
+
+    places = _places(problem, phi, _quiet(mode), own, guesses)[:_PLACES]
+    best = max((fitted(problem, phi, each, mode.sigma) for each in places), key=log_posterior)
+    for _ in range(_ROUNDS):
+        place, *_ = _places(best.problem, best.phi, _quiet(best), own, best.phi[own][None])
+        again = fitted(best.problem, best.phi, place, best.sigma)
+        if again.log_posterior < best.log_posterior + _BETTER:
+            break
+        best = again
+    return best
+
+
+def _places(
+    problem: Problem, phi: Array, sigma: Array, own: list[int], guesses: Array
+) -> list[Array]:
+    """Improve guesses of some parameters, the others held; distinct ones, best first."""
+    lower, upper = (bound[own] for bound in problem.layout.bounds)
+
+    def loss(values: Array) -> float:
+        if np.any(values <= lower) or np.any(values >= upper):
+            return np.inf
+        here = phi.copy()
+        here[own] = values
+        whitened = np.nan_to_num(problem.whitened(here, sigma)).reshape(problem.segments.n, -1)
+        square = (whitened**2).sum(axis=1)
+        return float(0.5 * (_NU + whitened.shape[1]) * np.log1p(square / _NU).sum())
+
+    losses = [loss(guess) for guess in guesses]
+    side = _SIDE * min(problem.layout.priors[place].sigma for place in own)
+    found: list[tuple[float, Array]] = []
+    for i in np.argsort(losses)[:_GUESSES]:
+        best = minimize(
+            loss,
+            guesses[i],
+            method="Nelder-Mead",
+            options={
+                "maxfev": _RUNS,
+                "initial_simplex": np.vstack([guesses[i], guesses[i] + side * np.eye(len(own))]),
+                "xatol": 1e-4,
+                "fatol": 0.1,
+            },
+        )
+        if all(abs(best.fun - value) > _SAME for value, _ in found):
+            found.append((float(best.fun), best.x))
+    return [place for _, place in sorted(found, key=lambda entry: entry[0])]
+
+
+def _quiet(mode: Mode) -> Array:
+    """The mode's noise, with little added by a step."""
+    problem, sigma = mode.problem, mode.sigma.copy()
+    steps = slice(len(problem.trajectory_noise.cells.sensors), None)
+    sigma[steps] = np.minimum(sigma[steps], _ADDED * problem.noise_prior[0][steps])
+    return sigma
