@@ -19,15 +19,20 @@ BELOW_THE_MODEL = ("scene", "parameters", "history", "effects", "physics")
 LONGEST = (
     "criticism/test_revision.py",
     "criticism/test_revision_pivots.py",
-    "modes/test_configurations.py",
-    "sampling/test_updating.py",
-    "posterior/test_updated_prior.py",
-    "sampling/test_fitting.py",
-    "sampling/test_emulator.py",
-    "criticism/test_criticism.py",
     "domains/test_namo.py",
-    "planning/test_planning_modes.py",
+    "sampling/test_updating.py",
+    "sampling/test_fitting.py",
+    "modes/test_joint_search.py",
+    "modes/test_configurations.py",
+    "posterior/test_updated_prior.py",
     "planning/test_planning_loop.py",
+    "planning/test_planning_modes.py",
+    "criticism/test_held_out.py",
+    "criticism/test_misfit.py",
+    "criticism/test_criticism.py",
+    "criticism/test_structure_search.py",
+    "model/test_gradients.py",
+    "sampling/test_emulator.py",
 )
 
 
