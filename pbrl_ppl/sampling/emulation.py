@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 _DEGREES, _A_COEFFICIENT, _LEAST, _MOST, _ROUNDS = (1, 2), 4, 100, 400, 4
 #: How far off (standard deviation) the log-likelihood may be: half of the moves still pass.
 _CLOSE = 1.0
+#: Points farther off count if their likelihood is above this quantile of the draws'.
+_LIKELY = 0.05
 #: Half of the runs are so many times as far from the middle as draws from the posterior.
 _FARTHER = 2.0
 #: Steps of the exploring chain between two runs.
@@ -68,13 +70,32 @@ def emulate(
             drawn, sigma = (np.array(x) for x in zip(*(unpack(y)[:2] for y in chain), strict=True))
             phi = spread(problem, drawn)
             residual = problem.residual(phi)
-            told = np.array([emulator(point).copy() for point in drawn])
-            exact = problem.log_density(residual[: len(drawn)], sigma, drawn).sum(axis=-1)
-            off = problem.log_density(told, sigma, drawn).sum(axis=-1) - exact
+            told = np.array([emulator(point).copy() for point in phi])
+            sigma = np.concatenate([sigma, sigma])
+            exact = problem.log_density(residual, sigma, phi).sum(axis=-1)
+            told = problem.log_density(told, sigma, phi).sum(axis=-1)
+            off = errors(told, exact, len(drawn))
             good = np.isfinite(residual).all(axis=(1, 2, 3, 4))
             if np.isfinite(off).all() and off.std() < close:
                 return Emulator(problem, phi[good], residual[good], degree)
     return None
+
+
+def errors(told: Array, exact: Array, draws: int) -> Array:
+    """Errors of log-likelihoods at an emulator's draws, and farther off where it is as likely.
+
+    There the posterior is wider than the emulator's, whose draws alone would confirm it.
+
+    Parameters
+    ----------
+    told, exact : ndarray
+        Of the emulator and of the engine, shape (n,); the draws come first.
+    draws : int
+        How many those are.
+    """
+    far = exact >= np.nanquantile(exact[:draws], _LIKELY)
+    far[:draws] = True
+    return np.asarray((told - exact)[far])
 
 
 def spread(problem: Problem, phi: Array) -> Array:

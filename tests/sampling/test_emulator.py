@@ -100,6 +100,13 @@ def test_runs_reach_farther_than_the_posterior_and_stay_in_the_support(model) ->
     assert runs[200:, heaviest].std() == pytest.approx(2 * drawn[:, heaviest].std())
 
 
+def test_errors_count_farther_off_where_the_engine_says_it_is_as_likely() -> None:
+    """Of cart-null's kinks an emulator learned one side, whose draws confirmed it."""
+    exact = np.array([-1.0, -2.0, -3.0, -4.0, -2.5, -40.0])
+    told = exact + np.array([0.1, 0.0, -0.1, 0.0, -6.0, 9.0])
+    np.testing.assert_allclose(emulation.errors(told, exact, 4), [0.1, 0.0, -0.1, 0.0, -6.0])
+
+
 def test_none_where_no_polynomial_is_close(model, monkeypatch) -> None:
     """An engine that answers at random about the mode cannot be emulated."""
     mode = find_mode(model.problem, seed=1)
