@@ -8,7 +8,8 @@
 Box2D makes the data (models/shopping_cart/make_history.py): a cart on a wheel, a free puck and a
 pendulum, each effect at three sizes; each with itself left out of the catalogue; effects that are
 not in it; clean data; and logs that are nonsense. An oracle that knows what is hidden says which
-cases can be told at all: scores are over those.
+cases can be told at all: scores are over those. Where the measured pendulum lies beside the
+project, the loop's forecasts of it are told too (``--only`` leaves them out).
 """
 
 from __future__ import annotations
@@ -28,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 from attribution.cases import Case, a_tenth, all_cases
+from attribution.measured import SWING, pendulum_errors
 from attribution.one_case import Row, cache_path, load, run_case, save, sources
 from attribution.scores import score
 from attribution.words import plain, score_table, table, told
@@ -204,6 +206,9 @@ def main() -> None:
     rows = watched(in_batches(cases, options), len(cases), kept, options.verbose)
     scores = score(rows)
     console = Console(stderr=options.json == "-", width=None if sys.stdout.isatty() else _WIDTH)
+    if not options.only:
+        say("the measured pendulum" + ("" if SWING.is_dir() else f": none at {SWING}"))
+        scores |= pendulum_errors(seed=options.seed)
     console.print(table(rows), score_table(scores))
     if options.json:
         ordered = sorted(rows, key=lambda row: row.name)

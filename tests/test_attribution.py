@@ -18,6 +18,7 @@ def attribution(monkeypatch):
     """Modules of analysis/attribution can be imported, as the script imports them."""
     monkeypatch.syspath_prepend(str(ROOT / "analysis"))
     import attribution.cases
+    import attribution.measured
     import attribution.one_case
     import attribution.oracle
     import attribution.scores
@@ -216,3 +217,9 @@ def test_a_dead_worker_is_a_row(attribution, monkeypatch) -> None:
     assert only.verdict == "failed"
     assert "gone" in only.error
     assert "--workers" in only.error
+
+
+def test_the_measured_pendulum_is_left_out_where_it_is_not(attribution, tmp_path) -> None:
+    none = attribution.measured.pendulum_errors(tmp_path / "nowhere")
+    assert {"pendulum_1s", "pendulum_2s", "pendulum_angle_only_1s"} < set(none)
+    assert set(none.values()) == {None}
