@@ -125,7 +125,10 @@ PENDULUM = Kind(
         "sensor_bias": tuple((0.0, 0.0, theta, 0.0, 0.0, 0.0) for theta in (0.002, 0.01, 0.04)),
     },
     outside={},
-    twins=(("pivot_damping", "linear_drag", "angular_drag"),),
+    twins=(
+        ("pivot_damping", "linear_drag", "angular_drag"),
+        ("constant_torque", "body_force"),  # a force fixed to the arm turns it alike everywhere
+    ),
 )
 
 BODIES = {"cart": CART, "puck": PUCK, "pendulum": PENDULUM}
