@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 from scipy.stats import chi2
 
 import pbrl_ppl as pp
@@ -70,12 +69,11 @@ def ask(case: Case, train: pp.History, seed: int) -> Oracle:
 def _with(mode: Mode, added: Attached, values: dict[str, float]) -> Mode:
     """Mode with the effect in the model, sought from the truth."""
     problem = mode.problem.with_physics(effects=(*mode.problem.physics.effects, added))
-    labels = problem.layout.labels
-    phi = np.array([prior.centre for prior in problem.layout.priors])
-    phi[[labels.index(label) for label in mode.problem.layout.labels]] = mode.phi
+    layout = problem.layout
+    phi = layout.from_layout(mode.problem.layout, mode.phi)
     for name, value in values.items():
-        phi[labels.index(f"{added.effect.name}_{name}[{added.body}]")] = value
-    return trajectory_mode(problem, inside(problem.layout.priors, phi), mode.sigma)
+        phi[layout.index(f"{added.effect.name}_{name}", added.body)] = value
+    return trajectory_mode(problem, inside(layout.priors, phi), mode.sigma)
 
 
 def _log_likelihood(mode: Mode) -> float:

@@ -3,8 +3,8 @@
     python make_history.py --effect angular_drag=1.2 --seed 5 --out recorded
 
 Forces, floor friction and damping are applied here, not by the engine, so an agreement with
-pbrl_ppl is no tautology. Vectors of the plane are complex numbers: ``a.real`` is
-along x, a turn by an angle is a product with ``exp(1j * angle)``.
+pbrl_ppl is no tautology. Vectors of the plane are complex numbers: ``a.real`` is along x, a turn
+by an angle is a product with ``exp(1j * angle)``.
 """
 
 import argparse
@@ -162,18 +162,13 @@ def rollout(
     effects = Effects() if effects is None else effects
     if setup.hinge is None and (effects.pivot_friction or effects.pivot_damping):
         raise ValueError("pivot_friction and pivot_damping act in a hinge, and the setup has none")
-    x, y, theta, vx, vy, omega = (float(v) for v in start)
-    if setup.hinge is not None:
-        x, y, vx, vy = hang(setup.hinge, theta, omega)
     factor, loaded_from, loaded_at = effects.mass_change
 
     # Box2D kicks, then drifts. With positions held half a step ahead of the velocities that is the
     # leapfrog, of second order; read without it, positions are half a step's way too far.
     step = setup.step
     ahead = step / 2
-    x, y, theta = x + ahead * vx, y + ahead * vy, theta + ahead * omega
-    if setup.hinge is not None:
-        x, y, vx, vy = hang(setup.hinge, theta, omega)
+    x, y, theta, vx, vy, omega = drift(setup.hinge, ahead, *(float(v) for v in start))
     world = Box2D.b2World(gravity=(0, -setup.gravity * CM), doSleep=False, continuousPhysics=False)
     ground = world.CreateStaticBody()
     if setup.room is not None:
@@ -212,15 +207,7 @@ def rollout(
         p, v = body.position, body.linearVelocity
         return [p.x / CM, p.y / CM, body.angle, v.x / CM, v.y / CM, body.angularVelocity]
 
-    def measured() -> list[float]:
-        x, y, theta, vx, vy, omega = state()
-        theta -= ahead * omega
-        if setup.hinge is not None:
-            x, y, vx, vy = hang(setup.hinge, theta, omega)
-            return [x, y, theta, vx, vy, omega]
-        return [x - ahead * vx, y - ahead * vy, theta, vx, vy, omega]
-
-    states = [measured()]
+    states = [drift(setup.hinge, -ahead, *state())]
     steps = round(setup.time_step / step)
     before = np.vstack([np.zeros(3), wrenches])
     for i in range(len(wrenches)):
@@ -253,8 +240,26 @@ def rollout(
                 # the old velocity on the new tangent and so lose energy, 2.5 % a second at 5 rad/s.
                 _, _, vx, vy = hang(setup.hinge, body.angle, body.angularVelocity)
                 body.linearVelocity = (vx * CM, vy * CM)
-        states.append(measured())
+        states.append(drift(setup.hinge, -ahead, *state()))
     return np.array(states)
+
+
+def drift(
+    hinge: complex | None,
+    time: float,
+    x: float,
+    y: float,
+    theta: float,
+    vx: float,
+    vy: float,
+    omega: float,
+) -> list[float]:
+    """Return the state after some time (s) without forces; a hinged body stays in its hinge."""
+    theta += time * omega
+    if hinge is not None:
+        x, y, vx, vy = hang(hinge, theta, omega)
+        return [x, y, theta, vx, vy, omega]
+    return [x + time * vx, y + time * vy, theta, vx, vy, omega]
 
 
 def hang(hinge: complex, theta: float, omega: float) -> tuple[float, float, float, float]:

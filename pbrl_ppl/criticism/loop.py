@@ -130,10 +130,11 @@ def _revised(
         if effect not in full_catalogue:
             try_effect(effect, scene, train)
     selection = Selection(scene, catalogue, say)
+    effects = attach(scene, (), catalogue)
     say("looking whether the prior could have made the data")
-    prior = _prior_test(scene, train, attach(scene, (), catalogue), seed)
+    prior = _prior_test(scene, train, effects, seed)
     say("fitting the declared model")
-    declared = loop.declared_mode(attach(scene, (), catalogue), substeps)
+    declared = loop.declared_mode(effects, substeps)
     say("scoring what the model might lack")
     first = rank_candidates(declared, selection.missing(declared))
     current, ranked = declared, first

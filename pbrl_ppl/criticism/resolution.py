@@ -42,9 +42,8 @@ def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
 
 def _afresh(mode: Mode) -> Mode:
     """The better of two modes: smoothed anew, and smoothed as if steps added next to nothing."""
-    problem, sigma = mode.problem, mode.sigma.copy()
-    steps = slice(len(problem.trajectory_noise.cells.sensors), None)
-    sigma[steps] = np.minimum(sigma[steps], _LITTLE * problem.noise_prior[0][steps])
+    problem = mode.problem
+    sigma = problem.quiet(mode.sigma, _LITTLE)
     quiet = trajectory_mode(smoothed(problem, mode.phi, sigma), mode.phi, sigma)
     return max(trajectory_mode(problem, mode.phi), quiet, key=lambda found: found.log_posterior)
 

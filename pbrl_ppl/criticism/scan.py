@@ -59,9 +59,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
     wide = problem.with_physics(effects=(*problem.physics.effects, candidate)).rough
     labels = wide.layout.labels
     declared = [labels.index(label) for label in problem.layout.labels]
-    own = [
-        labels.index(f"{variable}[{candidate.body}]") for variable in candidate.variables
-    ]  # places in the wider vector
+    own = [labels.index(label) for label in candidate.labels]  # places in the wider vector
     null = np.array(effect.null)
 
     def whitened(points: Array) -> Array:

@@ -130,11 +130,8 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
     null[declared] = mode.phi
     columns: list[list[int]] = []
     for attached in candidates:
-        places = []
-        for parameter in attached.effect.parameters:
-            place = labels.index(f"{attached.effect.variable(parameter)}[{attached.body}]")
-            null[place] = parameter.null
-            places.append(place)
+        places = [labels.index(label) for label in attached.labels]
+        null[places] = attached.effect.null
         columns.append(places)
     new = [*declared, *(place for places in columns for place in places)]
     lower, upper = (bound[new] for bound in wide.layout.bounds)

@@ -86,19 +86,15 @@ class Selection:
     def _refit(self, mode: Mode, signature: Signature) -> Mode:
         """Mode with the candidate in the model, under the same noise structure."""
         attached = signature.attached
+        estimate = np.array(list(signature.candidate.estimate.values()))
         if isinstance(attached.effect.stage, Structure):
-            estimate = np.array(list(signature.candidate.estimate.values()))
             return structure_mode(mode, attached, estimate)
         effects = (*mode.problem.physics.effects, attached)
         problem = mode.problem.with_physics(effects=effects)
-        labels = list(problem.layout.labels)
-        phi = np.array([prior.centre for prior in problem.layout.priors])
-        for label, value in zip(mode.problem.layout.labels, mode.phi, strict=True):
-            phi[labels.index(label)] = value
-        for name, value in signature.candidate.estimate.items():
-            label = f"{attached.effect.name}_{name}[{attached.body}]"
-            phi[labels.index(label)] = value
-        return trajectory_mode(problem, inside(problem.layout.priors, phi), mode.sigma)
+        layout = problem.layout
+        phi = layout.from_layout(mode.problem.layout, mode.phi)
+        phi[[layout.labels.index(label) for label in attached.labels]] = estimate
+        return trajectory_mode(problem, inside(layout.priors, phi), mode.sigma)
 
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
@@ -126,9 +122,8 @@ class Selection:
     def _without(self, mode: Mode, effect: Attached) -> Mode:
         kept = tuple(attached for attached in mode.problem.physics.effects if attached != effect)
         problem = mode.problem.with_physics(effects=kept)
-        labels = mode.problem.layout.labels
-        phi = [mode.phi[labels.index(label)] for label in problem.layout.labels]
-        return trajectory_mode(problem, np.array(phi), mode.sigma)
+        phi = problem.layout.from_layout(mode.problem.layout, mode.phi)
+        return trajectory_mode(problem, phi, mode.sigma)
 
 
 def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:

@@ -56,9 +56,8 @@ def structure_mode(mode: Mode, candidate: Attached, estimate: Array) -> Mode:
         effects=(*physics.effects, candidate), substeps=max(_SUBSTEPS, physics.substeps)
     )
     layout = problem.layout
-    phi = np.array([prior.centre for prior in layout.priors])
-    phi[[layout.labels.index(label) for label in mode.problem.layout.labels]] = mode.phi
-    own = [layout.labels.index(f"{name}[{candidate.body}]") for name in candidate.variables]
+    phi = layout.from_layout(mode.problem.layout, mode.phi)
+    own = [layout.labels.index(label) for label in candidate.labels]
     guesses = estimate[None]
     if candidate.effect.scan is not None:
         body = problem.scene.body(candidate.body)
@@ -70,13 +69,12 @@ def structure_mode(mode: Mode, candidate: Attached, estimate: Array) -> Mode:
         start[own] = place
         return trajectory_mode(problem, inside(layout.priors, start), sigma)
 
-    def log_posterior(found: Mode) -> float:
-        return found.log_posterior
-
-    places = _places(problem, phi, _quiet(mode), own, guesses)[:_PLACES]
-    best = max((fitted(problem, phi, each, mode.sigma) for each in places), key=log_posterior)
+    places = _places(problem, phi, problem.quiet(mode.sigma, _ADDED), own, guesses)[:_PLACES]
+    fits = [fitted(problem, phi, place, mode.sigma) for place in places]
+    best = max(fits, key=lambda found: found.log_posterior)
     for _ in range(_ROUNDS):
-        place, *_ = _places(best.problem, best.phi, _quiet(best), own, best.phi[own][None])
+        quiet = best.problem.quiet(best.sigma, _ADDED)
+        place, *_ = _places(best.problem, best.phi, quiet, own, best.phi[own][None])
         again = fitted(best.problem, best.phi, place, best.sigma)
         if again.log_posterior < best.log_posterior + _BETTER:
             break
@@ -117,11 +115,3 @@ def _places(
         if all(abs(best.fun - value) > _SAME for value, _ in found):
             found.append((float(best.fun), best.x))
     return [place for _, place in sorted(found, key=lambda entry: entry[0])]
-
-
-def _quiet(mode: Mode) -> Array:
-    """The mode's noise, with little added by a step."""
-    problem, sigma = mode.problem, mode.sigma.copy()
-    steps = slice(len(problem.trajectory_noise.cells.sensors), None)
-    sigma[steps] = np.minimum(sigma[steps], _ADDED * problem.noise_prior[0][steps])
-    return sigma

@@ -149,6 +149,11 @@ class Attached:
         """Names of its parameters' random variables in a model."""
         return tuple(self.effect.variable(parameter) for parameter in self.effect.parameters)
 
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Labels of its parameters in a model's layout."""
+        return tuple(f"{variable}[{self.body}]" for variable in self.variables)
+
 
 def at_stage(effects: tuple[Attached, ...], stage: type) -> list[Attached]:
     """Effects that act at a stage, in their order."""

@@ -237,6 +237,13 @@ class Problem:
             raise TypeError("the problem is one of single transitions, expected whole trajectories")
         return self.trajectories
 
+    def quiet(self, sigma: Array, share: float) -> Array:
+        """Noise of trajectories, a step's no larger than a share of its prior's median."""
+        steps = slice(len(self.trajectory_noise.cells.sensors), None)
+        sigma = sigma.copy()
+        sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])
+        return sigma
+
     @property
     def noise_variables(self) -> dict[str, tuple[str, ...]]:
         """Variables of the noise, and the state dimensions of each, in the order of sigma."""

@@ -19,9 +19,9 @@ def tail_places(physics: Physics) -> list[int]:
     """Where phi holds parameters of the noise stage."""
     labels = physics.layout.labels
     return [
-        labels.index(f"{variable}[{attached.body}]")
+        labels.index(label)
         for attached in at_stage(physics.effects, Noise)
-        for variable in attached.variables
+        for label in attached.labels
     ]
 
 

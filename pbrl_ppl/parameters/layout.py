@@ -216,6 +216,12 @@ class Layout:
             vector[place] = value.ravel()
         return vector
 
+    def from_layout(self, other: Layout, phi: Array) -> Array:
+        """Values of another layout's parameters, priors' centres of those it lacks, shape (p,)."""
+        known = dict(zip(other.labels, phi.tolist(), strict=True))
+        pairs = zip(self.labels, self.priors, strict=True)
+        return np.array([known.get(label, prior.centre) for label, prior in pairs])
+
     def to_vectors(self, draws: Mapping[str, Array], n: int) -> Array:
         """Stack ``n`` named draws, shape (n, owner) each, into vectors, shape (n, p)."""
         columns = [draws[block.name].reshape(n, -1) for block in self.blocks]

@@ -70,10 +70,10 @@ def emulate(
             drawn, sigma = (np.array(x) for x in zip(*(unpack(y)[:2] for y in chain), strict=True))
             phi = spread(problem, drawn)
             residual = problem.residual(phi)
-            told = np.array([emulator(point).copy() for point in phi])
+            emulated = np.array([emulator(point).copy() for point in phi])
             sigma = np.concatenate([sigma, sigma])
             exact = problem.log_density(residual, sigma, phi).sum(axis=-1)
-            told = problem.log_density(told, sigma, phi).sum(axis=-1)
+            told = problem.log_density(emulated, sigma, phi).sum(axis=-1)
             off = errors(told, exact, len(drawn))
             good = np.isfinite(residual).all(axis=(1, 2, 3, 4))
             if np.isfinite(off).all() and off.std() < close:
