@@ -121,6 +121,7 @@ PENDULUM = Kind(
         "pivot_damping": (0.0002, 0.001, 0.005),
         "pivot_friction": (0.0005, 0.003, 0.015),
         "quadratic_drag": (0.01, 0.05, 0.2),
+        "gravity_tilt": (0.002, 0.01, 0.04),
         "constant_torque": (0.002, 0.01, 0.05),
         "sensor_bias": tuple((0.0, 0.0, theta, 0.0, 0.0, 0.0) for theta in (0.002, 0.01, 0.04)),
     },
@@ -128,6 +129,8 @@ PENDULUM = Kind(
     twins=(
         ("pivot_damping", "linear_drag", "angular_drag"),
         ("constant_torque", "body_force"),  # a force fixed to the arm turns it alike everywhere
+        # angles from a vertical that is off; a force turns gravity and adds to it
+        ("gravity_tilt", "sensor_bias", "constant_force"),
     ),
 )
 

@@ -81,6 +81,7 @@ class Effects:
     linear_drag: float = 0.0  # kg/s
     quadratic_drag: float = 0.0  # kg/m
     angular_drag: float = 0.0  # N m s
+    gravity_tilt: float = 0.0  # rad
     constant_force: tuple[float, float] = (0.0, 0.0)  # N, world frame
     body_force: tuple[float, float] = (0.0, 0.0)  # N, body frame
     constant_torque: float = 0.0  # N m
@@ -169,7 +170,9 @@ def rollout(
     step = setup.step
     ahead = step / 2
     x, y, theta, vx, vy, omega = drift(setup.hinge, ahead, *(float(v) for v in start))
-    world = Box2D.b2World(gravity=(0, -setup.gravity * CM), doSleep=False, continuousPhysics=False)
+    down = -1j * setup.gravity * cmath.exp(1j * effects.gravity_tilt) * CM
+    gravity = (down.real, down.imag)
+    world = Box2D.b2World(gravity=gravity, doSleep=False, continuousPhysics=False)
     ground = world.CreateStaticBody()
     if setup.room is not None:
         a = setup.room * CM

@@ -61,7 +61,7 @@ class Selection:
 
         def rank(item: tuple[Signature, Mode]) -> float:
             signature, fitted = item
-            penalty = 0.5 * len(signature.attached.variables) * np.log(fitted.problem.segments.n)
+            penalty = 0.5 * signature.candidate.dof * np.log(fitted.problem.segments.n)
             return float(_log_likelihood(fitted) - penalty)
 
         waiting = _distinct(ranked, order)[:TRIED]

@@ -8,6 +8,7 @@ from pbrl_ppl.effects.constant_force import constant_force
 from pbrl_ppl.effects.constant_torque import constant_torque
 from pbrl_ppl.effects.dead_zone import dead_zone
 from pbrl_ppl.effects.effect import Effect
+from pbrl_ppl.effects.gravity_tilt import gravity_tilt
 from pbrl_ppl.effects.heavy_tails import heavy_tails
 from pbrl_ppl.effects.hidden_obstacle import hidden_obstacle
 from pbrl_ppl.effects.inertia_scale import inertia_scale
@@ -28,6 +29,7 @@ catalogue: tuple[Effect, ...] = (
     linear_drag,
     quadratic_drag,
     angular_drag,
+    gravity_tilt,
     constant_force,
     body_force,
     constant_torque,

@@ -9,6 +9,9 @@ import numpy as np
 
 from pbrl_ppl.physics.calls import call1, call2, call_int, call_law, call_pointer, get1, get2
 from pbrl_ppl.physics.setters import (
+    EXTRA_X,
+    EXTRA_Y,
+    MASS,
     W_THETA,
     drive,
     iterations,
@@ -169,7 +172,12 @@ def _transition(  # type: ignore[no-untyped-def]
             for i in range(k):
                 if driven and world.kinematic[i]:
                     continue
-                call2(fn.cpBodySetForce, world.bodies[i], wrench[i, 0], wrench[i, 1])
+                weight_x = bodies[i, MASS] * bodies[i, EXTRA_X]
+                weight_y = bodies[i, MASS] * bodies[i, EXTRA_Y]
+                call2(
+                    fn.cpBodySetForce, world.bodies[i], wrench[i, 0] + weight_x,
+                    wrench[i, 1] + weight_y,
+                )  # fmt: skip
                 call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
             place_wheels(fn, world, bodies, state, axes, step)
             if sliding:

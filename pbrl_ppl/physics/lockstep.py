@@ -22,6 +22,8 @@ from pbrl_ppl.physics.lockstep_solver import (
     COEF,
     FX,
     FY,
+    GX,
+    GY,
     II,
     JX_MAX,
     JY_MAX,
@@ -58,6 +60,7 @@ _MASS, _MOMENT, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _TORQUE, _DAMPING, _MU, _RAD
         "patch_mu", "patch_radius",
     )
 )  # fmt: skip
+_EXTRA_X, _EXTRA_Y = COLUMN["extra_gravity_x"], COLUMN["extra_gravity_y"]
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 
 
@@ -106,6 +109,7 @@ def free_body(world: World) -> FreeBody | None:
 def _set_properties(z, links, free, i, row, joints, normal_gravity, step):  # type: ignore[no-untyped-def]
     """Give lane ``i`` its numbers for an interval; what is stored in joints stays."""
     z[MI + i], z[II + i] = 1.0 / row[_MASS], 1.0 / row[_MOMENT]
+    z[GX + i], z[GY + i] = row[_MASS] * row[_EXTRA_X], row[_MASS] * row[_EXTRA_Y]
     if free.wheel:
         load = row[_MASS] * normal_gravity
         z[WX + i], z[WY + i] = row[_W_X], row[_W_Y]
@@ -127,8 +131,9 @@ def _set_properties(z, links, free, i, row, joints, normal_gravity, step):  # ty
 
 @numba.njit(nogil=True, cache=True)
 def _set_wrench(z, i, wrench):  # type: ignore[no-untyped-def]
-    """Give lane ``i`` the accelerations of a wrench."""
-    z[FX + i], z[FY + i] = wrench[0] * z[MI + i], wrench[1] * z[MI + i]
+    """Give lane ``i`` the accelerations of a wrench and of the weight beside it."""
+    z[FX + i] = (wrench[0] + z[GX + i]) * z[MI + i]
+    z[FY + i] = (wrench[1] + z[GY + i]) * z[MI + i]
     z[T + i] = wrench[2] * z[II + i]
 
 

@@ -23,7 +23,9 @@ WX, WY, WC, WS, JX_MAX, JY_MAX, JX, JY = (i * LANES for i in range(13, 21))
 NX, NY, CX, CY, MX, MY = (i * LANES for i in range(21, 27))
 # Hinge's motor and damper.
 T_MAX, TJ, COEF, AIM = (i * LANES for i in range(27, 31))
-ROWS = 31 * LANES
+# Weight that the body has beyond the scene's gravity.
+GX, GY = (i * LANES for i in range(31, 33))
+ROWS = 33 * LANES
 # A link: anchor on the body, the point it is held at, length; arm, stored impulse, bias; a hinge's
 # inverse tensor, of which a rod's mass is the first; a rod's direction.
 AX, AY, PX, PY, L, RX, RY, LX, LY, BX, BY, K, KXY, KYY, DX, DY = (i * LANES for i in range(16))

@@ -10,6 +10,8 @@ from pbrl_ppl.effects import Attached, Command, Force, at_stage
 from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput
 from pbrl_ppl.physics.world import DIVERGED, RING, STICKING, World
 
+_EXTRA = [COLUMN["extra_gravity_x"], COLUMN["extra_gravity_y"]]
+
 
 def rollout(
     world: World,
@@ -82,7 +84,8 @@ def rollout(
             for i, body in enumerate(world.bodies):
                 if world.kinematic[i]:
                     continue
-                body.force, body.torque = tuple(wrench[i, :2]), wrench[i, 2]
+                weight = bodies[i, COLUMN["mass"]] * bodies[i, _EXTRA]
+                body.force, body.torque = tuple(wrench[i, :2] + weight), wrench[i, 2]
             _place_wheels(world, bodies, step)
             _place_patches(world, bodies, step)
             world.space.step(step)

@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 
 #: Columns of a body's properties. ``moment`` is about the centroid (kg m^2); ``pivot_torque`` (N m)
 #: and ``pivot_damping`` (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m)
-#: are of the friction under it.
+#: are of the friction under it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) come on top of
+#: the scene's gravity.
 COLUMNS = (
     *BODY_PARAMETERS,
     "moment",
@@ -34,6 +35,8 @@ COLUMNS = (
     "pivot_damping",
     "patch_mu",
     "patch_radius",
+    "extra_gravity_x",
+    "extra_gravity_y",
 )
 COLUMN = {name: i for i, name in enumerate(COLUMNS)}
 #: Columns of a joint's properties: its anchors and its length (m).
@@ -42,7 +45,13 @@ JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
 _NO_LENGTH = 1e-9
 _MAX = np.finfo(float).max
 _POSITIVE = ("mass", "moment")
-_ANYTHING = ("w_x", "w_y", "w_theta")
+_ANYTHING = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y")
+#: What an effect sees in place of a column: the moment follows from the mass, gravity is the whole.
+_GIVEN = {
+    "moment_per_mass": "moment",
+    "gravity_x": "extra_gravity_x",
+    "gravity_y": "extra_gravity_y",
+}
 #: Least value of each column.
 _LEAST = np.array(
     [
@@ -83,7 +92,7 @@ def _is_patch(attached: Attached) -> bool:
     stage = attached.effect.stage
     if not isinstance(stage, Properties):
         return False
-    row = {name: np.zeros((1, 1)) for name in (*COLUMNS, "moment_per_mass")}
+    row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *_GIVEN)}
     centre = {p.name: np.full((1, 1), p.prior.centre) for p in attached.effect.parameters}
     never = np.full((1, 1), np.inf)
     stage.modify(row, centre, Clock(never, never, never))
@@ -232,17 +241,22 @@ class EngineProperties:
             return bodies[:, None]
         never = np.full((1, 1), np.inf)
         clock = clock if self.timed and clock is not None else Clock(never, never, never)
-        m = clock.begin.shape[1]
+        m, gravity = clock.begin.shape[1], self._scene.gravity
         result = np.repeat(bodies[:, None], m, axis=1)
         for name in dict.fromkeys(attached.body for attached in modifying):
             i = self._bodies.index(name)
             row = {key: result[:, :, i, column].copy() for key, column in COLUMN.items()}
-            del row["moment"]
+            for column in _GIVEN.values():
+                del row[column]
             row["moment_per_mass"] = np.full((len(phi), m), self._unit_moment[i])
+            for key, own in zip(("gravity_x", "gravity_y"), gravity, strict=True):
+                row[key] = np.full((len(phi), m), own)
             for attached in modifying:
                 if attached.body == name and isinstance(attached.effect.stage, Properties):
                     attached.effect.stage.modify(row, self.values(attached, phi, 1), clock)
             row["moment"] = row["mass"] * row["moment_per_mass"]
+            row["extra_gravity_x"] = row["gravity_x"] - gravity[0]
+            row["extra_gravity_y"] = row["gravity_y"] - gravity[1]
             for key, column in COLUMN.items():
                 result[:, :, i, column] = row[key]
         return result

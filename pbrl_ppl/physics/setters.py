@@ -15,8 +15,8 @@ from pbrl_ppl.physics.calls import call1, call2, call_pointer
 from pbrl_ppl.physics.properties import COLUMNS, JOINT_COLUMNS
 from pbrl_ppl.physics.world import FAR, ITERATIONS_A_RATIO, MOST_ITERATIONS, NO_SIZE, STICKING
 
-_MASS, _R, _MU_C, _W_X, _W_Y, W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(11)
-_PATCH_MU, _PATCH_RADIUS = range(11, len(COLUMNS))
+MASS, _R, _MU_C, _W_X, _W_Y, W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(11)
+_PATCH_MU, _PATCH_RADIUS, EXTRA_X, EXTRA_Y = range(11, len(COLUMNS))
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 
 
@@ -26,8 +26,8 @@ def iterations(world, bodies):  # type: ignore[no-untyped-def]
     lightest, heaviest = np.inf, 0.0
     for i in range(len(world.chained)):
         if world.chained[i]:
-            lightest = min(lightest, bodies[i, _MASS])
-            heaviest = max(heaviest, bodies[i, _MASS])
+            lightest = min(lightest, bodies[i, MASS])
+            heaviest = max(heaviest, bodies[i, MASS])
     enough = min(ITERATIONS_A_RATIO * (heaviest / lightest), MOST_ITERATIONS)
     return max(world.iterations, int(enough))
 
@@ -38,7 +38,7 @@ def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
     for i in range(len(world.bodies)):
         if world.kinematic[i]:
             continue
-        call1(fn.cpBodySetMass, world.bodies[i], bodies[i, _MASS])
+        call1(fn.cpBodySetMass, world.bodies[i], bodies[i, MASS])
         call1(fn.cpBodySetMoment, world.bodies[i], bodies[i, _MOMENT])
     for j in range(len(world.shapes)):
         row = bodies[world.shape_body[j]]
@@ -90,7 +90,7 @@ def set_strengths(fn, world, bodies, normal_gravity, on):  # type: ignore[no-unt
     """Give the joints their greatest forces, or none at all."""
     for j in range(len(world.wheel_body)):
         row = bodies[world.wheel_body[j]]
-        load = on * row[_MASS] * normal_gravity
+        load = on * row[MASS] * normal_gravity
         call1(fn.cpConstraintSetMaxForce, world.wheels[0, j], row[_MU_X] * load)
         call1(fn.cpConstraintSetMaxForce, world.wheels[1, j], row[_MU_Y] * load)
     for j in range(len(world.links)):
@@ -126,7 +126,7 @@ def place_patches(fn, world, bodies, state, step, normal_gravity):  # type: igno
     for j in range(len(world.patch_body)):
         i = world.patch_body[j]
         radius, slowing = bodies[i, _PATCH_RADIUS], bodies[i, _PATCH_MU] * normal_gravity
-        most = slowing * bodies[i, _MASS] / len(world.ring)
+        most = slowing * bodies[i, MASS] / len(world.ring)
         theta = state[i, 2] + state[i, 5] * step
         c, s = math.cos(theta), math.sin(theta)
         for point in range(len(world.ring)):

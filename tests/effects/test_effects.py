@@ -32,6 +32,7 @@ def full_scene() -> Scene:
     cart = body("cart", BOX, wheel=True, mass=MASS, r=0.3, mu_c=0.3, mu_x=0.05, mu_y=0.4, w_x=-0.2)
     return Scene(
         time_step=0.1,
+        gravity=(0.5, -1.0),
         normal_gravity=G,
         bodies=(cart, body("arm", Shape.box(0.05, 0.4), mass=0.3)),
         walls=(Wall((-1.0, -2.0), (-1.0, 2.0)), Wall((1.0, -2.0), (1.0, 2.0))),
@@ -170,6 +171,22 @@ def test_actuator_rotation_turns_the_commanded_force(path) -> None:
     got = predict(free(), state(theta=1.0), (4.0, 0.0, 0.2), effects=effects, path=path)[0, 0]
     a = np.array([4 * math.cos(0.3), 4 * math.sin(0.3) + 1.0]) / MASS
     np.testing.assert_allclose(got[3:], [*a, 0.2 / INERTIA], atol=1e-10)
+
+
+@PATHS
+def test_gravity_tilt_turns_gravity_for_all_masses_alike(path) -> None:
+    """A free fall, beside a force that stays as it is."""
+    scene = free().replace(gravity=(0.6, -G))
+    effects = {"gravity_tilt": 0.2, "constant_force": (1.0, 0.0)}
+    got = predict(scene, state(omega=1.0), effects=effects, path=path)[0, 0]
+    c, s = math.cos(0.2), math.sin(0.2)
+    a = np.array([c * 0.6 + s * G + 1.0 / MASS, s * 0.6 - c * G])
+    np.testing.assert_allclose(got, [*(a / 2), 1.0, *a, 1.0], atol=1e-10)
+
+
+def test_gravity_tilt_needs_gravity_in_the_plane() -> None:
+    assert not BY_NAME["gravity_tilt"].applies(free(), free().bodies[0])
+    assert BY_NAME["gravity_tilt"].applies(free().replace(gravity=(0.0, -G)), free().bodies[0])
 
 
 @PATHS

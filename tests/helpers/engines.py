@@ -12,8 +12,9 @@ BOX = Shape.box(0.9, 0.55)
 ARM = Shape.box(0.03, 0.4)
 #: Friction in hinges.
 PIVOT = [e for e in catalogue if e.name.startswith("pivot")]
+TILT = [e for e in catalogue if e.name == "gravity_tilt"]
 #: Without hinges there is no friction in them, and without obstacles nothing to touch.
-OTHERS = [e for e in catalogue if not e.name.startswith(("pivot", "hidden_obstacle"))]
+OTHERS = [e for e in catalogue if not e.name.startswith(("pivot", "gravity", "hidden_obstacle"))]
 
 
 def ring(half: float) -> tuple[Wall, ...]:
@@ -57,7 +58,7 @@ def chain() -> tuple[Simulator, np.ndarray, np.ndarray]:
     speed[:, 1] += 2 * speed[:, 0]
     start = np.concatenate([place, theta[..., None], speed, omega[..., None]], axis=-1)
     actions = rng.normal(0, [0, 0, 0.3], (40, 3, 2, 3))
-    return simulator(scene, tuple(PIVOT)), start, actions
+    return simulator(scene, (*PIVOT, *TILT)), start, actions
 
 
 def crowd() -> tuple[Simulator, np.ndarray, np.ndarray]:

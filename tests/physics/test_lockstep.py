@@ -53,7 +53,7 @@ SCENES = {
     "payload": cart("mass_change", "actuator_delay"),
     "disc": cart("hidden_obstacle"),
 }
-PIVOT = tuple(BY_NAME[name] for name in ("pivot_friction", "pivot_damping"))
+PIVOT = tuple(BY_NAME[name] for name in ("pivot_friction", "pivot_damping", "gravity_tilt"))
 
 
 def case(name: str) -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:

@@ -81,7 +81,10 @@ def test_effects_agree_with_box2d(make_history) -> None:
         assert rms.max() < 0.002, (case, rms)
 
 
-@pytest.mark.parametrize("effects", [{}, {"pivot_damping": 0.01}, {"pivot_friction": 0.02}])
+@pytest.mark.parametrize(
+    "effects",
+    [{}, {"pivot_damping": 0.01}, {"pivot_friction": 0.02}, {"gravity_tilt": 0.3}],
+)
 def test_hinged_arm_against_box2d(make_history, effects) -> None:
     setup = make_history.PENDULUM
     arm = body("arm", Shape.box(*setup.size), mass=setup.mass)
