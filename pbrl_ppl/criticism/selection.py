@@ -14,7 +14,7 @@ from pbrl_ppl.criticism.score import Signature, inseparable, twins
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, trajectory_mode
-from pbrl_ppl.parameters import inside
+from pbrl_ppl.parameters import inside, prior_slopes
 from pbrl_ppl.scene import Scene
 
 #: A candidate is tried if chance alone gives its statistic less often than this (corrected).
@@ -27,6 +27,8 @@ MIN_ERROR_FALL = 0.01
 TRIED = 4
 #: A candidate with less than this share of the leader's statistic waits until that has failed.
 WORTH_A_REFIT = 0.5
+#: A parameter whose posterior is narrower than this share of its prior has been fitted.
+TOLD = 0.7
 #: Likelihoods that differ by less do not choose between effects: the catalogue's order does.
 TIE = 1.0
 
@@ -61,7 +63,8 @@ class Selection:
 
         def rank(item: tuple[Signature, Mode]) -> float:
             signature, fitted = item
-            penalty = 0.5 * signature.candidate.dof * np.log(fitted.problem.segments.n)
+            fitting = _told(fitted, signature.attached)
+            penalty = 0.5 * fitting * np.log(fitted.problem.segments.n)
             return float(_log_likelihood(fitted) - penalty)
 
         waiting = _distinct(ranked, order)[:TRIED]
@@ -154,6 +157,20 @@ def _share(before: Mode, after: Mode) -> float:
     model = after.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
     worse, better = model.whitened(before.phi, after.sigma), after.whitened_residual()
     return 1.0 - float(np.sqrt((better**2).sum() / (worse**2).sum()))
+
+
+def _told(mode: Mode, attached: Attached) -> int:
+    """How many of an effect's parameters the data say something of: others fit nothing.
+
+    Where the derivative vanishes, as at a threshold, the posterior cannot tell: all count.
+    """
+    if attached.effect.scan is not None:
+        return len(attached.variables)
+    layout = mode.problem.layout
+    # posterior standard deviations in units of the prior's
+    left = np.sqrt(np.diag(mode.covariance)) * np.abs(prior_slopes(layout.priors, mode.phi))
+    places = [layout.labels.index(label) for label in attached.labels]
+    return int((left[places] < TOLD).sum())
 
 
 def _log_likelihood(mode: Mode) -> float:

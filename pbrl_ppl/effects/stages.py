@@ -85,8 +85,9 @@ class Properties:
     ----------
     modify : callable
         ``modify(properties, parameters, clock)`` changes a dict of arrays in place, keys as
-        :data:`pbrl_ppl.physics.properties.COLUMNS`. What follows from them is computed after: the
-        moment of inertia is mass times ``moment_per_mass``.
+        :data:`pbrl_ppl.physics.properties.COLUMNS`, but that the moment of inertia follows after,
+        as mass times ``moment_per_mass``, and that ``gravity_x`` and ``gravity_y`` (m/s^2) are the
+        whole of gravity.
     timed : bool
         Whether the numbers depend on the clock; shapes are then (proposal, interval), else
         (proposal, 1).

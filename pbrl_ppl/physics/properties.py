@@ -246,8 +246,8 @@ class EngineProperties:
         for name in dict.fromkeys(attached.body for attached in modifying):
             i = self._bodies.index(name)
             row = {key: result[:, :, i, column].copy() for key, column in COLUMN.items()}
-            for column in _GIVEN.values():
-                del row[column]
+            for key in _GIVEN.values():
+                del row[key]
             row["moment_per_mass"] = np.full((len(phi), m), self._unit_moment[i])
             for key, own in zip(("gravity_x", "gravity_y"), gravity, strict=True):
                 row[key] = np.full((len(phi), m), own)
