@@ -83,6 +83,8 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
         before, after = noise.smoothed(residual, sigma)
         spread = np.sqrt(np.median(np.diagonal(noise.gains(sigma)[2], axis1=1, axis2=2), axis=0))
         states = _moved(problem, cells, noise.first, before, after)
+        if not (np.isfinite(states).all() and np.isfinite(spread).all()):
+            break  # no motion fits such data: stay where it was linearised last
         problem = replace(problem, data=replace(problem.data, states=states))
         problem = problem.with_noise(trajectories=_sloped(problem, cells, phi, sigma, spread))
         if (np.sqrt(np.mean(after**2, axis=0)) < _SETTLED * spread).all():

@@ -121,6 +121,15 @@ def test_smoothed_states_are_the_likeliest(problem) -> None:
     assert np.abs(difference).max() < 1e-4
 
 
+def test_smoothing_stops_where_no_motion_fits(problem) -> None:
+    """The engine diverges from speeds beyond measure: states stay where they were."""
+    states = problem.data.smoothed_states.copy()
+    states[..., 3] = 1e9
+    lost = replace(problem, data=replace(problem.data, states=states))
+    again = smoothed(lost, PHI, NOISE)
+    np.testing.assert_array_equal(again.data.smoothed_states, states)
+
+
 def test_derivative_is_that_of_differences(problem) -> None:
     noise = problem.trajectories
     residual, sigma = pt.tensor4("residual"), pt.vector("sigma")
