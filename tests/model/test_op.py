@@ -20,10 +20,10 @@ BOX = Shape.box(0.9, 0.55)
 MODES = pytest.mark.parametrize("mode", [None, "FAST_COMPILE"])
 
 
-def make(effects=("linear_drag",), **options) -> SimulatorOp:
+def make(effects=("linear_drag",), gravity=(0.0, 0.0), **options) -> SimulatorOp:
     cart = Body("cart", BOX, wheel=True, effects=effects)
     walls = (Wall((2.0, -9.0), (2.0, 9.0)),)
-    scene = Scene(time_step=0.1, normal_gravity=G, bodies=(cart,), walls=walls)
+    scene = Scene(time_step=0.1, gravity=gravity, normal_gravity=G, bodies=(cart,), walls=walls)
     attached = attach(scene)
     return SimulatorOp(scene, build_layout(scene, attached), attached, **options)
 
@@ -289,7 +289,7 @@ def test_start_states_have_no_derivative() -> None:
 
 def test_every_catalogue_effect_compiles_into_the_op() -> None:
     names = tuple(effect.name for effect in catalogue if not effect.name.startswith("pivot"))
-    op = make(effects=names)
+    op = make(effects=names, gravity=(0.0, -0.5))
     phi = np.array([max(prior.centre, 0.05) for prior in op.layout.priors])
     _, start, actions = inputs(make())
     got = op(phi, start, actions).eval()
