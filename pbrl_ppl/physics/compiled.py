@@ -21,7 +21,7 @@ from pbrl_ppl.physics.setters import (
     set_properties,
     set_strengths,
 )
-from pbrl_ppl.physics.world import DIVERGED, FAR, TINY
+from pbrl_ppl.physics.world import DIVERGED, FAR, FINER, TINY
 
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
@@ -78,6 +78,15 @@ def _near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-unt
             if ex * ex + ey * ey <= reach * reach:
                 return True
     return False
+
+
+@numba.njit(nogil=True, cache=True)
+def _meeting(discs):  # type: ignore[no-untyped-def]
+    """How many times finer to step what comes near something."""
+    for i in range(len(discs)):
+        if discs[i, 2] > 0.0:
+            return FINER
+    return 1
 
 
 @numba.njit(nogil=True, cache=True)
@@ -210,7 +219,7 @@ def rollout(  # type: ignore[no-untyped-def]
     transition, body, 6). ``out`` has shape (proposal * transition, H, body, 6). The transition is
     run with each number of substeps in ``counts``, the finest first, and the weighted sum taken,
     which cancels the leading errors; where shapes came close the finest run stands alone: a
-    collision's time is no smooth function of the substep.
+    collision's time is no smooth function of the substep. With hidden discs it is finer still.
 
     Returns the place among the items at which the engine diverged (its world is then of no more
     use), or their number.
@@ -225,7 +234,7 @@ def rollout(  # type: ignore[no-untyped-def]
         np.empty((k, 6)), np.empty(8), np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 3)),
         np.empty((len(world.wheel_body), 2)),
     )  # fmt: skip
-    proposal = -1
+    proposal, finer = -1, 1
     state = _TOUCHED  # what an earlier call left behind is unknown
     for place in range(len(items)):
         item = items[place]
@@ -235,9 +244,10 @@ def rollout(  # type: ignore[no-untyped-def]
             proposal = p
             set_properties(fn, world, properties[0], joints[p])
             set_discs(fn, world, discs[p])
+            finer = _meeting(discs[p])
         total[:] = 0.0
         for level in range(len(counts)):
-            before = state
+            before, substeps = state, counts[level]
             for _ in range(2):
                 if timed:
                     set_properties(fn, world, properties[0], joints[p])
@@ -245,11 +255,15 @@ def rollout(  # type: ignore[no-untyped-def]
                 state = _transition(
                     fn, world, properties, joints[p], commands, command_parameters[p], forces,
                     force_parameters[p], start[p if len(start) > 1 else 0, t], inputs[t],
-                    time_step, normal_gravity, counts[level], room, scratch,
+                    time_step, normal_gravity, substeps, room, scratch,
                 )  # fmt: skip
-                if state != _TOUCHED or before == _TOUCHED:
+                if substeps > counts[level] and state == _FREE:
+                    state = _TOUCHED  # by a hair not: what stands alone is the same for all
+                fine = substeps == counts[level] * finer
+                if state != _TOUCHED or (before == _TOUCHED and fine):
                     break
-                before = _TOUCHED  # contacts in the order of a new world: once more from there
+                # contacts in the order of a new world: once more from there
+                before, substeps = _TOUCHED, counts[level] * finer
             if state == _LOST:
                 return place
             if level == 0:

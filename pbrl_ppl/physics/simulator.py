@@ -20,7 +20,7 @@ from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Engine, share_out
 from pbrl_ppl.physics.inputs import after_recording
 from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput, EngineProperties
-from pbrl_ppl.physics.world import World
+from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT
 
@@ -308,6 +308,11 @@ class Simulator:
                     self._new_world(choice), self.effects, given, p, t, start, inputs[t],
                     int(count),
                 )  # fmt: skip
+                if touched and (given.discs[p, :, 2] > 0).any():
+                    states, _ = plain.rollout(
+                        self._new_world(choice), self.effects, given, p, t, start, inputs[t],
+                        int(count) * FINER,
+                    )  # fmt: skip
                 if level == 0 or np.isnan(states).any():  # diverged
                     out[item] = states
                 if touched:

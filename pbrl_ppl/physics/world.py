@@ -27,6 +27,9 @@ STICKING = 1.0
 COLLISION_SLOP = 1e-4
 #: Where bodies are parked (m), and for how long (s).
 FAR, TINY = 1e5, 1e-9
+#: How many times finer to step what comes near something, where there are hidden discs: their place
+#: is sought, and must not hang on the substep in which a body stops.
+FINER = 8
 #: Radius of a disc that is not there (m).
 NO_SIZE = 1e-9
 #: Sizes of the engine's hash tables: the least that is more than what it holds.
