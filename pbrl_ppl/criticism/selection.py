@@ -76,11 +76,12 @@ class Selection:
             ]
             waiting = [signature for signature in waiting if signature.candidate.statistic < enough]
             fits = [(signature, self._refit(mode, signature)) for signature in leading]
-            while fits:
-                best = max(map(rank, fits))
-                tied = [item for item in fits if rank(item) > best - TIE]
+            ranks = {item: rank(item) for item in fits}
+            while ranks:
+                best = max(ranks.values())
+                tied = [item for item, value in ranks.items() if value > best - TIE]
                 item = min(tied, key=lambda pair: order.index(pair[0].attached.effect.name))
-                fits.remove(item)
+                del ranks[item]
                 step = self._confirm(mode, *item, ranked)
                 if step is not None:
                     return step

@@ -152,8 +152,8 @@ class EngineProperties:
         One that is not in phi has its null value.
         """
         result = {}
-        for parameter in attached.effect.parameters:
-            place = self._places.get(f"{attached.effect.variable(parameter)}[{attached.body}]")
+        for parameter, label in zip(attached.effect.parameters, attached.labels, strict=True):
+            place = self._places.get(label)
             column = np.full(len(phi), parameter.null) if place is None else phi[:, place]
             result[parameter.name] = column.reshape(-1, *(1,) * axes)
         return result

@@ -303,16 +303,14 @@ class Simulator:
             p, t = divmod(item, len(inputs))
             start = starts[p if len(starts) > 1 else 0, t]
             total = np.zeros_like(out[item])
+            stepped = partial(
+                plain.rollout, effects=self.effects, given=given, proposal=p, item=t, start=start,
+                inputs=inputs[t],
+            )  # fmt: skip
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
-                states, touched = plain.rollout(
-                    self._new_world(choice), self.effects, given, p, t, start, inputs[t],
-                    int(count),
-                )  # fmt: skip
+                states, touched = stepped(self._new_world(choice), substeps=int(count))
                 if touched and (given.discs[p, :, 2] > 0).any():
-                    states, _ = plain.rollout(
-                        self._new_world(choice), self.effects, given, p, t, start, inputs[t],
-                        int(count) * FINER,
-                    )  # fmt: skip
+                    states, _ = stepped(self._new_world(choice), substeps=int(count) * FINER)
                 if level == 0 or np.isnan(states).any():  # diverged
                     out[item] = states
                 if touched:
