@@ -3,15 +3,15 @@
 import math
 from typing import Any
 
-import numpy as np
-
 from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.scans import force_levels
 from pbrl_ppl.effects.stages import Command
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
-_LOOKS = 20
+#: The likelihood has a step at each size that was commanded: no climb finds the right one.
+_LOOKS = 200
 
 
 def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
@@ -22,11 +22,7 @@ def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
 
 def _scan(scene: Scene, history: History, body: Body) -> Any:
     """Thresholds between the sizes of the forces that were commanded."""
-    action = history.dataset["action"].sel(body=body.name).to_numpy()[..., :2]
-    size = np.unique(np.round(np.linalg.norm(action, axis=-1), 9))
-    size = size[size > 0]  # not NaN either
-    between = np.unique(np.quantile(size, np.linspace(0, 1, _LOOKS + 1))) if len(size) else size
-    return (0.5 * (between[1:] + between[:-1]))[:, None]
+    return force_levels(history, body, _LOOKS)
 
 
 dead_zone = Effect(

@@ -19,6 +19,8 @@ BOX = Shape.box(0.9, 0.55)
 MASS = 2.0
 INERTIA = MASS * BOX.unit_moment
 NAMES = [effect.name for effect in catalogue]
+#: How far from nothing shows an effect, where 0.3 is too little or too much.
+AWAY = {"dead_zone": 5.0, "magnus_force": 0.01, "saturation": 1.0 - BY_NAME["saturation"].null[0]}
 PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
 
 
@@ -77,7 +79,7 @@ def test_null_value_is_no_effect(name, path) -> None:
     sim = simulator(scene, (effect,), path=path)
     null = np.repeat(effect.null, sim.layout.size // len(effect.parameters))
     np.testing.assert_array_equal(sim(null, start, actions), without)
-    away = sim(null + (5.0 if name == "dead_zone" else 0.3), start, actions)
+    away = sim(null + AWAY.get(name, 0.3), start, actions)
     if isinstance(effect.stage, Noise):  # it changes the likelihood alone
         np.testing.assert_array_equal(away, without)
     else:
@@ -187,6 +189,78 @@ def test_gravity_tilt_turns_gravity_for_all_masses_alike(path) -> None:
 def test_gravity_tilt_needs_gravity_in_the_plane() -> None:
     assert not BY_NAME["gravity_tilt"].applies(free(), free().bodies[0])
     assert BY_NAME["gravity_tilt"].applies(free().replace(gravity=(0.0, -G)), free().bodies[0])
+
+
+@PATHS
+@pytest.mark.parametrize(
+    ("effects", "factors"),
+    [
+        ({"force_gain": 1.3}, (1.3, 1.3, 1.0)),
+        ({"torque_gain": 0.7}, (1.0, 1.0, 0.7)),
+        ({"anisotropic_gain": (1.2, 0.5)}, (1.2, 0.5, 1.0)),
+        ({"saturation": 2.5}, (0.5, 0.5, 1.0)),  # of a push of 5 N
+        ({"saturation": 6.0}, (1.0, 1.0, 1.0)),
+    ],
+)
+def test_gains_are_of_the_command_alone(effects, factors, path) -> None:
+    """Along the world's axes, whatever the heading, and not of what else acts."""
+    effects = effects | {"constant_force": (0.0, 2.0)}
+    got = predict(free(), state(theta=0.7), (4.0, 3.0, 0.2), effects=effects, path=path)[0, 0]
+    x, y, turn = np.array([4.0, 3.0, 0.2]) * factors
+    np.testing.assert_allclose(got[3:], [x / MASS, (y + 2.0) / MASS, turn / INERTIA], atol=1e-10)
+
+
+@PATHS
+def test_magnus_force_turns_the_motion(path) -> None:
+    """Without a torque the velocity turns at c omega / m and keeps its size."""
+    c, omega = 0.5, 2.0
+    got = predict(
+        free(), state(vx=1.0, vy=0.5, omega=omega), effects={"magnus_force": c}, path=path
+    )[0, 0]
+    turned = complex(1.0, 0.5) * np.exp(1j * c * omega / MASS)
+    np.testing.assert_allclose(got[3:], [turned.real, turned.imag, omega], atol=2e-4)
+
+
+@PATHS
+def test_a_spring_swings_about_its_anchor(path) -> None:
+    k, anchor = 3.0, np.array([0.5, -1.0])
+    rate = math.sqrt(k / MASS)
+    got = predict(free(), state(vx=0.4), effects={"spring": (k, *anchor)}, path=path)[0, 0]
+    c, s = math.cos(rate), math.sin(rate)
+    place = anchor - c * anchor + np.array([0.4 / rate * s, 0.0])
+    np.testing.assert_allclose(got[:2], place, atol=2e-4)
+    np.testing.assert_allclose(got[3:5], rate * s * anchor + np.array([0.4 * c, 0.0]), atol=2e-4)
+    assert got[2] == got[5] == 0.0
+
+
+@PATHS
+def test_a_torsion_spring_turns_back_the_shorter_way(path) -> None:
+    k = 0.3
+    rate = math.sqrt(k / INERTIA)
+    got = predict(free(), state(theta=3.0), effects={"torsion_spring": (k, -3.1)}, path=path)[0, 0]
+    off = 6.1 - 2 * math.pi  # 0.18 rad short of it
+    assert got[2] == pytest.approx(3.0 - off + off * math.cos(rate), abs=2e-4)
+    assert got[5] == pytest.approx(-off * rate * math.sin(rate), abs=2e-4)
+    np.testing.assert_array_equal(got[[0, 1, 3, 4]], 0.0)
+
+
+@PATHS
+def test_a_point_attractor_conserves_energy_and_angular_momentum(path) -> None:
+    strength, place = 2.0, np.array([1.0, 0.5])
+    scene = free(time_step=0.05, substeps=100)
+    effects = {"point_attractor": (strength, *place)}
+    start = state(vx=0.3, vy=-0.6)
+    got = predict(scene, start, horizon=30, effects=effects, path=path)[:, 0]
+    way, speed = got[:, :2] - place, got[:, 3:5]
+
+    def energy(way, speed) -> np.ndarray:
+        far = np.sqrt((way**2).sum(axis=-1) + 0.05**2)
+        return 0.5 * MASS * (speed**2).sum(axis=-1) - strength / far
+
+    np.testing.assert_allclose(energy(way, speed), energy(-place, start[3:5]), atol=2e-3)
+    about = way[:, 0] * speed[:, 1] - way[:, 1] * speed[:, 0]
+    np.testing.assert_allclose(about, 0.6 * 1.0 + 0.5 * 0.3, atol=2e-3)
+    assert np.ptp(np.hypot(*way.T)) > 0.3  # it fell, and sped up
 
 
 @PATHS

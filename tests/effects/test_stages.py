@@ -202,6 +202,30 @@ def test_a_biased_sensor_shifts_what_is_measured(path) -> None:
     assert found == pytest.approx(expected, abs=1e-12)
 
 
+@PATHS
+def test_a_scaled_sensor_shows_lengths_and_angles_larger(path) -> None:
+    true = state(x=1.0, y=-0.5, theta=0.4, vx=1.3, omega=0.1)
+    factors = np.array([1.1, 1.1, 0.9, 1.1, 1.1, 0.9])
+    push = inputs((1.0, 0.5, 0.2))
+    expected = simulate(free(), {}, [[true]], push, path=path)[0, 0, 0] * factors
+    scale = {"sensor_scale": (1.1, 0.9)}
+    found = simulate(free(), scale, [[true * factors]], push, path=path)[0, 0, 0]
+    assert found == pytest.approx(expected, abs=1e-12)
+
+
+@PATHS
+def test_in_a_turned_frame_pushes_go_askew(path) -> None:
+    """A push along the commands' x is seen to go along the frame's."""
+    found = simulate(
+        free(), {"frame_rotation": 0.3}, [[state(x=1.0, theta=0.1)]], inputs((2.0, 0.0, 0.0)),
+        path=path,
+    )[0, 0, 0]  # fmt: skip
+    way = np.array([math.cos(0.3), math.sin(0.3)])
+    assert found[3:5] == pytest.approx(2.0 / MASS * way)
+    assert found[:2] == pytest.approx(np.array([1.0, 0.0]) + 1.0 / MASS * way)
+    assert found[2] == pytest.approx(0.1)
+
+
 def test_a_hinged_body_stays_in_its_hinge_whatever_its_sensor_says() -> None:
     rod = body("rod", Shape.box(0.05, 1.0), mass=1.0)
     hinge = Joint("hinge", ("rod", "world"), (0.0, 0.5), (0.0, 0.0))

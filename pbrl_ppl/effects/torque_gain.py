@@ -1,0 +1,21 @@
+"""Gain of the commanded torque."""
+
+from typing import Any
+
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Command
+from pbrl_ppl.parameters import Prior
+
+
+def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    wrench[2] *= parameters[0]
+
+
+torque_gain = Effect(
+    "torque_gain",
+    (EffectParameter("factor", "1", Prior("log_normal", mu=0.0, sigma=0.5), null=1.0),),
+    "every torque is stronger or weaker than commanded by the same factor: the motor's scale is"
+    " off",
+    "gain of an actuator",
+    Command(_law),
+)

@@ -1,0 +1,40 @@
+"""Linear torsion spring to an angle."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Force
+from pbrl_ppl.history import History
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.scene import Body, Scene
+
+_LOOKS = 8
+
+
+def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    # the shorter way round: a logged angle has no number of turns
+    off = state[2] - parameters[1]
+    off -= 2.0 * math.pi * math.floor((off + math.pi) / (2.0 * math.pi))
+    wrench[2] -= parameters[0] * off
+
+
+def _scan(scene: Scene, history: History, body: Body) -> Any:
+    """Angles of rest all around; the stiffness is differentiated."""
+    angles = np.linspace(-np.pi, np.pi, _LOOKS, endpoint=False)
+    return np.array([(np.nan, angle) for angle in angles])
+
+
+torsion_spring = Effect(
+    "torsion_spring",
+    (
+        EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=5.0)),
+        EffectParameter("angle", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
+    ),
+    "a torque towards an angle that grows with the way from it: a twisted cable or a bent hinge",
+    "Hooke's law of torsion",
+    Force(_law),
+    scan=_scan,
+)
