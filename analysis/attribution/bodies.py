@@ -51,8 +51,13 @@ _ANYWHERE: dict[str, tuple[Hidden, ...]] = {
     "inertia_scale": (1.01, 1.08, 1.5),
     "mass_change": _LOAD,
     "sensor_bias": _bias(0.01, 0.03, 0.08),
+    "torque_gain": (1.01, 1.05, 1.3),
+    "anisotropic_gain": ((1.01, 1.0), (1.05, 1.0), (1.3, 1.0)),
+    "frame_rotation": (0.005, 0.03, 0.15),
 }
-_GAIN = ((1.01, 1.0), (1.05, 1.0), (1.3, 1.0))
+
+#: A turned frame sees pushes askew; where the mass is free, a force's scale is that of the torque.
+_PUSHED_TWINS = (("actuator_rotation", "frame_rotation"), ("torque_gain", "force_gain"))
 
 CART = Kind(
     setup=replace(mh.CART, step=_STEP),
@@ -68,14 +73,20 @@ CART = Kind(
         "sliding_friction": ((0.003, 0.15), (0.015, 0.15), (0.06, 0.15)),
         "dead_zone": (3.0, 6.0, 10.0),
         "hidden_obstacle": ((2.0, 0.0, 0.1), (2.0, 0.0, 0.2), (2.0, 0.0, 0.4)),
+        "saturation": (25.0, 15.0, 8.0),
+        "magnus_force": (0.02, 0.1, 0.5),
+        "spring": ((0.05, 1.0, -0.5), (0.3, 1.0, -0.5), (1.5, 1.0, -0.5)),
+        "torsion_spring": ((0.03, 0.5), (0.2, 0.5), (1.0, 0.5)),
+        "point_attractor": ((0.1, 1.0, -0.5), (0.6, 1.0, -0.5), (4.0, 1.0, -0.5)),
+        "sensor_scale": ((1.0, 1.003), (1.0, 1.01), (1.0, 1.05)),
         **_ANYWHERE,
     },
     outside={
-        "saturation": (25.0, 15.0, 8.0),
-        "anisotropic_gain": _GAIN,
-        "spring": ((0.05, 1.0, -0.5), (0.3, 1.0, -0.5), (1.5, 1.0, -0.5)),
-        "magnus_force": (0.02, 0.1, 0.5),
+        "cubic_drag": (0.02, 0.1, 0.5),
+        "corrugation": ((0.2, 0.3), (1.0, 0.3), (5.0, 0.3)),
+        "swirl_drag": (0.03, 0.2, 1.0),
     },
+    twins=_PUSHED_TWINS,
 )
 
 _PUCK = mh.Setup(
@@ -103,14 +114,20 @@ PUCK = Kind(
         "sliding_friction": ((0.0008, 0.1), (0.006, 0.1), (0.05, 0.1)),
         "dead_zone": (1.0, 2.0, 3.5),
         "hidden_obstacle": ((1.8, 0.0, 0.1), (1.8, 0.0, 0.2), (1.8, 0.0, 0.4)),
+        "saturation": (8.0, 5.0, 2.7),
+        "magnus_force": (0.01, 0.04, 0.15),
+        "spring": ((0.01, 1.0, -0.5), (0.07, 1.0, -0.5), (0.5, 1.0, -0.5)),
+        "torsion_spring": ((0.0005, 0.5), (0.004, 0.5), (0.02, 0.5)),
+        "point_attractor": ((0.02, 1.0, -0.5), (0.15, 1.0, -0.5), (1.0, 1.0, -0.5)),
         **_ANYWHERE,
     },
     outside={
-        "saturation": (8.0, 5.0, 2.7),
-        "anisotropic_gain": _GAIN,
-        "spring": ((0.01, 1.0, -0.5), (0.07, 1.0, -0.5), (0.5, 1.0, -0.5)),
-        "magnus_force": (0.01, 0.04, 0.15),
+        "cubic_drag": (0.001, 0.01, 0.1),
+        "corrugation": ((0.05, 0.3), (0.3, 0.3), (1.5, 0.3)),
+        "swirl_drag": (0.0005, 0.004, 0.03),
     },
+    # nothing depends on its heading: what scales torques or angles scales its inertia
+    twins=(_PUSHED_TWINS[0], ("inertia_scale", *_PUSHED_TWINS[1], "sensor_scale")),
 )
 
 _SWING = replace(mh.PENDULUM, time_step=0.05, step=_STEP, n_train=12, n_test=4, n_intervals=30)
@@ -124,6 +141,8 @@ PENDULUM = Kind(
         "gravity_tilt": (0.002, 0.01, 0.04),
         "constant_torque": (0.002, 0.01, 0.05),
         "sensor_bias": tuple((0.0, 0.0, theta, 0.0, 0.0, 0.0) for theta in (0.002, 0.01, 0.04)),
+        "sensor_scale": ((1.0, 1.003), (1.0, 1.01), (1.0, 1.05)),
+        "torsion_spring": ((0.001, 0.5), (0.006, 0.5), (0.03, 0.5)),
     },
     outside={},
     twins=(

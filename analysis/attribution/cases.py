@@ -17,7 +17,7 @@ CATALOGUED, LEFT_OUT, OUTSIDE = "catalogued", "left-out", "outside"
 CLEAN, NONSENSE = "clean", "nonsense"
 KINDS = (CATALOGUED, LEFT_OUT, OUTSIDE, CLEAN, NONSENSE)
 #: Clean cases a body, about a fifth of all; nonsense of each sort and body.
-_CLEAN, _NONSENSE = 20, 2
+_CLEAN, _NONSENSE = 30, 2
 #: Draws a chain with which no chains converge.
 _TOO_FEW = 5
 

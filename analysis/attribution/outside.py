@@ -10,67 +10,46 @@ import pbrl_ppl as pp
 _REFERENCE = "attribution benchmark"
 
 
-def _saturation(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
-    # its parameter is the reciprocal of the cap: nothing is capped at 0
-    size = math.hypot(wrench[0], wrench[1]) * parameters[0]
-    if size > 1.0:
-        wrench[0] /= size
-        wrench[1] /= size
+def _cubic_drag(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    drag = parameters[0] * (state[3] * state[3] + state[4] * state[4])
+    wrench[0] -= drag * state[3]
+    wrench[1] -= drag * state[4]
 
 
-def _gain(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
-    wrench[0] *= parameters[0]
-    wrench[1] *= parameters[1]
+def _corrugation(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    wrench[0] -= parameters[0] * math.sin(state[0] / parameters[1])
 
 
-def _spring(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
-    wrench[0] -= parameters[0] * (state[0] - parameters[1])
-    wrench[1] -= parameters[0] * (state[1] - parameters[2])
+def _swirl_drag(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    wrench[2] -= parameters[0] * math.hypot(state[3], state[4]) * state[5]
 
 
-def _magnus(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
-    wrench[0] -= parameters[0] * state[5] * state[4]
-    wrench[1] += parameters[0] * state[5] * state[3]
-
-
-_WIDE = pp.Prior("normal", sigma=20.0)
-_FACTOR = pp.Prior("log_normal", mu=0.0, sigma=0.5)
+_SIZE = pp.Prior("half_normal", sigma=10.0)
 
 _EFFECTS = (
     pp.Effect(
-        "saturation",
-        (pp.EffectParameter("reciprocal", "1/N", pp.Prior("half_normal", sigma=1.0)),),
-        "the push is never stronger than a cap",
+        "cubic_drag",
+        (pp.EffectParameter("coefficient", "kg s/m^2", _SIZE),),
+        "a force against the motion that grows with the cube of the speed",
         _REFERENCE,
-        pp.Command(_saturation),
+        pp.Force(_cubic_drag),
     ),
     pp.Effect(
-        "anisotropic_gain",
+        "corrugation",
         (
-            pp.EffectParameter("x", "1", _FACTOR, null=1.0),
-            pp.EffectParameter("y", "1", _FACTOR, null=1.0),
+            pp.EffectParameter("force", "N", pp.Prior("normal", sigma=10.0)),
+            pp.EffectParameter("length", "m", pp.Prior("log_normal", sigma=1.0), null=1.0),
         ),
-        "the push is weaker along one axis",
+        "a force along x that changes with the place like a sine",
         _REFERENCE,
-        pp.Command(_gain),
+        pp.Force(_corrugation),
     ),
     pp.Effect(
-        "spring",
-        (
-            pp.EffectParameter("stiffness", "N/m", pp.Prior("half_normal", sigma=20.0)),
-            pp.EffectParameter("anchor_x", "m", _WIDE),
-            pp.EffectParameter("anchor_y", "m", _WIDE),
-        ),
-        "a pull towards a place that grows with the distance",
+        "swirl_drag",
+        (pp.EffectParameter("coefficient", "N s", _SIZE),),
+        "a torque against turning that grows with the speed",
         _REFERENCE,
-        pp.Force(_spring),
-    ),
-    pp.Effect(
-        "magnus_force",
-        (pp.EffectParameter("coefficient", "kg", _WIDE),),
-        "a force across the motion of a body that turns",
-        _REFERENCE,
-        pp.Force(_magnus),
+        pp.Force(_swirl_drag),
     ),
 )
 OUTSIDE_EFFECTS = {effect.name: effect for effect in _EFFECTS}
@@ -79,6 +58,4 @@ OUTSIDE_EFFECTS = {effect.name: effect for effect in _EFFECTS}
 def parameters_of(effect: pp.Effect, value: float | tuple[float, ...]) -> dict[str, float]:
     """Parameters of an effect from what the generator was told."""
     values = value if isinstance(value, tuple) else (value,)
-    if effect.name == "saturation":
-        values = (1.0 / values[0],)
     return {p.name: float(v) for p, v in zip(effect.parameters, values, strict=True)}
