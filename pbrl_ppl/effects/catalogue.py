@@ -5,6 +5,7 @@ from pbrl_ppl.effects.actuator_rotation import actuator_rotation
 from pbrl_ppl.effects.angular_drag import angular_drag
 from pbrl_ppl.effects.anisotropic_gain import anisotropic_gain
 from pbrl_ppl.effects.body_force import body_force
+from pbrl_ppl.effects.com_offset import com_offset
 from pbrl_ppl.effects.constant_force import constant_force
 from pbrl_ppl.effects.constant_torque import constant_torque
 from pbrl_ppl.effects.dead_zone import dead_zone
@@ -46,6 +47,7 @@ catalogue: tuple[Effect, ...] = (
     push_offset,
     actuator_rotation,
     inertia_scale,
+    com_offset,
     force_gain,
     torque_gain,
     anisotropic_gain,

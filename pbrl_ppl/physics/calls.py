@@ -31,6 +31,7 @@ Functions = namedtuple(
         "cpSpaceRemoveShape",
         "cpBodySetMass",
         "cpBodySetMoment",
+        "cpBodySetCenterOfGravity",
         "cpBodySetPosition",
         "cpBodySetAngle",
         "cpBodySetVelocity",

@@ -13,8 +13,10 @@ from pbrl_ppl.physics.setters import (
     EXTRA_Y,
     MASS,
     W_THETA,
+    arm,
     drive,
     iterations,
+    place_bodies,
     place_patches,
     place_wheels,
     set_discs,
@@ -155,16 +157,12 @@ def _transition(  # type: ignore[no-untyped-def]
     acting = len(commands[0]) + len(forces[0]) > 0
     sliding = len(world.patch_body) > 0
     watch = len(world.obstacles) > 0 or k > 1
-    for i in range(k):
-        body = world.bodies[i]
-        call2(fn.cpBodySetPosition, body, state[i, 0], state[i, 1])
-        call1(fn.cpBodySetAngle, body, state[i, 2])
-        call2(fn.cpBodySetVelocity, body, state[i, 3], state[i, 4])
-        call1(fn.cpBodySetAngularVelocity, body, state[i, 5])
+    place_bodies(fn, world, bodies, state)
     for h in range(len(inputs)):
         if h > 0 and len(properties) > 1:
             bodies = properties[h]
             set_properties(fn, world, bodies, joints)
+            place_bodies(fn, world, bodies, state)
             set_strengths(fn, world, bodies, normal_gravity, 1.0)
             call_int(fn.cpSpaceSetIterations, world.space, iterations(world, bodies))
         if driven:
@@ -187,7 +185,9 @@ def _transition(  # type: ignore[no-untyped-def]
                     fn.cpBodySetForce, world.bodies[i], wrench[i, 0] + weight_x,
                     wrench[i, 1] + weight_y,
                 )  # fmt: skip
-                call1(fn.cpBodySetTorque, world.bodies[i], wrench[i, 2])
+                x, y = arm(bodies[i], state[i, 2])
+                torque = wrench[i, 2] - (x * wrench[i, 1] - y * wrench[i, 0])
+                call1(fn.cpBodySetTorque, world.bodies[i], torque)
             place_wheels(fn, world, bodies, state, axes, step)
             if sliding:
                 place_patches(fn, world, bodies, state, step, normal_gravity)
@@ -196,8 +196,10 @@ def _transition(  # type: ignore[no-untyped-def]
                 body = world.bodies[i]
                 state[i, 0], state[i, 1] = get2(fn.cpBodyGetPosition, body)
                 state[i, 2] = get1(fn.cpBodyGetAngle, body)
-                state[i, 3], state[i, 4] = get2(fn.cpBodyGetVelocity, body)
-                state[i, 5] = get1(fn.cpBodyGetAngularVelocity, body)
+                turn = get1(fn.cpBodyGetAngularVelocity, body)
+                x, y = arm(bodies[i], state[i, 2])
+                v_x, v_y = get2(fn.cpBodyGetVelocity, body)
+                state[i, 3], state[i, 4], state[i, 5] = v_x + turn * y, v_y - turn * x, turn
                 speed = abs(state[i, 3]) + abs(state[i, 4]) + abs(state[i, 5])
                 if not speed < DIVERGED:  # also true of NaN
                     return _LOST

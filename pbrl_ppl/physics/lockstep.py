@@ -61,6 +61,7 @@ _MASS, _MOMENT, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _TORQUE, _DAMPING, _MU, _RAD
     )
 )  # fmt: skip
 _EXTRA_X, _EXTRA_Y = COLUMN["extra_gravity_x"], COLUMN["extra_gravity_y"]
+_COM_X, _COM_Y = COLUMN["com_x"], COLUMN["com_y"]
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 
 
@@ -203,8 +204,8 @@ def rollout(  # type: ignore[no-untyped-def]
 ):  # fmt: skip
     """Predict items ``first`` to ``last`` as `compiled.rollout` does, and mark those it cannot.
 
-    ``left``, shape (last - first,), says which items come near something, or are lost: the engine
-    is for them.
+    ``left``, shape (last - first,), says which items come near something, are lost, or have their
+    mass elsewhere than at the origin: the engine is for them.
     """
     bodies, joints, discs, command_parameters, force_parameters = given
     n, horizon = len(inputs), inputs.shape[1]
@@ -237,6 +238,7 @@ def rollout(  # type: ignore[no-untyped-def]
                     item = begin + min(i, width - 1)
                     p, t = item // n, item % n
                     row = bodies[p, t * horizon + h if timed else 0, 0]
+                    touched[i] |= (row[_COM_X] != 0.0) | (row[_COM_Y] != 0.0)
                     if timed or h == 0:
                         _set_properties(z, links, free, i, row, joints[p], normal_gravity, step)
                         slowing[i], patch_radius[i] = row[_MU] * normal_gravity, row[_RADIUS]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pymunk
 
 from pbrl_ppl.effects import Attached, Command, Force, at_stage
 from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput
@@ -56,9 +57,7 @@ def rollout(
     bodies = properties[item * len(inputs) if timed else 0]
     world.set_properties(bodies, joints)
     world.set_discs(given.discs[proposal])
-    for body, state in zip(world.bodies, start, strict=True):
-        body.position, body.angle = tuple(state[:2]), state[2]
-        body.velocity, body.angular_velocity = tuple(state[3:5]), state[5]
+    _place_bodies(world, start)
     names = [body.name for body in world.scene.moving]
     commands = _laws(effects, Command, given.commands[proposal], names)
     forces = _laws(effects, Force, given.forces[proposal], names)
@@ -69,6 +68,7 @@ def rollout(
         if timed and h > 0:
             bodies = properties[item * len(inputs) + h]
             world.set_properties(bodies, joints)
+            _place_bodies(world, states[h - 1])
         _drive(world, interval)
         for s in range(substeps):
             command = interval[:, :3].copy()
@@ -85,7 +85,9 @@ def rollout(
                 if world.kinematic[i]:
                     continue
                 weight = bodies[i, COLUMN["mass"]] * bodies[i, _EXTRA]
-                body.force, body.torque = tuple(wrench[i, :2] + weight), wrench[i, 2]
+                x, y = _arm(body)
+                body.force = tuple(wrench[i, :2] + weight)
+                body.torque = wrench[i, 2] - (x * wrench[i, 1] - y * wrench[i, 0])
             _place_wheels(world, bodies, step)
             _place_patches(world, bodies, step)
             world.space.step(step)
@@ -136,22 +138,40 @@ def _drive(world: World, action: Array) -> None:
         body.velocity, body.angular_velocity = tuple(action[i, :2]), action[i, 2]
 
 
+def _place_bodies(world: World, states: Array) -> None:
+    """Put the bodies in a state: the engine's velocity is that of the centre of mass."""
+    for body, state in zip(world.bodies, states, strict=True):
+        body.angle = state[2]  # first: the place of the centre hangs on it
+        body.position = tuple(state[:2])
+        x, y = _arm(body)
+        body.velocity = state[3] - state[5] * y, state[4] + state[5] * x
+        body.angular_velocity = state[5]
+
+
+def _arm(body: pymunk.Body) -> tuple[float, float]:
+    """From a body's origin to its centre of mass, in the world's frame."""
+    x, y = body.center_of_gravity
+    c, s = math.cos(body.angle), math.sin(body.angle)
+    return c * x - s * y, s * x + c * y
+
+
 def _state(world: World, i: int) -> Array:
     body = world.bodies[i]
-    return np.array(
-        [*body.position, body.angle, *body.velocity, body.angular_velocity], dtype=float
-    )
+    x, y = _arm(body)
+    turn = body.angular_velocity
+    velocity = body.velocity.x + turn * y, body.velocity.y - turn * x
+    return np.array([*body.position, body.angle, *velocity, turn], dtype=float)
 
 
 def _place_wheels(world: World, bodies: Array, step: float) -> None:
     """Put the rods' ends on the wheels' axes, as they will be when the engine solves for forces."""
     for wheel in world.wheels:
-        body, row = world.bodies[wheel.body], bodies[wheel.body]
-        theta = body.angle + body.angular_velocity * step
+        row = bodies[wheel.body]
+        at_x, at_y, angle, v_x, v_y, omega = _state(world, wheel.body)
+        theta = angle + omega * step
         c, s = math.cos(theta), math.sin(theta)
         x, y = row[COLUMN["w_x"]], row[COLUMN["w_y"]]
-        at_x = body.position.x + body.velocity.x * step + c * x - s * y
-        at_y = body.position.y + body.velocity.y * step + s * x + c * y
+        at_x, at_y = at_x + v_x * step + c * x - s * y, at_y + v_y * step + s * x + c * y
         c, s = math.cos(theta + row[COLUMN["w_theta"]]), math.sin(theta + row[COLUMN["w_theta"]])
         wheel.along_x.anchor_b, wheel.along_y.anchor_b = (at_x + c, at_y + s), (at_x - s, at_y + c)
 
@@ -159,25 +179,25 @@ def _place_wheels(world: World, bodies: Array, step: float) -> None:
 def _place_patches(world: World, bodies: Array, step: float) -> None:
     """Put each point's rod along its velocity, and share its friction with what holds it."""
     for patch in world.patches:
-        body, row = world.bodies[patch.body], bodies[patch.body]
+        row = bodies[patch.body]
+        at_x, at_y, angle, v_x, v_y, omega = _state(world, patch.body)
         radius = row[COLUMN["patch_radius"]]
         slowing = row[COLUMN["patch_mu"]] * world.scene.normal_gravity
         most = slowing * row[COLUMN["mass"]] / len(RING)
-        theta = body.angle + body.angular_velocity * step
+        theta = angle + omega * step
         c, s = math.cos(theta), math.sin(theta)
         for (x, y), hold, rod in zip(RING, patch.holds, patch.rods, strict=True):
             x, y = x * radius, y * radius
             x, y = c * x - s * y, s * x + c * y
-            along_x = body.velocity.x - body.angular_velocity * y
-            along_y = body.velocity.y + body.angular_velocity * x
+            along_x, along_y = v_x - omega * y, v_y + omega * x
             speed = math.sqrt(along_x * along_x + along_y * along_y)
             slow = STICKING * slowing * step
             share = 1.0 if speed >= slow else speed / slow
             if speed == 0.0:  # any direction will do: the point rests
                 along_x, speed = 1.0, 1.0
             rod.anchor_b = (
-                body.position.x + body.velocity.x * step + x + along_x / speed,
-                body.position.y + body.velocity.y * step + y + along_y / speed,
+                at_x + v_x * step + x + along_x / speed,
+                at_y + v_y * step + y + along_y / speed,
             )
             hold.max_force, rod.max_force = (1.0 - share) * most, share * most
 

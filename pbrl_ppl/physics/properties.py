@@ -24,10 +24,10 @@ from pbrl_ppl.scene import WORLD, Scene
 
 Array = NDArray[np.float64]
 
-#: Columns of a body's properties. ``moment`` is about the centroid (kg m^2); ``pivot_torque`` (N m)
-#: and ``pivot_damping`` (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m)
-#: are of the friction under it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) come on top of
-#: the scene's gravity.
+#: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
+#: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
+#: (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m) are of the friction
+#: under it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) come on top of the scene's gravity.
 COLUMNS = (
     *BODY_PARAMETERS,
     "moment",
@@ -37,6 +37,8 @@ COLUMNS = (
     "patch_radius",
     "extra_gravity_x",
     "extra_gravity_y",
+    "com_x",
+    "com_y",
 )
 COLUMN = {name: i for i, name in enumerate(COLUMNS)}
 #: Columns of a joint's properties: its anchors and its length (m).
@@ -45,7 +47,7 @@ JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
 _NO_LENGTH = 1e-9
 _MAX = np.finfo(float).max
 _POSITIVE = ("mass", "moment")
-_ANYTHING = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y")
+_ANYTHING = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y", "com_x", "com_y")
 #: What an effect sees in place of a column: the moment follows from the mass, gravity is the whole.
 _GIVEN = {
     "moment_per_mass": "moment",

@@ -16,7 +16,7 @@ from pbrl_ppl.physics.properties import COLUMNS, JOINT_COLUMNS
 from pbrl_ppl.physics.world import FAR, ITERATIONS_A_RATIO, MOST_ITERATIONS, NO_SIZE, STICKING
 
 MASS, _R, _MU_C, _W_X, _W_Y, W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(11)
-_PATCH_MU, _PATCH_RADIUS, EXTRA_X, EXTRA_Y = range(11, len(COLUMNS))
+_PATCH_MU, _PATCH_RADIUS, EXTRA_X, EXTRA_Y, _COM_X, _COM_Y = range(11, len(COLUMNS))
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 
 
@@ -40,6 +40,7 @@ def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
             continue
         call1(fn.cpBodySetMass, world.bodies[i], bodies[i, MASS])
         call1(fn.cpBodySetMoment, world.bodies[i], bodies[i, _MOMENT])
+        call2(fn.cpBodySetCenterOfGravity, world.bodies[i], bodies[i, _COM_X], bodies[i, _COM_Y])
     for j in range(len(world.shapes)):
         row = bodies[world.shape_body[j]]
         call1(fn.cpShapeSetElasticity, world.shapes[j], row[_R])
@@ -66,6 +67,28 @@ def set_properties(fn, world, bodies, joints):  # type: ignore[no-untyped-def]
             x, y = world.ring[point] * radius
             call2(fn.cpPivotJointSetAnchorA, world.patches[0, j, point], x, y)
             call2(fn.cpPinJointSetAnchorA, world.patches[1, j, point], x, y)
+
+
+@numba.njit(nogil=True, cache=True)
+def arm(row, theta):  # type: ignore[no-untyped-def]
+    """From a body's origin to its centre of mass, in the world's frame."""
+    x, y = row[_COM_X], row[_COM_Y]
+    if x == 0.0 and y == 0.0:
+        return 0.0, 0.0
+    c, s = math.cos(theta), math.sin(theta)
+    return c * x - s * y, s * x + c * y
+
+
+@numba.njit(nogil=True, cache=True)
+def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
+    """Put the bodies in a state: the engine's velocity is that of the centre of mass."""
+    for i in range(len(world.bodies)):
+        body, (x, y) = world.bodies[i], arm(bodies[i], state[i, 2])
+        call1(fn.cpBodySetAngle, body, state[i, 2])  # first: the place of the centre hangs on it
+        call2(fn.cpBodySetPosition, body, state[i, 0], state[i, 1])
+        turn = state[i, 5]
+        call2(fn.cpBodySetVelocity, body, state[i, 3] - turn * y, state[i, 4] + turn * x)
+        call1(fn.cpBodySetAngularVelocity, body, turn)
 
 
 @numba.njit(nogil=True, cache=True)

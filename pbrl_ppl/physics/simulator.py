@@ -309,7 +309,8 @@ class Simulator:
             )  # fmt: skip
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
                 states, touched = stepped(self._new_world(choice), substeps=int(count))
-                if touched and (given.discs[p, :, 2] > 0).any():
+                lost = np.isnan(states).any()
+                if touched and not lost and (given.discs[p, :, 2] > 0).any():
                     states, _ = stepped(self._new_world(choice), substeps=int(count) * FINER)
                 if level == 0 or np.isnan(states).any():  # diverged
                     out[item] = states

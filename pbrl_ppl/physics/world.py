@@ -274,6 +274,7 @@ class World:
                 continue
             body.mass = bodies[i, COLUMN["mass"]]
             body.moment = bodies[i, COLUMN["moment"]]
+            body.center_of_gravity = bodies[i, COLUMN["com_x"]], bodies[i, COLUMN["com_y"]]
         for i, shape in self.shapes:
             shape.elasticity = bodies[i, COLUMN["r"]]
             shape.friction = bodies[i, COLUMN["mu_c"]]

@@ -270,7 +270,9 @@ def test_both_paths_agree_with_effects_of_every_stage() -> None:
         Simulator(scene, layout, attached, substeps=8, path=path)(phi, start, given)
         for path in ("compiled", "plain")
     )
-    assert compiled == pytest.approx(plain, rel=1e-9, abs=1e-9)
+    assert compiled == pytest.approx(plain, rel=1e-9, abs=1e-9, nan_ok=True)
+    diverged = np.isnan(plain).any(axis=(-3, -2, -1))  # drag of 33 kg/m at 4 substeps
+    assert diverged.mean() < 0.1
 
 
 def test_order_and_threads_change_nothing_with_effects_of_every_stage() -> None:

@@ -18,7 +18,8 @@ phi = proposals(sim.layout, 20)
 expected = sim(phi, start, actions)
 with ThreadPoolExecutor(3) as pool:
     results = list(pool.map(lambda _: sim(phi, start, actions), range(9)))
-raise SystemExit(not all((result == expected).all() for result in results))
+same = [np.array_equal(result, expected, equal_nan=True) for result in results]
+raise SystemExit(not all(same))
 """
 
 
