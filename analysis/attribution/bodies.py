@@ -27,7 +27,8 @@ LEVELS = ("small", "medium", "large")
 class Kind:
     """A body: its truth, its declaration, and small, medium and large effects on it, by name.
 
-    ``twins`` are effects that are the same physics on this body: they are left out together.
+    ``twins`` are effects that are the same physics on this body: they are left out together, and
+    so are those that ``contain`` an effect, being more.
     """
 
     setup: mh.Setup
@@ -35,6 +36,7 @@ class Kind:
     catalogued: dict[str, tuple[Hidden, Hidden, Hidden]]
     outside: dict[str, tuple[Hidden, Hidden, Hidden]]
     twins: tuple[tuple[str, ...], ...] = ()
+    contain: tuple[tuple[str, str], ...] = ()  # the richer one, and what is in it
 
 
 def _bias(*sizes: float) -> tuple[Hidden, ...]:
@@ -58,6 +60,7 @@ _ANYWHERE: dict[str, tuple[Hidden, ...]] = {
 
 #: A turned frame sees pushes askew; where the mass is free, a force's scale is that of the torque.
 _PUSHED_TWINS = (("actuator_rotation", "frame_rotation"), ("torque_gain", "force_gain"))
+_GAINS = (("anisotropic_gain", "torque_gain"),)
 
 CART = Kind(
     setup=replace(mh.CART, step=_STEP),
@@ -87,6 +90,7 @@ CART = Kind(
         "swirl_drag": (0.03, 0.2, 1.0),
     },
     twins=_PUSHED_TWINS,
+    contain=_GAINS,
 )
 
 _PUCK = mh.Setup(
@@ -128,6 +132,7 @@ PUCK = Kind(
     },
     # nothing depends on its heading: what scales torques or angles scales its inertia
     twins=(_PUSHED_TWINS[0], ("inertia_scale", *_PUSHED_TWINS[1], "sensor_scale")),
+    contain=(*_GAINS, ("anisotropic_gain", "inertia_scale")),
 )
 
 _SWING = replace(mh.PENDULUM, time_step=0.05, step=_STEP, n_train=12, n_test=4, n_intervals=30)

@@ -118,6 +118,7 @@ def _effects(kind: str) -> list[Case]:
         effects = body.outside if kind == OUTSIDE else body.catalogued
         for effect, values in effects.items():
             twins = next((same for same in body.twins if effect in same), (effect,))
+            twins += tuple(richer for richer, own in body.contain if own == effect)
             for level, value in zip(LEVELS, values, strict=True):
                 if kind == LEFT_OUT and level == "small":
                     continue

@@ -13,7 +13,7 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
 #: Places tried along each axis, and how far beyond where the body has been (share of the range).
-_LOOKS, _BEYOND = 5, 0.15
+_LOOKS, _BEYOND = 9, 0.15
 #: What attracts has a size, and so a force that is finite everywhere (m^2).
 _CORE = 0.05**2
 

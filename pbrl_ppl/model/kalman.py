@@ -4,6 +4,8 @@ The deviation ``d`` of a state from where it was linearised moves by ``d' = F d 
 measured as ``y = d + e``. Measured cells are taken in one by one (their noises are independent), so
 that missing ones are simply left out. See B. D. O. Anderson and J. B. Moore, Optimal Filtering
 (1979), chapter 6, and G. J. Bierman, Fixed interval smoothing with discrete measurements (1973).
+The derivative by the noise is S. J. Koopman and N. Shephard's, Exact score for time series models
+in state space form (1992).
 """
 
 from __future__ import annotations
@@ -184,3 +186,74 @@ def adjoint(
         state[:] = moved
         before[k] = state
     return before, residual, after
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def score(
+    slope: Array, last: Ints, seen: Bools, gain: Array, scale: Array, white: Array
+) -> tuple[Array, Array, Array]:
+    """Derivative of the log-likelihood by the variances, half the expectation of a quadratic form.
+
+    Parameters
+    ----------
+    slope, last, seen, gain, scale : ndarray
+        As of :func:`adjoint`.
+    white : ndarray
+        White innovations, shape (transition, cell).
+
+    Returns
+    -------
+    sensor : ndarray
+        Twice the derivative by each cell's variance of measuring, shape (cell,).
+    step : ndarray
+        Twice that by the covariance of what a step adds, shape (cell, cell).
+    begin : ndarray
+        Twice that by the variance of the state before each transition, shape (transition, cell).
+    """
+    n, d = seen.shape
+    sensor, step, begin = np.zeros(d), np.zeros((d, d)), np.zeros((n, d))
+    state, moved = np.zeros(d), np.zeros(d)
+    known, pulled = np.zeros((d, d)), np.zeros((d, d))
+    for k in range(n - 1, -1, -1):
+        if last[k]:
+            state[:], known[:] = 0.0, 0.0
+        for i in range(d - 1, -1, -1):
+            if not seen[k, i]:
+                continue
+            own = gain[k, i]
+            total, spread = white[k, i] / scale[k, i], 1.0 / scale[k, i] ** 2
+            for a in range(d):
+                moved[a] = 0.0
+                for b in range(d):
+                    moved[a] += known[a, b] * own[b]
+            for a in range(d):
+                total += own[a] * state[a]
+                spread += own[a] * moved[a]
+            sensor[i] += total * total - spread
+            state[i] -= total
+            for a in range(d):
+                known[i, a] -= moved[a]
+                known[a, i] -= moved[a]
+            known[i, i] += spread
+        for a in range(d):
+            for b in range(d):
+                step[a, b] += state[a] * state[b] - known[a, b]
+        own = slope[k]
+        for a in range(d):
+            moved[a] = 0.0
+            for b in range(d):
+                moved[a] += own[b, a] * state[b]
+                total = 0.0
+                for c in range(d):
+                    total += known[a, c] * own[c, b]
+                pulled[a, b] = total
+        for a in range(d):
+            for b in range(a + 1):
+                total = 0.0
+                for c in range(d):
+                    total += own[c, a] * pulled[c, b]
+                known[a, b] = known[b, a] = total
+        state[:] = moved
+        for a in range(d):
+            begin[k, a] = state[a] * state[a] - known[a, a]
+    return sensor, step, begin

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import fill_hinges
-from pbrl_ppl.model.kalman import adjoint, gains, innovations
+from pbrl_ppl.model.kalman import adjoint, gains, innovations, score
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, wrapped
 
@@ -213,6 +213,31 @@ class TrajectoryNoise:
             self.slope, last, self.seen, gain, scale, weighted
         )
         return pulled
+
+    def score(self, residual: Array, sigma: Array) -> tuple[float, Array]:
+        """Gaussian log-likelihood, and its derivative by the logarithm of the noise parameters.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Shape (transition, 1, body, state).
+        sigma : ndarray
+            Shape (parameter,).
+        """
+        white = self.filtered(self.cells.of_residual(residual)[None], sigma)[0][0]
+        gain, scale, _, log_scale = self.gains(sigma)
+        last = np.append(self.first[1:], True)
+        sensor, step, begin = score(self.slope, last, self.seen, gain, scale, white)
+        # measured states begin a trajectory: their error is that of measuring
+        begun = np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0).sum(axis=0)
+        cells, slope = self.cells, np.zeros(len(sigma))
+        free = cells.sensor >= 0
+        np.add.at(slope, cells.sensor[free], (sensor + begun)[free])
+        pushes = np.einsum("ja,ab,jb->j", cells.push, step, cells.push)
+        np.add.at(slope, cells.pushed, pushes)
+        norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
+        value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
+        return value, sigma**2 * slope
 
     def foreseen(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
         """Mean and covariance of each measurement, as deviations, given those before it.

@@ -67,17 +67,34 @@ def _of_trajectories(
 ) -> Array:
     """Noise parameters of highest posterior density along trajectories."""
     residual = np.nan_to_num(residual, nan=FAR_OFF)
+    gaussian = problem.nu(phi) is None
 
     def cost(log_sigma: Array) -> float:
         likelihood = problem.log_density(residual, np.exp(log_sigma), phi).sum()
         return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
+
+    def with_slope(log_sigma: Array) -> tuple[float, Array]:
+        return _cost_and_slope(problem, noise, residual, log_sigma)
 
     begin = np.log(noise.sigma)
     bounds = [(b - _FAR, b + _FAR) for b in begin]
     for place, value in held.items():
         begin[place] = np.log(value)
         bounds[place] = (begin[place], begin[place])
-    return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x))
+    found = minimize(
+        with_slope if gaussian else cost, begin, jac=gaussian, method="L-BFGS-B", bounds=bounds
+    )
+    return np.asarray(np.exp(found.x))
+
+
+def _cost_and_slope(
+    problem: Problem, noise: TrajectoryNoise, residual: Array, log_sigma: Array
+) -> tuple[float, Array]:
+    """Minus the log-density of Gaussian noise parameters, and its derivative by their logarithm."""
+    centre, spread = noise_law(problem)
+    likelihood, slope = noise.score(residual, np.exp(log_sigma))
+    cost = float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
+    return cost, 1.0 + (log_sigma - centre) / spread**2 - slope
 
 
 def gaussian_log_sigma(problem: Problem, square: Array) -> Array:

@@ -4,18 +4,58 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from itertools import combinations
 from queue import SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.physics import calls, compiled, lockstep
-from pbrl_ppl.physics.lockstep import free_body
+from pbrl_ppl.physics.lockstep import free_bodies
 from pbrl_ppl.physics.pointers import pointers
 from pbrl_ppl.physics.world import World
 
 Array = NDArray[np.float64]
+Laws = tuple[NDArray[Any], ...]
+
+#: Items whose bodies' ways are kept at a time.
+_BLOCK = 512
+
+
+class Batch(NamedTuple):
+    """What the rollouts take: see `compiled.rollout`."""
+
+    given: tuple[Array, ...]
+    commands: Laws
+    forces: Laws
+    start: Array
+    inputs: Array
+    time_step: float
+    normal_gravity: float
+    counts: NDArray[np.int64]
+    weights: Array
+
+    def of_body(self, i: int) -> Batch:
+        """Reduce to what one body sees."""
+        bodies, *others = self.given
+        return self._replace(
+            given=(_column(bodies, i), *others),
+            commands=_own(self.commands, i),
+            forces=_own(self.forces, i),
+            start=_column(self.start, i),
+            inputs=_column(self.inputs, i),
+        )
+
+
+def _column(array: Array, i: int) -> Array:
+    return np.ascontiguousarray(array[..., i : i + 1, :])
+
+
+def _own(laws: Laws, i: int) -> Laws:
+    addresses, owners, *others = laws
+    mine = owners == i
+    return (addresses[mine], np.zeros_like(owners[mine]), *(other[mine] for other in others))
 
 
 class Engine:
@@ -33,31 +73,55 @@ class Engine:
 
     def _renew(self) -> None:
         self.world = self._build()
-        self.pointers, self.free = pointers(self.world), free_body(self.world)
+        self.pointers, self.free = pointers(self.world), free_bodies(self.world)
 
-    def rollout(self, shared: tuple[Any, ...], first: int, last: int, out: Array) -> None:
+    def rollout(
+        self, batch: Batch, alone: tuple[Batch, ...], first: int, last: int, out: Array
+    ) -> None:
         """Predict the items ``first`` to ``last`` into ``out``, NaN where the engine diverges.
 
         Parameters
         ----------
-        shared : tuple
-            What both rollouts take: see `compiled.rollout`.
+        batch : Batch
+            Of all bodies.
+        alone : tuple of Batch
+            What each body sees, in their order.
         first, last : int
             Of proposals x transitions.
         out : ndarray
             Shape (proposal * transition, H, body, 6).
         """
         items = np.arange(first, last)
-        if self.free is not None:
-            left = np.zeros(len(items), dtype=bool)
-            lockstep.rollout(self.free, *shared, first, last, out, left)
-            items = items[left]
+        if self.free:
+            blocks = range(first, last, _BLOCK)
+            left = [self._apart(alone, b, min(b + _BLOCK, last), out) for b in blocks]
+            items = items[np.concatenate([np.zeros(0, dtype=bool), *left])]
         while len(items):
-            done = compiled.rollout(calls.FUNCTIONS, self.pointers, *shared, items, out)
+            done = compiled.rollout(calls.FUNCTIONS, self.pointers, *batch, items, out)
             if done < len(items):  # diverged: that world is spoilt, and the item is lost
                 out[items[done]] = np.nan
                 self._renew()
             items = items[done + 1 :]
+
+    def _apart(
+        self, alone: tuple[Batch, ...], first: int, last: int, out: Array
+    ) -> NDArray[np.bool_]:
+        """Predict each body as if alone, and say in which items it is not."""
+        left = np.zeros(last - first, dtype=bool)
+        if len(self.free) == 1:
+            no_trail = np.empty((0, 0, 2))
+            lockstep.rollout(self.free[0], *alone[0], first, last, out[first:last], left, no_trail)
+            return left
+        steps = alone[0].inputs.shape[1] * int(alone[0].counts.sum())
+        trails = np.empty((len(self.free), last - first, steps, 2))
+        for i, (free, batch) in enumerate(zip(self.free, alone, strict=True)):
+            own = np.empty((last - first, *out.shape[1:2], 1, 6))
+            lockstep.rollout(free, *batch, first, last, own, left, trails[i])
+            out[first:last, :, i] = own[:, :, 0]
+        for i, j in combinations(range(len(self.free)), 2):
+            reach = self.free[i].radius + self.free[j].radius
+            lockstep.meet(trails[i], trails[j], reach, left)
+        return left
 
 
 def share_out(run: Callable[[Engine, int, int], None], engines: list[Engine], n: int) -> None:

@@ -1,4 +1,4 @@
-"""The contact-free rollout: transitions of one body side by side, in the engine's own arithmetic.
+"""The contact-free rollout: transitions of a body side by side, in the engine's own arithmetic.
 
 A body that touches nothing needs no collision search: positions, forces and the solver's clamped
 impulses are a few lines, which the compiler vectorises over transitions. They are those of
@@ -66,7 +66,7 @@ _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 
 
 class FreeBody(NamedTuple):
-    """What the contact-free rollout must know of a world with one moving body."""
+    """What the contact-free rollout must know of a moving body and its world."""
 
     wheel: bool
     pivot: bool
@@ -81,27 +81,32 @@ class FreeBody(NamedTuple):
     obstacles: NDArray[np.float64]  # (obstacle, 5), without the discs
 
 
-def free_body(world: World) -> FreeBody | None:
-    """Describe a world for the contact-free rollout; None where several bodies move."""
-    if len(world.bodies) != 1 or world.kinematic.any():
-        return None
-    body = world.bodies[0]
+def free_bodies(world: World) -> tuple[FreeBody, ...]:
+    """Describe each moving body of a world; none where joints or paths tie them to each other."""
+    if world.chained.any() or world.kinematic.any():
+        return ()
+    return tuple(_free_body(world, i) for i in range(len(world.bodies)))
+
+
+def _free_body(world: World, index: int) -> FreeBody:
+    body = world.bodies[index]
+    links = [link for link in world.links if body in (link.constraint.a, link.constraint.b)]
     holders = [
-        link.constraint.b if link.constraint.a is body else link.constraint.a
-        for link in world.links
+        link.constraint.b if link.constraint.a is body else link.constraint.a for link in links
     ]
     poses = [(*h.position, math.cos(h.angle), math.sin(h.angle)) for h in holders]
+    patched = any(patch.body == index for patch in world.patches)
     return FreeBody(
-        wheel=bool(world.wheels),
-        pivot=bool(world.pivots),
+        wheel=any(wheel.body == index for wheel in world.wheels),
+        pivot=any(pivot.body == index for pivot in world.pivots),
         iterations=world.iterations,
         gravity=np.array(world.space.gravity, dtype=float),
-        link_joint=np.array([link.joint for link in world.links], dtype=np.int64),
-        link_rod=np.array([link.rod for link in world.links], dtype=bool),
-        link_first=np.array([link.constraint.a is body for link in world.links], dtype=bool),
+        link_joint=np.array([link.joint for link in links], dtype=np.int64),
+        link_rod=np.array([link.rod for link in links], dtype=bool),
+        link_first=np.array([link.constraint.a is body for link in links], dtype=bool),
         link_pose=np.array(poses, dtype=float).reshape(-1, 4),
-        ring=np.array(RING if world.patches else (), dtype=float).reshape(-1, 2),
-        radius=float(world.radii[0]),
+        ring=np.array(RING if patched else (), dtype=float).reshape(-1, 2),
+        radius=float(world.radii[index]),
         obstacles=world.obstacles[: len(world.obstacles) - len(world.discs)].copy(),
     )
 
@@ -200,11 +205,13 @@ def _substep(z, links, points, free, slowing, patch_radius, step):  # type: igno
 @numba.njit(nogil=True, cache=True)
 def rollout(  # type: ignore[no-untyped-def]
     free, given, commands, forces, start, inputs, time_step, normal_gravity, counts, weights,
-    first, last, out, left,
+    first, last, out, left, trail,
 ):  # fmt: skip
     """Predict items ``first`` to ``last`` as `compiled.rollout` does, and mark those it cannot.
 
-    ``left``, shape (last - first,), says which items come near something, are lost, or have their
+    All arrays are of one body, and ``out``, shape (last - first, H, 1, 6), of these items.
+    ``trail``, if it has rows, is given x and y after every step of every number of substeps, shape
+    (last - first, step, 2). ``left``, shape (last - first,), says which items come near something, are lost, or have their
     mass elsewhere than at the origin: the engine is for them.
     """
     bodies, joints, discs, command_parameters, force_parameters = given
@@ -223,6 +230,7 @@ def rollout(  # type: ignore[no-untyped-def]
     for begin in range(first, last, LANES):
         width = min(LANES, last - begin)
         touched[:] = False
+        steps = 0
         for level in range(len(counts)):
             substeps, weight = counts[level], weights[level]
             step = time_step / substeps
@@ -258,10 +266,15 @@ def rollout(  # type: ignore[no-untyped-def]
                             _set_wrench(z, i, wrench[0])
                     _substep(z, links, points, free, slowing, patch_radius, step)
                     _lose(z, touched)
+                    if len(trail):
+                        for i in range(width):
+                            trail[begin - first + i, steps, 0] = z[X + i]
+                            trail[begin - first + i, steps, 1] = z[Y + i]
+                        steps += 1
                     if watch:
                         _watch(z, free.radius, free.obstacles, own_discs, touched)
                 for i in range(width):
-                    at = out[begin + i, h, 0]
+                    at = out[begin - first + i, h, 0]
                     for d in range(6):
                         value = z[rows[d] + i]
                         if len(counts) == 1:
@@ -269,3 +282,13 @@ def rollout(  # type: ignore[no-untyped-def]
                         else:
                             at[d] = weight * value + (at[d] if level else 0.0)
         left[begin - first : begin - first + width] = touched[:width]
+
+
+@numba.njit(nogil=True, cache=True)
+def meet(trail, other, reach, left):  # type: ignore[no-untyped-def]
+    """Mark the items in which two bodies come within reach of each other."""
+    for item in range(len(trail)):
+        for step in range(trail.shape[1]):
+            x = trail[item, step, 0] - other[item, step, 0]
+            y = trail[item, step, 1] - other[item, step, 1]
+            left[item] |= x * x + y * y <= reach * reach

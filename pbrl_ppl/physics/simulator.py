@@ -17,7 +17,7 @@ from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, plain
-from pbrl_ppl.physics.engines import Engine, share_out
+from pbrl_ppl.physics.engines import Batch, Engine, share_out
 from pbrl_ppl.physics.inputs import after_recording
 from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import FINER, World
@@ -325,13 +325,15 @@ class Simulator:
     def _run_compiled(
         self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array
     ) -> None:
-        shared = (
+        batch = Batch(
             tuple(given[:-1]), self._commands, self._forces, starts, inputs,
             self.scene.time_step, self.scene.normal_gravity, *self.levels,
         )  # fmt: skip
+        k = len(self.scene.moving)
+        alone = tuple(batch.of_body(i) for i in range(k)) if k > 1 else (batch,)
 
         def run(engine: Engine, first: int, last: int) -> None:
-            engine.rollout(shared, first, last, out)
+            engine.rollout(batch, alone, first, last, out)
 
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.threads, len(out), steps // _A_THREAD))

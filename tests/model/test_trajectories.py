@@ -108,6 +108,28 @@ def test_what_was_not_measured_is_left_out(problem) -> None:
     np.testing.assert_allclose(value, expected, rtol=1e-6)
 
 
+@pytest.mark.parametrize("missing", [False, True])
+def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
+    """By the logarithm of every noise parameter; the first states are measured, or not at all."""
+    noise = problem.trajectories
+    if missing:
+        seen, wide = noise.seen.copy(), noise.wide.copy()
+        seen[1, 2:4] = seen[5] = False
+        wide[:, 4] = 3.0
+        noise = replace(noise, seen=seen, wide=wide)
+        problem = problem.with_noise(trajectories=noise)
+    residual, at = problem.residual(PHI * 1.2), np.log(NOISE * np.linspace(0.5, 2.0, len(NOISE)))
+    value, slope = noise.score(residual, np.exp(at))
+
+    def density(log_sigma) -> float:
+        return float(problem.log_density(residual, np.exp(log_sigma), PHI).sum())
+
+    assert value == pytest.approx(density(at), rel=1e-12)
+    steps = 1e-5 * np.eye(len(at))
+    by_differences = [(density(at + h) - density(at - h)) / 2e-5 for h in steps]
+    np.testing.assert_allclose(slope, by_differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+
+
 def test_smoothed_states_are_the_likeliest(problem) -> None:
     """No state is moved once the smoother has settled, and the fit of all is a minimum there."""
     settled = smoothed(problem, PHI, NOISE)

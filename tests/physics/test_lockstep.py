@@ -135,7 +135,12 @@ def test_what_comes_near_something_is_left_to_the_engine() -> None:
     np.testing.assert_allclose(near(phi, start, inputs), plain, rtol=1e-9, atol=1e-9)
 
 
-def test_only_a_lone_body_is_free() -> None:
-    assert lockstep.free_body(World(SCENES["wheel"])) is not None
-    two = SCENES["wheel"].replace(bodies=(Body("a", BOX), Body("b", BOX)))
-    assert lockstep.free_body(World(two)) is None
+def test_bodies_that_nothing_ties_are_free() -> None:
+    assert len(lockstep.free_bodies(World(SCENES["wheel"]))) == 1
+    bodies = (Body("a", BOX), Body("b", BOX, wheel=True))
+    two = SCENES["wheel"].replace(bodies=bodies)
+    assert [free.wheel for free in lockstep.free_bodies(World(two))] == [False, True]
+    joint = Joint("hinge", ("a", "b"), (0.5, 0.0), (-0.5, 0.0))
+    assert not lockstep.free_bodies(World(two.replace(joints=(joint,)), (True,)))
+    pushed = (bodies[0], Body("finger", BOX, kinematic=True))
+    assert not lockstep.free_bodies(World(two.replace(bodies=pushed)))
