@@ -25,7 +25,6 @@ with warnings.catch_warnings():  # Box2D's generated wrapper warns on import und
 NORMAL_GRAVITY = 9.81  # m/s^2
 SINGLE = 3e-6  # m, rad: more than the engine's rounding, less than what a contact moves
 RING = 12  # points of a ring of contact
-CORE = 0.05  # m, size of what attracts
 # Box2D's tolerances are compiled in (b2_linearSlop 0.005, b2_velocityThreshold 1 length unit per
 # second, below which nothing bounces). With the centimetre as unit of length they are 0.05 mm and
 # 1 cm/s, too small to matter here.
@@ -108,7 +107,7 @@ class Effects:
     magnus_force: float = 0.0  # kg, F = c omega x v
     spring: tuple[float, float, float] = (0.0, 0.0, 0.0)  # N/m, to an anchor x, y (m)
     torsion_spring: tuple[float, float] = (0.0, 0.0)  # N m/rad, to an angle (rad)
-    point_attractor: tuple[float, float, float] = (0.0, 0.0, 0.0)  # N m^2, to x, y (m)
+    point_attractor: tuple[float, ...] = (0.0, 0.0, 0.0, 0.2)  # N m^2, to x, y, at a depth (m)
     # Outside pbrl_ppl's catalogue:
     cubic_drag: float = 0.0  # kg s/m^2, F = -c v^2 v
     corrugation: tuple[float, float] = (0.0, 1.0)  # N along x, as the sine of x over a length (m)
@@ -322,10 +321,10 @@ def total_wrench(
     force += complex(*effects.constant_force) + turn * complex(*effects.body_force)
     force -= effects.spring[0] * (place - complex(*effects.spring[1:]))
     force += effects.magnus_force * omega * 1j * v
-    strength, *attracted = effects.point_attractor
+    strength, at_x, at_y, depth = effects.point_attractor
     if strength:
-        way = complex(*attracted) - place
-        force += strength * way / (abs(way) ** 2 + CORE**2) ** 1.5
+        way = complex(at_x, at_y) - place
+        force += strength * way / (abs(way) ** 2 + depth**2) ** 1.5
     stiffness, rest = effects.torsion_spring
     torque -= effects.swirl_drag * speed * omega
     torque -= stiffness * cmath.phase(turn * cmath.exp(-1j * rest))

@@ -11,6 +11,11 @@ def is_pivoted(scene: Scene, body: Body) -> bool:
     return any(hanging_body(scene, joint) == body.name for joint in _hinges(scene))
 
 
+def hangs_in_none(scene: Scene, body: Body) -> bool:
+    """Whether the body goes where it will; along a hinge's circle, many pulls look the same."""
+    return not is_pivoted(scene, body)
+
+
 def _hinges(scene: Scene) -> list[Joint]:
     return [joint for joint in scene.joints if joint.kind == "hinge" and joint.bodies]
 

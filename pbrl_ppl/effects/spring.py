@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.hinge import hangs_in_none
 from pbrl_ppl.effects.scans import places
 from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.history import History
@@ -40,5 +41,6 @@ spring = Effect(
     "a pull towards a place that grows with the distance: a cable or a hose drags at the body",
     "Hooke's law",
     Force(_law),
+    applies=hangs_in_none,
     scan=_scan,
 )

@@ -248,7 +248,7 @@ def test_a_torsion_spring_turns_back_the_shorter_way(path) -> None:
 def test_a_point_attractor_conserves_energy_and_angular_momentum(path) -> None:
     strength, place = 2.0, np.array([1.0, 0.5])
     scene = free(time_step=0.05, substeps=100)
-    effects = {"point_attractor": (strength, *place)}
+    effects = {"point_attractor": (strength, *place, 0.05)}
     start = state(vx=0.3, vy=-0.6)
     got = predict(scene, start, horizon=30, effects=effects, path=path)[:, 0]
     way, speed = got[:, :2] - place, got[:, 3:5]
