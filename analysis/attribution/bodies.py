@@ -60,7 +60,8 @@ _ANYWHERE: dict[str, tuple[Hidden, ...]] = {
 
 #: A turned frame sees pushes askew; where the mass is free, a force's scale is that of the torque.
 _PUSHED_TWINS = (("actuator_rotation", "frame_rotation"), ("torque_gain", "force_gain"))
-_GAINS = (("anisotropic_gain", "torque_gain"),)
+#: A source deep below the plane pulls like a spring.
+_RICHER = (("anisotropic_gain", "torque_gain"), ("point_attractor", "spring"))
 
 CART = Kind(
     setup=replace(mh.CART, step=_STEP),
@@ -90,7 +91,7 @@ CART = Kind(
         "swirl_drag": (0.03, 0.2, 1.0),
     },
     twins=_PUSHED_TWINS,
-    contain=_GAINS,
+    contain=_RICHER,
 )
 
 _PUCK = mh.Setup(
@@ -132,7 +133,7 @@ PUCK = Kind(
     },
     # nothing depends on its heading: what scales torques or angles scales its inertia
     twins=(_PUSHED_TWINS[0], ("inertia_scale", *_PUSHED_TWINS[1], "sensor_scale")),
-    contain=(*_GAINS, ("anisotropic_gain", "inertia_scale")),
+    contain=(*_RICHER, ("anisotropic_gain", "inertia_scale")),
 )
 
 _SWING = replace(mh.PENDULUM, time_step=0.05, step=_STEP, n_train=12, n_test=4, n_intervals=30)

@@ -88,9 +88,10 @@ def unexplained_acceleration(mode: Mode) -> Left:
     for d in cells.rates:
         own = cells.places[cells.places % len(STATE) == d] // len(STATE)
         typical.append(np.sqrt(np.mean((change[:, own, d] / dt) ** 2)))
-    relative = mode.sigma[k:] / np.maximum(typical, 1e-300)
+    size = mode.sigma[k : k + len(cells.rates)]
+    relative = size / np.maximum(typical, 1e-300)
     names = tuple(STATE[d] for d in cells.rates)
-    return Left(names, mode.sigma[k:], relative, _p_values(mode, k), _numerical(mode))
+    return Left(names, size, relative, _p_values(mode, k), _numerical(mode))
 
 
 def innovations_over_steps(mode: Mode) -> Array:
@@ -127,7 +128,7 @@ def _p_values(mode: Mode, k: int) -> Array:
     def best(sigma: Array) -> float:
         return float(problem.log_density(residual, sigma, mode.phi).sum())
 
-    here, p_values = best(mode.sigma), np.empty(len(mode.sigma) - k)
+    here, p_values = best(mode.sigma), np.empty(len(problem.trajectory_noise.cells.rates))
     for i in range(len(p_values)):
         held = {k + i: _NOTHING * median[k + i]}
         without = profile_sigma(problem, residual, mode.phi, held)

@@ -14,7 +14,7 @@ from pbrl_ppl.model.log_posterior import log_noise_prior, log_posterior, log_pri
 from pbrl_ppl.model.noise import Noise, estimate_sigma, sigma_prior
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
-from pbrl_ppl.model.problem import ACCELERATION, Problem
+from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.simulation import simulated_trajectories, with_measurements
 from pbrl_ppl.model.smoothing import (
     along_trajectories,
@@ -24,11 +24,12 @@ from pbrl_ppl.model.smoothing import (
     smoothed,
 )
 from pbrl_ppl.model.table1 import build_layout, index_priors
-from pbrl_ppl.model.trajectory_noise import Cells, TrajectoryNoise
+from pbrl_ppl.model.trajectory_noise import ACCELERATION, JOLT, Cells, TrajectoryNoise
 from pbrl_ppl.model.transition import Transition
 
 __all__ = [
     "ACCELERATION",
+    "JOLT",
     "Cells",
     "Data",
     "Noise",

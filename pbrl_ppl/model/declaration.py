@@ -15,21 +15,26 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, measured_alone
 from pbrl_ppl.model.library import ParameterLibrary
-from pbrl_ppl.model.likelihood import Observations, next_state_logp, next_state_random
+from pbrl_ppl.model.likelihood import (
+    Observations,
+    difference,
+    next_state_logp,
+    next_state_random,
+)
 from pbrl_ppl.model.noise import Noise
 from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
-from pbrl_ppl.model.problem import ACCELERATION, Problem
+from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.smoothing import along_trajectories
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.model.tails import tail_tensor
-from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
+from pbrl_ppl.model.trajectory_noise import ACCELERATION, JOLT, TrajectoryNoise
 from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
 from pbrl_ppl.parameters import Block, Layout
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE
 
 #: Dimensions of the two noises along trajectories.
-_NOISE_DIMS = {"sigma": "sensor", ACCELERATION: "velocity"}
+_NOISE_DIMS = {"sigma": "sensor", ACCELERATION: "velocity", JOLT: "velocity"}
 
 
 def physics_model(
@@ -71,9 +76,10 @@ def physics_model(
         ``library_index`` holds the bodies' choices, and the parameters follow from it.
     trajectories : bool
         Whether whole trajectories are whitened together, with two noises: ``sigma``, the error of
-        measuring a state, and ``unexplained_acceleration``, what a step adds. Neighbours share a
-        measured state, which Eq. 11 takes as exact. The transitions are linearised about smoothed
-        states, at the prior's centre until :func:`pbrl_ppl.fit` finds the mode.
+        measuring a state, ``unexplained_acceleration``, what a step adds, and where bodies touch
+        ``contact_acceleration``, what comes on top of it there. Neighbours share a measured state,
+        which Eq. 11 takes as exact. The transitions are linearised about smoothed states, at the
+        prior's centre until :func:`pbrl_ppl.fit` finds the mode.
 
     Returns
     -------
@@ -286,7 +292,8 @@ def _log_density(
     # what was measured is in the noise, as deviations from the states of the linearisation
     bodies = observations.values.shape[2]
     tails = tail[0] if tail else np.full(bodies, 0.0 if nu is None else 1.0 / nu)
-    return TrajectoryDensityOp(noise)(linearised - predicted, sigma, tails)
+    residual = difference(pt.as_tensor(linearised), predicted, observations)
+    return TrajectoryDensityOp(noise)(residual, sigma, tails)
 
 
 def _random(

@@ -21,7 +21,13 @@ Ints = NDArray[np.int64]
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def gains(
-    slope: Array, first: Ints, seen: Bools, begin: Array, sensor: Array, step: Array
+    slope: Array,
+    first: Ints,
+    seen: Bools,
+    begin: Array,
+    sensor: Array,
+    step: Array,
+    kind: Ints,
 ) -> tuple[Array, Array, Array]:
     """Gain and standard deviation of every innovation; they do not depend on what was measured.
 
@@ -38,7 +44,9 @@ def gains(
     sensor : ndarray
         Variance of a measurement, shape (cell,).
     step : ndarray
-        Covariance of what a step adds, shape (cell, cell).
+        Covariance of what a step of each kind adds, shape (kind, cell, cell).
+    kind : ndarray
+        Which of them each transition is of, shape (transition,).
 
     Returns
     -------
@@ -67,7 +75,7 @@ def gains(
                 moved[a, b] = total
         for a in range(d):  # p = moved F' + step
             for b in range(a + 1):
-                total = step[a, b]
+                total = step[kind[k], a, b]
                 for c in range(d):
                     total += moved[a, c] * own[b, c]
                 p[a, b] = total
@@ -190,7 +198,13 @@ def adjoint(
 
 @numba.njit(cache=True, nogil=True, fastmath=True)
 def score(
-    slope: Array, last: Ints, seen: Bools, gain: Array, scale: Array, white: Array
+    slope: Array,
+    last: Ints,
+    seen: Bools,
+    gain: Array,
+    scale: Array,
+    white: Array,
+    kind: Ints,
 ) -> tuple[Array, Array, Array]:
     """Derivative of the log-likelihood by the variances, half the expectation of a quadratic form.
 
@@ -200,18 +214,20 @@ def score(
         As of :func:`adjoint`.
     white : ndarray
         White innovations, shape (transition, cell).
+    kind : ndarray
+        As of :func:`gains`: 0 or 1.
 
     Returns
     -------
     sensor : ndarray
         Twice the derivative by each cell's variance of measuring, shape (cell,).
     step : ndarray
-        Twice that by the covariance of what a step adds, shape (cell, cell).
+        Twice that by the covariance of what a step of each kind adds, shape (2, cell, cell).
     begin : ndarray
         Twice that by the variance of the state before each transition, shape (transition, cell).
     """
     n, d = seen.shape
-    sensor, step, begin = np.zeros(d), np.zeros((d, d)), np.zeros((n, d))
+    sensor, step, begin = np.zeros(d), np.zeros((2, d, d)), np.zeros((n, d))
     state, moved = np.zeros(d), np.zeros(d)
     known, pulled = np.zeros((d, d)), np.zeros((d, d))
     for k in range(n - 1, -1, -1):
@@ -237,7 +253,7 @@ def score(
             known[i, i] += spread
         for a in range(d):
             for b in range(d):
-                step[a, b] += state[a] * state[b] - known[a, b]
+                step[kind[k], a, b] += state[a] * state[b] - known[a, b]
         own = slope[k]
         for a in range(d):
             moved[a] = 0.0

@@ -199,6 +199,24 @@ def log_norm(nu: float | Array | None) -> Array:
     return np.asarray(np.where(heavy, norm, normal))
 
 
+def difference(value: Any, predicted: Any, observations: Observations) -> Any:
+    """Difference of states as a pytensor expression, angles wrapped to (-pi, pi].
+
+    Parameters
+    ----------
+    value, predicted : tensor
+        Shape (transition, H, body, state).
+    observations : Observations
+        Says which states they are.
+    """
+    residual = value - predicted  # s' - f(s, a; Phi)
+    if THETA in observations.columns:
+        theta = observations.columns.index(THETA)
+        wrapped = np.pi - pt.mod(np.pi - residual[..., theta], 2 * np.pi)
+        residual = pt.set_subtensor(residual[..., theta], wrapped)
+    return residual
+
+
 def next_state_logp(
     value: Any,
     predicted: Any,
@@ -224,11 +242,7 @@ def next_state_logp(
     """
     measured = observations.measured
     n = len(measured)
-    residual = value - predicted  # s' - f(s, a; Phi)
-    if THETA in observations.columns:
-        theta = observations.columns.index(THETA)
-        wrapped = np.pi - pt.mod(np.pi - residual[..., theta], 2 * np.pi)
-        residual = pt.set_subtensor(residual[..., theta], wrapped)
+    residual = difference(value, predicted, observations)
     z = (residual / sigma * measured).reshape((n, -1))
     log_sigma = (pt.log(sigma) * measured).sum(axis=(1, 2, 3))
     count = measured.sum(axis=(1, 2, 3))

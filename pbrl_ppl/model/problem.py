@@ -36,8 +36,6 @@ Array = NDArray[np.float64]
 
 #: Phi, start states and wrenches in, next states out.
 Engine = Callable[[Array, Array, Array], Array]
-#: The variable of what a step adds: an acceleration that nothing in the model explains.
-ACCELERATION = "unexplained_acceleration"
 #: How far predictions may differ and be the same to the likelihood, in units of the noise.
 _SAME = 0.01
 
@@ -239,8 +237,8 @@ class Problem:
 
     def quiet(self, sigma: Array, share: float) -> Array:
         """Noise of trajectories, a step's no larger than a share of its prior's median."""
-        steps = slice(len(self.trajectory_noise.cells.sensors), None)
-        sigma = sigma.copy()
+        cells, sigma = self.trajectory_noise.cells, sigma.copy()
+        steps = slice(len(cells.sensors), len(cells.sensors) + len(cells.rates))
         sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])
         return sigma
 
@@ -249,12 +247,7 @@ class Problem:
         """Variables of the noise, and the state dimensions of each, in the order of sigma."""
         if self.trajectories is None:
             return {"sigma": self.observations.names}
-        cells = self.trajectories.cells
-        names = {
-            "sigma": tuple(STATE[d] for d in cells.sensors),
-            ACCELERATION: tuple(STATE[d] for d in cells.rates),
-        }
-        return {name: own for name, own in names.items() if own}
+        return self.trajectories.cells.variables
 
     def named(self, phi: Array, sigma: Array) -> dict[str, Array]:
         """The model's variables at phi, shape (..., p), and sigma, shape (..., parameter)."""

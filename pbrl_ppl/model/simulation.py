@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.history import History
 from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.smoothing import along_trajectories
+from pbrl_ppl.physics import touching
 
 Array = NDArray[np.float64]
 
@@ -43,8 +44,9 @@ def simulated_trajectories(
         lost = ~np.isfinite(begin).all(axis=(1, 2))
         ends = problem.one_world(phi, np.where(lost[:, None, None], 0.0, begin), inputs)[:, 0]
         ends[lost] = np.nan
-        pushes = sigma[cells.pushed] * rng.standard_normal((len(now), len(cells.pushed)))
-        flat[own[:, None], step + 1, cells.places] = cells.of(ends) + pushes @ cells.push
+        met = touching(problem.scene, begin, np.nan_to_num(ends))
+        pushes = cells.pushes(sigma, met, rng)
+        flat[own[:, None], step + 1, cells.places] = cells.of(ends) + pushes
         cells.completed(problem.scene, states[:, step + 1])
     errors = cells.errors(sigma) * rng.standard_normal((*flat.shape[:2], len(cells.places)))
     measured = states.copy()

@@ -6,6 +6,7 @@ See B. M. Bell, The iterated Kalman smoother as a Gauss-Newton method (1994).
 from __future__ import annotations
 
 from dataclasses import replace
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.history import History, hung_bodies
 from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.trajectory_noise import Cells, TrajectoryNoise
+from pbrl_ppl.physics import touching
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA
 
@@ -21,7 +23,7 @@ Bools = NDArray[np.bool_]
 
 #: Medians of the noise parameters' priors, as shares of what the states do in a step, and the
 #: priors' log-scale.
-SENSOR_SHARE, STEP_SHARE, SPREAD = 0.1, 0.01, 2.0
+SENSOR_SHARE, STEP_SHARE, JOLT_SHARE, SPREAD = 0.1, 0.01, 0.1, 2.0
 #: A state that was not measured may be this many times as large as any that is estimated.
 _FAR = 10.0
 #: Error of measuring what does not move at all (m, rad, m/s, rad/s).
@@ -133,12 +135,19 @@ def cells_of(scene: Scene, history: History) -> Cells:
             sensor[i] = np.searchsorted(sensors, d)
     push, pushed = [], []
     dt = scene.time_step
-    for b in range(len(scene.moving)):
+    ways = first_states(history)
+    begin, end = (s.reshape(-1, *s.shape[2:]) for s in (ways[:, :-1], ways[:, 1:]))
+    jolted = bool(touching(scene, begin, end).any())
+    kinds = product(range(1 + jolted), range(len(scene.moving)))
+    for kind, b in kinds:
         for j, d in enumerate(rates):
             if free[b, d] and not still[b, d]:
                 row = np.where((body == b) & (dimension == d), dt, 0.0)
-                push.append(row + np.where((body == b) & (dimension == d - _RATE), dt**2 / 2, 0.0))
-                pushed.append(len(sensors) + j)
+                place = np.where((body == b) & (dimension == d - _RATE), dt**2, 0.0)
+                push.append(row + place / 2)
+                if kind:  # a blow falls at any moment of the interval
+                    push.append(place / np.sqrt(12))
+                pushed += [len(sensors) + kind * len(rates) + j] * (1 + kind)
     return Cells(
         places,
         tuple(int(d) for d in np.unique(dimension)),
@@ -148,6 +157,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
         np.array(pushed, dtype=np.intp),
         tuple(int(d) for d in sensors),
         tuple(int(d) for d in rates),
+        tuple(int(d) for d in rates) if jolted else (),
     )
 
 
@@ -164,7 +174,8 @@ def noise_medians(cells: Cells, history: History, states: Array) -> Array:
     dt = float(history.dataset.attrs["time_step"])
     sensors = SENSOR_SHARE * typical[list(cells.sensors)]
     steps = STEP_SHARE * typical[list(cells.rates)] / dt
-    return np.asarray(np.maximum(np.concatenate([sensors, steps]), 1e-9))
+    jolts = JOLT_SHARE * typical[list(cells.jolts)] / dt
+    return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts]), 1e-9))
 
 
 def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
@@ -176,7 +187,7 @@ def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
     }
     dt = problem.scene.time_step
     guess = [by_dimension[d] / np.sqrt(2) for d in cells.sensors]
-    guess += [by_dimension[d] / np.sqrt(2) / dt for d in cells.rates]
+    guess += [by_dimension[d] / np.sqrt(2) / dt for d in (*cells.rates, *cells.jolts)]
     return np.maximum(guess, problem.noise_prior[0] * 0.01)
 
 
@@ -240,4 +251,14 @@ def linearised(problem: Problem, cells: Cells, slope: Array, sigma: Array) -> Tr
         begin=np.nan_to_num(begin),
         wide=np.where(np.isfinite(begin), 0.0, far**2),
         sigma=np.asarray(sigma, dtype=float),
+        touching=_touching(problem, cells),
     )
+
+
+def _touching(problem: Problem, cells: Cells) -> Bools:
+    """In which transitions bodies touch, where that has noise of its own, shape (transition,)."""
+    segments, states = problem.segments, problem.data.smoothed_states
+    if not cells.jolts:
+        return np.zeros(segments.n, dtype=bool)
+    trajectory, step = segments.trajectory, segments.step
+    return touching(problem.scene, states[trajectory, step], states[trajectory, step + 1])

@@ -10,7 +10,12 @@ from numpy.typing import NDArray
 from pbrl_ppl.history import fill_hinges
 from pbrl_ppl.model.kalman import adjoint, gains, innovations, score
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA, wrapped
+from pbrl_ppl.state import STATE, THETA, wrapped
+
+#: The variable of what a step adds: an acceleration that nothing in the model explains.
+ACCELERATION = "unexplained_acceleration"
+#: And the one of what comes on top of it where bodies touch.
+JOLT = "contact_acceleration"
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -36,8 +41,9 @@ class Cells:
         velocity, shape (push, cell).
     pushed : ndarray of int
         Which noise parameter is the acceleration of each row, shape (push,).
-    sensors, rates : tuple of int
-        State dimensions that the noise parameters are about: of measurements, of accelerations.
+    sensors, rates, jolts : tuple of int
+        State dimensions that the noise parameters are about: of measurements, of accelerations, of
+        what bodies that touch add to those.
     """
 
     places: Ints
@@ -48,6 +54,32 @@ class Cells:
     pushed: Ints
     sensors: tuple[int, ...]
     rates: tuple[int, ...]
+    jolts: tuple[int, ...] = ()
+
+    @property
+    def variables(self) -> dict[str, tuple[str, ...]]:
+        """Variables of the noise, and the state dimensions of each, in the order of sigma."""
+        own = {"sigma": self.sensors, ACCELERATION: self.rates, JOLT: self.jolts}
+        return {name: tuple(STATE[d] for d in about) for name, about in own.items() if about}
+
+    @property
+    def always(self) -> Bools:
+        """Which rows act in every step, and not only where bodies touch, shape (push,)."""
+        return self.pushed < len(self.sensors) + len(self.rates)
+
+    def steps(self, sigma: Array) -> Array:
+        """Covariance of what a step adds where no bodies touch, and where some do.
+
+        Shape (2, cell, cell).
+        """
+        size = sigma[self.pushed] ** 2
+        free = np.where(self.always, size, 0.0)
+        return np.stack([(self.push.T * own) @ self.push for own in (free, size)])
+
+    def pushes(self, sigma: Array, touching: Bools, rng: np.random.Generator) -> Array:
+        """Draw what steps add to the cells, shape (..., cell), as ``touching`` has its axes."""
+        drawn = sigma[self.pushed] * rng.standard_normal((*touching.shape, len(self.pushed)))
+        return np.where(self.always | touching[..., None], drawn, 0.0) @ self.push
 
     def errors(self, sigma: Array) -> Array:
         """Standard deviation of measuring each cell, shape (cell,)."""
@@ -91,7 +123,8 @@ class TrajectoryNoise:
     Neighbouring transitions share a measured state, so their residuals are correlated. Whitened
     along the trajectory they are the innovations of a Kalman filter. The noise parameters are the
     standard deviations of a measurement, R, one a measured state dimension, followed by those of an
-    unexplained acceleration, held over an interval, Q, one a velocity.
+    unexplained acceleration, held over an interval, Q, one a velocity, and of what comes on top of
+    it where bodies touch: how they part hangs on more than any engine knows.
 
     Parameters
     ----------
@@ -111,6 +144,8 @@ class TrajectoryNoise:
         Variance of that where it was not measured, 0 elsewhere, shape (transition, cell).
     sigma : ndarray
         Noise parameters at which it was linearised, shape (parameter,).
+    touching : ndarray of bool
+        Whether bodies touch in a transition, shape (transition,).
     """
 
     cells: Cells
@@ -121,6 +156,7 @@ class TrajectoryNoise:
     begin: Array
     wide: Array
     sigma: Array
+    touching: Bools
     _known: dict[bytes, tuple[Array, Array, Array, Array]] = field(
         default_factory=dict, init=False, repr=False
     )
@@ -135,13 +171,18 @@ class TrajectoryNoise:
         if known is None:
             if len(self._known) > 3:
                 self._known.clear()
-            step = (self.cells.push.T * sigma[self.cells.pushed] ** 2) @ self.cells.push
             sensor = self.cells.errors(sigma) ** 2
             gain, scale, after = gains(
-                self.slope, self.first, self.seen, self._begin(sigma), sensor, step
-            )
+                self.slope, self.first, self.seen, self._begin(sigma), sensor,
+                self.cells.steps(sigma), self.kind,
+            )  # fmt: skip
             known = self._known[key] = gain, scale, after, np.log(scale).sum(axis=1)
         return known
+
+    @property
+    def kind(self) -> Ints:
+        """1 where bodies touch in a transition and 0 elsewhere, shape (transition,)."""
+        return self.touching.astype(np.int64)
 
     def whiten(self, residual: Array, sigma: Array) -> Array:
         """Innovations over their standard deviations.
@@ -227,14 +268,14 @@ class TrajectoryNoise:
         white = self.filtered(self.cells.of_residual(residual)[None], sigma)[0][0]
         gain, scale, _, log_scale = self.gains(sigma)
         last = np.append(self.first[1:], True)
-        sensor, step, begin = score(self.slope, last, self.seen, gain, scale, white)
+        sensor, step, begin = score(self.slope, last, self.seen, gain, scale, white, self.kind)
         # measured states begin a trajectory: their error is that of measuring
         begun = np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0).sum(axis=0)
         cells, slope = self.cells, np.zeros(len(sigma))
         free = cells.sensor >= 0
         np.add.at(slope, cells.sensor[free], (sensor + begun)[free])
-        pushes = np.einsum("ja,ab,jb->j", cells.push, step, cells.push)
-        np.add.at(slope, cells.pushed, pushes)
+        steps = np.where(cells.always[:, None, None], step.sum(axis=0), step[1])
+        np.add.at(slope, cells.pushed, np.einsum("ja,jab,jb->j", cells.push, steps, cells.push))
         norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
         value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
         return value, sigma**2 * slope
@@ -259,7 +300,7 @@ class TrajectoryNoise:
         state = np.where(first, self.begin, np.roll(filtered, 1, axis=0))
         begin = self._begin(sigma)[:, :, None] * np.eye(len(self.cells.places))
         known = np.where(first[..., None], begin, np.roll(after, 1, axis=0))
-        step = (self.cells.push.T * sigma[self.cells.pushed] ** 2) @ self.cells.push
+        step = self.cells.steps(sigma)[self.kind]
         covariance = self.slope @ known @ self.slope.transpose(0, 2, 1) + step
         return (
             np.einsum("kab,kb->ka", self.slope, state) - residual,

@@ -6,6 +6,7 @@ from pbrl_ppl.physics.one_world import OneWorld
 from pbrl_ppl.physics.parts import Part, PartedSimulator
 from pbrl_ppl.physics.placement import check_history, check_placement, overlap
 from pbrl_ppl.physics.simulator import Simulator
+from pbrl_ppl.physics.touch import touching
 from pbrl_ppl.physics.trial import try_effect
 
 __all__ = [
@@ -20,5 +21,6 @@ __all__ = [
     "independent_parts",
     "joined_parts",
     "overlap",
+    "touching",
     "try_effect",
 ]

@@ -8,14 +8,13 @@ from functools import lru_cache
 from itertools import product
 
 import numpy as np
-import pymunk
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics.properties import Array
-from pbrl_ppl.physics.world import _shapes
-from pbrl_ppl.scene import WORLD, Body, Joint, Scene
+from pbrl_ppl.physics.solids import Solid, depth_of, put, solid_of, to_segment
+from pbrl_ppl.scene import WORLD, Joint, Scene
 
 #: What is put down to noise and resting contact: a share of the smaller body's size.
 ALLOWED = 0.25
@@ -128,7 +127,8 @@ def overlap(scene: Scene, poses: Array) -> Array:
         if len(rows):
             a, b = world.solids[i], world.solids[j]
             at_a, at_b = poses[rows, i], poses[rows, j]
-            own[rows] = np.max([_depth(p, at_a, q, at_b) for p, q in product(a.parts, b.parts)], 0)
+            parts = product(a.parts, b.parts)
+            own[rows] = np.max([depth_of(p, at_a, q, at_b) for p, q in parts], 0)
         deepest = np.maximum(deepest, own)
     return deepest
 
@@ -164,7 +164,7 @@ def _apart(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
 
 def _anchor_distance(joint: Joint, poses: list[Array]) -> Array:
     anchors = (joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0))
-    a, b = (_put(np.array([at]), pose) for at, pose in zip(anchors, poses, strict=True))
+    a, b = (put(np.array([at]), pose) for at, pose in zip(anchors, poses, strict=True))
     return np.asarray(np.hypot(*np.moveaxis(a - b, -1, 0))[:, 0])
 
 
@@ -172,25 +172,10 @@ def _anchor_distance(joint: Joint, poses: list[Array]) -> Array:
 
 
 @dataclass(frozen=True, eq=False)
-class _Solid:
-    """A body in its own frame, or a wall in the world's.
-
-    ``parts`` are convex: corners (k, 2) counter-clockwise and a radius about them; one corner is a
-    circle, two are a wall. All of them are within ``reach`` of the ``core``, a segment (2, 2).
-    """
-
-    name: str
-    parts: tuple[tuple[Array, float], ...]
-    core: Array
-    reach: float
-    width: float
-
-
-@dataclass(frozen=True, eq=False)
 class _Solids:
     """Solids of a scene: moving bodies, then walls and static bodies."""
 
-    solids: tuple[_Solid, ...]
+    solids: tuple[Solid, ...]
     fixed: Array  # poses of those that do not move, (fixed, 3)
     pairs: tuple[tuple[int, int], ...]  # those that may not overlap; the first one moves
     allowed: Array  # (pair,)
@@ -198,11 +183,11 @@ class _Solids:
 
 @lru_cache(maxsize=16)
 def _solids(scene: Scene) -> _Solids:
-    moving = [_solid(body) for body in scene.moving]
+    moving = [solid_of(body) for body in scene.moving]
     ends = [np.array([wall.start, wall.end]) for wall in scene.walls]
-    walls = [_Solid(WORLD, ((end, 0.0),), end, 0.0, np.inf) for end in ends]
+    walls = [Solid(WORLD, ((end, 0.0),), end, 0.0, np.inf) for end in ends]
     static = [body for body in scene.bodies if body.static]
-    solids = [*moving, *walls, *(_solid(body) for body in static)]
+    solids = [*moving, *walls, *(solid_of(body) for body in static)]
     fixed = [_ORIGIN] * len(walls) + [body.pose or _ORIGIN for body in static]
     joined = [set(joint.bodies) for joint in scene.joints if joint.bodies is not None]
     # a joint of unknown bodies could join any two of the moving ones and the world
@@ -220,20 +205,6 @@ def _solids(scene: Scene) -> _Solids:
     )
 
 
-def _solid(body: Body) -> _Solid:
-    parts: list[tuple[Array, float]] = []
-    for shape in _shapes(body, pymunk.Body()):
-        if isinstance(shape, pymunk.Poly):
-            parts.append((np.array(shape.get_vertices()), 0.0))
-        else:
-            parts.append((np.zeros((1, 2)), float(body.shape.radius or 0.0)))
-    x_min, x_max, y_min, y_max = body.shape.bounds
-    width = min(x_max - x_min, y_max - y_min)
-    if len(parts) > 1:  # no part of a thin frame can lie as deep as the whole is wide
-        width = min(width, max(float(np.ptp(corners, axis=0).min()) for corners, _ in parts))
-    return _Solid(body.name, tuple(parts), np.zeros((2, 2)), body.shape.bounding_radius, width)
-
-
 def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
     """First transition and message of every two shapes that lie deep inside each other."""
     world = _solids(scene)
@@ -245,7 +216,7 @@ def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
         a, b, allowed = world.solids[i], world.solids[j], world.allowed[pair]
         rows = np.flatnonzero(near[:, pair])
         at_a, at_b = poses[rows, i], poses[rows, j]
-        depth = np.max([_depth(p, at_a, q, at_b) for p, q in product(a.parts, b.parts)], axis=0)
+        depth = np.max([depth_of(p, at_a, q, at_b) for p, q in product(a.parts, b.parts)], axis=0)
         deep = np.flatnonzero(depth > allowed)
         if len(deep):
             what, whose = f'bodies "{a.name}" and "{b.name}"', "the smaller one's"
@@ -275,61 +246,5 @@ def _circles(world: _Solids, poses: Array) -> Array:
     reach = np.array([solid.reach for solid in world.solids])
     edge = cores[j, 1] - cores[j, 0]
     arm = poses[:, i, :2] - poses[:, j, :2] - cores[j, 0]
-    gap = _to_segment(arm, edge)
+    gap = to_segment(arm, edge)
     return np.asarray(reach[i] + reach[j] - gap)
-
-
-# -- geometry --------------------------------------------------------------------------------------
-
-
-def _put(points: Array, poses: Array) -> Array:
-    """Points (k, 2) of a body's frame in the world, at each pose (n, 3): shape (n, k, 2)."""
-    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    x, y = points.T
-    return np.stack([c * x - s * y + poses[:, :1], s * x + c * y + poses[:, 1:2]], axis=-1)
-
-
-def _depth(
-    part_a: tuple[Array, float], poses_a: Array, part_b: tuple[Array, float], poses_b: Array
-) -> Array:
-    """Penetration depth of two convex parts at each pose (m); negative if they are apart.
-
-    The engine's own answer is not used: it is zero for polygons whose centres coincide.
-    """
-    a, b = _put(part_a[0], poses_a), _put(part_b[0], poses_b)
-    radii = part_a[1] + part_b[1]
-    if a.shape[1] == 1:
-        return radii - _distance(a[:, 0], b)
-    if b.shape[1] == 1:
-        return radii - _distance(b[:, 0], a)
-    return radii + np.minimum(_behind(a, b), _behind(b, a))
-
-
-def _behind(a: Array, b: Array) -> Array:
-    """Least depth of corners b behind an edge of a (separating axes), shape (n,)."""
-    least = np.full(len(a), np.inf)
-    for corner, after in zip(
-        np.moveaxis(a, 1, 0), np.moveaxis(np.roll(a, -1, 1), 1, 0), strict=True
-    ):
-        x, y = (after - corner).T
-        outward = np.stack([y, -x], axis=-1) / np.hypot(x, y)[:, None]
-        reach = ((b - corner[:, None]) * outward[:, None]).sum(axis=-1).min(axis=1)
-        least = np.minimum(least, -reach)
-    return least
-
-
-def _distance(point: Array, corners: Array) -> Array:
-    """Distance of a point (n, 2) from corners (n, k, 2), negative inside a polygon, shape (n,)."""
-    edge = np.roll(corners, -1, axis=1) - corners
-    arm = point[:, None] - corners
-    distance = _to_segment(arm, edge).min(axis=1)
-    left = edge[..., 0] * arm[..., 1] >= edge[..., 1] * arm[..., 0]
-    inside = left.all(axis=1) & (corners.shape[1] > 2)
-    return np.asarray(np.where(inside, -distance, distance))
-
-
-def _to_segment(arm: Array, edge: Array) -> Array:
-    """Distance of points from segments, given from each one's begin (..., 2); it may be a point."""
-    square = np.maximum((edge**2).sum(axis=-1), np.finfo(float).tiny)
-    share = np.clip((arm * edge).sum(axis=-1) / square, 0.0, 1.0)
-    return np.asarray(np.hypot(*np.moveaxis(arm - share[..., None] * edge, -1, 0)))

@@ -75,10 +75,10 @@ class AccelerationNoise:
     def add(self, states: Array, rng: np.random.Generator) -> Array:
         """States (draw, n, body, 6) with noise."""
         out, cells = states.copy(), self.cells
-        size = self.sigma[:, None, cells.pushed]
-        draws, n = states.shape[:2]
-        pushes = size * rng.standard_normal((draws, n, len(cells.pushed)))
-        out.reshape(draws, n, -1)[..., cells.places] += pushes @ cells.push
+        n = states.shape[1]
+        apart = np.zeros(n, dtype=bool)  # what a contact adds is left out: it is not foreseen
+        for draw, sigma in enumerate(self.sigma):
+            out[draw].reshape(n, -1)[..., cells.places] += cells.pushes(sigma, apart, rng)
         return out
 
     def single(self, draw: int) -> AccelerationNoise:

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
-from pbrl_ppl.model import ACCELERATION, Problem
+from pbrl_ppl.model import ACCELERATION, JOLT, Problem
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
@@ -179,7 +179,8 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
         posterior[block.name].attrs["units"] = block.unit
     posterior["sigma"].attrs["units"] = "the unit of each state dimension"
     if problem.trajectories is not None:
-        posterior[ACCELERATION].attrs["units"] = "m/s^2, of omega rad/s^2"
+        for name in {ACCELERATION, JOLT} & set(problem.noise_variables):
+            posterior[name].attrs["units"] = "m/s^2, of omega rad/s^2"
     return posterior
 
 

@@ -102,12 +102,17 @@ def test_an_effect_outside_the_catalogue_gets_no_wrong_name(make_history) -> Non
 
 
 @pytest.mark.parametrize(
-    ("name", "size"),
-    [("saturation", 2.7), ("spring", (0.5, 1.0, -0.5)), ("actuator_delay", 0.4)],
+    ("name", "size", "richer"),
+    [
+        ("saturation", 2.7, ()),
+        ("spring", (0.5, 1.0, -0.5), ("point_attractor",)),  # deep down, it pulls like a spring
+        ("actuator_delay", 0.4, ()),
+        ("cubic_drag", 0.1, ()),
+    ],
 )
-def test_selection_has_no_name_for_what_is_outside(name, size, make_history) -> None:
+def test_selection_has_no_name_for_what_is_outside(name, size, richer, make_history) -> None:
     mode = fitted(BOX, box2d(make_history, 4, **{name: size})[0])
-    selection = Selection(BOX, without(name), lambda stage: None)
+    selection = Selection(BOX, without(name, *richer), lambda stage: None)
     step = selection.best_addition(mode, rank_candidates(mode, selection.missing(mode)))
     if step is not None:  # then most of what was missing remains
         before, after = mode.sigma[6:], step.after.sigma[6:]

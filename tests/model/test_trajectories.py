@@ -21,6 +21,7 @@ from pbrl_ppl.model import (
 )
 from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
 from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.state import wrapped
 from tests.helpers.histories import simulated_history
 
 PUCK = Scene(
@@ -174,7 +175,7 @@ def test_derivative_is_that_of_differences(problem) -> None:
             np.testing.assert_allclose(2 * (by_sigma * step).sum(), change, rtol=1e-4)
 
 
-def test_the_model_is_the_problem(problem) -> None:
+def density_of_the_model(problem) -> float:
     model = build_model(problem)
     assert [variable.name for variable in model.free_RVs] == [
         "mass", "linear_drag_coefficient", "sigma", "unexplained_acceleration",
@@ -183,10 +184,29 @@ def test_the_model_is_the_problem(problem) -> None:
         "mass": PHI[:1], "linear_drag_coefficient": PHI[1:],
         "sigma": NOISE[:6], "unexplained_acceleration": NOISE[6:],
     }  # fmt: skip
-    value = model.compile_logp(vars=model.observed_RVs)(
+    return model.compile_logp(vars=model.observed_RVs)(
         {model.rvs_to_values[v].name: np.log(point[v.name]) for v in model.free_RVs}
     )
+
+
+def test_the_model_is_the_problem(problem) -> None:
+    value = density_of_the_model(problem)
     np.testing.assert_allclose(value, problem.log_density(problem.residual(PHI), NOISE).sum())
+
+
+def test_the_model_is_the_problem_where_a_body_turns_by_more_than_half_a_turn() -> None:
+    """An interval's turn of 4 rad is one of -2.3 rad to the sensor, whichever way it is counted."""
+    history = simulated_history(PUCK, TRUTH, seed=3, trajectories=2, intervals=5, substeps=2)
+    dataset = history.dataset.copy()
+    for name in ("start", "observed"):
+        values = dataset[name].to_numpy().copy()
+        values[..., 2] = wrapped(values[..., 2] + 4.0 * np.arange(values.shape[1])[:, None])
+        values[..., 5] += 40.0
+        dataset[name] = dataset[name].copy(data=values)
+    fast = along_trajectories(Problem.of(PUCK, History(dataset), attach(PUCK)), PHI, NOISE)
+    density = fast.log_density(fast.residual(PHI), NOISE).sum()
+    assert density_of_the_model(fast) == pytest.approx(density, rel=1e-9)
+    assert density > -1e4  # a turn more or less would cost a million
 
 
 def test_draws_of_the_model_have_its_covariance(problem) -> None:

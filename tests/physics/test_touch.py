@@ -1,0 +1,56 @@
+"""In which intervals bodies touch, from where they are at the ends."""
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.physics import touching
+from pbrl_ppl.scene import Body, Joint, Scene, Shape
+
+BOX, DISC = Shape.box(0.6, 0.2), Shape.circle(0.1)
+
+
+def scene(*bodies: Body, joints: tuple[Joint, ...] = ()) -> Scene:
+    return Scene(time_step=0.1, bodies=bodies, joints=joints)
+
+
+TWO = scene(Body("box", BOX), Body("disc", DISC))
+
+
+def at(*poses: tuple[float, float, float]) -> np.ndarray:
+    """States of bodies at rest, shape (1, body, 6)."""
+    return np.array([[(*pose, 0.0, 0.0, 0.0) for pose in poses]])
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "expected"),
+    [
+        ((0.0, 0.45, 0.0), (0.0, 0.45, 0.0), False),  # beside it, 0.25 m apart
+        ((0.0, 0.205, 0.0), (0.0, 0.205, 0.0), True),  # within what outlines are known to
+        ((0.0, 0.45, 0.0), (0.0, 0.19, 0.0), True),  # at the end alone
+        ((-0.5, 0.3, 0.0), (0.5, 0.15, 0.0), True),  # in between
+        ((2.0, 0.0, 0.0), (2.5, 0.0, 0.0), False),
+    ],
+)
+def test_a_disc_passes_a_box(begin, end, expected) -> None:
+    still = (0.0, 0.0, 0.0)
+    assert touching(TWO, at(still, begin), at(still, end)) == [expected]
+
+
+def test_a_turning_box_sweeps_a_circle() -> None:
+    """At rest 0.1 m beside its long side; a quarter turn brings its end there."""
+    disc = (0.0, 0.3, 0.0)
+    flat, upright = (0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2)
+    assert not touching(TWO, at(flat, disc), at(flat, disc))
+    assert touching(TWO, at(flat, disc), at(upright, disc))
+    away = (0.0, 0.6, 0.0)
+    assert not touching(TWO, at(flat, away), at((0.0, 0.0, 50.0), away))
+
+
+def test_bodies_that_follow_a_path_or_are_joined_are_no_matter() -> None:
+    together = at((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    assert touching(TWO, together, together)
+    finger = scene(Body("box", BOX), Body("disc", DISC, kinematic=True))
+    assert not touching(finger, together, together)
+    hinge = Joint("hinge", ("box", "disc"), (0.0, 0.0), (0.0, 0.0))
+    joined = TWO.replace(joints=(hinge,))
+    assert not touching(joined, together, together)
