@@ -67,10 +67,17 @@ def derived_velocities(history: History) -> Bools:
             for trajectory, n in enumerate(rows):
                 position, rate = observed[trajectory, :n, body, [d - 3, d]]
                 if np.isfinite(position).all() and np.isfinite(rate).all():
-                    unwrapped = np.unwrap(position) if d - 3 == THETA else position
-                    series.append((unwrapped, rate))
+                    angle = d - 3 == THETA
+                    series.append((_unwrapped(position, rate, dt) if angle else position, rate))
             result[body, d] = _is_derived(series, dt)
     return result
+
+
+def _unwrapped(angle: Floats, rate: Floats, dt: float) -> Floats:
+    """Angles without jumps; the rates say how often a body has turned round between samples."""
+    step, expected = np.diff(angle), 0.5 * dt * (rate[1:] + rate[:-1])
+    step += 2 * np.pi * np.round((expected - step) / (2 * np.pi))
+    return np.concatenate([angle[:1], angle[0] + np.cumsum(step)])
 
 
 def _is_derived(series: list[tuple[Floats, Floats]], dt: float) -> bool:

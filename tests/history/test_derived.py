@@ -21,13 +21,15 @@ SMOOTHERS = {
 }
 
 
-def recorded(rates, seed: int = 0, position_noise: float = 0.002, n: int = 8) -> History:
+def recorded(
+    rates, seed: int = 0, position_noise: float = 0.002, n: int = 8, spin: float = 0.0
+) -> History:
     """Pushed at random, with measured positions, and rates as a function of positions and truth."""
     rng = np.random.default_rng(seed)
     rows = []
     for trajectory in range(n):
         push = rng.normal(size=(40, 3)) * (2.0, 2.0, 8.0)
-        v = np.cumsum(np.vstack([rng.normal(size=3), DT * push]), axis=0)
+        v = np.cumsum(np.vstack([rng.normal(size=3) + (0.0, 0.0, spin), DT * push]), axis=0)
         moved = DT * v[:-1] + DT**2 / 2 * push
         p = np.cumsum(np.vstack([rng.normal(size=3), moved]), axis=0)
         p = p + position_noise * rng.normal(size=p.shape)
@@ -52,6 +54,14 @@ def test_a_measured_velocity_is_not(noise: float) -> None:
     for seed in range(10):
         history = recorded(lambda p, v, rng: v + noise * rng.normal(size=v.shape), seed)
         assert not derived_velocities(history).any()
+
+
+def test_a_body_may_turn_by_more_than_half_a_turn_between_samples() -> None:
+    fast = 1.3 * np.pi / DT
+    own = recorded(lambda p, v, rng: v + 0.05 * rng.normal(size=v.shape), spin=fast)
+    assert not derived_velocities(own).any()
+    computed = recorded(lambda p, v, rng: np.gradient(p, DT, axis=0), spin=fast)
+    assert derived_velocities(computed).tolist() == [[False] * 3 + [True] * 3]
 
 
 def test_a_short_recording_says_nothing() -> None:
