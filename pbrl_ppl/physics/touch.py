@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.physics.properties import Array
-from pbrl_ppl.physics.solids import depth_of, solid_of
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.physics.solids import Solid, depth_of, solid_of, to_segment
+from pbrl_ppl.scene import WORLD, Scene
 
 #: Places looked at between the ends of an interval.
 _LOOKS = 5
@@ -19,12 +19,13 @@ _OUTLINE, _SHARE = 0.05, 0.25
 
 
 def touching(scene: Scene, begin: Array, end: Array) -> NDArray[np.bool_]:
-    """Whether two bodies that forces move touch within an interval, or come so near that they may.
+    """Whether a body touches another within an interval, or comes so near that it may.
 
     Parameters
     ----------
     scene : Scene
-        Shapes; bodies that a joint joins do not collide.
+        Shapes, walls and static bodies; what a joint joins does not collide, and a body that
+        follows a path is no matter.
     begin, end : ndarray
         States, shape (transition, body, 6), SI units.
 
@@ -33,31 +34,57 @@ def touching(scene: Scene, begin: Array, end: Array) -> NDArray[np.bool_]:
     ndarray of bool
         Shape (transition,).
     """
+    solids, fixed = _solids(scene)
+    still = np.broadcast_to(fixed, (len(begin), *fixed.shape))
+    begin, end = (np.concatenate([s[..., :3], still], axis=1) for s in (begin, end))
     touched = np.zeros(len(begin), dtype=bool)
-    for i, j in pairs(scene):
-        a, b = (solid_of(scene.moving[place]) for place in (i, j))
-        moved = end[:, (i, j), :3] - begin[:, (i, j), :3]
-        shift = moved[:, 0, :2] - moved[:, 1, :2]
-        reach = np.array([scene.moving[place].shape.bounding_radius for place in (i, j)])
-        outline = _OUTLINE * min(a.width, b.width)
-        way = np.hypot(shift[:, 0], shift[:, 1])
-        gap = outline + _SHARE * (way + np.abs(moved[:, :, 2]) @ reach)
-        apart = begin[:, i, :2] - begin[:, j, :2]
-        far = np.hypot(apart[:, 0], apart[:, 1]) - way
-        near = np.flatnonzero(far < reach.sum() + outline)
-        for share in np.linspace(0.0, 1.0, _LOOKS):
-            at = begin[near][:, (i, j), :3] + share * moved[near]
-            # the circles about them bound how near they are, however fast they turn
-            between = at[:, 0, :2] - at[:, 1, :2]
-            close = np.hypot(between[:, 0], between[:, 1]) < reach.sum() + outline
-            for p, q in product(a.parts, b.parts):
-                touched[near] |= close & (depth_of(p, at[:, 0], q, at[:, 1]) > -gap[near])
+    for i, j in _pairs(scene, len(solids)):
+        touched |= _meet(solids[i], solids[j], begin[:, (i, j)], end[:, (i, j)])
     return touched
 
 
-def pairs(scene: Scene) -> list[tuple[int, int]]:
-    """Pairs of bodies that forces move and that nothing joins, by their places."""
-    free = [i for i, body in enumerate(scene.moving) if not body.kinematic]
-    names = [body.name for body in scene.moving]
+def _solids(scene: Scene) -> tuple[list[Solid], Array]:
+    """Moving bodies, then walls and static bodies, with the poses (fixed, 3) of these."""
+    static = [body for body in scene.bodies if body.static]
+    walls = [np.array([wall.start, wall.end]) for wall in scene.walls]
+    solids = [solid_of(body) for body in scene.moving]
+    solids += [Solid(WORLD, ((wall, 0.0),), wall, 0.0, np.inf) for wall in walls]
+    solids += [solid_of(body) for body in static]
+    poses = [(0.0, 0.0, 0.0)] * len(walls) + [body.pose or (0.0, 0.0, 0.0) for body in static]
+    return solids, np.array(poses, dtype=float).reshape(-1, 3)
+
+
+def _pairs(scene: Scene, n: int) -> list[tuple[int, int]]:
+    """Pairs of solids, of which a force moves the first, that nothing joins."""
+    bodies = [*scene.moving, *(None for _ in scene.walls), *(b for b in scene.bodies if b.static)]
+    names = [WORLD if body is None else body.name for body in bodies]
     joined = [set(joint.bodies) for joint in scene.joints if joint.bodies is not None]
-    return [(i, j) for i, j in combinations(free, 2) if {names[i], names[j]} not in joined]
+    led = [body is not None and body.kinematic for body in bodies]
+    return [
+        (i, j)
+        for i, j in combinations(range(n), 2)
+        if i < len(scene.moving) and not (led[i] or led[j]) and {names[i], names[j]} not in joined
+    ]
+
+
+def _meet(a: Solid, b: Solid, begin: Array, end: Array) -> NDArray[np.bool_]:
+    """Whether two solids touch on their way between poses (transition, 2, 3)."""
+    moved = end - begin
+    radii = np.array([a.reach, b.reach])
+    outline = _OUTLINE * min(a.width, b.width)
+    shift = moved[:, 0, :2] - moved[:, 1, :2]
+    gap = outline + _SHARE * (np.hypot(shift[:, 0], shift[:, 1]) + np.abs(moved[..., 2]) @ radii)
+    touched = np.zeros(len(begin), dtype=bool)
+    for share in np.linspace(0.0, 1.0, _LOOKS):
+        at = begin + share * moved
+        # circles about a body bound how near it is, however fast it turns
+        near = np.flatnonzero(_between(a, b, at) < outline)
+        for p, q in product(a.parts, b.parts):
+            touched[near] |= depth_of(p, at[near, 0], q, at[near, 1]) > -gap[near]
+    return touched
+
+
+def _between(a: Solid, b: Solid, poses: Array) -> Array:
+    """Distance of the circles about two solids, or of one's and a wall, shape (transition,)."""
+    arm = poses[:, 0, :2] - poses[:, 1, :2] - b.core[0]
+    return to_segment(arm, b.core[1] - b.core[0]) - a.reach - b.reach

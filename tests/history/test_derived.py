@@ -29,7 +29,7 @@ def recorded(
     rows = []
     for trajectory in range(n):
         push = rng.normal(size=(40, 3)) * (2.0, 2.0, 8.0)
-        v = np.cumsum(np.vstack([rng.normal(size=3) + (0.0, 0.0, spin), DT * push]), axis=0)
+        v = np.cumsum(np.vstack([[*rng.normal(size=2), rng.normal() + spin], DT * push]), axis=0)
         moved = DT * v[:-1] + DT**2 / 2 * push
         p = np.cumsum(np.vstack([rng.normal(size=3), moved]), axis=0)
         p = p + position_noise * rng.normal(size=p.shape)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.physics import touching
-from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 
 BOX, DISC = Shape.box(0.6, 0.2), Shape.circle(0.1)
 
@@ -44,6 +44,17 @@ def test_a_turning_box_sweeps_a_circle() -> None:
     assert touching(TWO, at(flat, disc), at(upright, disc))
     away = (0.0, 0.6, 0.0)
     assert not touching(TWO, at(flat, away), at((0.0, 0.0, 50.0), away))
+
+
+def test_walls_and_static_bodies_are_touched_too() -> None:
+    wall = Wall((1.0, -5.0), (1.0, 5.0))
+    post = Body("post", DISC, static=True, pose=(0.0, -1.0, 0.0))
+    room = Scene(time_step=0.1, bodies=(Body("box", BOX), post), walls=(wall,))
+    middle = at((0.0, 0.0, 0.0))
+    assert not touching(room, middle, middle)
+    assert touching(room, middle, at((0.75, 3.0, 0.0)))  # its end is over the wall
+    assert touching(room, middle, at((0.0, -0.81, 0.0)))  # beside the post
+    assert not touching(room, middle, at((0.0, 0.5, np.pi / 2)))
 
 
 def test_bodies_that_follow_a_path_or_are_joined_are_no_matter() -> None:
