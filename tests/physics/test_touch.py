@@ -16,9 +16,12 @@ def scene(*bodies: Body, joints: tuple[Joint, ...] = ()) -> Scene:
 TWO = scene(Body("box", BOX), Body("disc", DISC))
 
 
-def at(*poses: tuple[float, float, float]) -> np.ndarray:
-    """States of bodies at rest, shape (1, body, 6)."""
-    return np.array([[(*pose, 0.0, 0.0, 0.0) for pose in poses]])
+def at(*states: tuple[float, ...]) -> np.ndarray:
+    """States of bodies, at rest where velocities are left out, shape (1, body, 6)."""
+    return np.array([[(*state, *[0.0] * (6 - len(state))) for state in states]])
+
+
+STILL = (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -26,24 +29,26 @@ def at(*poses: tuple[float, float, float]) -> np.ndarray:
     [
         ((0.0, 0.45, 0.0), (0.0, 0.45, 0.0), False),  # beside it, 0.25 m apart
         ((0.0, 0.205, 0.0), (0.0, 0.205, 0.0), True),  # within what outlines are known to
-        ((0.0, 0.45, 0.0), (0.0, 0.19, 0.0), True),  # at the end alone
-        ((-0.5, 0.3, 0.0), (0.5, 0.15, 0.0), True),  # in between
-        ((2.0, 0.0, 0.0), (2.5, 0.0, 0.0), False),
+        ((0.0, 0.45, 0.0, 0.0, -3.0), (0.0, 0.4, 0.0, 0.0, 1.0), True),  # a blow in between
+        ((0.0, 0.45, 0.0, 0.0, -3.0), (0.0, 0.45, 0.0), True),  # on its way on
+        ((0.0, 0.45, 0.0), (0.0, 0.4, 0.0, 0.0, 2.0), True),  # on its way back
+        ((0.0, 0.45, 0.0, 0.0, 2.0), (0.0, 0.65, 0.0, 0.0, 2.0), False),  # away from it
+        ((-0.5, 0.3, 0.0, 10.0, -1.5), (0.5, 0.15, 0.0, 10.0, -1.5), True),  # past its corner
+        ((2.0, 0.0, 0.0, 5.0), (2.5, 0.0, 0.0, 5.0), False),
     ],
 )
 def test_a_disc_passes_a_box(begin, end, expected) -> None:
-    still = (0.0, 0.0, 0.0)
-    assert touching(TWO, at(still, begin), at(still, end)) == [expected]
+    assert touching(TWO, at(STILL, begin), at(STILL, end)) == [expected]
 
 
 def test_a_turning_box_sweeps_a_circle() -> None:
     """At rest 0.1 m beside its long side; a quarter turn brings its end there."""
-    disc = (0.0, 0.3, 0.0)
-    flat, upright = (0.0, 0.0, 0.0), (0.0, 0.0, np.pi / 2)
-    assert not touching(TWO, at(flat, disc), at(flat, disc))
+    disc, rate = (0.0, 0.3, 0.0), 0.5 * np.pi / TWO.time_step
+    flat, upright = (*STILL, 0.0, 0.0, rate), (0.0, 0.0, np.pi / 2, 0.0, 0.0, rate)
+    assert not touching(TWO, at(STILL, disc), at(STILL, disc))
     assert touching(TWO, at(flat, disc), at(upright, disc))
     away = (0.0, 0.6, 0.0)
-    assert not touching(TWO, at(flat, away), at((0.0, 0.0, 50.0), away))
+    assert not touching(TWO, at((*STILL, 0.0, 0.0, 500.0), away), at((0.0, 0.0, 50.0), away))
 
 
 def test_walls_and_static_bodies_are_touched_too() -> None:
