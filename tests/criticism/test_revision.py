@@ -107,7 +107,7 @@ def test_an_effect_outside_the_catalogue_gets_no_wrong_name(make_history) -> Non
         ("saturation", 2.7, ()),
         ("spring", (0.5, 1.0, -0.5), ("point_attractor",)),  # deep down, it pulls like a spring
         ("actuator_delay", 0.4, ()),
-        ("cubic_drag", 0.1, ()),
+        ("corrugation", (0.3, 0.3), ()),
     ],
 )
 def test_selection_has_no_name_for_what_is_outside(name, size, richer, make_history) -> None:
