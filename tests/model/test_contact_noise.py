@@ -72,7 +72,7 @@ def test_both_kinds_of_noise_are_told_apart(pucks) -> None:
 def test_the_model_names_it_where_bodies_touch_and_there_alone(pucks) -> None:
     model = build_model(pucks)
     assert "contact_acceleration" in model.named_vars
-    assert model.named_vars_to_dims["contact_acceleration"] == ("velocity",)
+    assert tuple(model.named_vars_to_dims["contact_acceleration"]) == ("velocity",)
     density = pucks.log_density(pucks.residual(PHI), NOISE).sum()
     values = {"sigma": NOISE[:6], "unexplained_acceleration": NOISE[6:9]}
     values["contact_acceleration"] = NOISE[9:]
