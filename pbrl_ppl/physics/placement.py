@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import lru_cache
-from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics.properties import Array
-from pbrl_ppl.physics.solids import Solid, depth_of, put, solid_of, to_segment
+from pbrl_ppl.physics.solids import Pairs, circles, depth, put, scenery
 from pbrl_ppl.scene import WORLD, Joint, Scene
 
 #: What is put down to noise and resting contact: a share of the smaller body's size.
@@ -51,7 +47,7 @@ def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | No
 
     Examples
     --------
-    >>> from pbrl_ppl.scene.scene import Shape
+    >>> from pbrl_ppl.scene import Body, Shape
     >>> pucks = (Body("a", Shape.circle(0.1)), Body("b", Shape.circle(0.2)))
     >>> scene = Scene(time_step=0.1, bodies=pucks)
     >>> start = np.zeros((1, 2, 6))
@@ -113,22 +109,17 @@ def overlap(scene: Scene, poses: Array) -> Array:
     poses : ndarray
         Shape (n, body, 3), bodies in the order of ``scene.moving``: x, y, theta (m, m, rad).
     """
-    world = _solids(scene)
-    poses = np.concatenate(
-        [poses, np.broadcast_to(world.fixed, (len(poses), *world.fixed.shape))], axis=1
-    )
+    world, pairs = scenery(scene), _may_not(scene)
+    poses = world.with_fixed(poses)
     deepest = np.full(len(poses), -np.inf)
-    if not world.pairs:
+    if not pairs:
         return deepest
-    circles = _circles(world, poses)
-    for pair, (i, j) in enumerate(world.pairs):
-        rows = np.flatnonzero(circles[:, pair] > 0)
-        own = circles[:, pair].copy()
+    bound = circles(world.solids, pairs, poses)
+    for pair, (i, j) in enumerate(pairs):
+        rows = np.flatnonzero(bound[:, pair] > 0)
+        own = bound[:, pair].copy()
         if len(rows):
-            a, b = world.solids[i], world.solids[j]
-            at_a, at_b = poses[rows, i], poses[rows, j]
-            parts = product(a.parts, b.parts)
-            own[rows] = np.max([depth_of(p, at_a, q, at_b) for p, q in parts], 0)
+            own[rows] = depth(world.solids[i], poses[rows, i], world.solids[j], poses[rows, j])
         deepest = np.maximum(deepest, own)
     return deepest
 
@@ -171,53 +162,31 @@ def _anchor_distance(joint: Joint, poses: list[Array]) -> Array:
 # -- shapes ----------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Solids:
-    """Solids of a scene: moving bodies, then walls and static bodies."""
-
-    solids: tuple[Solid, ...]
-    fixed: Array  # poses of those that do not move, (fixed, 3)
-    pairs: tuple[tuple[int, int], ...]  # those that may not overlap; the first one moves
-    allowed: Array  # (pair,)
-
-
-@lru_cache(maxsize=16)
-def _solids(scene: Scene) -> _Solids:
-    moving = [solid_of(body) for body in scene.moving]
-    ends = [np.array([wall.start, wall.end]) for wall in scene.walls]
-    walls = [Solid(WORLD, ((end, 0.0),), end, 0.0, np.inf) for end in ends]
-    static = [body for body in scene.bodies if body.static]
-    solids = [*moving, *walls, *(solid_of(body) for body in static)]
-    fixed = [_ORIGIN] * len(walls) + [body.pose or _ORIGIN for body in static]
-    joined = [set(joint.bodies) for joint in scene.joints if joint.bodies is not None]
+def _may_not(scene: Scene) -> Pairs:
+    """Pairs of solids that may not overlap."""
+    pairs = scenery(scene).pairs
+    if all(joint.bodies is not None for joint in scene.joints):
+        return pairs
     # a joint of unknown bodies could join any two of the moving ones and the world
-    anyhow = any(joint.bodies is None for joint in scene.joints)
-    first = len(moving) + len(walls) if anyhow else 0
-    pairs = [
-        (i, j)
-        for i in range(len(moving))
-        for j in range(max(i + 1, first), len(solids))
-        if {solids[i].name, solids[j].name} not in joined
-    ]
-    allowed = [ALLOWED * min(solids[i].width, solids[j].width) for i, j in pairs]
-    return _Solids(
-        tuple(solids), np.array(fixed, dtype=float).reshape(-1, 3), tuple(pairs), np.array(allowed)
-    )
+    first = len(scene.moving) + len(scene.walls)
+    return tuple((i, j) for i, j in pairs if j >= first)
 
 
 def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
     """First transition and message of every two shapes that lie deep inside each other."""
-    world = _solids(scene)
-    fixed = np.broadcast_to(world.fixed, (len(poses), *world.fixed.shape))
-    poses = np.concatenate([poses, fixed], axis=1)
-    near = _near(world, poses)
+    world, pairs = scenery(scene), _may_not(scene)
+    if not pairs:
+        return
+    poses, solids = world.with_fixed(poses), world.solids
+    smaller = [ALLOWED * min(solids[i].width, solids[j].width) for i, j in pairs]
+    # shapes overlap by no more than the circles about them do
+    near = circles(solids, pairs, poses) > np.array(smaller)
     for pair in np.flatnonzero(near.any(axis=0)):
-        i, j = world.pairs[pair]
-        a, b, allowed = world.solids[i], world.solids[j], world.allowed[pair]
+        i, j = pairs[pair]
+        a, b, allowed = solids[i], solids[j], smaller[pair]
         rows = np.flatnonzero(near[:, pair])
-        at_a, at_b = poses[rows, i], poses[rows, j]
-        depth = np.max([depth_of(p, at_a, q, at_b) for p, q in product(a.parts, b.parts)], axis=0)
-        deep = np.flatnonzero(depth > allowed)
+        found = depth(a, poses[rows, i], b, poses[rows, j])
+        deep = np.flatnonzero(found > allowed)
         if len(deep):
             what, whose = f'bodies "{a.name}" and "{b.name}"', "the smaller one's"
             if b.name == WORLD:
@@ -226,25 +195,6 @@ def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
                 whose = "the body's"
             yield (
                 int(rows[deep[0]]),
-                f"{what} overlap by {depth[deep[0]]:.3g} m, allowed is {allowed:.3g} m (a quarter"
+                f"{what} overlap by {found[deep[0]]:.3g} m, allowed is {allowed:.3g} m (a quarter"
                 f" of {whose} width); correct the poses, the shapes or the walls",
             )
-
-
-def _near(world: _Solids, poses: Array) -> NDArray[np.bool_]:
-    """Which pairs may overlap by more than is allowed, shape (transition, pair).
-
-    They overlap by no more than the circles about them, or about one and a wall's segment.
-    """
-    return np.asarray(_circles(world, poses) > world.allowed)
-
-
-def _circles(world: _Solids, poses: Array) -> Array:
-    """Penetration depth of each pair's bounding circles, shape (transition, pair)."""
-    i, j = np.array(world.pairs, dtype=int).reshape(-1, 2).T
-    cores = np.array([solid.core for solid in world.solids])
-    reach = np.array([solid.reach for solid in world.solids])
-    edge = cores[j, 1] - cores[j, 0]
-    arm = poses[:, i, :2] - poses[:, j, :2] - cores[j, 0]
-    gap = to_segment(arm, edge)
-    return np.asarray(reach[i] + reach[j] - gap)

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
+from itertools import combinations, product
 
 import numpy as np
 import pymunk
 
 from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.world import _shapes
-from pbrl_ppl.scene import Body
+from pbrl_ppl.scene import WORLD, Body, Scene
+
+Pairs = tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +44,61 @@ def solid_of(body: Body) -> Solid:
     if len(parts) > 1:  # no part of a thin frame can lie as deep as the whole is wide
         width = min(width, max(float(np.ptp(corners, axis=0).min()) for corners, _ in parts))
     return Solid(body.name, tuple(parts), np.zeros((2, 2)), body.shape.bounding_radius, width)
+
+
+@dataclass(frozen=True, eq=False)
+class Scenery:
+    """Solids of a scene: moving bodies, then walls and static bodies.
+
+    ``fixed`` are the poses of those that do not move, shape (fixed, 3); ``pairs`` are the solids
+    that nothing joins, the first of which moves.
+    """
+
+    solids: tuple[Solid, ...]
+    fixed: Array
+    pairs: Pairs
+
+    def with_fixed(self, moving: Array) -> Array:
+        """Poses or states (n, body, 3 or 6) of all solids, shape (n, solid, 3 or 6)."""
+        n, _, width = moving.shape
+        still = np.zeros((n, len(self.fixed), width))
+        still[..., :3] = self.fixed
+        return np.concatenate([moving, still], axis=1)
+
+
+@lru_cache(maxsize=16)
+def scenery(scene: Scene) -> Scenery:
+    """Describe what a scene's bodies may meet."""
+    static = [body for body in scene.bodies if body.static]
+    walls = [np.array([wall.start, wall.end]) for wall in scene.walls]
+    solids = [solid_of(body) for body in scene.moving]
+    solids += [Solid(WORLD, ((wall, 0.0),), wall, 0.0, np.inf) for wall in walls]
+    solids += [solid_of(body) for body in static]
+    origin = (0.0, 0.0, 0.0)
+    fixed = [origin] * len(walls) + [body.pose or origin for body in static]
+    joined = [set(joint.bodies) for joint in scene.joints if joint.bodies is not None]
+    pairs = tuple(
+        (i, j)
+        for i, j in combinations(range(len(solids)), 2)
+        if i < len(scene.moving) and {solids[i].name, solids[j].name} not in joined
+    )
+    return Scenery(tuple(solids), np.array(fixed, dtype=float).reshape(-1, 3), pairs)
+
+
+def depth(a: Solid, poses_a: Array, b: Solid, poses_b: Array) -> Array:
+    """Penetration depth of the deepest parts of two solids at each pose (m), shape (n,)."""
+    parts = product(a.parts, b.parts)
+    return np.asarray(np.max([depth_of(p, poses_a, q, poses_b) for p, q in parts], axis=0))
+
+
+def circles(solids: tuple[Solid, ...], pairs: Pairs, poses: Array) -> Array:
+    """Penetration depth of each pair's bounding circles, or of one and a wall: (n, pair)."""
+    i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
+    cores = np.array([solid.core for solid in solids])
+    reach = np.array([solid.reach for solid in solids])
+    arm = poses[:, i, :2] - poses[:, j, :2] - cores[j, 0]
+    gap = to_segment(arm, cores[j, 1] - cores[j, 0])
+    return np.asarray(reach[i] + reach[j] - gap)
 
 
 def put(points: Array, poses: Array) -> Array:
