@@ -80,7 +80,7 @@ class Left:
 def unexplained_acceleration(mode: Mode) -> Left:
     """Size of the acceleration that the model of a mode leaves unexplained."""
     noise = mode.problem.trajectory_noise
-    cells, k = noise.cells, len(noise.cells.sensors)
+    cells = noise.cells
     segments = mode.problem.segments
     change = segments.observed[:, 0] - segments.start
     dt = mode.problem.scene.time_step
@@ -88,10 +88,10 @@ def unexplained_acceleration(mode: Mode) -> Left:
     for d in cells.rates:
         own = cells.places[cells.places % len(STATE) == d] // len(STATE)
         typical.append(np.sqrt(np.mean((change[:, own, d] / dt) ** 2)))
-    size = mode.sigma[k : k + len(cells.rates)]
+    size = mode.sigma[cells.accelerations]
     relative = size / np.maximum(typical, 1e-300)
     names = tuple(STATE[d] for d in cells.rates)
-    return Left(names, size, relative, _p_values(mode, k), _numerical(mode))
+    return Left(names, size, relative, _p_values(mode), _numerical(mode))
 
 
 def innovations_over_steps(mode: Mode) -> Array:
@@ -116,7 +116,7 @@ def _numerical(mode: Mode) -> Array:
     return np.array([np.sqrt(square[dimension == d].mean()) for d in cells.rates])
 
 
-def _p_values(mode: Mode, k: int) -> Array:
+def _p_values(mode: Mode) -> Array:
     """Likelihood-ratio test of each acceleration against none, the other noises free.
 
     At the edge of what a variance may be: half a chi-squared with one degree of freedom.
@@ -128,9 +128,10 @@ def _p_values(mode: Mode, k: int) -> Array:
     def best(sigma: Array) -> float:
         return float(problem.log_density(residual, sigma, mode.phi).sum())
 
-    here, p_values = best(mode.sigma), np.empty(len(problem.trajectory_noise.cells.rates))
-    for i in range(len(p_values)):
-        held = {k + i: _NOTHING * median[k + i]}
+    places = problem.trajectory_noise.cells.accelerations
+    here, p_values = best(mode.sigma), np.empty(len(places))
+    for i, place in enumerate(places):
+        held = {place: _NOTHING * median[place]}
         without = profile_sigma(problem, residual, mode.phi, held)
         p_values[i] = 0.5 * chi2.sf(max(2 * (here - best(without)), 0.0), 1)
     return p_values

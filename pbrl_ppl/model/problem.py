@@ -237,8 +237,7 @@ class Problem:
 
     def quiet(self, sigma: Array, share: float) -> Array:
         """Noise of trajectories, a step's no larger than a share of its prior's median."""
-        cells, sigma = self.trajectory_noise.cells, sigma.copy()
-        steps = slice(len(cells.sensors), len(cells.sensors) + len(cells.rates))
+        steps, sigma = self.trajectory_noise.cells.accelerations, sigma.copy()
         sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])
         return sigma
 

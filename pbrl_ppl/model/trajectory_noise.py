@@ -63,9 +63,14 @@ class Cells:
         return {name: tuple(STATE[d] for d in about) for name, about in own.items() if about}
 
     @property
+    def accelerations(self) -> range:
+        """Places of the noise parameters that are unexplained accelerations."""
+        return range(len(self.sensors), len(self.sensors) + len(self.rates))
+
+    @property
     def always(self) -> Bools:
         """Which rows act in every step, and not only where bodies touch, shape (push,)."""
-        return self.pushed < len(self.sensors) + len(self.rates)
+        return self.pushed < self.accelerations.stop
 
     def steps(self, sigma: Array) -> Array:
         """Covariance of what a step adds where no bodies touch, and where some do.
@@ -77,8 +82,11 @@ class Cells:
         return np.stack([(self.push.T * own) @ self.push for own in (free, size)])
 
     def pushes(self, sigma: Array, touching: Bools, rng: np.random.Generator) -> Array:
-        """Draw what steps add to the cells, shape (..., cell), as ``touching`` has its axes."""
-        drawn = sigma[self.pushed] * rng.standard_normal((*touching.shape, len(self.pushed)))
+        """Draw what steps add to the cells, shape (..., cell), as ``touching`` has its axes.
+
+        The leading axes of ``sigma``, shape (..., parameter), go with those.
+        """
+        drawn = sigma[..., self.pushed] * rng.standard_normal((*touching.shape, len(self.pushed)))
         return np.where(self.always | touching[..., None], drawn, 0.0) @ self.push
 
     def errors(self, sigma: Array) -> Array:
@@ -180,6 +188,11 @@ class TrajectoryNoise:
         return known
 
     @property
+    def last(self) -> Bools:
+        """Whether a transition is its trajectory's last, shape (transition,)."""
+        return np.append(self.first[1:], True)
+
+    @property
     def kind(self) -> Ints:
         """1 where bodies touch in a transition and 0 elsewhere, shape (transition,)."""
         return self.touching.astype(np.int64)
@@ -249,9 +262,8 @@ class TrajectoryNoise:
     def pulled(self, weighted: Array, sigma: Array) -> tuple[Array, Array, Array]:
         """Derivatives of a sum of white innovations, see :func:`kalman.adjoint`."""
         gain, scale, *_ = self.gains(sigma)
-        last = np.append(self.first[1:], True)
         pulled: tuple[Array, Array, Array] = adjoint(
-            self.slope, last, self.seen, gain, scale, weighted
+            self.slope, self.last, self.seen, gain, scale, weighted
         )
         return pulled
 
@@ -267,8 +279,7 @@ class TrajectoryNoise:
         """
         white = self.filtered(self.cells.of_residual(residual)[None], sigma)[0][0]
         gain, scale, _, log_scale = self.gains(sigma)
-        last = np.append(self.first[1:], True)
-        sensor, step, begin = score(self.slope, last, self.seen, gain, scale, white, self.kind)
+        sensor, step, begin = score(self.slope, self.last, self.seen, gain, scale, white, self.kind)
         # measured states begin a trajectory: their error is that of measuring
         begun = np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0).sum(axis=0)
         cells, slope = self.cells, np.zeros(len(sigma))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,12 +51,11 @@ def profile_sigma(
     if problem.nu(phi) is None:
         return np.asarray(np.exp(begin) * ones)
 
-    def cost(log_sigma: Array) -> float:
-        likelihood = problem.log_density(residual, np.exp(log_sigma) * ones, phi).sum()
-        return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
-
     bounds = [(b - 6, b + 6) for b in begin]
-    return np.asarray(np.exp(minimize(cost, begin, method="L-BFGS-B", bounds=bounds).x) * ones)
+    found = minimize(
+        partial(_cost, problem, residual, phi), begin, method="L-BFGS-B", bounds=bounds
+    )
+    return np.asarray(np.exp(found.x) * ones)
 
 
 def _of_trajectories(
@@ -68,23 +68,25 @@ def _of_trajectories(
     """Noise parameters of highest posterior density along trajectories."""
     residual = np.nan_to_num(residual, nan=FAR_OFF)
     gaussian = problem.nu(phi) is None
-
-    def cost(log_sigma: Array) -> float:
-        likelihood = problem.log_density(residual, np.exp(log_sigma), phi).sum()
-        return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
-
-    def with_slope(log_sigma: Array) -> tuple[float, Array]:
-        return _cost_and_slope(problem, noise, residual, log_sigma)
-
     begin = np.log(noise.sigma)
     bounds = [(b - _FAR, b + _FAR) for b in begin]
     for place, value in held.items():
         begin[place] = np.log(value)
         bounds[place] = (begin[place], begin[place])
-    found = minimize(
-        with_slope if gaussian else cost, begin, jac=gaussian, method="L-BFGS-B", bounds=bounds
+    cost = (
+        partial(_cost_and_slope, problem, noise, residual)
+        if gaussian
+        else partial(_cost, problem, residual, phi)
     )
+    found = minimize(cost, begin, jac=gaussian, method="L-BFGS-B", bounds=bounds)
     return np.asarray(np.exp(found.x))
+
+
+def _cost(problem: Problem, residual: Array, phi: Array | None, log_sigma: Array) -> float:
+    """Minus the log-density of data and the logarithm of noise parameters."""
+    sigma = np.exp(log_sigma) * np.ones(residual.shape[-1] if problem.trajectories is None else 1)
+    likelihood = problem.log_density(residual, sigma, phi).sum()
+    return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
 
 
 def _cost_and_slope(
@@ -156,17 +158,13 @@ def noise_covariance(problem: Problem, residual: Array, sigma: Array, phi: Array
     at, n = np.log(sigma), len(sigma)
     spread = noise_law(problem)[1]
 
-    def cost(log_sigma: Array) -> float:
-        likelihood = problem.log_density(residual, np.exp(log_sigma), phi).sum()
-        return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
-
     def moved(*places: tuple[int, float]) -> float:
         point = at.copy()
         for place, step in places:
             point[place] += step
-        return cost(point)
+        return _cost(problem, residual, phi, point)
 
-    middle, hessian, h = cost(at), np.empty((n, n)), _SECOND
+    middle, hessian, h = moved(), np.empty((n, n)), _SECOND
     for i in range(n):
         hessian[i, i] = (moved((i, h)) - 2 * middle + moved((i, -h))) / h**2
         for j in range(i):

@@ -36,8 +36,12 @@ class Batch(NamedTuple):
     counts: NDArray[np.int64]
     weights: Array
 
-    def of_body(self, i: int) -> Batch:
-        """Reduce to what one body sees."""
+    def alone(self) -> tuple[Batch, ...]:
+        """What each body sees."""
+        k = self.start.shape[-2]
+        return tuple(self._of_body(i) for i in range(k)) if k > 1 else (self,)
+
+    def _of_body(self, i: int) -> Batch:
         bodies, *others = self.given
         return self._replace(
             given=(_column(bodies, i), *others),
@@ -85,7 +89,7 @@ class Engine:
         batch : Batch
             Of all bodies.
         alone : tuple of Batch
-            What each body sees, in their order.
+            What each body sees, in their order; not needed in a world without free bodies.
         first, last : int
             Of proposals x transitions.
         out : ndarray

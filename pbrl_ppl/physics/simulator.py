@@ -329,12 +329,6 @@ class Simulator:
             tuple(given[:-1]), self._commands, self._forces, starts, inputs,
             self.scene.time_step, self.scene.normal_gravity, *self.levels,
         )  # fmt: skip
-        k = len(self.scene.moving)
-        alone = tuple(batch.of_body(i) for i in range(k)) if k > 1 else (batch,)
-
-        def run(engine: Engine, first: int, last: int) -> None:
-            engine.rollout(batch, alone, first, last, out)
-
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.threads, len(out), steps // _A_THREAD))
         with self._lock:
@@ -344,4 +338,9 @@ class Simulator:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
                 engines.append(Engine(partial(self._new_world, choice)))
+            alone = batch.alone() if engines[0].free else ()
+
+            def run(engine: Engine, first: int, last: int) -> None:
+                engine.rollout(batch, alone, first, last, out)
+
             share_out(run, engines[:workers], len(out))

@@ -74,11 +74,11 @@ class AccelerationNoise:
 
     def add(self, states: Array, rng: np.random.Generator) -> Array:
         """States (draw, n, body, 6) with noise."""
-        out, cells = states.copy(), self.cells
-        n = states.shape[1]
-        apart = np.zeros(n, dtype=bool)  # what a contact adds is left out: it is not foreseen
-        for draw, sigma in enumerate(self.sigma):
-            out[draw].reshape(n, -1)[..., cells.places] += cells.pushes(sigma, apart, rng)
+        out = np.ascontiguousarray(states).copy()
+        # what a contact adds is left out: it is not foreseen
+        apart = np.zeros(states.shape[:2], dtype=bool)
+        flat = out.reshape(*apart.shape, -1)
+        flat[..., self.cells.places] += self.cells.pushes(self.sigma[:, None], apart, rng)
         return out
 
     def single(self, draw: int) -> AccelerationNoise:

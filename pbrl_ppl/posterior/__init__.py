@@ -12,7 +12,7 @@ from pbrl_ppl.posterior.record import (
     parameter_draws,
     predictive_rows,
 )
-from pbrl_ppl.posterior.recording import both_recordings, recording
+from pbrl_ppl.posterior.recording import both_recordings, recorded, recording
 from pbrl_ppl.posterior.store import (
     DATATREE,
     HDI_PROB,
@@ -54,6 +54,7 @@ __all__ = [
     "parameter_draws",
     "predictive_rows",
     "problem_of",
+    "recorded",
     "recording",
     "save_posterior",
     "scalars",

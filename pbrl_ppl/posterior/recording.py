@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, TrajectoryNoise, cells_of, linearised
+from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -38,6 +39,18 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
     """A problem with the whole trajectories that a posterior's constant data hold, if they do."""
     if "smoothed" not in given:
         return problem
+    history = recorded(problem.scene, given, data_sha256)
+    cells = cells_of(problem.scene, history)
+    states = given["smoothed"].to_numpy()
+    data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
+    noise: TrajectoryNoise = linearised(
+        problem.on(data), cells, given["slope"].to_numpy(), given["linearised_at"].to_numpy()
+    )
+    return problem.on(data).with_noise(trajectories=noise, scalar=False)
+
+
+def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:
+    """The history that a posterior's constant data hold."""
     names = [str(name) for name in given.data_vars if str(name).startswith(_PREFIX)]
     back = {
         name: str(name).removeprefix(_PREFIX)
@@ -45,18 +58,10 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
         if str(name).startswith(_PREFIX)
     }
     dataset = given[names].rename(back)
-    scene = problem.scene
     dataset = dataset.assign_coords(
         kinematic=("body", [body.kinematic for body in scene.moving])
     ).assign_attrs(time_step=scene.time_step, data_sha256=data_sha256)
-    history = History(dataset)
-    cells = cells_of(scene, history)
-    states = given["smoothed"].to_numpy()
-    data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
-    noise: TrajectoryNoise = linearised(
-        problem.on(data), cells, given["slope"].to_numpy(), given["linearised_at"].to_numpy()
-    )
-    return problem.on(data).with_noise(trajectories=noise, scalar=False)
+    return History(dataset)
 
 
 def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:

@@ -15,7 +15,13 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import RefitWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.model import (
+    Problem,
+    along_trajectories,
+    build_model,
+    cells_of,
+    single_transitions,
+)
 from pbrl_ppl.posterior import (
     MIN_ESS,
     both_recordings,
@@ -29,6 +35,7 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     predictive_rows,
     problem_of,
+    recorded,
     recording,
     smoothed,
 )
@@ -168,7 +175,8 @@ def _updated(
     heavy = np.isfinite(k) and k > _HEAVY
     # a chain that the data speak against sits where the others do not: then they must mix
     of_chains = weights.reshape(base.sizes["chain"], -1).sum(axis=1) * base.sizes["chain"]
-    if min(share, of_chains.min()) >= _MOVE and not heavy:
+    more_noise = _more_noise(problem, data)
+    if min(share, of_chains.min()) >= _MOVE and not heavy and not more_noise:
         result = _reweighted(base, weights, data, idata.attrs | together, rng)
         if not _worn(base, result):
             return checked(problem, result), how | {"did": "reweighted"}
@@ -176,10 +184,14 @@ def _updated(
     whole = problem_of(from_groups(groups(idata) | data, idata.attrs | together), effects)
     # sets of parameters, and which bodies a joint joins, cannot be moved by steps
     chosen_among = whole.library is not None or whole.layout.discrete.any()
-    if share < _REFIT or heavy or chosen_among:
+    if share < _REFIT or heavy or chosen_among or more_noise:
         why = f"their tail has a shape k of {k:.2g}" if heavy else f"worth {share:.1%} of the draws"
+        why = f"the new data leave the posterior so far behind ({why})"
+        if more_noise:
+            why = f"the new data have noise that the posterior lacks ({', '.join(more_noise)}), so"
+            whole = along_trajectories(single_transitions(whole), np.median(phi, axis=0))
         warnings.warn(
-            f"update: the new data leave the posterior so far behind ({why}) that all of them are"
+            f"update: {why} that all of them are"
             " fitted anew; look whether they are of the same bodies, under the same conditions",
             RefitWarning,
             stacklevel=2,
@@ -197,6 +209,20 @@ def _updated(
     method = str(idata.attrs.get("method", "update"))
     result = complete(whole, trace, seed=seed, method=method)
     return result, how | {"did": "moved", "draws": draws}
+
+
+def _more_noise(problem: Problem, data: Mapping[str, xr.Dataset]) -> list[str]:
+    """Noise parameters of whole trajectories that all data have and the posterior has not."""
+    if problem.trajectories is None:
+        return []
+    history = recorded(problem.scene, data["constant_data"])
+    cells, own = cells_of(problem.scene, history), problem.noise_variables
+    return [
+        f"{name}[{dimension}]"
+        for name, dimensions in cells.variables.items()
+        for dimension in dimensions
+        if dimension not in own.get(name, ())
+    ]
 
 
 def _worn(base: xr.Dataset, result: Any) -> bool:

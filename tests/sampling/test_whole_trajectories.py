@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.errors import ConvergenceWarning
+from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.model import along_trajectories, physics_model, simulated_trajectories
 from pbrl_ppl.planning import Dynamics
@@ -155,3 +155,25 @@ def test_a_plan_expects_steps_noise_and_not_the_sensors(first) -> None:
     assert (sigma[chosen, :2] > spread[:, :2]).all()
     one = dynamics.single()
     assert one.noisy(states[:1], np.random.default_rng(7)).shape == (1, 20_000, 1, 6)
+
+
+@pytest.mark.slow
+def test_a_first_contact_brings_a_noise_of_its_own() -> None:
+    """Two pucks far apart, then side by side: the posterior knows no noise of contacts."""
+    shape, known = Shape.circle(0.3), {"r": 0.5, "mu_c": 0.2}
+    bodies = (Body("one", shape, known=known), Body("two", shape, known=known | {"mass": 1.0}))
+    scene = Scene(time_step=0.1, substeps=4, bodies=bodies)
+    made = {"trajectories": 3, "intervals": 5, "wrench_sd": (1.5, 1.5, 0.1), "substeps": 8}
+    apart = simulated_history(scene, {"mass": [2.0]}, seed=1, **made)
+    beside = [(0.0, 0.0, 0.0), (0.61, 0.0, 0.0)]
+    together = simulated_history(scene, {"mass": [2.0]}, seed=2, poses=beside, **made)
+    first = quiet(pp.fit, physics_model(scene, apart, trajectories=True), seed=1, **QUICK)
+    assert "contact_acceleration" not in group(first, "posterior")
+    with pytest.warns(RefitWarning, match=r"contact_acceleration\[vx\].* fitted anew"):
+        both = quiet(pp.update, first, together, seed=2, progress=False)
+    assert set(group(both, "posterior")["contact_acceleration"]["velocity"].values) >= {"vx", "vy"}
+    assert problem_of(both).trajectories.touching.any()
+    more = simulated_history(scene, {"mass": [2.0]}, seed=3, **made | {"trajectories": 1})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RefitWarning)
+        assert len(json.loads(quiet(pp.update, both, more, seed=3).attrs["updates"])) == 2
