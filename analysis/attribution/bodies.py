@@ -117,6 +117,7 @@ PUCK = Kind(
         "constant_torque": (0.0005, 0.004, 0.02),
         "push_offset": ((-0.0004, 0.0003), (-0.003, 0.002), (-0.02, 0.015)),
         "sliding_friction": ((0.0008, 0.1), (0.006, 0.1), (0.05, 0.1)),
+        "wheel": tuple((-0.1, 0.05, 0.4, 0.2 * mu, mu) for mu in (0.001, 0.01, 0.1)),
         "dead_zone": (1.0, 2.0, 3.5),
         "hidden_obstacle": ((1.8, 0.0, 0.1), (1.8, 0.0, 0.2), (1.8, 0.0, 0.4)),
         "saturation": (8.0, 5.0, 2.7),
@@ -155,7 +156,9 @@ PENDULUM = Kind(
         ("pivot_damping", "linear_drag", "angular_drag"),
         ("constant_torque", "body_force"),  # a force fixed to the arm turns it alike everywhere
         # angles from a vertical that is off; a force turns gravity and adds to it
-        ("gravity_tilt", "sensor_bias", "constant_force"),
+        ("gravity_tilt", "sensor_bias", "constant_force", "frame_rotation"),
+        # to the angle's fourth power, a scaled angle moves as one with a spring does
+        ("torsion_spring", "sensor_scale"),
     ),
 )
 

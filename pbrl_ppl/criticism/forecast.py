@@ -88,8 +88,9 @@ def forecast(problem: Problem, phi: Array, sigma: Array, intervals: int) -> Fore
     for begin, length in zip(begins, lengths, strict=True):
         if length >= intervals:
             first = min(_SETTLED, length - intervals)
-            rows = np.arange(first, length - intervals + 1, max(1, intervals // 2))
-            starts.append(begin + rows)
+            rows = begin + np.arange(first, length - intervals + 1)
+            told = noise.seen[rows + intervals - 1].any(axis=1)
+            starts.append(rows[told][:: max(1, intervals // 2)])
     at = np.concatenate(starts)
     trajectory, step = segments.trajectory[at], segments.step[at]
     every = at[:, None] + np.arange(intervals)

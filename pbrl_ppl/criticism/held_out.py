@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 from pbrl_ppl.criticism.forecast import filtered_states, forecast
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.model import Problem, along_trajectories, cells_of
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
@@ -77,9 +77,13 @@ class HeldOut:
         }
 
     def rollout_horizon(self, time_step: float) -> int:
-        """Intervals of the forecasts in the error table: a second, or a whole trajectory."""
+        """Intervals of the forecasts in the error table: a second, or a whole trajectory.
+
+        More than a second where bodies are seen less often.
+        """
         longest = int(self.history.dataset["n_rows"].min()) - 1
-        return min(longest, max(1, round(ROLLOUT_SECONDS / time_step)))
+        least = longest_gap(self.history)
+        return min(longest, max(least, round(ROLLOUT_SECONDS / time_step)))
 
     def errors(self, mode: Mode, scale: Mode, posterior: Any, rollout: int) -> Errors:
         """Errors of a model; ``scale`` is the model whose noise is the unit."""

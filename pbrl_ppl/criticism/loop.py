@@ -31,7 +31,7 @@ from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.model import Problem, build_model, single_transitions
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.physics import try_effect
 from pbrl_ppl.posterior import compare, identify, interval, versions
@@ -217,7 +217,7 @@ class _Loop:
     def declared_mode(self, effects: tuple[Attached, ...], substeps: int | None) -> Mode:
         """Mode of the declared model along trajectories, the engine's error small."""
         problem = Problem.of(self.scene, self.train, effects, substeps=substeps, threads=2)
-        mode = find_mode(problem, seed=self.seed)
+        mode = find_mode(single_transitions(problem), seed=self.seed)
         return with_enough_substeps(trajectory_mode(problem, mode.phi), self.say)
 
     def posterior(self, mode: Mode, draws: int | None) -> Any:

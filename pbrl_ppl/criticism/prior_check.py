@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.model import Problem, prior_predictive_draws
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, wrapped
@@ -133,13 +133,17 @@ def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> Pr
     columns = list(observations.columns)
     noise = problem.noise_prior[0]
     first = segments.start[..., columns]
-    measured = observations.wrapped(observations.values[:, -1] - first)
+    # where bodies are seen now and then, the last row that shows one is what tells of it
+    steps = np.arange(1, observations.values.shape[1] + 1)[:, None, None]
+    last = np.maximum((steps * observations.measured).max(axis=1), 1) - 1
+    measured = _at(observations.values, last)
+    measured = observations.wrapped(measured - first)
     names = [block.name for block in problem.layout.blocks]
     drawn = prior_predictive_draws(model, names, draws, int(rng.integers(2**31)))
     phi = problem.layout.to_vectors(drawn, draws)
     ends = np.concatenate(
         [
-            problem.predict(phi[i : i + _CHUNK], problem.one_world)[..., -1, :, :][..., columns]
+            _at(problem.predict(phi[i : i + _CHUNK], problem.one_world)[..., columns], last)
             for i in range(0, len(phi), _CHUNK)
         ]
     )
@@ -163,6 +167,15 @@ def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> Pr
         draws,
         int(draws - good.sum()),
     )
+
+
+def _at(states: Array, step: NDArray[np.intp]) -> Array:
+    """States (..., transition, H, body, state) at each cell's step: (..., transition, body, state).
+
+    ``step`` has the shape (transition, body, state).
+    """
+    picked = np.broadcast_to(step[:, None], (*states.shape[:-3], 1, *states.shape[-2:]))
+    return np.asarray(np.take_along_axis(states, picked, axis=-3)[..., 0, :, :])
 
 
 def telling_horizon(history: History) -> int:
@@ -190,7 +203,7 @@ def telling_horizon(history: History) -> int:
             return np.zeros(len(places))
         return np.asarray(np.nan_to_num(np.nanmean(change**2, axis=1)))
 
-    horizon = 1
+    horizon = longest_gap(history)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # of means of nothing
         noise = size(1, 3) / 20.0

@@ -70,16 +70,19 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
 
     free = np.isnan(proposed)
     steps = np.array([1e-3 * min(p.prior.sigma, 1.0) for p in effect.parameters])
+    lower, upper = np.array([p.prior.support for p in effect.parameters]).T
+    # one-sided where the null is the least that there can be
+    ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null
     nothing = whitened(null[None])[0]
     found = []
     for begin in range(0, len(proposed), _AT_ONCE):
         part = slice(begin, begin + _AT_ONCE)
-        points, plan = _points(proposed[part], free[part], null, steps)
+        points, plan = _points(proposed[part], free[part], null, (ahead, behind))
         states = whitened(points)
         for values, columns, rows in plan:
             if columns:
                 ends = states[rows].reshape(len(columns), 2, -1)
-                width = 2 * steps[list(columns)]
+                width = (ahead - behind)[list(columns)]
                 signature = ((ends[:, 0] - ends[:, 1]) / width[:, None]).T
             else:
                 signature = (states[rows] - nothing).T
@@ -89,7 +92,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
 
 
 def _points(
-    proposed: Array, free: Array, null: Array, steps: Array
+    proposed: Array, free: Array, null: Array, steps: tuple[Array, Array]
 ) -> tuple[Array, list[tuple[Array, tuple[int, ...], list[int]]]]:
     """Points to simulate, and each look's values, free columns and rows of the points."""
     points: list[Array] = []
@@ -99,9 +102,9 @@ def _points(
         columns = tuple(int(i) for i in np.flatnonzero(unknown))
         begin = len(points)
         for column in columns:
-            for sign in (1.0, -1.0):
+            for step in steps:
                 moved = values.copy()
-                moved[column] += sign * steps[column]
+                moved[column] += step[column]
                 points.append(moved)
         if not columns:
             points.append(values)

@@ -64,7 +64,8 @@ class Selection:
         def rank(item: tuple[Signature, Mode]) -> float:
             signature, fitted = item
             fitting = _told(fitted, signature.attached)
-            penalty = 0.5 * fitting * np.log(fitted.problem.segments.n)
+            shown = fitted.problem.trajectory_noise.seen.any(axis=1).sum()
+            penalty = 0.5 * fitting * np.log(shown)
             return float(_log_likelihood(fitted) - penalty)
 
         waiting = _distinct(ranked, order)[:TRIED]

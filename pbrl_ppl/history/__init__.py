@@ -2,6 +2,7 @@
 
 from pbrl_ppl.history.derived import derived_velocities, measured_alone
 from pbrl_ppl.history.files import write_atomically
+from pbrl_ppl.history.gaps import longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
 from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
@@ -14,7 +15,9 @@ __all__ = [
     "from_segments",
     "hung_bodies",
     "lever",
+    "longest_gap",
     "measured_alone",
     "segment_rows",
+    "unseen",
     "write_atomically",
 ]

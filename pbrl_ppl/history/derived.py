@@ -61,7 +61,7 @@ def derived_velocities(history: History) -> Bools:
     rows = history.dataset["n_rows"].to_numpy()
     dt = float(history.dataset.attrs["time_step"])
     result = np.zeros(observed.shape[2:], dtype=bool)
-    for body in range(len(result)):
+    for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
         for d in range(3, len(STATE)):
             series = []
             for trajectory, n in enumerate(rows):

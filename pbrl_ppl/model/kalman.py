@@ -6,6 +6,8 @@ that missing ones are simply left out. See B. D. O. Anderson and J. B. Moore, Op
 (1979), chapter 6, and G. J. Bierman, Fixed interval smoothing with discrete measurements (1973).
 The derivative by the noise is S. J. Koopman and N. Shephard's, Exact score for time series models
 in state space form (1992).
+
+Noise so small that a variance rounds to zero gives NaN, which is no likelihood.
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def gains(
     slope: Array,
     first: Ints,
@@ -97,7 +99,7 @@ def gains(
     return gain, scale, covariance
 
 
-@numba.njit(cache=True, nogil=True)
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def innovations(
     slope: Array,
     first: Ints,
@@ -149,7 +151,7 @@ def innovations(
     return white, filtered
 
 
-@numba.njit(cache=True)
+@numba.njit(cache=True, error_model="numpy")
 def adjoint(
     slope: Array, last: Ints, seen: Bools, gain: Array, scale: Array, weighted: Array
 ) -> tuple[Array, Array, Array]:
@@ -196,7 +198,7 @@ def adjoint(
     return before, residual, after
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def score(
     slope: Array,
     last: Ints,

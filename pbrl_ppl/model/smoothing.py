@@ -11,7 +11,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.history import History, hung_bodies
+from pbrl_ppl.history import History, hung_bodies, longest_gap, unseen
 from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.trajectory_noise import Cells, TrajectoryNoise
 from pbrl_ppl.physics import touching
@@ -58,6 +58,8 @@ def along_trajectories(
     """
     history = problem.data.history
     states = first_states(history)
+    if longest_gap(history) > 1:
+        states = foreseen(problem.on(replace(problem.data, horizon=1, states=states)), phi)
     if cells is None:
         cells = cells_of(problem.scene, history)
         medians = tuple(noise_medians(cells, history, states).tolist())
@@ -72,7 +74,8 @@ def along_trajectories(
 
 def single_transitions(problem: Problem) -> Problem:
     """The problem with the likelihood of single transitions (Eq. 11), as a search begins with."""
-    data = replace(problem.data, states=None, columns=None)
+    horizon = longest_gap(problem.data.history)
+    data = replace(problem.data, horizon=horizon, states=None, columns=None)
     return problem.on(data).with_noise(prior=None)
 
 
@@ -88,8 +91,12 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # no motion fits such data: stay where it was linearised last
         problem = replace(problem, data=replace(problem.data, states=states))
+        if longest_gap(problem.data.history) > 1:
+            data = replace(problem.data, states=foreseen(problem, phi))
+            problem = replace(problem, data=data)
         problem = problem.with_noise(trajectories=_sloped(problem, cells, phi, sigma, spread))
-        if (np.sqrt(np.mean(after**2, axis=0)) < _SETTLED * spread).all():
+        shown = after[noise.seen.any(axis=1)]
+        if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
             break
     return problem
 
@@ -109,10 +116,39 @@ def first_states(history: History) -> Array:
     return np.asarray(np.nan_to_num(states))
 
 
+def foreseen(problem: Problem, phi: Array) -> Array:
+    """Linearised states, but those that no row shows as predicted from the row before.
+
+    What a body meets on its way is nowhere near a straight line between far apart rows.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its data hold the states; of horizon 1.
+    phi : ndarray
+        Parameters to predict with, shape (p,).
+
+    Returns
+    -------
+    ndarray
+        Shape (trajectory, time, body, 6), SI units.
+    """
+    hidden, states = unseen(problem.data.history), problem.data.smoothed_states.copy()
+    segments, inputs = problem.segments, problem.inputs
+    for step in np.flatnonzero(hidden.any(axis=(0, 2))):
+        now = np.flatnonzero(segments.step == step - 1)
+        own = segments.trajectory[now]
+        ends = problem.one_world(phi, states[own, step - 1], inputs[now])[:, 0]
+        found = hidden[own, step] & np.isfinite(ends).all(axis=-1)
+        states[own, step] = np.where(found[..., None], ends, states[own, step])
+    return states
+
+
 def cells_of(scene: Scene, history: History) -> Cells:
     """Unknown coordinates of a scene's bodies, and the noise parameters of a recording."""
     observed = history.dataset["observed"].to_numpy()
-    measured = np.isfinite(observed).any(axis=(0, 1))
+    # what was measured of first states alone is given with them
+    measured = np.isfinite(observed[:, 1:]).any(axis=(0, 1))
     with np.errstate(invalid="ignore"):
         low = np.where(measured, np.fmin.reduce(observed, axis=(0, 1)), 0.0)
         high = np.where(measured, np.fmax.reduce(observed, axis=(0, 1)), 0.0)
@@ -162,20 +198,29 @@ def cells_of(scene: Scene, history: History) -> Cells:
 
 
 def noise_medians(cells: Cells, history: History, states: Array) -> Array:
-    """Medians of the noise parameters' priors, from how much the states change in a step."""
-    change = np.diff(states, axis=1)
-    real = np.isfinite(history.dataset["clock"].to_numpy()[:, 1:])
-    typical = np.zeros(len(STATE))
-    for d in range(len(STATE)):
-        own = np.flatnonzero(cells.places % len(STATE) == d)
-        if len(own):
-            values = change[real][:, cells.places[own] // len(STATE), d]
-            typical[d] = np.sqrt(np.mean(values**2))
+    """Medians of the noise parameters' priors, from how much the states change.
+
+    Errors of measuring are scaled by the change from one row that shows the bodies to the next.
+    """
+    real = np.isfinite(history.dataset["clock"].to_numpy())
+    shown = real & ~unseen(history).any(axis=-1)
+    each, seen = (
+        _typical(cells, [np.diff(own[row], axis=0) for own, row in zip(states, rows, strict=True)])
+        for rows in (real, shown)
+    )
     dt = float(history.dataset.attrs["time_step"])
-    sensors = SENSOR_SHARE * typical[list(cells.sensors)]
-    steps = STEP_SHARE * typical[list(cells.rates)] / dt
-    jolts = JOLT_SHARE * typical[list(cells.jolts)] / dt
+    sensors = SENSOR_SHARE * seen[list(cells.sensors)]
+    steps = STEP_SHARE * each[list(cells.rates)] / dt
+    jolts = JOLT_SHARE * each[list(cells.jolts)] / dt
     return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts]), 1e-9))
+
+
+def _typical(cells: Cells, changes: list[Array]) -> Array:
+    """Root mean square of changes (row, body, 6) of each dimension's cells, shape (6,)."""
+    square = np.concatenate([own.reshape(len(own), -1) for own in changes]) ** 2
+    own = square.mean(axis=0)[cells.places]
+    of = cells.places % len(STATE)
+    return np.array([np.sqrt(own[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
 
 
 def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
