@@ -2,8 +2,6 @@
 
 from .agents import Acted as Acted
 from .agents import act as act
-from .calibration import Calibration as Calibration
-from .calibration import calibrate as calibrate
 from .criticism import Findings as Findings
 from .criticism import PriorCheck as PriorCheck
 from .criticism import prior_predictive_check as prior_predictive_check
@@ -38,6 +36,8 @@ from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
 from .report import Loop as Loop
 from .report import close_loop as close_loop
+from .sampling import Calibration as Calibration
+from .sampling import calibrate as calibrate
 from .sampling import fit as fit
 from .sampling import update as update
 from .scene import Body as Body
