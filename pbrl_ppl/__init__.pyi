@@ -17,6 +17,9 @@ from .model import SimulatorOp as SimulatorOp
 from .model import Transition as Transition
 from .model import physics_model as physics_model
 from .modes import joint_probabilities as joint_probabilities
+from .oomdp import LWR as LWR
+from .oomdp import OOLWR as OOLWR
+from .oomdp import SectorContacts as SectorContacts
 from .parameters import Prior as Prior
 from .physics import Simulator as Simulator
 from .planning import Action as Action
@@ -25,6 +28,7 @@ from .planning import Dynamics as Dynamics
 from .planning import Goal as Goal
 from .planning import Plan as Plan
 from .planning import Target as Target
+from .planning import TransitionModel as TransitionModel
 from .planning import plan as plan
 from .posterior import Identifiability as Identifiability
 from .posterior import identify as identify
