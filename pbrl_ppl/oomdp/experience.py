@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -91,7 +92,8 @@ def grouped(flags: Flags) -> dict[bytes, NDArray[np.intp]]:
     [array([0, 2]), array([1])]
     """
     found: dict[bytes, list[int]] = {}
-    for i, bits in enumerate(np.packbits(flags.reshape(len(flags), -1), axis=1)):
+    flat = flags.reshape(len(flags), math.prod(flags.shape[1:]))
+    for i, bits in enumerate(np.packbits(flat, axis=1)):
         found.setdefault(bits.tobytes(), []).append(i)
     return {key: np.array(rows) for key, rows in found.items()}
 

@@ -19,6 +19,10 @@ Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
 
+#: Nothing is this far or this fast (SI units): steps that each extrapolate have run away.
+_DIVERGED = 1e6
+
+
 class Learner(ABC):
     """Independent single-body models of transitions, learned as they are observed.
 
@@ -221,8 +225,8 @@ class Learner(ABC):
         Returns
         -------
         ndarray
-            Shape (1, n, body, 6); NaN for a body in a condition in which nothing was observed: it
-            has no model there.
+            Shape (1, n, body, 6); NaN for a body in a condition in which nothing was observed, for
+            it has no model there, and where what a few transitions taught has led beyond measure.
 
         Raises
         ------
@@ -239,7 +243,7 @@ class Learner(ABC):
                 f"step: states have shape {states.shape} and wrenches {wrenches.shape}, expected"
                 f" (1, n, {k}, {len(STATE)}) and (n, {k}, {len(WRENCH)})"
             )
-        rows = np.flatnonzero(np.isfinite(states[0]).reshape(n, -1).all(axis=1))
+        rows = np.flatnonzero(np.asarray(np.isfinite(states[0]).all(axis=(1, 2))))
         begin, pushes = states[0, rows], wrenches[rows]
         flags = self.predicates(begin)
         out = np.full_like(states[0], np.nan)
@@ -251,6 +255,7 @@ class Learner(ABC):
             x = inputs(state, push, pose_invariant=self.pose_invariant)
             added = own.predict(x, flags[:, i])
             out[rows, i] = displaced(state, added, pose_invariant=self.pose_invariant)
+        out[abs(out) > _DIVERGED] = np.nan
         return np.asarray(out[None])
 
     def experience(self, body: str) -> Experience:

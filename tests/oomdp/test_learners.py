@@ -133,6 +133,8 @@ def test_unknown_condition_has_no_model(free) -> None:
     assert np.isnan(found[1]).all()
     lost = predicted(model, found, np.zeros((2, 1, 3)))  # and it stays so
     assert np.isfinite(lost[0]).all() and np.isnan(lost[1]).all()
+    assert np.isnan(predicted(model, found[1:], NO_PUSH)).all()
+    assert predicted(model, ahead[:0], NO_PUSH[:0]).shape == (0, 1, 6)
 
 
 def test_learning_is_incremental(near_wall) -> None:
@@ -209,6 +211,16 @@ def test_angles_take_the_short_way() -> None:
         model = taught(LWR(FREE, pose_invariant=invariant), state, NO_PUSH[0], after)
         found = predicted(model, state[None], NO_PUSH)
         np.testing.assert_allclose(found[0, 0, 2], 2 * np.pi - 3.1, atol=0.01)
+
+
+def test_what_runs_away_is_lost() -> None:
+    """One transition in which a body doubled its speed: after 30 such steps nothing is known."""
+    model = taught(LWR(FREE), [[0, 0, 0, 1.0, 0, 0]], NO_PUSH[0], [[0.1, 0, 0, 2.0, 0, 0]])
+    states = np.array([[[[0, 0, 0, 1.0, 0, 0]]]])
+    for _ in range(30):
+        states = model.step(states, NO_PUSH)
+        assert not (abs(states) > 1e6).any()
+    assert np.isnan(states).all()
 
 
 def test_nothing_observed() -> None:
