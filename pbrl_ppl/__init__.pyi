@@ -2,8 +2,6 @@
 
 from .agents import Acted as Acted
 from .agents import act as act
-from .calibration import Calibration as Calibration
-from .calibration import calibrate as calibrate
 from .criticism import Findings as Findings
 from .criticism import PriorCheck as PriorCheck
 from .criticism import prior_predictive_check as prior_predictive_check
@@ -19,6 +17,9 @@ from .model import SimulatorOp as SimulatorOp
 from .model import Transition as Transition
 from .model import physics_model as physics_model
 from .modes import joint_probabilities as joint_probabilities
+from .oomdp import LWR as LWR
+from .oomdp import OOLWR as OOLWR
+from .oomdp import SectorContacts as SectorContacts
 from .parameters import Prior as Prior
 from .physics import Simulator as Simulator
 from .planning import Action as Action
@@ -27,6 +28,7 @@ from .planning import Dynamics as Dynamics
 from .planning import Goal as Goal
 from .planning import Plan as Plan
 from .planning import Target as Target
+from .planning import TransitionModel as TransitionModel
 from .planning import plan as plan
 from .posterior import Identifiability as Identifiability
 from .posterior import identify as identify
@@ -38,6 +40,8 @@ from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
 from .report import Loop as Loop
 from .report import close_loop as close_loop
+from .sampling import Calibration as Calibration
+from .sampling import calibrate as calibrate
 from .sampling import fit as fit
 from .sampling import update as update
 from .scene import Body as Body

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.history import History, from_segments
-from pbrl_ppl.planning import ActionSet, Dynamics, Goal, plan, start_state
+from pbrl_ppl.planning import ActionSet, Goal, TransitionModel, plan, start_state
 from pbrl_ppl.posterior import scene_of
 from pbrl_ppl.scene import Scene
 
@@ -100,7 +100,7 @@ def act(
     """
     if intervals < 1 or (every is not None and every < 1):
         raise GoalError(f"act: every is {every} and intervals {intervals}, expected 1 or more")
-    scene = idata.scene if isinstance(idata, Dynamics) else scene_of(idata)
+    scene = idata.scene if isinstance(idata, TransitionModel) else scene_of(idata)
     goal = goal if isinstance(goal, Goal) else Goal.of(goal)
     goal.check(scene)
     states, plans = [start_state(scene, start)], 0

@@ -15,7 +15,7 @@ from pbrl_ppl.cli.terminal import FAILED, SceneFile, Velocities, interruptible, 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
 
-    from pbrl_ppl.calibration import Calibration
+    from pbrl_ppl.sampling import Calibration
 
 
 def calibrate(
@@ -39,8 +39,8 @@ def calibrate(
         declared, design = load_files(scene, history, estimate_velocities)
         os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report
-        from pbrl_ppl.calibration import calibration
         from pbrl_ppl.history import write_atomically
+        from pbrl_ppl.sampling import calibration
 
         with _pool(jobs) as executor:
             result = calibration.calibrate(

@@ -6,6 +6,7 @@ from pbrl_ppl.physics.one_world import OneWorld
 from pbrl_ppl.physics.parts import Part, PartedSimulator
 from pbrl_ppl.physics.placement import check_history, check_placement, overlap
 from pbrl_ppl.physics.simulator import Simulator
+from pbrl_ppl.physics.solids import Scenery, circles, scenery
 from pbrl_ppl.physics.touch import touching
 from pbrl_ppl.physics.trial import try_effect
 
@@ -14,13 +15,16 @@ __all__ = [
     "Part",
     "PartedSimulator",
     "Parts",
+    "Scenery",
     "Simulator",
     "after_recording",
     "check_history",
     "check_placement",
+    "circles",
     "independent_parts",
     "joined_parts",
     "overlap",
+    "scenery",
     "touching",
     "try_effect",
 ]

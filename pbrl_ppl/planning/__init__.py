@@ -4,5 +4,17 @@ from pbrl_ppl.planning.actions import Action, ActionSet
 from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.goals import Goal, Target
 from pbrl_ppl.planning.planner import Plan, plan, start_state
+from pbrl_ppl.planning.transition_model import TransitionModel, rollout
 
-__all__ = ["Action", "ActionSet", "Dynamics", "Goal", "Plan", "Target", "plan", "start_state"]
+__all__ = [
+    "Action",
+    "ActionSet",
+    "Dynamics",
+    "Goal",
+    "Plan",
+    "Target",
+    "TransitionModel",
+    "plan",
+    "rollout",
+    "start_state",
+]

@@ -13,10 +13,10 @@ from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.bound import TimeToGo
 from pbrl_ppl.planning.contact import contact_cost
-from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.risk import tail_mean
 from pbrl_ppl.planning.search import NODES, Found
+from pbrl_ppl.planning.transition_model import TransitionModel
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -38,7 +38,7 @@ _REPORT = 0.5
 
 
 def astar(
-    dynamics: Dynamics,
+    dynamics: TransitionModel,
     start: Array,
     goal: Goal,
     actions: ActionSet,
@@ -63,7 +63,7 @@ def astar(
 
     Parameters
     ----------
-    dynamics : Dynamics
+    dynamics : TransitionModel
         One draw or many.
     start : ndarray
         Shape (body, 6).
@@ -148,7 +148,7 @@ class _Search:
 
     def __init__(
         self,
-        dynamics: Dynamics,
+        dynamics: TransitionModel,
         start: Array,
         goal: Goal,
         actions: ActionSet,
@@ -305,7 +305,7 @@ def mean_angle(angle: Array) -> Array:
 
 
 def played(
-    dynamics: Dynamics, start: Array, actions: ActionSet, steps: list[tuple[int, int]]
+    dynamics: TransitionModel, start: Array, actions: ActionSet, steps: list[tuple[int, int]]
 ) -> Array:
     """World-frame wrenches of actions from a start, one an interval, shape (time, body, 3)."""
     scene, states = dynamics.scene, np.repeat(start[None, None], dynamics.draws, axis=0)

@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning.actions import ActionSet
-from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.goals import Goal, Target
+from pbrl_ppl.planning.transition_model import TransitionModel
 from pbrl_ppl.scene import Body, Scene, Shape
 
 Array = NDArray[np.float64]
@@ -34,8 +34,8 @@ class TimeToGo:
 
     Parameters
     ----------
-    dynamics : Dynamics
-        Masses.
+    dynamics : TransitionModel
+        Says what a push can do.
     goal : Goal
         Targets.
     actions : ActionSet
@@ -44,7 +44,9 @@ class TimeToGo:
         Shape (body, 6); the grid covers it.
     """
 
-    def __init__(self, dynamics: Dynamics, goal: Goal, actions: ActionSet, start: Array) -> None:
+    def __init__(
+        self, dynamics: TransitionModel, goal: Goal, actions: ActionSet, start: Array
+    ) -> None:
         scene = dynamics.scene
         self.goal, self.scene = goal, scene
         anyone = max(actions.strongest(body.name)[0] for body in scene.dynamic)
@@ -52,13 +54,10 @@ class TimeToGo:
         self._fields, self._push, self._turn = [], [], []
         for target, i in zip(goal.targets, self._own, strict=True):
             force, torque = actions.strongest(target.body)
-            body, mass = scene.body(target.body), dynamics.mass(target.body)
-            force = force or anyone
-            self._push.append(force / mass + np.hypot(*scene.gravity))
-            # a wheel or a contact at the rim turns the body as hard as it is pushed
-            lever = body.shape.bounding_radius
-            self._turn.append((torque + force * lever) / (mass * body.shape.unit_moment))
-            self._fields.append(_distances(scene, body, target, start[i]))
+            push, turn = dynamics.acceleration(target.body, force or anyone, torque)
+            self._push.append(push)
+            self._turn.append(turn)
+            self._fields.append(_distances(scene, scene.body(target.body), target, start[i]))
 
     def __call__(self, states: Array) -> Array:
         """Seconds, shape (draw, n), from states of shape (draw, n, body, 6)."""

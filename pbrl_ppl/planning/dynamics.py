@@ -14,6 +14,7 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.model import build_layout, log_posterior
 from pbrl_ppl.physics import Simulator, after_recording
 from pbrl_ppl.planning.noise import StepNoise, step_noise
+from pbrl_ppl.planning.transition_model import rollout
 from pbrl_ppl.posterior import draws as all_draws
 from pbrl_ppl.posterior import group, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
@@ -156,6 +157,14 @@ class Dynamics:
             return np.full(self.draws, float(known["mass"]))
         return self.phi[:, self.layout.index("mass", body)]
 
+    def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
+        """The most that a push without friction can do: m/s^2 and rad/s^2, shape (draw,) each."""
+        shape, mass = self.scene.body(body).shape, self.mass(body)
+        # a wheel or a contact at the rim turns the body as hard as it is pushed
+        turning = torque + force * shape.bounding_radius
+        linear = force / mass + np.hypot(*self.scene.gravity)
+        return linear, turning / (mass * shape.unit_moment)
+
     def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
         """States after one sampling interval.
 
@@ -205,12 +214,4 @@ class Dynamics:
 
         With a generator, Eq. 13's noise is added after each interval.
         """
-        states = np.broadcast_to(start, (self.draws, 1, *start.shape))
-        every = [states]
-        last = self.before
-        for wrench in wrenches:
-            states, last = self.step(states, wrench[None], last[None]), wrench
-            if rng is not None:
-                states = self.noisy(states, rng)
-            every.append(states)
-        return np.concatenate(every, axis=1)
+        return rollout(self, start, wrenches, rng)

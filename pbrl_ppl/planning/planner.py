@@ -23,6 +23,7 @@ from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.risk import tail_mean
 from pbrl_ppl.planning.search import NODES, Found
+from pbrl_ppl.planning.transition_model import TransitionModel, rollout
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE
 
@@ -138,8 +139,9 @@ def plan(
 
     Parameters
     ----------
-    idata : InferenceData, DataTree or Dynamics
-        A posterior, as :func:`pbrl_ppl.load_posterior` gives it; or parameters that are known.
+    idata : InferenceData, DataTree or TransitionModel
+        A posterior, as :func:`pbrl_ppl.load_posterior` gives it; or a model of transitions:
+        parameters that are known, or what LWR has learned.
     start : mapping or array_like
         State of each body: ``{"cart": (x, y, theta)}`` at rest, or with ``vx, vy, omega``; a body
         that is left out is at rest at its pose in the scene. Or an array, shape (body, 6). SI.
@@ -200,10 +202,11 @@ def plan(
         raise GoalError(f"plan: tail is {tail}, expected a share above 0 and at most 1")
     if seconds is not None and not seconds > 0:
         raise GoalError(f"plan: seconds is {seconds}, expected more than 0")
-    if isinstance(idata, Dynamics):
+    dynamics: TransitionModel
+    if isinstance(idata, TransitionModel):
         dynamics = idata
         if actions is None:
-            raise GoalError("plan: parameters alone do not say how to push; give actions")
+            raise GoalError("plan: a model alone does not say how to push; give actions")
     else:
         dynamics = Dynamics.of(idata, draws, seed=seed, effects=effects)
         actions = ActionSet.recorded(idata) if actions is None else actions
@@ -225,7 +228,7 @@ def plan(
 
 
 def _described(
-    dynamics: Dynamics,
+    dynamics: TransitionModel,
     start: Array,
     goal: Goal,
     found: Found,
@@ -234,12 +237,12 @@ def _described(
     rng: np.random.Generator,
 ) -> Plan:
     scene = dynamics.scene
-    states = dynamics.rollout(start, found.wrenches)
+    states = rollout(dynamics, start, found.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
     if noise:
         times = -(-_NOISY // dynamics.draws)
         states = np.concatenate(
-            [dynamics.rollout(start, found.wrenches, rng) for _ in range(times)]
+            [rollout(dynamics, start, found.wrenches, rng) for _ in range(times)]
         )
     predicted = xr.Dataset(
         {"predicted": (("draw", "time", "body", "state"), states)},

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.contact import contact_cost
-from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.risk import tail_mean
 from pbrl_ppl.planning.search import NODES, Found
+from pbrl_ppl.planning.transition_model import TransitionModel
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ class Horizon:
 
     Parameters
     ----------
-    dynamics : Dynamics
+    dynamics : TransitionModel
         One draw or many.
     goal, actions
         As of :func:`pbrl_ppl.plan`; wrenches may be anything up to the strongest of the set, on
@@ -60,7 +60,7 @@ class Horizon:
 
     def __init__(
         self,
-        dynamics: Dynamics,
+        dynamics: TransitionModel,
         goal: Goal,
         actions: ActionSet,
         *,
@@ -130,7 +130,7 @@ class Horizon:
 
 
 def mppi(
-    dynamics: Dynamics,
+    dynamics: TransitionModel,
     start: Array,
     goal: Goal,
     actions: ActionSet,

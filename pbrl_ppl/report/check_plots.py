@@ -5,9 +5,9 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 from scipy.stats import binom
 
-from pbrl_ppl.calibration import Calibration, bins
 from pbrl_ppl.criticism import PriorCheck
 from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, UNITS, blank_figure
+from pbrl_ppl.sampling import Calibration, bins
 
 
 def plot_prior_check(check: PriorCheck) -> Figure:

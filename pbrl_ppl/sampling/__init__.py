@@ -1,6 +1,8 @@
-"""Draws from the posterior: `fit` and its samplers, and `update`."""
+"""Draws from the posterior: `fit` and its samplers, `update`, and whether the sampler is right."""
 
+from pbrl_ppl.sampling.calibration import calibrate
 from pbrl_ppl.sampling.fitting import fit
+from pbrl_ppl.sampling.ranks import Calibration, bins
 from pbrl_ppl.sampling.updating import update
 
-__all__ = ["fit", "update"]
+__all__ = ["Calibration", "bins", "calibrate", "fit", "update"]

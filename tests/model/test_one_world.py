@@ -7,7 +7,6 @@ import pymc as pm
 import pytest
 import xarray as xr
 
-from pbrl_ppl.calibration.replication import draw_truths
 from pbrl_ppl.criticism import prior_predictive_check
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.errors import MeetingWarning
@@ -24,6 +23,7 @@ from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Simulator
 from pbrl_ppl.posterior import evaluate, from_groups, group, problem_of
 from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling.replication import draw_truths
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
 

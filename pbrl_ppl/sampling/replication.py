@@ -10,7 +10,6 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.calibration.ranks import MOST_DRAWS, rank
 from pbrl_ppl.errors import (
     BoundWarning,
     ConvergenceWarning,
@@ -28,7 +27,8 @@ from pbrl_ppl.model import (
 )
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling.fitting import fit
+from pbrl_ppl.sampling.ranks import MOST_DRAWS, rank
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]

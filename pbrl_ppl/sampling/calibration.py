@@ -20,13 +20,13 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from pbrl_ppl.calibration.ranks import Calibration
-from pbrl_ppl.calibration.replication import Record, draw_truths, labels, replicate
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History, write_atomically
 from pbrl_ppl.model import Problem, physics_model
 from pbrl_ppl.posterior import versions
+from pbrl_ppl.sampling.ranks import Calibration
+from pbrl_ppl.sampling.replication import Record, draw_truths, labels, replicate
 from pbrl_ppl.scene import Scene
 
 #: What the replications in a folder depend on.

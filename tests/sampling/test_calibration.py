@@ -11,14 +11,14 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from pbrl_ppl.calibration import calibrate, calibration, replication
-from pbrl_ppl.calibration.ranks import MOST_DRAWS, Calibration, bins, holm, rank, uniformity
-from pbrl_ppl.calibration.replication import Record, Truth, draw_truths, simulated
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Noise, Problem, build_model, physics_model
 from pbrl_ppl.report import plot_calibration, png
+from pbrl_ppl.sampling import calibrate, calibration, replication
+from pbrl_ppl.sampling.ranks import MOST_DRAWS, Calibration, bins, holm, rank, uniformity
+from pbrl_ppl.sampling.replication import Record, Truth, draw_truths, simulated
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history

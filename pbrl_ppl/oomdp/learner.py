@@ -1,0 +1,279 @@
+"""A learner of transitions that a planner can plan with: one regression a body and condition."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from pbrl_ppl.errors import FitError, HistoryError, SimulationError
+from pbrl_ppl.history import History
+from pbrl_ppl.oomdp.experience import Experience
+from pbrl_ppl.oomdp.frames import displaced, displacements, inputs
+from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.state import STATE, WRENCH
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+
+#: Nothing is this far or this fast (SI units): steps that each extrapolate have run away.
+_DIVERGED = 1e6
+
+
+class Learner(ABC):
+    """Independent single-body models of transitions, learned as they are observed.
+
+    A :class:`pbrl_ppl.planning.TransitionModel`: :func:`pbrl_ppl.plan` plans with it.
+
+    Parameters
+    ----------
+    scene : Scene
+        Orders the bodies. A kinematic body goes where its action, a velocity, leads it.
+    neighbours : int
+        Nearest transitions that count, k.
+    bandwidth : float
+        Of the kernel, lambda.
+    ridge : float
+        As of :class:`pbrl_ppl.oomdp.Regression`.
+    standardise : bool
+        Whether distances between inputs are in units of each input's standard deviation in the
+        data, so that lambda has no unit; the paper names none. Otherwise in SI units.
+    pose_invariant : bool
+        Whether a body's transitions are learned in its own frame, without its pose.
+
+    Raises
+    ------
+    FitError
+        If ``neighbours`` is below 1, or ``bandwidth`` or ``ridge`` not positive.
+
+    Attributes
+    ----------
+    transitions : int
+        Number of transitions that were observed.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        *,
+        neighbours: int,
+        bandwidth: float,
+        ridge: float,
+        standardise: bool,
+        pose_invariant: bool,
+    ) -> None:
+        if isinstance(neighbours, bool) or not isinstance(neighbours, int) or neighbours < 1:
+            raise FitError(f"LWR: neighbours is {neighbours!r}, expected a whole number from 1 up")
+        for name, value in (("bandwidth", bandwidth), ("ridge", ridge)):
+            if not 0 < value < np.inf:
+                raise FitError(f"LWR: {name} is {value!r}, expected a number above 0")
+        self.scene, self.pose_invariant = scene, pose_invariant
+        options = {"neighbours": neighbours, "bandwidth": bandwidth, "ridge": ridge}
+        self._own = {
+            i: Experience(standardise=standardise, options=options)
+            for i, body in enumerate(scene.moving)
+            if not body.kinematic
+        }
+        self.transitions = 0
+
+    @abstractmethod
+    def predicates(self, states: Array) -> Flags:
+        """Predicates of each moving body in states (n, body, 6), shape (n, body, ...)."""
+
+    # -- learning ----------------------------------------------------------------------------------
+
+    def observe(self, state: ArrayLike, action: ArrayLike, next_state: ArrayLike) -> None:
+        """Learn from a transition, or from many.
+
+        Parameters
+        ----------
+        state, next_state : array_like
+            States at the ends of one sampling interval, shape (body, 6) or (n, body, 6), SI units.
+        action : array_like
+            Wrenches held in between, shape (body, 3) or (n, body, 3), world frame, N and N m; of a
+            kinematic body its velocity.
+
+        Raises
+        ------
+        HistoryError
+            If shapes do not fit together, or a value is not finite.
+        """
+        k = len(self.scene.moving)
+        arrays = []
+        for name, given, width in (
+            ("state", state, len(STATE)),
+            ("action", action, len(WRENCH)),
+            ("next_state", next_state, len(STATE)),
+        ):
+            values = np.asarray(given, dtype=float)
+            if values.ndim not in (2, 3) or values.shape[-2:] != (k, width):
+                raise HistoryError(
+                    f"observe: {name} has shape {values.shape}, expected ({k}, {width}) or"
+                    f" (n, {k}, {width}): {', '.join(body.name for body in self.scene.moving)}"
+                )
+            arrays.append(values.reshape(-1, k, width))
+            lost = ~np.isfinite(arrays[-1]).all(axis=-1)
+            lost[:, [i for i in range(k) if i not in self._own]] = False
+            if lost.any():
+                row, body = np.argwhere(lost)[0]
+                raise HistoryError(
+                    f"observe: {name} of {self.scene.moving[body].name} in transition {row} is not"
+                    " finite; leave out transitions that were not measured whole"
+                )
+        if len({len(values) for values in arrays}) > 1:
+            raise HistoryError(
+                f"observe: got {', '.join(str(len(values)) for values in arrays)} states, actions"
+                " and next states, expected as many of each"
+            )
+        begin, wrench, after = arrays
+        flags = self.predicates(begin)
+        for i, own in self._own.items():
+            x = inputs(begin[:, i], wrench[:, i], pose_invariant=self.pose_invariant)
+            y = displacements(begin[:, i], after[:, i], pose_invariant=self.pose_invariant)
+            own.add(x, y, flags[:, i])
+        self.transitions += len(begin)
+
+    def learn(self, history: History) -> None:
+        """Learn from the transitions of a history that were measured whole.
+
+        Raises
+        ------
+        HistoryError
+            If it is of other bodies, or no transition was measured whole.
+        """
+        names = tuple(body.name for body in self.scene.moving)
+        if history.bodies != names:
+            raise HistoryError(
+                f"learn: the history is of {', '.join(history.bodies)}, expected"
+                f" {', '.join(names)}; load it with the learner's scene"
+            )
+        every = history.transitions(history.dataset["start"].to_numpy())
+        state, action, after = every.start, every.actions[:, 0], every.observed[:, 0]
+        own = list(self._own)
+        whole = np.asarray(np.isfinite(state).all(axis=(1, 2)))
+        for values in (action, after):
+            whole &= np.isfinite(values[:, own]).all(axis=(1, 2))
+        if not whole.any():
+            raise HistoryError(
+                f"learn: none of {len(whole)} transitions was measured whole; load the history with"
+                " estimate_velocities=True if velocities are missing"
+            )
+        self.observe(state[whole], action[whole], after[whole])
+
+    # -- planning ----------------------------------------------------------------------------------
+
+    @property
+    def draws(self) -> int:
+        """1: a point estimate."""
+        return 1
+
+    @property
+    def before(self) -> Array:
+        """Zeros, shape (body, 3): it remembers no wrench."""
+        return np.zeros((len(self.scene.moving), len(WRENCH)))
+
+    def single(self) -> Self:
+        """Itself."""
+        return self
+
+    def after(self, before: Array) -> Self:
+        """Itself: it remembers no wrench."""
+        return self
+
+    def noisy(self, states: Array, rng: np.random.Generator) -> Array:
+        """Refused: regression says nothing of noise.
+
+        Raises
+        ------
+        FitError
+            Always.
+        """
+        raise FitError("noise: LWR predicts a mean alone; plan without noise")
+
+    def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
+        """What a push does to a body, shape (1,) each: m/s^2 and rad/s^2.
+
+        A linear fit to the transitions in its commonest condition, at the heading at which the push
+        does most.
+
+        Raises
+        ------
+        FitError
+            If nothing was observed yet.
+        """
+        self._check_data()
+        gains = self.experience(body).gains()[-len(WRENCH) :, 3:] / self.scene.time_step
+        linear = force * np.linalg.norm(gains[:2, :2], 2) + torque * np.hypot(*gains[2, :2])
+        angular = force * np.hypot(*gains[:2, 2]) + torque * abs(gains[2, 2])
+        return np.array([linear]), np.array([angular])
+
+    def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
+        """States after one sampling interval (Eqs. 5 and 6).
+
+        Parameters
+        ----------
+        states : ndarray
+            Shape (1, n, body, 6), SI units.
+        wrenches : ndarray
+            Shape (n, body, 3), world frame, N and N m.
+        previous : ndarray, optional
+            No matter.
+
+        Returns
+        -------
+        ndarray
+            Shape (1, n, body, 6); NaN for a body in a condition in which nothing was observed, for
+            it has no model there, and where what a few transitions taught has led beyond measure.
+
+        Raises
+        ------
+        FitError
+            If nothing was observed yet.
+        SimulationError
+            If shapes do not fit together.
+        """
+        self._check_data()
+        k = len(self.scene.moving)
+        n = states.shape[1] if states.ndim == 4 else 0
+        if states.shape != (1, n, k, len(STATE)) or wrenches.shape != (n, k, len(WRENCH)):
+            raise SimulationError(
+                f"step: states have shape {states.shape} and wrenches {wrenches.shape}, expected"
+                f" (1, n, {k}, {len(STATE)}) and (n, {k}, {len(WRENCH)})"
+            )
+        rows = np.flatnonzero(np.asarray(np.isfinite(states[0]).all(axis=(1, 2))))
+        begin, pushes = states[0, rows], wrenches[rows]
+        flags = self.predicates(begin)
+        out = np.full_like(states[0], np.nan)
+        for i in range(k):
+            own, state, push = self._own.get(i), begin[:, i], pushes[:, i]
+            if own is None:  # kinematic: the push is its velocity
+                out[rows, i] = np.hstack([state[:, :3] + self.scene.time_step * push, push])
+                continue
+            x = inputs(state, push, pose_invariant=self.pose_invariant)
+            added = own.predict(x, flags[:, i])
+            out[rows, i] = displaced(state, added, pose_invariant=self.pose_invariant)
+        out[abs(out) > _DIVERGED] = np.nan
+        return np.asarray(out[None])
+
+    def experience(self, body: str) -> Experience:
+        """What was observed of a body.
+
+        Raises
+        ------
+        FitError
+            If the scene has no such body that forces move.
+        """
+        names = [mover.name for mover in self.scene.dynamic]
+        if body not in names:
+            raise FitError(
+                f'LWR: the scene has no moving body "{body}" that can be pushed'
+                f"{nearest(body, names)}"
+            )
+        return dict(zip(names, self._own.values(), strict=True))[body]
+
+    def _check_data(self) -> None:
+        if not self.transitions:
+            raise FitError("LWR: nothing was observed yet; observe() a transition, or learn() some")
