@@ -41,7 +41,7 @@ notebooks: $(VENV)/.installed-docs
 	mkdir -p out/notebooks
 	for notebook in analysis/notebooks/*.py; do \
 	    page=out/notebooks/$$(basename $$notebook .py).ipynb; \
-	    $(BIN)/jupytext --to ipynb --set-kernel - --execute --run-path . --output $$page $$notebook \
+	    $(BIN)/jupytext --to ipynb --set-kernel python3 --execute --run-path . --output $$page $$notebook \
 	        && $(BIN)/jupyter-nbconvert --to html $$page || exit 1; \
 	done
 

@@ -1,4 +1,7 @@
-"""The notebooks run from their first cell to their last at small size, and find what they say."""
+"""The notebooks run from their first cell to their last at small size, and find what they say.
+
+None is marked slow, so that both generations of PyMC and ArviZ run them in CI.
+"""
 
 import re
 from pathlib import Path

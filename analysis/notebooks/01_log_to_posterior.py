@@ -123,25 +123,27 @@ table = summary(idata)
 table.round(4)
 
 # %% [markdown]
-# The same as pictures: posterior (blue) and prior (grey), each scaled to the same height. Where
-# the blue hill is narrow, the data say much; where both are alike, they say nothing. The wheel's
-# direction `w_theta` has four equal descriptions, of which the same one is shown of posterior and
-# prior.
+# The same as pictures: draws from the prior (grey), and of the posterior the median (line) and
+# the interval that holds 94 % (band). Where the band is narrow, the data say much; where it is as
+# wide as the prior, they say nothing. The wheel's direction `w_theta` has four equal
+# descriptions, of which the same one is shown of posterior and prior.
 
 # %%
 names = ("mass", "w_x", "w_y", "w_theta", "mu_x", "mu_y", "r", "mu_c")
 figure, panels = plt.subplots(2, 4, figsize=(11, 4.5), layout="constrained")
 for axes, name in zip(panels.flat, names, strict=True):
-    for group, colour in (("prior", "#999999"), ("posterior", "#0072B2")):
-        values = idata[group][name].to_numpy().ravel()
-        if name in ("mass", "r"):  # positive, over orders of magnitude
-            values = np.log10(values)
-        counts, edges = np.histogram(values, 40)
-        axes.stairs(counts / counts.max(), edges, fill=True, color=colour, alpha=0.7, label=group)
-    axes.set_xlabel(f"log10 {name}" if name in ("mass", "r") else name)
+    prior, posterior = (idata[group][name].to_numpy().ravel() for group in ("prior", "posterior"))
+    label = name
+    if name in ("mass", "r"):  # positive, over orders of magnitude
+        prior, posterior, label = np.log10(prior), np.log10(posterior), f"log10 {name}"
+    low, middle, high = np.quantile(posterior, (0.03, 0.5, 0.97))
+    axes.hist(prior, 30, color="#bbbbbb", label="prior")
+    axes.axvspan(low, high, color="#0072B2", alpha=0.3, label="posterior, 94 %")
+    axes.axvline(middle, color="#0072B2", linewidth=1.5, label="posterior, median")
+    axes.set_xlabel(label)
     axes.set_yticks([])
 handles, labels = panels[0, 0].get_legend_handles_labels()
-figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=False)
+figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False)
 figure.savefig(OUT / "01_posterior.png", dpi=100)
 
 # %% [markdown]

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Writing your own effect
 #
-# The catalogue has the usual suspects: drags, springs, delays, offsets. What is special about
-# your system is a dozen lines: a law, its parameters with priors, and a sentence for the report.
-# It is passed in; there is no registry.
+# The catalogue has common effects: drags, springs, delays, offsets. One that is particular to
+# your system takes a dozen lines: a law, its parameters with priors, and a sentence for the
+# report. It is passed in; there is no registry.
 
 # %%
 import warnings
@@ -94,8 +94,8 @@ train, test = recording(seed=1), recording(seed=2)
 # %% [markdown]
 # ## Without it
 #
-# With the package's own catalogue the loop sees that something is missing. It has no name for it,
-# and it must not make one up.
+# With the package's own catalogue the loop sees that something is missing, and has no name for
+# it: the verdict is `unexplained`.
 
 # %%
 without = pp.close_loop(scene, train, test, seed=1, method=METHOD)
