@@ -24,7 +24,7 @@ CART = ROOT / "models" / "shopping_cart"
 
 # %% tags=["parameters"]
 TRAJECTORIES = 12  # of the cart's recording, at most 12
-METHOD = "metropolis"  # of the posteriors before and after
+METHOD = "metropolis"  # of the cart's posteriors before and after
 PENDULUM = ROOT.parent / "shared" / "data" / "real" / "pendulum-swing"  # a measured pendulum
 OUT = ROOT / "out" / "notebooks"
 
@@ -79,8 +79,9 @@ print("unexplained:", cart.unexplained)
 # %% [markdown]
 # ### Before and after
 #
-# Errors on the test recording, in units of the noise floor (dotted line: no model can be better).
-# Left: one step ahead. Right: a forecast over many steps, where what is missing adds up.
+# Errors on the test recording, in units of the noise floor (dotted line), which is an estimate of
+# how well any model could do. Left: one step ahead. Right: a forecast over many steps, where what
+# is missing adds up.
 
 # %%
 figure = plot_errors(cart.findings)
@@ -117,14 +118,15 @@ print(cart.report(OUT / "03_cart.html").name)
 #
 # A real arm on a bearing, recorded at 50 Hz by an encoder. The scene knows its mass and its
 # pivot, and says that it may not be an even bar (`inertia_scale`). It declares no friction. The
-# data are not part of this repository; without them this section is skipped.
+# posteriors are taken from the modes (`laplace`), for chains over so many samples take many
+# minutes. The data are not part of this repository; without them this section is skipped.
 
 # %%
 pendulum = None
 if PENDULUM.is_dir():
     scene = pp.Scene.load(PENDULUM / "scene.toml")
     train, test = (pp.History.load(PENDULUM / f"{part}.csv", scene) for part in ("train", "test"))
-    pendulum = pp.close_loop(scene, train, test, seed=1, method=METHOD)
+    pendulum = pp.close_loop(scene, train, test, seed=1, method="laplace")
     print(pendulum)
 else:
     print("skipped: the measured pendulum is not here")
