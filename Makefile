@@ -6,7 +6,7 @@ PYTEST_ARGS ?=
 BIN := $(VENV)/bin
 CART := models/shopping_cart
 
-.PHONY: demo test test-fast test-generation test-long lint clean
+.PHONY: demo test test-fast test-generation test-long lint notebooks clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -35,6 +35,15 @@ lint: $(VENV)/.installed-lint
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -c 'from tests.test_rooms import test_sizes; test_sizes()'
+
+# as .ipynb and HTML with their pictures; jupytext runs them, from here, in a kernel of its own Python
+notebooks: $(VENV)/.installed-docs
+	mkdir -p out/notebooks
+	for notebook in analysis/notebooks/*.py; do \
+	    page=out/notebooks/$$(basename $$notebook .py).ipynb; \
+	    $(BIN)/jupytext --to ipynb --set-kernel python3 --execute --run-path . --output $$page $$notebook \
+	        && $(BIN)/jupyter-nbconvert --to html $$page || exit 1; \
+	done
 
 clean:
 	rm -rf .venv .venv-next build out *.egg-info

@@ -35,6 +35,7 @@ from .posterior import identify as identify
 from .posterior import learned_library as learned_library
 from .posterior import library_probabilities as library_probabilities
 from .posterior import load_posterior as load_posterior
+from .posterior import loo_pit as loo_pit
 from .posterior import save_posterior as save_posterior
 from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene

@@ -20,6 +20,7 @@ LONGEST = (
     "criticism/test_revision.py",
     "criticism/test_revision_pivots.py",
     "domains/test_namo.py",
+    "test_notebooks.py",
     "sampling/test_updating.py",
     "sampling/test_fitting.py",
     "modes/test_joint_search.py",

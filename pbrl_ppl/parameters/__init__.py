@@ -20,6 +20,7 @@ from pbrl_ppl.parameters.priors import (
 from pbrl_ppl.parameters.wheel_symmetry import (
     MIXED,
     Wheel,
+    beside,
     evened,
     fold_draws,
     fold_wheels,
@@ -39,6 +40,7 @@ __all__ = [
     "Layout",
     "Prior",
     "Wheel",
+    "beside",
     "box",
     "differentiate",
     "evened",

@@ -182,6 +182,33 @@ def likeliest(layout: Layout, phi: Array) -> Array:
     return fold_wheels(layout, phi)
 
 
+def beside(layout: Layout, phi: Array, others: Array) -> Array:
+    """Describe every wheel as others are described, where its prior cannot tell that apart.
+
+    Parameters
+    ----------
+    layout : Layout
+        Says which bodies' wheels are unknown, and their prior.
+    phi : ndarray
+        Draws to be described, shape (draw, p).
+    others : ndarray
+        Draws whose mean each is to be nearest to, shape (other, p).
+    """
+    for wheel in wheels(layout):
+        if wheel.period < 4:
+            centre = _points(others[:, list(wheel.places)]).mean(axis=0)
+            equal = np.array([wheel.turned(phi, turns) for turns in range(0, 4, wheel.period)])
+            off = ((_points(equal[..., list(wheel.places)]) - centre) ** 2).sum(axis=-1)
+            phi = equal[off.argmin(axis=0), np.arange(len(phi))]
+    return phi
+
+
+def _points(values: Array) -> Array:
+    """Wheels (..., 3) as points (..., 4) that are near where the wheels are alike."""
+    angle = values[..., 0]
+    return np.stack([np.cos(angle), np.sin(angle), values[..., 1], values[..., 2]], axis=-1)
+
+
 def redescribed(layout: Layout, phi: Array, rng: np.random.Generator) -> Array:
     """Draw each wheel's description anew from the prior, given which wheel it is.
 

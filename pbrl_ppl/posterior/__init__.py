@@ -3,14 +3,16 @@
 from pbrl_ppl.posterior.comparison import Comparison, compare
 from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
 from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
+from pbrl_ppl.posterior.loo_pit import loo_pit
 from pbrl_ppl.posterior.origin import problem_of, versions
+from pbrl_ppl.posterior.predictions import predicted_rows
+from pbrl_ppl.posterior.prior_groups import prior_groups
 from pbrl_ppl.posterior.record import (
     MIN_ESS,
     checked,
     complete,
     evaluate,
     parameter_draws,
-    predictive_rows,
 )
 from pbrl_ppl.posterior.recording import both_recordings, recorded, recording
 from pbrl_ppl.posterior.store import (
@@ -51,8 +53,10 @@ __all__ = [
     "learned_library",
     "library_probabilities",
     "load_posterior",
+    "loo_pit",
     "parameter_draws",
-    "predictive_rows",
+    "predicted_rows",
+    "prior_groups",
     "problem_of",
     "recorded",
     "recording",

@@ -1,4 +1,4 @@
-"""The record of a fit: predictions, likelihoods, units, origin and convergence."""
+"""The record of a fit: predictions, likelihoods, prior, units, origin and convergence."""
 
 from __future__ import annotations
 
@@ -17,6 +17,8 @@ from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.origin import origin
+from pbrl_ppl.posterior.predictions import predictive_rows
+from pbrl_ppl.posterior.prior_groups import prior_groups
 from pbrl_ppl.posterior.recording import recording
 from pbrl_ppl.posterior.store import (
     convergence,
@@ -30,7 +32,6 @@ Array = NDArray[np.float64]
 
 #: What a posterior needs before its summaries can be relied on (Vehtari et al., 2021).
 MAX_RHAT, MIN_ESS = 1.01, 400
-_PREDICTIVE_DRAWS = 50
 #: Draws are simulated in groups: of so many, or more if that makes fewer transitions.
 _DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE = 64, 20_000
 #: With fewer, nothing can be said of convergence.
@@ -42,7 +43,7 @@ _STUCK, _NEAR = 0.5, 0.01
 def complete(
     problem: Problem, trace: Any, *, seed: int, method: str, asked: int | None = None
 ) -> Any:
-    """Add to a trace what the posterior file must hold: likelihood, predictions, units, origin.
+    """Add to a trace what the posterior file must hold: likelihood, predictions, prior, origin.
 
     Parameters
     ----------
@@ -66,12 +67,14 @@ def complete(
     phi, sigma = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
     chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
     rng = np.random.default_rng(seed)
-    likelihood, predictive = evaluate(problem, phi, sigma, predictive_rows(chains * n), rng)
+    rows = predictive_rows(chains, n, problem.measured.size)
+    likelihood, predictive = evaluate(problem, phi, sigma, rows.ravel(), rng)
     data = groups(trace)
+    posterior = _with_units(problem, posterior)
     dims = ("transition", "step", "body", "state")
     coords = {dim: data["observed_data"][dim].values for dim in dims}
     result = {
-        "posterior": _with_units(problem, posterior),
+        "posterior": posterior,
         "sample_stats": data["sample_stats"],
         "log_likelihood": xr.Dataset(
             {
@@ -87,9 +90,15 @@ def complete(
             },
         ),
         "posterior_predictive": xr.Dataset(
-            {"next_state": (("chain", "draw", *dims), predictive[None])},
-            {"chain": [0], "draw": np.arange(len(predictive)), **coords},
+            {
+                "next_state": (
+                    ("chain", "draw", *dims),
+                    predictive.reshape(*rows.shape, *predictive.shape[1:]),
+                )
+            },
+            {"chain": posterior["chain"], "draw": posterior["draw"][rows[0]], **coords},
         ),
+        **prior_groups(problem, posterior, phi, sigma, seed),
         "observed_data": xr.Dataset({"next_state": (dims, problem.measured)}, coords),
         "constant_data": data["constant_data"].merge(recording(problem)),
     }
@@ -97,11 +106,6 @@ def complete(
     if ATTRIBUTE in trace.attrs:
         idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
     return checked(problem, idata, asked)
-
-
-def predictive_rows(draws: int) -> NDArray[np.intp]:
-    """Indices of the draws, chains joined, that the stored predictions are made with."""
-    return np.linspace(0, draws - 1, min(_PREDICTIVE_DRAWS, draws)).astype(int)
 
 
 def evaluate(

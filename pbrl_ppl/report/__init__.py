@@ -1,8 +1,11 @@
 """Plots and reports; the only place that imports matplotlib."""
 
 from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
+from pbrl_ppl.report.effect_plots import plot_candidates
+from pbrl_ppl.report.error_plots import plot_errors, plot_rollout
 from pbrl_ppl.report.loop import Loop, check_folder, close_loop
-from pbrl_ppl.report.scene_plots import animate_plan
+from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
+from pbrl_ppl.report.scene_plots import animate_plan, draw_goal, draw_motion, draw_scene
 from pbrl_ppl.report.style import png
 from pbrl_ppl.report.words import unseen_in_words, verdict_in_words
 
@@ -11,9 +14,18 @@ __all__ = [
     "animate_plan",
     "check_folder",
     "close_loop",
+    "draw_goal",
+    "draw_motion",
+    "draw_scene",
     "plot_calibration",
+    "plot_candidates",
+    "plot_errors",
     "plot_prior_check",
+    "plot_rank",
+    "plot_rollout",
+    "plot_trace",
     "png",
+    "summary",
     "unseen_in_words",
     "verdict_in_words",
 ]

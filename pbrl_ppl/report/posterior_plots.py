@@ -44,39 +44,50 @@ def summary(posterior: Any) -> pd.DataFrame:
     return result
 
 
-def most_interesting(findings: Findings, table: pd.DataFrame | None = None) -> list[str]:
+def most_interesting(of: Any, table: pd.DataFrame | None = None) -> list[str]:
     """Parameters to look at first: those of added effects, then the worst by R-hat.
 
     Parameters
     ----------
-    findings : Findings
-        The posterior after revision is looked at.
+    of : Findings, InferenceData or DataTree
+        Findings, of which the posterior after revision is looked at, or a posterior.
     table : pandas.DataFrame, optional
         Its :func:`summary`, where that is at hand.
     """
-    table = summary(findings.posterior_after) if table is None else table
+    revised = isinstance(of, Findings)
+    table = summary(of.posterior_after if revised else of) if table is None else table
     own = [
         f"{added.effect}_{name}[{added.body}]"
-        for added in findings.added
+        for added in (of.added if revised else ())
         for name in added.parameters
     ]
     worst = table["r_hat"].fillna(np.inf).sort_values(ascending=False, kind="stable").index
     return list(dict.fromkeys([*(n for n in own if n in table.index), *worst]))[:MOST_PARAMETERS]
 
 
-def plot_trace(findings: Findings, parameters: Sequence[str] | None = None) -> Figure:
-    """ArviZ's trace of the parameters of most interest, after revision."""
-    return _arviz(findings, "trace", parameters)
+def plot_trace(of: Any, parameters: Sequence[str] | None = None) -> Figure:
+    """ArviZ's trace of some parameters, laid out alike on every ArviZ.
+
+    Parameters
+    ----------
+    of : Findings, InferenceData or DataTree
+        Findings, of which the posterior after revision is shown, or a posterior.
+    parameters : sequence of str, optional
+        Labels such as ``mass[cart]``; by default those of most interest: of added effects, and with
+        the worst R-hat.
+    """
+    return _arviz(of, "trace", parameters)
 
 
-def plot_rank(findings: Findings, parameters: Sequence[str] | None = None) -> Figure:
-    """ArviZ's rank picture of the parameters of most interest, after revision."""
-    return _arviz(findings, "rank", parameters)
+def plot_rank(of: Any, parameters: Sequence[str] | None = None) -> Figure:
+    """ArviZ's rank picture of some parameters; arguments as of :func:`plot_trace`."""
+    return _arviz(of, "rank", parameters)
 
 
-def _arviz(findings: Findings, kind: str, parameters: Sequence[str] | None) -> Figure:
-    names = most_interesting(findings) if parameters is None else list(parameters)
-    draws = scalars(findings.posterior_after)[names]
+def _arviz(of: Any, kind: str, parameters: Sequence[str] | None) -> Figure:
+    posterior = of.posterior_after if isinstance(of, Findings) else of
+    names = most_interesting(of) if parameters is None else list(parameters)
+    draws = scalars(posterior)[names]
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # ArviZ uses what newer Matplotlib deprecates, and a constant parameter makes it complain
         warnings.simplefilter("ignore")

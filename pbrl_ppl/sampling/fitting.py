@@ -226,9 +226,10 @@ def fit(
     Returns
     -------
     InferenceData or DataTree
-        Posterior, sample_stats, log_likelihood, posterior_predictive, observed_data and
-        constant_data, with units, and in ``attrs`` the scene, effects, method, versions, seed, the
-        hash of the data and the convergence. An interrupted run keeps the draws so far.
+        Posterior, sample_stats, log_likelihood, posterior_predictive (of up to 200 draws, under
+        their own labels), prior, log_prior, observed_data and constant_data, with units, and in
+        ``attrs`` the scene, effects, method, versions, seed, the hash of the data and the
+        convergence. An interrupted run keeps the draws so far.
 
     Raises
     ------

@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.model import Problem, build_model
-from pbrl_ppl.posterior import parameter_draws, predictive_rows
+from pbrl_ppl.posterior import parameter_draws
 
 Array = NDArray[np.float64]
+
+#: Draws of a trace at which it is looked whether bodies meet, at most.
+_LOOKED_AT = 50
 
 
 def joined_model(problem: Problem, phi: Array, sigma: Array) -> pm.Model | None:
@@ -44,7 +47,7 @@ def joined_model(problem: Problem, phi: Array, sigma: Array) -> pm.Model | None:
 def model_of_draws(problem: Problem, trace: Any) -> pm.Model | None:
     """As :func:`joined_model`, at some of a trace's draws."""
     phi, sigma = parameter_draws(problem, trace)
-    rows = predictive_rows(len(phi))
+    rows = np.linspace(0, len(phi) - 1, min(_LOOKED_AT, len(phi))).astype(int)
     return joined_model(problem, phi[rows], sigma[rows])
 
 

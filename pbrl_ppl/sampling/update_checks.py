@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, derived_velocities, measured_alone
-from pbrl_ppl.model import Problem
-from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, scene_of
+from pbrl_ppl.model import Problem, cells_of
+from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, recorded, scene_of
 from pbrl_ppl.state import STATE
 
 #: With fewer draws there is nothing to choose from.
@@ -104,3 +106,17 @@ def check_engine(idata: Any, problem: Problem) -> None:
             f" off by {off:.2g} or more): it was made with other effects or another"
             " version; fit all data anew"
         )
+
+
+def more_noise(problem: Problem, data: Mapping[str, xr.Dataset]) -> list[str]:
+    """Noise parameters of whole trajectories that all data have and the posterior has not."""
+    if problem.trajectories is None:
+        return []
+    history = recorded(problem.scene, data["constant_data"])
+    cells, own = cells_of(problem.scene, history), problem.noise_variables
+    return [
+        f"{name}[{dimension}]"
+        for name, dimensions in cells.variables.items()
+        for dimension in dimensions
+        if dimension not in own.get(name, ())
+    ]

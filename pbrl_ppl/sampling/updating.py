@@ -19,7 +19,6 @@ from pbrl_ppl.model import (
     Problem,
     along_trajectories,
     build_model,
-    cells_of,
     single_transitions,
 )
 from pbrl_ppl.posterior import (
@@ -33,9 +32,9 @@ from pbrl_ppl.posterior import (
     group,
     groups,
     parameter_draws,
-    predictive_rows,
+    predicted_rows,
+    prior_groups,
     problem_of,
-    recorded,
     recording,
     smoothed,
 )
@@ -46,6 +45,7 @@ from pbrl_ppl.sampling.update_checks import (
     check_engine,
     check_history,
     checked_log,
+    more_noise,
 )
 
 Array = NDArray[np.float64]
@@ -175,20 +175,20 @@ def _updated(
     heavy = np.isfinite(k) and k > _HEAVY
     # a chain that the data speak against sits where the others do not: then they must mix
     of_chains = weights.reshape(base.sizes["chain"], -1).sum(axis=1) * base.sizes["chain"]
-    more_noise = _more_noise(problem, data)
-    if min(share, of_chains.min()) >= _MOVE and not heavy and not more_noise:
-        result = _reweighted(base, weights, data, idata.attrs | together, rng)
+    louder = more_noise(problem, data)
+    if min(share, of_chains.min()) >= _MOVE and not heavy and not louder:
+        result = _reweighted(problem, base, weights, data, idata.attrs | together, rng)
         if not _worn(base, result):
             return checked(problem, result), how | {"did": "reweighted"}
     # from here on all data are needed
     whole = problem_of(from_groups(groups(idata) | data, idata.attrs | together), effects)
     # sets of parameters, and which bodies a joint joins, cannot be moved by steps
     chosen_among = whole.library is not None or whole.layout.discrete.any()
-    if share < _REFIT or heavy or chosen_among or more_noise:
+    if share < _REFIT or heavy or chosen_among or louder:
         why = f"their tail has a shape k of {k:.2g}" if heavy else f"worth {share:.1%} of the draws"
         why = f"the new data leave the posterior so far behind ({why})"
-        if more_noise:
-            why = f"the new data have noise that the posterior lacks ({', '.join(more_noise)}), so"
+        if louder:
+            why = f"the new data have noise that the posterior lacks ({', '.join(louder)}), so"
             whole = along_trajectories(single_transitions(whole), np.median(phi, axis=0))
         warnings.warn(
             f"update: {why} that all of them are"
@@ -211,20 +211,6 @@ def _updated(
     return result, how | {"did": "moved", "draws": draws}
 
 
-def _more_noise(problem: Problem, data: Mapping[str, xr.Dataset]) -> list[str]:
-    """Noise parameters of whole trajectories that all data have and the posterior has not."""
-    if problem.trajectories is None:
-        return []
-    history = recorded(problem.scene, data["constant_data"])
-    cells, own = cells_of(problem.scene, history), problem.noise_variables
-    return [
-        f"{name}[{dimension}]"
-        for name, dimensions in cells.variables.items()
-        for dimension in dimensions
-        if dimension not in own.get(name, ())
-    ]
-
-
 def _worn(base: xr.Dataset, result: Any) -> bool:
     """Whether the effective sample size fell below its minimum, and was above it before."""
     if float(base["min_ess"]) < MIN_ESS:
@@ -233,6 +219,7 @@ def _worn(base: xr.Dataset, result: Any) -> bool:
 
 
 def _reweighted(
+    problem: Problem,
     base: xr.Dataset,
     weights: Array,
     data: Mapping[str, xr.Dataset],
@@ -248,16 +235,18 @@ def _reweighted(
     drawn = base.isel(chain=xr.DataArray(np.arange(chains), dims="chain"), draw=where)
     drawn = drawn.assign_coords(chain=base["chain"], draw=base["draw"])
     own = ("log_likelihood", "log_weight", "next_state", "min_ess")
-    posterior = drawn[[str(v) for v in base.data_vars if v not in own]]
+    posterior = _used(drawn[[str(v) for v in base.data_vars if v not in own]])
+    vectors = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
     rows = _systematic(weights[base["row"].to_numpy()] + 1e-300, base.sizes["row"], rng)
     predictive = base["next_state"].isel(row=rows).rename(row="draw")
     predictive = predictive.assign_coords(draw=np.arange(len(rows))).expand_dims(chain=[0])
     result = {
         **data,
-        "posterior": _used(posterior),
+        "posterior": posterior,
         "sample_stats": xr.Dataset({"ancestor": where}, _chain_and_draw(base)),
         "log_likelihood": _used(drawn[["log_likelihood"]].rename(log_likelihood="next_state")),
         "posterior_predictive": _used(predictive.to_dataset()),
+        **prior_groups(problem, posterior, *vectors, int(attrs.get("seed", 0))),
         BASE: base,
     }
     return from_groups(result, {**attrs, "updates": "[]"})  # what they are is the caller's to say
@@ -288,15 +277,15 @@ def _base(idata: Any, problem: Problem) -> xr.Dataset:
     posterior = held["posterior"].transpose("chain", "draw", ...)
     chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
     likelihood = held["log_likelihood"]["next_state"].transpose("chain", "draw", "transition")
-    predictive = group(idata, "posterior_predictive")["next_state"]
-    predictive = predictive.stack(row=("chain", "draw")).transpose("row", *CELLS)
+    foreseen = group(idata, "posterior_predictive")
+    predictive = foreseen["next_state"].stack(row=("chain", "draw")).transpose("row", *CELLS)
     variables = {
         "min_ess": ((), float(idata.attrs.get("min_ess", 0.0))),
         "log_likelihood": (("chain", "draw", "transition"), likelihood.to_numpy()),
         "log_weight": (("chain", "draw"), np.zeros((chains, draws))),
         "next_state": (("row", *CELLS), predictive.to_numpy()),
     }
-    return posterior.assign(variables).assign_coords(row=predictive_rows(chains * draws))
+    return posterior.assign(variables).assign_coords(row=predicted_rows(posterior, foreseen))
 
 
 def _with_new(base: xr.Dataset, likelihood: Array, predictive: Array) -> xr.Dataset:

@@ -73,6 +73,8 @@ def test_groups_are_complete(model, fitted) -> None:
         "sample_stats",
         "log_likelihood",
         "posterior_predictive",
+        "prior",
+        "log_prior",
         "observed_data",
         "constant_data",
     }
@@ -133,10 +135,10 @@ def test_log_likelihood_is_pymc_s(model, fitted) -> None:
 
 def test_posterior_predictive_is_like_the_data(fitted) -> None:
     """Standardised by the draws: mean square near one in each measured dimension."""
-    predicted = group(fitted, "posterior_predictive")["next_state"].values[0]
+    predicted = group(fitted, "posterior_predictive")["next_state"].values.reshape(200, 40, 1, 1, 6)
     observed = group(fitted, "observed_data")["next_state"].values
     z = (observed - predicted.mean(axis=0)) / predicted.std(axis=0)
-    # 40 cells a dimension, 50 draws for the sd: chi-squared / 40 has sd 0.22; +-4 of it, 6 times
+    # 40 cells a dimension, 200 draws for the sd: chi-squared / 40 has sd 0.22; +-4 of it, 6 times
     mean_square = (z**2).mean(axis=(0, 1, 2))
     assert ((mean_square > 0.25) & (mean_square < 2.0)).all(), mean_square
 

@@ -20,7 +20,7 @@ from pbrl_ppl.errors import (
 from pbrl_ppl.history import History
 from pbrl_ppl.model import along_trajectories, build_model, physics_model
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import problem_of
+from pbrl_ppl.posterior import loo_pit, problem_of
 from pbrl_ppl.posterior.store import (
     az,
     convergence,
@@ -149,9 +149,9 @@ def test_stored_likelihoods_and_data_are_those_of_all_data(parts, one) -> None:
     observed = np.concatenate([a.segments().observed, b.segments().observed[:2]])
     np.testing.assert_array_equal(group(one, "observed_data")["next_state"].values, observed)
     predicted = group(one, "posterior_predictive")["next_state"]
-    assert predicted.shape == (1, 50, *observed.shape)
+    assert predicted.shape == (1, 200, *observed.shape)
     z = (observed - predicted.values[0].mean(axis=0)) / predicted.values[0].std(axis=0)
-    # 124 cells a dimension, 50 draws for each sd: chi-squared / 124 has sd 0.13; 5 of it
+    # 124 cells a dimension, 200 draws for each sd: chi-squared / 124 has sd 0.13; 5 of it
     assert (np.abs((z**2).mean(axis=(0, 1, 2)) - 1) < 0.65).all()
 
 
@@ -162,6 +162,17 @@ def test_arviz_takes_it(one) -> None:
         az.loo(one)
     # the group that the next update starts from is no obstacle
     assert "before_updates" in groups(one)
+
+
+def test_prior_groups_follow_the_draws(first, one) -> None:
+    """And predictions, which are now of no draws in particular, make no LOO-PIT."""
+    ancestor = group(one, "sample_stats")["ancestor"].values
+    was, now = (group(idata, "log_prior")["mass"].values for idata in (first, one))
+    for chain, chosen in enumerate(ancestor):
+        np.testing.assert_allclose(now[chain], was[chain][chosen])
+    np.testing.assert_array_equal(group(one, "prior")["mass"], group(first, "prior")["mass"])
+    with pytest.raises(PosteriorError, match=r"reweighted by update .*; fit all data anew"):
+        loo_pit(one)
 
 
 @pytest.mark.slow

@@ -1,0 +1,197 @@
+"""What ArviZ wants of a posterior: prior, its density, predictions that belong to draws."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import xarray as xr
+from pymc.stats import compute_log_prior
+
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.parameters import wheels
+from pbrl_ppl.posterior import from_groups, group, groups, loo_pit, predicted_rows
+from pbrl_ppl.posterior.predictions import predictive_rows
+from pbrl_ppl.posterior.prior_groups import prior_groups
+from pbrl_ppl.posterior.store import DATATREE, az, load_posterior, save_posterior
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
+from tests.helpers.stacks import GENERATIONS, SCENE, file, fitted, history
+
+
+@pytest.fixture(scope="module")
+def idata(tmp_path_factory):
+    """A puck's posterior, written and read; 500 draws of each of 2 chains."""
+    path = tmp_path_factory.mktemp("arviz") / "puck.nc"
+    save_posterior(fitted(), path)
+    return load_posterior(path)
+
+
+@pytest.fixture(scope="module")
+def of_vx(idata):
+    """The draws that have predictions, and of these what concerns one state: see the notebooks."""
+    aligned = idata.sel(draw=idata["posterior_predictive"]["draw"].values)
+    return aligned.sel(state="vx").isel(step=0, body=0)
+
+
+# what failed before there were the groups, by the generation that has it
+def prior_against_posterior(idata, of_vx):
+    return az.plot_prior_posterior(idata, var_names=["mass"])
+
+
+def bayes_factor(idata, of_vx):
+    name = {"var_names": "mass"} if DATATREE else {"var_name": "mass"}
+    return az.plot_bf(idata, ref_val=2.0, **name)
+
+
+def power_scaling(idata, of_vx):
+    table = az.psense_summary(idata)
+    assert table.loc["mass[puck]", "prior"] < table.loc["mass[puck]", "likelihood"]
+    return az.plot_psense_dist(idata, var_names=["mass"])
+
+
+def pit(idata, of_vx):
+    return az.plot_loo_pit(of_vx) if DATATREE else az.plot_loo_pit(of_vx, y="next_state")
+
+
+def predictive_pit(idata, of_vx):
+    return az.plot_ppc_pit(of_vx)
+
+
+def predictive_interval(idata, of_vx):
+    return az.plot_ppc_interval(of_vx)
+
+
+def expectations(idata, of_vx):
+    return az.loo_metrics(of_vx)
+
+
+BOTH = (bayes_factor, pit)
+NEWER = (
+    prior_against_posterior,
+    power_scaling,
+    predictive_pit,
+    predictive_interval,
+    expectations,
+)
+
+
+@pytest.mark.parametrize("function", (*BOTH, *NEWER) if DATATREE else BOTH)
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::UserWarning")  # ArviZ's own
+def test_arviz_takes_it(function, idata, of_vx) -> None:
+    assert function(idata, of_vx) is not None
+    plt.close("all")
+
+
+def test_prior_is_pymc_s(idata) -> None:
+    """Its density against PyMC's; its draws against their law, false alarm 1e-4 each."""
+    model = physics_model(SCENE, history(1))
+    theirs = compute_log_prior(idata, model=model, extend_inferencedata=False, progressbar=False)
+    posterior, prior, density = (group(idata, g) for g in ("posterior", "prior", "log_prior"))
+    for name in posterior.data_vars:
+        np.testing.assert_allclose(density[name], theirs[name])
+        assert density[name].dims == prior[name].dims == posterior[name].dims
+        assert prior[name].attrs == posterior[name].attrs
+    for each in (prior, density):
+        assert each.sizes == posterior.sizes
+    z = (np.log(prior["mass"].values.ravel()) - 1.0) / 1.5
+    assert abs(z.mean()) < 4 / np.sqrt(1000)
+    assert abs(z.std() - 1) < 4 / np.sqrt(2000)
+
+
+def test_prior_of_a_wheel_is_described_like_the_posterior() -> None:
+    """Its angle is within an eighth of a turn of the posterior's, where every one is equal."""
+    scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
+    problem = physics_model(scene, simulated_history(scene, CART, seed=1)).problem
+    draws = 400
+    phi = np.tile(problem.layout.to_vector(CART), (draws, 1))
+    sigma = np.full((draws, 6), 0.01)
+    named = problem.named(phi, sigma)
+    posterior = xr.Dataset({n: (("chain", "draw", f"{n}_of"), v[None]) for n, v in named.items()})
+    made = prior_groups(problem, posterior, phi, sigma, seed=1)
+    angle, x, y = (made["prior"][name].values.ravel() for name in ("w_theta", "mu_x", "mu_y"))
+    (wheel,) = wheels(problem.layout)
+    assert wheel.period == 1
+    assert (np.cos(angle - CART["w_theta"]) > 0).all()
+    assert (x > y).mean() == pytest.approx(0.5, abs=0.25)  # frictions as they come
+    # descriptions are equally probable, so that the density at the draws is the declared one
+    np.testing.assert_allclose(
+        made["log_prior"]["mu_x"].values.ravel(), problem.layout.log_prior(phi)[:, 4]
+    )
+
+
+def test_predictions_belong_to_draws(idata) -> None:
+    """As many of each chain, at the draws that their labels name: residuals are of that noise."""
+    posterior, predictive = group(idata, "posterior"), group(idata, "posterior_predictive")
+    assert dict(predictive.sizes) | {"chain": 2, "draw": 100} == dict(predictive.sizes)
+    rows = predicted_rows(posterior, predictive)
+    sigma = posterior["sigma"].values.reshape(1000, -1)
+    np.testing.assert_array_equal(
+        posterior["sigma"].sel(draw=predictive["draw"]).values.reshape(200, -1), sigma[rows]
+    )
+    problem = physics_model(SCENE, history(1)).problem
+    phi = posterior["mass"].values.reshape(1000, 1)[rows]
+    predicted = predictive["next_state"].values.reshape(200, *problem.measured.shape)
+    z = (predicted - problem.predict(phi)) / sigma[rows][:, None, None, None]
+    assert (z**2).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / z.size))
+
+
+@pytest.mark.parametrize("generation", GENERATIONS)
+def test_predictions_of_older_files(generation) -> None:
+    """50 of them, of one chain for all."""
+    there = load_posterior(file(generation))
+    rows = predicted_rows(group(there, "posterior"), group(there, "posterior_predictive"))
+    np.testing.assert_array_equal(rows, np.linspace(0, 999, 50).astype(int))
+    assert ((loo_pit(there) >= 0) & (loo_pit(there) <= 1)).all()
+
+
+@pytest.mark.parametrize(
+    ("chains", "draws", "cells", "expected"),
+    [(4, 800, 2160, 50), (1, 800, 2160, 200), (30, 1900, 2160, 7), (4, 800, 66_000, 13),
+     (4, 20, 100, 20), (1, 1, 100, 1)],
+)  # fmt: skip
+def test_how_many_predictions(chains, draws, cells, expected) -> None:
+    rows = predictive_rows(chains, draws, cells)
+    assert rows.shape == (chains, expected)
+    assert (np.diff(rows, axis=1) > 0).all()
+    assert (rows[:, -1] == draws * np.arange(1, chains + 1) - 1).all()
+
+
+def test_loo_pit_is_arviz_s(idata, of_vx) -> None:
+    """Of one state, as far as 200 draws agree with 1000 in the weights."""
+    ours = loo_pit(idata)
+    if DATATREE:
+        theirs = az.loo_pit(of_vx)["next_state"].values
+    else:
+        theirs = az.loo_pit(of_vx, y="next_state")
+    assert ours.dims == ("transition", "step", "body", "state")
+    np.testing.assert_allclose(ours.sel(state="vx").values.ravel(), theirs, atol=0.05)
+
+
+def test_loo_pit_of_angles_and_gaps(idata) -> None:
+    """A turn more is the same angle; what was not measured has no place among predictions."""
+    data = groups(idata)
+    values = data["observed_data"]["next_state"].copy(deep=True)
+    values.loc[{"state": "theta"}] += 2 * np.pi
+    values.loc[{"state": "x", "transition": 3}] = np.nan
+    data["observed_data"] = values.to_dataset(name="next_state")
+    before, after = loo_pit(idata), loo_pit(from_groups(data, idata.attrs))
+    np.testing.assert_allclose(after.sel(state="theta"), before.sel(state="theta"))
+    assert np.isnan(after.sel(state="x", transition=3)).all()
+    assert int(np.isnan(after).sum()) == 1
+
+
+def test_prior_of_one_sigma_for_all() -> None:
+    """As the paper has it: a single number, whose median is the geometric mean."""
+    model = physics_model(SCENE, history(1), sigma="scalar")
+    problem = model.problem
+    phi, sigma = np.full((300, 1), 2.0), np.full((300, 6), 0.05)
+    named = {"mass": phi, "sigma": sigma[:, 0]}
+    dims = {"mass": ("chain", "draw", "body"), "sigma": ("chain", "draw")}
+    posterior = xr.Dataset({name: (dims[name], named[name][None]) for name in named})
+    made = prior_groups(problem, posterior, phi, sigma, seed=1)
+    assert made["prior"]["sigma"].shape == (1, 300)
+    theirs = compute_log_prior(
+        from_groups({"posterior": posterior}, {}), model=model, extend_inferencedata=False,
+        progressbar=False,
+    )  # fmt: skip
+    np.testing.assert_allclose(made["log_prior"]["sigma"], theirs["sigma"])
