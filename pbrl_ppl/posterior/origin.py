@@ -101,7 +101,7 @@ def problem_of(
         segments = Segments(start, actions, observed, none, none, actions)
         median, spread = sigma_prior(Observations(values, columns), segments)
     noise = Noise(
-        scalar="state" not in group(idata, "posterior")["sigma"].dims,
+        scalar=group(idata, "posterior")["sigma"].ndim == 2,  # chain and draw
         nu=float(attrs["nu"]) if "nu" in attrs else None,
         prior=(tuple(float(value) for value in median), float(spread)),
     )

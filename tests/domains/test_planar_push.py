@@ -1,10 +1,12 @@
 """A measured block, pushed over a table by a finger: how far off its last pose is predicted."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pbrl_ppl.criticism import revise
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Transition, physics_model
 from pbrl_ppl.modes import Mode, find_mode
@@ -62,3 +64,18 @@ def test_the_fitted_friction_predicts_held_out_pushes(recorded) -> None:
     far, turned = last_pose_error(scene, test, mode.values)
     assert far <= 2.0
     assert turned <= 1.7
+
+
+@pytest.mark.long
+def test_the_loop_names_the_friction(recorded) -> None:
+    """Nothing of the table is declared; 3.2 mm and 2.1 degrees without it, fitted."""
+    declared, train, test = recorded
+    scene = declared.replace(bodies=tuple(replace(each, effects=()) for each in declared.bodies))
+    found = revise(scene, train, test, seed=1, method="laplace")
+    assert (found.verdict, [added.effect for added in found.added]) == (
+        "effects-added",
+        ["sliding_friction"],
+    )
+    after = found.after.rollout_rmse
+    assert 1e3 * np.hypot(after["x"], after["y"]) <= 1.6
+    assert np.degrees(after["theta"]) <= 1.45
