@@ -96,7 +96,6 @@ class Effects:
     dead_zone: float = 0.0  # N
     mass_change: tuple[float, float, float] = (1.0, 0.0, 0.0)  # factor, from trajectory, from s
     hidden_obstacle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # disc: x, y, radius (m)
-    wheel: tuple[float, ...] = (0.0,) * 5  # x, y (m), theta (rad), mu_x, mu_y
     sensor_bias: tuple[float, ...] = (0.0,) * 6  # m, m, rad, m/s, m/s, rad/s
     heavy_tails: float = 0.0  # reciprocal of the degrees of freedom of the noise
     sensor_scale: tuple[float, float] = (1.0, 1.0)  # of lengths and of angles
@@ -175,7 +174,6 @@ def rollout(
     if setup.hinge is None and (effects.pivot_friction or effects.pivot_damping):
         raise ValueError("pivot_friction and pivot_damping act in a hinge, and the setup has none")
     factor, loaded_from, loaded_at = effects.mass_change
-    wheel = Wheel(*effects.wheel) if any(effects.wheel) else setup.wheel
 
     # Box2D kicks, then drifts. With positions held half a step ahead of the velocities that is the
     # leapfrog, of second order; read without it, positions are half a step's way too far.
@@ -249,8 +247,8 @@ def rollout(
                 v *= 1 - min(1.0, effects.stiction_patch * NORMAL_GRAVITY * step / (abs(v) or 1.0))
             if effects.sliding_friction[0]:
                 v, omega = rub(*effects.sliding_friction, step, mass, inertia, v, omega)
-            if wheel is not None:
-                v, omega = roll(wheel, step, mass, inertia, turn, v, omega)
+            if setup.wheel is not None:
+                v, omega = roll(setup.wheel, step, mass, inertia, turn, v, omega)
             body.linearVelocity = (v.real * CM, v.imag * CM)
             body.angularVelocity = omega
             world.Step(step, 20, 10)

@@ -89,8 +89,8 @@ class EngineInput(NamedTuple):
     indices: NDArray[np.int64]
 
 
-def _sets(attached: Attached, column: str) -> bool:
-    """Whether an effect gives its body such a number, by a trial evaluation."""
+def _is_patch(attached: Attached) -> bool:
+    """Whether an effect puts friction under its body, by a trial evaluation."""
     stage = attached.effect.stage
     if not isinstance(stage, Properties):
         return False
@@ -98,7 +98,7 @@ def _sets(attached: Attached, column: str) -> bool:
     centre = {p.name: np.full((1, 1), p.prior.centre) for p in attached.effect.parameters}
     never = np.full((1, 1), np.inf)
     stage.modify(row, centre, Clock(never, never, never))
-    return bool(row[column].any())
+    return bool(row["patch_mu"].any())
 
 
 class EngineProperties:
@@ -142,10 +142,9 @@ class EngineProperties:
         )
         #: How many discs the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
-        #: Which bodies have friction under them, and which have wheels by an effect.
-        self.patches, self.wheels = (
-            tuple(sorted({bodies.index(own.body) for own in effects if _sets(own, column)}))
-            for column in ("patch_mu", "mu_x")
+        #: Which bodies have friction under them.
+        self.patches = tuple(
+            sorted({bodies.index(attached.body) for attached in effects if _is_patch(attached)})
         )
         self._bind_joints(scene, places)
 

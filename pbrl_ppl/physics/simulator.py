@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections import OrderedDict
+from collections.abc import Iterator
 from functools import cached_property, partial
 from typing import Any
 
@@ -16,10 +17,9 @@ from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, plain
-from pbrl_ppl.physics.choices import Choice, choices
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
 from pbrl_ppl.physics.inputs import after_recording
-from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
+from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT
@@ -32,6 +32,12 @@ _STEP, _FAR = 1e-5, 1e300
 _KEPT = 64
 #: Engine steps worth a thread of their own.
 _A_THREAD = 1000
+#: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
+Joined = tuple[tuple[int, int], ...]
+#: And whether there is friction under bodies: what worlds differ in.
+Choice = tuple[Joined, bool]
+#: Where there is nothing to choose.
+_ONE_WORLD: Choice = ((), False)
 
 
 class Simulator:
@@ -140,19 +146,34 @@ class Simulator:
         n, horizon, k = actions.shape[:3]
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         run = self._run_plain if self.path == "plain" else self._run_compiled
-        own = self._properties
-        if not (own.patches or own.wheels or given.indices.shape[1]):
-            run(Choice(), given, starts, inputs, out.reshape(-1, horizon, k, 6))
+        if not (self._properties.patches or given.indices.shape[1]):
+            run(_ONE_WORLD, given, starts, inputs, out.reshape(-1, horizon, k, 6))
         else:
-            for choice, rows in choices(own, given):
-                begin = starts[rows] if len(starts) > 1 else starts
+            for choice, rows in self._choices(given):
+                own = starts[rows] if len(starts) > 1 else starts
                 count = int(rows.sum())
                 part = np.full((count * n, horizon, k, 6), np.nan)
-                run(choice, EngineInput(*(array[rows] for array in given)), begin, inputs, part)
+                run(choice, EngineInput(*(array[rows] for array in given)), own, inputs, part)
                 out[rows] = part.reshape(count, n, horizon, k, 6)
         for i, sensor, values in self._properties.sensors(proposals):
             out[..., i, :] = sensor.measure(out[..., i, :], values)
         return out if phi.ndim == 2 else out[0]
+
+    def _choices(self, given: EngineInput) -> Iterator[tuple[Choice, Any]]:
+        """The worlds that proposals need, and which of them each is for.
+
+        What bodies an inferred joint holds makes another world; and so does friction under bodies,
+        whose joints would cost ten times as much as all else where the coefficient is zero, as it
+        is when candidates are scored.
+        """
+        sliding = given.bodies[..., list(self._properties.patches), COLUMN["patch_mu"]] > 0
+        proposals, joints, _ = given.indices.shape
+        indices = given.indices.reshape(proposals, 2 * joints)
+        keys = np.column_stack([sliding.any(axis=(1, 2)), indices])
+        choices, which = np.unique(keys, axis=0, return_inverse=True)
+        for i, (slides, *pairs) in enumerate(choices.astype(int).tolist()):
+            joined = tuple(zip(pairs[::2], pairs[1::2], strict=True))
+            yield (joined, bool(slides)), which.ravel() == i
 
     def _inputs(self, actions: Array) -> tuple[Array, Clock | None]:
         """Inputs of the rollout, and times of the intervals."""
@@ -237,8 +258,7 @@ class Simulator:
         The engine's error is a series in the substep (Richardson, 1911): two runs cancel its first
         term, three its second as well. Friction on the floor has kinks that a third run amplifies.
         """
-        own = self._properties
-        kinks = any(body.wheel for body in self.scene.moving) or own.patches or own.wheels
+        kinks = any(body.wheel for body in self.scene.moving) or self._properties.patches
         runs = (2 if kinks else 3) if self.extrapolate else 1
         counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
         # in closed form: a solver's last digits differ between machines
@@ -272,9 +292,9 @@ class Simulator:
         )
 
     def _new_world(self, choice: Choice) -> World:
+        joined, slides = choice
         own = self._properties
-        patches, wheels = own.patches if choice.slides else (), own.wheels if choice.rolls else ()
-        return World(self.scene, own.hinges, choice.joined, own.n_discs, patches, wheels)
+        return World(self.scene, own.hinges, joined, own.n_discs, own.patches if slides else ())
 
     def _run_plain(
         self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array
