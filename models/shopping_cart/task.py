@@ -19,7 +19,10 @@ TRUTH = {
     "mu_y": 0.45,
 }  # fmt: skip
 
+#: How far a start may be from the scene's (m, m, rad): episodes differ by it.
+SPREAD = 0.2
+
 
 def world(sigma: float = 0.0) -> pp.World:
     """The true cart; the paper's noise is 0 or 0.25 (m, rad, m/s, rad/s)."""
-    return pp.World(TASK, TRUTH, sigma=sigma)
+    return pp.World(TASK, TRUTH, sigma=sigma, spread=SPREAD)

@@ -6,6 +6,8 @@ from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, as_completed
 from pathlib import Path
 
+import numpy as np
+
 from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.episode import Episode
 from pbrl_ppl.agents.online import AnyWorld, run_episode
@@ -54,7 +56,7 @@ def run_episodes(
     Raises
     ------
     EpisodeError
-        If a file there is of another scene, agent, noise or limit of steps, or as
+        If a file there is of another scene, start, noise or limit of steps, or as
         :func:`run_episode`.
     OutputError
         If a file cannot be written.
@@ -132,4 +134,6 @@ def _same(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
                 f"{path}: this is an episode with {name} {got}, expected {value}; give another"
                 " folder"
             )
+    if not np.array_equal(episode.dataset["state"][0], world.reset(seed)):
+        raise EpisodeError(f"{path}: this episode starts elsewhere; give another folder")
     return episode

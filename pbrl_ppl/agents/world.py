@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.agents.task import Task
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.physics import touching
-from pbrl_ppl.planning import Dynamics
+from pbrl_ppl.planning import Dynamics, start_state
 
 Array = NDArray[np.float64]
 
@@ -59,13 +59,17 @@ class World:
         True effects beside those that the scene declares.
     sigma : float
         Noise of each observed state dimension (m, rad, m/s, rad/s).
+    spread : float
+        How far an episode's start may be from the task's, either way (m, m, rad): episodes without
+        noise differ by it alone.
     substeps : int, optional
         Engine steps an interval; the scene's by default.
 
     Raises
     ------
     EpisodeError
-        If ``sigma`` is negative or not finite.
+        If ``sigma`` or ``spread`` is negative or not finite, or a start is to be varied of bodies
+        that joints hold.
     ParameterError
         If a parameter is missing, unknown or impossible.
 
@@ -89,24 +93,35 @@ class World:
         effects: Any = (),
         *,
         sigma: float = 0.0,
+        spread: float = 0.0,
         substeps: int | None = None,
     ) -> None:
-        if not 0 <= sigma < np.inf:
-            raise EpisodeError(f"world: sigma is {sigma}, expected a finite number from 0 up")
-        self.task, self.sigma = task, float(sigma)
+        for name, value in (("sigma", sigma), ("spread", spread)):
+            if not 0 <= value < np.inf:
+                raise EpisodeError(f"world: {name} is {value}, expected a finite number from 0 up")
+        if spread and task.scene.joints:
+            raise EpisodeError("world: joints hold bodies of the scene at their start; spread is 0")
+        self.task, self.sigma, self.spread = task, float(sigma), float(spread)
         self._truth = Dynamics.known(task.scene, parameters, effects, threads=1, substeps=substeps)
         self.reset(0)
 
     def reset(self, seed: int) -> Array:
-        """Back to the start; the seed is that of the noise.
+        """Back to the start; the seed is that of the noise and the start.
 
         Returns
         -------
         ndarray
             The state, shape (body, 6), SI units.
+
+        Raises
+        ------
+        GoalError
+            If bodies lie inside each other there.
         """
         self._rng = np.random.default_rng([seed, 1])  # [seed, 0] is the agent's
-        self._state, self._last = self.task.start, self._truth.before
+        state = self.task.start.copy()
+        state[:, :3] += self._rng.uniform(-self.spread, self.spread, state[:, :3].shape)
+        self._state, self._last = start_state(self.task.scene, state), self._truth.before
         return self._state.copy()
 
     def step(self, action: Array) -> Outcome:

@@ -77,6 +77,14 @@ def test_noise_is_on_what_is_learned_from_alone() -> None:
         np.testing.assert_array_equal(exact.step(PUCK.wrenches(state)[0]).state, each.state)
 
 
+def test_starts_differ_by_seed() -> None:
+    world = World(PUCK, PUCK_TRUTH, spread=0.1)
+    first, other = world.reset(1), world.reset(2)
+    np.testing.assert_array_equal(world.reset(1), first)
+    assert (abs(first - PUCK.start)[:, :3] <= 0.1).all() and (first != other)[:, :3].all()
+    assert not first[:, 3:].any()
+
+
 def test_seeds_reproduce_an_episode() -> None:
     def run(seed: int):
         agent = PBRLAgent(PUCK, seed=seed, draws=4, nodes=1000)

@@ -54,6 +54,8 @@ def _strong() -> TrueModelAgent:
 def test_other_bad_requests() -> None:
     with pytest.raises(EpisodeError, match="sigma is -1"):
         World(PUCK, PUCK_TRUTH, sigma=-1.0)
+    with pytest.raises(EpisodeError, match="spread is nan"):
+        World(PUCK, PUCK_TRUTH, spread=np.nan)
     with pytest.raises(EpisodeError, match="steps is 0"):
         run_episode(TrueModelAgent(PUCK, PUCK_TRUTH), puck_world(), steps=0)
     with pytest.raises(EpisodeError, match="different tasks"):

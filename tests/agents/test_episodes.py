@@ -6,7 +6,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from pbrl_ppl.agents import Agent, Episode, TrueModelAgent, run_episode, run_episodes
+from pbrl_ppl.agents import Agent, Episode, TrueModelAgent, World, run_episode, run_episodes
 from pbrl_ppl.errors import EpisodeError
 from tests.helpers.tasks import PUCK, PUCK_TRUTH, puck_world
 
@@ -81,6 +81,8 @@ def test_finished_episodes_are_not_run_again(tmp_path) -> None:
         run_episodes({"true": known}, puck_world(0.25), [1], tmp_path, steps=30)
     with pytest.raises(EpisodeError, match=r"limit 30, expected 31"):
         run_episodes({"true": known}, puck_world(), [1], tmp_path, steps=31)
+    with pytest.raises(EpisodeError, match="starts elsewhere"):
+        run_episodes({"true": known}, World(PUCK, PUCK_TRUTH, spread=0.1), [1], tmp_path, steps=30)
 
 
 class Interrupted(Agent):
