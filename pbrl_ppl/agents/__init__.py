@@ -1,4 +1,4 @@
-"""Acting in a world: plan, look where that led, plan again."""
+"""Acting in a world: agents that plan, look where that led, and learn."""
 
 from pbrl_ppl.agents.acting import Acted, act
 from pbrl_ppl.agents.agent import Agent

@@ -48,6 +48,7 @@ class Agent(ABC):
         self._options = {"nodes": nodes, **options}
         self._rng = np.random.default_rng([seed, 0])  # [seed, 1] is the world's
         self._ahead = np.empty((0, len(task.scene.moving), 3))
+        self._last = np.zeros((len(task.scene.moving), 3))  # an actuator may remember it
         self.planned = False
 
     @property
@@ -97,20 +98,23 @@ class Agent(ABC):
         model = self.model
         self._ahead = self._ahead[:0] if model is None else self._planned(model, state)
         self.planned = len(self._ahead) > 0
-        if not self.planned:
-            return np.asarray(every[self._rng.integers(len(every))])
-        wanted, self._ahead = self._ahead[0], self._ahead[1:]
-        # a body's heading is not quite what the plan foretold, and with it the wrench
-        return np.asarray(every[np.argmin(((every - wanted) ** 2).sum(axis=(1, 2)))])
+        if self.planned:
+            wanted, self._ahead = self._ahead[0], self._ahead[1:]
+            # a body's heading is not quite what the plan foretold, and with it the wrench
+            chosen = int(np.argmin(((every - wanted) ** 2).sum(axis=(1, 2))))
+        else:
+            chosen = int(self._rng.integers(len(every)))
+        self._last = every[chosen]
+        return self._last.copy()
 
     def _planned(self, model: TransitionModel, state: Array) -> Array:
         """Wrenches ahead, shape (time, body, 3): those of before if they still lead to the goal."""
         task = self.task
         if len(self._ahead):
-            end = rollout(model, state, self._ahead)[:, -1]
+            end = rollout(model.after(self._last), state, self._ahead)[:, -1]
             if float(task.goal.shortfall(task.scene, end).mean()) <= 1.0:  # not where NaN
                 return self._ahead
-        found = plan(model, state, task.goal, task.actions, **self._options)
+        found = plan(model, state, task.goal, task.actions, before=self._last, **self._options)
         if found.stopped == "interrupted":  # the search keeps it to itself
             raise KeyboardInterrupt
         return found.wrenches if found.reached else found.wrenches[:1]

@@ -20,9 +20,9 @@ Array = NDArray[np.float64]
 _KIND = "episode"
 #: Variables of a file, and their dimensions.
 _DIMS = {
-    "state": ("time", "body", "state_name"),
-    "observed": ("interval", "body", "state_name"),
-    "action": ("interval", "body", "wrench_name"),
+    "states": ("time", "body", "state"),
+    "observed": ("interval", "body", "state"),
+    "action": ("interval", "body", "wrench"),
     "reward": ("time",),
     "bumped": ("interval",),
     "planned": ("interval",),
@@ -30,7 +30,7 @@ _DIMS = {
     "estimate": ("interval", "parameter"),
 }
 _UNITS = {
-    "state": ", ".join(STATE_UNITS),
+    "states": ", ".join(STATE_UNITS),
     "observed": ", ".join(STATE_UNITS),
     "action": ", ".join(WRENCH_UNITS),
     "reward": "m",
@@ -46,10 +46,10 @@ class Episode:
     dataset : xarray.Dataset
         With the variables
 
-        - ``state`` (time, body, state_name): where the bodies were, the start first (SI units);
-        - ``observed`` (interval, body, state_name): the ends of the intervals as the agent observed
+        - ``states`` (time, body, state): where the bodies were, the start first (SI units);
+        - ``observed`` (interval, body, state): the ends of the intervals as the agent observed
           them, with the world's noise;
-        - ``action`` (interval, body, wrench_name): held in the interval (N, N, N m);
+        - ``action`` (interval, body, wrench): held in the interval (N, N, N m);
         - ``reward`` (time,): minus the L2 distance from the goal (m);
         - ``bumped``, ``planned`` (interval,): whether a body touched something, and whether the
           action was planned rather than random;
@@ -108,7 +108,7 @@ class Episode:
         n, k = len(states) - 1, len(scene.moving)
         variables: dict[str, Any] = {
             **recorded,
-            "state": states,
+            "states": states,
             "observed": np.reshape(recorded["observed"], (n, k, len(STATE))),
             "action": np.reshape(recorded["action"], (n, k, len(WRENCH))),
             "estimate": np.reshape(np.array(believed, dtype=float), (n, len(labels))),
@@ -116,8 +116,8 @@ class Episode:
         coords = {
             "time": ("time", scene.time_step * np.arange(n + 1), {"units": "s"}),
             "body": [body.name for body in scene.moving],
-            "state_name": list(STATE),
-            "wrench_name": list(WRENCH),
+            "state": list(STATE),
+            "wrench": list(WRENCH),
             "parameter": np.array(labels, dtype=object),
         }
         given = {
@@ -219,7 +219,7 @@ class Episode:
         HistoryError
             If no action was taken.
         """
-        states = self.dataset["state"].to_numpy()
+        states = self.dataset["states"].to_numpy()
         action, observed = self.dataset["action"].to_numpy(), self.dataset["observed"].to_numpy()
         return from_segments(self.scene, states[:-1], action[:, None], observed[:, None])
 

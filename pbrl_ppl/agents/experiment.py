@@ -134,6 +134,6 @@ def _same(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
                 f"{path}: this is an episode with {name} {got}, expected {value}; give another"
                 " folder"
             )
-    if not np.array_equal(episode.dataset["state"][0], world.reset(seed)):
+    if not np.array_equal(episode.dataset["states"][0], world.reset(seed)):
         raise EpisodeError(f"{path}: this episode starts elsewhere; give another folder")
     return episode

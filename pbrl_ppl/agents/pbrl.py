@@ -37,7 +37,8 @@ class PBRLAgent(Agent):
     The posterior is fitted anew, for ``update`` reweights draws, which a few transitions without
     noise leave next to nothing of, and a fit's search for the mode takes a second or two; but only
     when there is something to learn: not while the model foretells what comes exactly, and within
-    its noise only when the data have grown by a share, ``growth``.
+    its noise only when the data have grown by a share, ``growth``. Each transition is one by
+    itself: an effect of the scene that remembers the command before sees none.
 
     Parameters
     ----------

@@ -32,7 +32,7 @@ def test_file(episode, tmp_path) -> None:
 def test_record(episode) -> None:
     data = episode.dataset
     assert data.sizes["time"] == episode.steps + 1
-    distance = PUCK.goal.distance(PUCK.scene, data["state"].to_numpy())
+    distance = PUCK.goal.distance(PUCK.scene, data["states"].to_numpy())
     np.testing.assert_allclose(data["reward"], -distance)
     padded = episode.rewards(40)
     assert padded.shape == (41,) and (padded[episode.steps :] == -distance[-1]).all()
@@ -42,7 +42,7 @@ def test_history_is_what_was_observed(episode) -> None:
     """Each transition from its exact state to a noisy one."""
     pieces = episode.history().segments()
     assert pieces.n == episode.steps
-    np.testing.assert_array_equal(pieces.start, episode.dataset["state"][:-1])
+    np.testing.assert_array_equal(pieces.start, episode.dataset["states"][:-1])
     np.testing.assert_array_equal(pieces.observed[:, 0], episode.dataset["observed"])
     np.testing.assert_array_equal(pieces.actions[:, 0], episode.dataset["action"])
 
