@@ -5,7 +5,7 @@
     python analysis/04_shopping_cart.py --workers 2
 
 Episodes that are there are not run again. A step is one action of 0.25 s. Curves are means over
-episodes with 95 % intervals (Student's t); a cart that has reached the goal stays there. The return
+episodes with 95 % intervals (bootstrap); a cart that has reached the goal stays there. The return
 is the sum of rewards over all steps, likewise.
 """
 
@@ -44,24 +44,24 @@ def agent(name: str, seed: int) -> pp.Agent:
 AGENTS = {name: partial(agent, name) for name in ("true", "pbrl", "oolwr", "lwr")}
 
 
-def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over the first axis, and half of its 95 % interval."""
-    mean, n = values.mean(axis=0), len(values)
-    return mean, stats.t.ppf(0.975, n - 1) * values.std(axis=0, ddof=1) / np.sqrt(n)
+def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean over the first axis, and the ends of its 95 % interval."""
+    found = stats.bootstrap((values,), np.mean, method="percentile", rng=np.random.default_rng(1))
+    return values.mean(axis=0), *found.confidence_interval
 
 
 def summary(episodes: list[pp.Episode], steps: int) -> dict[str, object]:
     """A row of the table."""
     rewards = np.array([episode.rewards(steps) for episode in episodes])
     reached = [episode.steps for episode in episodes if episode.reached]
-    total, half = interval(rewards.sum(axis=1))
+    total, low, high = interval(rewards.sum(axis=1))
     seconds = np.concatenate([episode.dataset["seconds"] for episode in episodes])
     return {
         "agent": episodes[0].agent,
         "reached": f"{len(reached)}/{len(episodes)}",
         "steps to goal (median)": f"{np.median(reached):.0f}" if reached else "-",
         "bumps (mean)": f"{np.mean([episode.bumps for episode in episodes]):.1f}",
-        "return (m)": f"{total:.0f} +- {half:.0f}",
+        "return (m)": f"{total:.0f} [{low:.0f}, {high:.0f}]",
         "final reward (m)": f"{rewards[:, -1].mean():.2f}",
         "s a step (median)": f"{np.median(seconds):.2f}",
     }
@@ -73,9 +73,9 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, default=80)
     parser.add_argument("--workers", type=int, default=1, help="processes")
-    parser.add_argument("--quick", action="store_true", help="two episodes of 6 steps, for CI")
+    parser.add_argument("--quick", action="store_true", help="two episodes of 4 steps, for CI")
     options = parser.parse_args()
-    episodes, steps = (2, 6) if options.quick else (options.episodes, options.steps)
+    episodes, steps = (2, 4) if options.quick else (options.episodes, options.steps)
     if episodes < 2:
         parser.error("--episodes: an interval needs at least 2")
     out = OUT.with_name("shopping_cart_quick") if options.quick else OUT
@@ -94,17 +94,15 @@ def main() -> None:
         print(f"\n4({panel}), sigma {sigma:g}, {episodes} episodes of at most {steps} steps")
         print(pd.DataFrame(rows).to_string(index=False), flush=True)
         for each in done.values():
-            mean, half = interval(np.array([episode.rewards(steps) for episode in each]))
+            mean, low, high = interval(np.array([episode.rewards(steps) for episode in each]))
             (line,) = axis.plot(mean, label=each[0].agent)
-            axis.fill_between(
-                np.arange(len(mean)), mean - half, mean + half, color=line.get_color(), alpha=0.2,
-                linewidth=0,
-            )  # fmt: skip
+            steps_done = np.arange(len(mean))
+            axis.fill_between(steps_done, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
         noise = f"noise of {sigma:g}" if sigma else "without noise"
         axis.set_title(f"4({panel}) {noise}", loc="left", fontsize=10)
         axis.set_xlabel("steps")
     axes[0].set_ylabel("reward: minus the distance to the goal (m)")
-    axes[1].legend(frameon=False)
+    axes[1].legend(frameon=False, loc="center right")
     figure.savefig(out / "figure_4ab.png", dpi=120)
     print(f"\n{out / 'figure_4ab.png'}")
 
