@@ -102,7 +102,7 @@ def main() -> None:
         axis.set_title(f"4({panel}) {noise}", loc="left", fontsize=10)
         axis.set_xlabel("steps")
     axes[0].set_ylabel("reward: minus the distance to the goal (m)")
-    axes[1].legend(frameon=False, loc="center right")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
     figure.savefig(out / "figure_4ab.png", dpi=120)
     print(f"\n{out / 'figure_4ab.png'}")
 
