@@ -1,7 +1,18 @@
 """The public names, each with the room that it comes from."""
 
 from .agents import Acted as Acted
+from .agents import Agent as Agent
+from .agents import Episode as Episode
+from .agents import LWRAgent as LWRAgent
+from .agents import OOLWRAgent as OOLWRAgent
+from .agents import Outcome as Outcome
+from .agents import PBRLAgent as PBRLAgent
+from .agents import Task as Task
+from .agents import TrueModelAgent as TrueModelAgent
+from .agents import World as World
 from .agents import act as act
+from .agents import run_episode as run_episode
+from .agents import run_episodes as run_episodes
 from .criticism import Findings as Findings
 from .criticism import PriorCheck as PriorCheck
 from .criticism import prior_predictive_check as prior_predictive_check

@@ -59,3 +59,7 @@ class FitError(PbrlError, ValueError):
 
 class GoalError(PbrlError, ValueError):
     """An invalid goal, start or set of actions."""
+
+
+class EpisodeError(PbrlError, ValueError):
+    """A world, an agent or an episode file that does not fit its task."""

@@ -72,8 +72,8 @@ class Experience:
         if key not in self._models:
             x, y = self._joined()
             scale = x.std(axis=0) if self._standardise else np.ones(x.shape[1])
-            # a constant column says nothing of distances
-            scale = np.where(scale > 1e-9 * abs(x).max(axis=0), scale, 1.0)
+            # a constant column says nothing of distances; one of rounding errors is constant, too
+            scale = np.where(scale > 1e-9 * abs(x).max(), scale, 1.0)
             rows = self._rows[key]
             self._models[key] = Regression(x[rows], y[rows], scale=scale, **self._options)
         return self._models[key]

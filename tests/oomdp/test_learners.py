@@ -257,6 +257,28 @@ def test_bad_transitions() -> None:
         model.noisy(good[0][None], np.random.default_rng(1))
 
 
+def test_rounding_errors_are_no_input() -> None:
+    """Pushed along its own x alone; what is left across it is rounding, after two turns."""
+    rng = np.random.default_rng(1)
+    states, _, _ = transitions(FREE, 40, 1, low=(-2, -2), high=(2, 2))
+
+    def pushed(heading: np.ndarray, force: np.ndarray) -> np.ndarray:
+        along = np.stack([np.cos(heading), np.sin(heading), np.zeros_like(heading)], axis=-1)
+        return (force[:, None] * along)[:, None]
+
+    force = rng.choice([-4.0, 0.0, 4.0], 40)
+    wrenches, after = pushed(states[:, 0, 2], force), states.copy()
+    after[:, :, 3:5] += abs(wrenches[..., :2])  # not linear: distances matter
+    states[..., 2] += 4 * np.pi
+    after[..., 2] += 4 * np.pi
+    model = taught(LWR(FREE), states, wrenches, after)
+    heading = np.linspace(-3.0, 3.0, 25)
+    same = np.zeros((25, 1, 6))
+    same[:, 0, 2] = heading + 4 * np.pi
+    speeds = predicted(model, same, pushed(heading, np.full(25, 4.0)))[:, 0, 3:5]
+    np.testing.assert_allclose(np.hypot(*speeds.T), np.hypot(*speeds[0]), rtol=1e-6)
+
+
 @pytest.mark.parametrize(
     "wrong", [{"neighbours": 0}, {"neighbours": 2.5}, {"bandwidth": 0.0}, {"ridge": np.nan}]
 )

@@ -1,0 +1,111 @@
+"""Figures 4(a) and 4(b) of the paper: four agents learn to push a shopping cart.
+
+    python analysis/04_shopping_cart.py            # ten episodes of each, in out/shopping_cart
+    python analysis/04_shopping_cart.py --quick    # two short ones, for CI
+    python analysis/04_shopping_cart.py --workers 2
+
+Episodes that are there are not run again. A step is one action of 0.25 s. Curves are means over
+episodes with 95 % intervals (bootstrap); a cart that has reached the goal stays there. The return
+is the sum of rewards over all steps, likewise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+from scipy import stats
+
+import pbrl_ppl as pp
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "models" / "shopping_cart"))
+from task import TASK, TRUTH, world
+
+SIGMAS = {"a": 0.0, "b": 0.25}
+OUT = Path("out") / "shopping_cart"
+#: States that a search generates at most, for all agents; the true model's plan takes 3500.
+NODES = 10_000
+
+
+def agent(name: str, seed: int) -> pp.Agent:
+    """One of the four: PBRL with the MAP, OO-LWR and LWR with Table 2's parameters."""
+    if name == "true":
+        return pp.TrueModelAgent(TASK, TRUTH, seed=seed, nodes=NODES)
+    kinds = {"pbrl": pp.PBRLAgent, "oolwr": pp.OOLWRAgent, "lwr": pp.LWRAgent}
+    return kinds[name](TASK, seed=seed, nodes=NODES)
+
+
+AGENTS = {name: partial(agent, name) for name in ("true", "pbrl", "oolwr", "lwr")}
+
+
+def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean over the first axis, and the ends of its 95 % interval."""
+    found = stats.bootstrap((values,), np.mean, method="percentile", rng=np.random.default_rng(1))
+    return values.mean(axis=0), *found.confidence_interval
+
+
+def summary(episodes: list[pp.Episode], steps: int) -> dict[str, object]:
+    """A row of the table."""
+    rewards = np.array([episode.rewards(steps) for episode in episodes])
+    reached = [episode.steps for episode in episodes if episode.reached]
+    total, low, high = interval(rewards.sum(axis=1))
+    seconds = np.concatenate([episode.dataset["seconds"] for episode in episodes])
+    return {
+        "agent": episodes[0].agent,
+        "reached": f"{len(reached)}/{len(episodes)}",
+        "steps to goal (median)": f"{np.median(reached):.0f}" if reached else "-",
+        "bumps (mean)": f"{np.mean([episode.bumps for episode in episodes]):.1f}",
+        "return (m)": f"{total:.0f} [{low:.0f}, {high:.0f}]",
+        "final reward (m)": f"{rewards[:, -1].mean():.2f}",
+        "s a step (median)": f"{np.median(seconds):.2f}",
+    }
+
+
+def main() -> None:
+    """Run what is missing, print the table, draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--episodes", type=int, default=10)
+    parser.add_argument("--steps", type=int, default=80)
+    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--quick", action="store_true", help="two episodes of 4 steps, for CI")
+    options = parser.parse_args()
+    episodes, steps = (2, 4) if options.quick else (options.episodes, options.steps)
+    if episodes < 2:
+        parser.error("--episodes: an interval needs at least 2")
+    out = OUT.with_name("shopping_cart_quick") if options.quick else OUT
+    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), sharey=True, layout="constrained")
+    for (panel, sigma), axis in zip(SIGMAS.items(), axes, strict=True):
+        run = partial(
+            pp.run_episodes, AGENTS, world(sigma), range(1, episodes + 1), out / f"sigma_{sigma:g}",
+            steps=steps, progress=partial(print, flush=True),
+        )  # fmt: skip
+        if options.workers > 1:
+            with ProcessPoolExecutor(options.workers) as executor:
+                done = run(executor=executor)
+        else:
+            done = run()
+        rows = [summary(each, steps) for each in done.values()]
+        print(f"\n4({panel}), sigma {sigma:g}, {episodes} episodes of at most {steps} steps")
+        print(pd.DataFrame(rows).to_string(index=False), flush=True)
+        for each in done.values():
+            mean, low, high = interval(np.array([episode.rewards(steps) for episode in each]))
+            (line,) = axis.plot(mean, label=each[0].agent)
+            steps_done = np.arange(len(mean))
+            axis.fill_between(steps_done, low, high, color=line.get_color(), alpha=0.2, linewidth=0)
+        noise = f"noise of {sigma:g}" if sigma else "without noise"
+        axis.set_title(f"4({panel}) {noise}", loc="left", fontsize=10)
+        axis.set_xlabel("steps")
+    axes[0].set_ylabel("reward: minus the distance to the goal (m)")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
+    figure.savefig(out / "figure_4ab.png", dpi=120)
+    print(f"\n{out / 'figure_4ab.png'}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,139 @@
+"""Many episodes: agents by seeds, over any executor; what is finished is kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, as_completed
+from pathlib import Path
+
+import numpy as np
+
+from pbrl_ppl.agents.agent import Agent
+from pbrl_ppl.agents.episode import Episode
+from pbrl_ppl.agents.online import AnyWorld, run_episode
+from pbrl_ppl.errors import EpisodeError
+
+#: Makes an agent of a seed.
+MakeAgent = Callable[[int], Agent]
+
+
+def run_episodes(
+    agents: Mapping[str, MakeAgent],
+    world: AnyWorld,
+    seeds: Iterable[int],
+    folder: str | Path,
+    *,
+    steps: int = 100,
+    executor: Executor | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> dict[str, list[Episode]]:
+    """Run each agent with each seed; skip the episodes whose files are in the folder.
+
+    Parameters
+    ----------
+    agents : mapping
+        What makes an agent of a seed, by the name of its files: ``{"pbrl": make_pbrl}``. An
+        executor of processes needs functions that can be pickled, such as ``functools.partial`` of
+        one in a module.
+    world : World
+        Each episode resets it, or a copy of it.
+    seeds : iterable of int
+        One episode each.
+    folder : str or Path
+        Of the files, ``<name>-<seed>.nc``; made if it is not there.
+    steps : int
+        The most actions of an episode.
+    executor : Executor, optional
+        Where the episodes run: processes, threads, Dask. Without it, here, one after the other.
+    progress : callable, optional
+        Told of each episode that is finished.
+
+    Returns
+    -------
+    dict
+        Episodes of each agent, in the order of the seeds.
+
+    Raises
+    ------
+    EpisodeError
+        If a file there is of another scene, start, noise or limit of steps, or as
+        :func:`run_episode`.
+    OutputError
+        If a file cannot be written.
+    KeyboardInterrupt
+        If it is interrupted: the files of finished episodes stay, and the same call goes on.
+
+    Examples
+    --------
+    ::
+
+        agents = {"pbrl": lambda seed: pp.PBRLAgent(task, seed=seed)}
+        with ThreadPoolExecutor(2) as executor:
+            done = pp.run_episodes(agents, world, range(10), "out/cart", executor=executor)
+    """
+    folder, seeds = Path(folder), list(seeds)
+    folder.mkdir(parents=True, exist_ok=True)
+    tell = progress or (lambda _: None)
+    paths = {(name, seed): folder / f"{name}-{seed}.nc" for name in agents for seed in seeds}
+    found = {
+        key: _same(path, world, steps, key[1]) for key, path in paths.items() if path.is_file()
+    }
+    count = len(found)
+    if count:
+        tell(f"{count} of {len(paths)} episodes are in {folder}")
+
+    def finished(key: tuple[str, int], episode: Episode) -> None:
+        found[key] = episode
+        tell(f"{len(found)}/{len(paths)} {in_words(episode)}")
+
+    left = [key for key in paths if key not in found]
+    try:
+        if executor is None:
+            for key in left:
+                finished(key, _played(agents[key[0]], world, key[1], steps, paths[key]))
+        else:
+            futures = {
+                executor.submit(_played, agents[key[0]], world, key[1], steps, paths[key]): key
+                for key in left
+            }
+            try:
+                for future in as_completed(futures):
+                    finished(futures[future], future.result())
+            finally:
+                for future in futures:
+                    future.cancel()
+    except KeyboardInterrupt:
+        tell(f"interrupted: {len(found)} of {len(paths)} episodes are in {folder}; run it again")
+        raise
+    return {name: [found[name, seed] for seed in seeds] for name in agents}
+
+
+def in_words(episode: Episode) -> str:
+    """One line: who, and how it went."""
+    how = "reached the goal" if episode.reached else "did not reach the goal"
+    return (
+        f"{episode.agent}, seed {episode.seed}: {how} in {episode.steps} steps,"
+        f" {episode.bumps} with bumps"
+    )
+
+
+def _played(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path: Path) -> Episode:
+    """Run one episode and save it, where it ran."""
+    episode = run_episode(make(seed), world, steps=steps, seed=seed)
+    episode.save(path)
+    return episode
+
+
+def _same(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
+    """An episode that was run before, of the same experiment."""
+    episode = Episode.load(path, world.task.scene)
+    expected = {"seed": seed, "sigma": world.sigma, "limit": steps}
+    for name, value in expected.items():
+        if (got := episode.dataset.attrs[name]) != value:
+            raise EpisodeError(
+                f"{path}: this is an episode with {name} {got}, expected {value}; give another"
+                " folder"
+            )
+    if not np.array_equal(episode.dataset["states"][0], world.reset(seed)):
+        raise EpisodeError(f"{path}: this episode starts elsewhere; give another folder")
+    return episode

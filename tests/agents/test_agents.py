@@ -1,0 +1,104 @@
+"""Four agents in worlds whose truth is known."""
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.agents import (
+    LWRAgent,
+    OOLWRAgent,
+    PBRLAgent,
+    Task,
+    TrueModelAgent,
+    World,
+    run_episode,
+)
+from pbrl_ppl.errors import FitError, GoalError
+from pbrl_ppl.planning import ActionSet, Goal
+from tests.helpers.tasks import CART, CART_TRUTH, PUCK, PUCK_TRUTH, puck_world
+
+
+@pytest.fixture(scope="module")
+def learned() -> tuple[PBRLAgent, object]:
+    agent = PBRLAgent(CART, seed=1)
+    return agent, run_episode(agent, World(CART, CART_TRUTH), steps=30, seed=1)
+
+
+def test_pbrl_reaches_the_goal(learned) -> None:
+    """It acts at random once, before it knows anything."""
+    agent, episode = learned
+    assert episode.reached and episode.steps < 20
+    planned = episode.dataset["planned"].to_numpy()
+    assert not planned[0] and planned[1:].all()
+    assert agent.fits < episode.steps  # what the model foretells teaches nothing
+
+
+def test_pbrl_finds_the_parameters_in_a_few_steps(learned) -> None:
+    """The paper's section 5.1: after two steps without noise; how fast the wheel shows depends."""
+    _, episode = learned
+    found = episode.dataset["estimate"].sel(interval=4)
+    for name in ("mass", "mu_x", "mu_y"):
+        got = float(found.sel(parameter=f"{name}[cart]"))
+        assert got == pytest.approx(CART_TRUTH[name], rel=0.03), name
+
+
+def test_the_true_model_is_the_bound(learned) -> None:
+    _, episode = learned
+    world = World(CART, CART_TRUTH)
+    best = run_episode(TrueModelAgent(CART, CART_TRUTH), world, steps=30)
+    assert best.reached and best.steps <= episode.steps
+    assert best.dataset["planned"].all()
+
+
+def test_round_a_wall() -> None:
+    """The paper's section 5.1: LWR sees none, and pushes against it."""
+    best = run_episode(TrueModelAgent(PUCK, PUCK_TRUTH), puck_world(), steps=40)
+    assert best.reached
+    blind = run_episode(LWRAgent(PUCK, seed=1, nodes=2000), puck_world(), steps=30, seed=1)
+    assert not blind.reached and blind.bumps > best.bumps
+
+
+def test_oolwr_plans_with_what_it_observed() -> None:
+    agent = OOLWRAgent(PUCK, seed=1, nodes=2000)
+    assert agent.model is None
+    episode = run_episode(agent, puck_world(), steps=10, seed=1)
+    assert agent.model.transitions == episode.steps
+    assert not episode.dataset["planned"][0] and episode.dataset["planned"].any()
+
+
+def test_noise_is_on_what_is_learned_from_alone() -> None:
+    world = puck_world(sigma=0.25)
+    state = world.reset(3)
+    outcomes = [world.step(PUCK.wrenches(state)[0]) for _ in range(40)]
+    errors = np.array([each.observed - each.state for each in outcomes])
+    assert errors.std() == pytest.approx(0.25, rel=0.15)
+    exact = puck_world()
+    exact.reset(3)
+    for each in outcomes:
+        np.testing.assert_array_equal(exact.step(PUCK.wrenches(state)[0]).state, each.state)
+
+
+def test_starts_differ_by_seed() -> None:
+    world = World(PUCK, PUCK_TRUTH, spread=0.1)
+    first, other = world.reset(1), world.reset(2)
+    np.testing.assert_array_equal(world.reset(1), first)
+    assert (abs(first - PUCK.start)[:, :3] <= 0.1).all() and (first != other)[:, :3].all()
+    assert not first[:, 3:].any()
+
+
+def test_seeds_reproduce_an_episode() -> None:
+    def run(seed: int):
+        agent = PBRLAgent(PUCK, seed=seed, draws=4, nodes=1000)
+        return run_episode(agent, puck_world(0.05), steps=3, seed=seed).dataset
+
+    first, again, other = run(1), run(1), run(2)
+    assert first.drop_vars("seconds").equals(again.drop_vars("seconds"))
+    assert not first["observed"].equals(other["observed"])
+
+
+def test_bad_requests() -> None:
+    with pytest.raises(FitError, match="draws is 0"):
+        PBRLAgent(PUCK, draws=0)
+    with pytest.raises(GoalError, match=r"one sampling interval of 0\.2 s"):
+        Task(PUCK.scene, PUCK.goal, ActionSet(PUCK.actions.actions, (0.2, 0.4)))
+    with pytest.raises(GoalError, match="no moving body"):
+        Task(PUCK.scene, Goal.of({"pluck": (0, 0, 0)}), PUCK.actions)

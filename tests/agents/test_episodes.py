@@ -1,0 +1,120 @@
+"""Episodes and their files: saved, loaded, resumed, refused."""
+
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.agents import Agent, Episode, TrueModelAgent, World, run_episode, run_episodes
+from pbrl_ppl.errors import EpisodeError
+from tests.helpers.tasks import PUCK, PUCK_TRUTH, puck_world
+
+
+def known(seed: int) -> Agent:
+    return TrueModelAgent(PUCK, PUCK_TRUTH, seed=seed)
+
+
+@pytest.fixture(scope="module")
+def episode() -> Episode:
+    return run_episode(known(1), puck_world(0.1), steps=40, seed=1)
+
+
+def test_file(episode, tmp_path) -> None:
+    episode.save(tmp_path / "episode.nc")
+    assert [path.name for path in tmp_path.iterdir()] == ["episode.nc"]
+    loaded = Episode.load(tmp_path / "episode.nc", PUCK.scene)
+    assert loaded.scene == PUCK.scene
+    assert loaded.dataset.identical(episode.dataset)
+    assert (loaded.agent, loaded.seed, loaded.reached) == ("true model", 1, True)
+
+
+def test_record(episode) -> None:
+    data = episode.dataset
+    assert data.sizes["time"] == episode.steps + 1
+    distance = PUCK.goal.distance(PUCK.scene, data["states"].to_numpy())
+    np.testing.assert_allclose(data["reward"], -distance)
+    padded = episode.rewards(40)
+    assert padded.shape == (41,) and (padded[episode.steps :] == -distance[-1]).all()
+
+
+def test_history_is_what_was_observed(episode) -> None:
+    """Each transition from its exact state to a noisy one."""
+    pieces = episode.history().segments()
+    assert pieces.n == episode.steps
+    np.testing.assert_array_equal(pieces.start, episode.dataset["states"][:-1])
+    np.testing.assert_array_equal(pieces.observed[:, 0], episode.dataset["observed"])
+    np.testing.assert_array_equal(pieces.actions[:, 0], episode.dataset["action"])
+
+
+def test_refused_files(episode, tmp_path) -> None:
+    path = tmp_path / "episode.nc"
+    with pytest.raises(EpisodeError, match="no such file"):
+        Episode.load(path)
+    path.write_text("nothing")
+    with pytest.raises(EpisodeError, match="not a NetCDF file"):
+        Episode.load(path)
+    episode.save(path)
+    with pytest.raises(EpisodeError, match=r"another scene \(walls differ\); give its own scene"):
+        Episode.load(path, PUCK.scene.replace(walls=()))
+    episode.dataset.drop_vars("reward").to_netcdf(path, engine="h5netcdf")
+    with pytest.raises(EpisodeError, match="variable 'reward' has dimensions None"):
+        Episode.load(path)
+    episode.history().save(path)
+    with pytest.raises(EpisodeError, match="no episode file"):
+        Episode.load(path)
+
+
+def test_finished_episodes_are_not_run_again(tmp_path) -> None:
+    said: list[str] = []
+    run = partial(run_episodes, {"true": known}, puck_world(), steps=30, folder=tmp_path)
+    (first,) = run(seeds=[1], progress=said.append)["true"]
+    assert said == [f"1/1 true model, seed 1: reached the goal in {first.steps} steps, "
+                    f"{first.bumps} with bumps"]  # fmt: skip
+    said.clear()
+    with ProcessPoolExecutor(1) as executor:
+        both = run(seeds=[1, 2], executor=executor, progress=said.append)["true"]
+    assert said[0] == f"1 of 2 episodes are in {tmp_path}" and len(said) == 2
+    assert [each.seed for each in both] == [1, 2]
+    assert both[0].dataset.identical(first.dataset)
+    with pytest.raises(EpisodeError, match=r"sigma 0.0, expected 0.25; give another folder"):
+        run_episodes({"true": known}, puck_world(0.25), [1], tmp_path, steps=30)
+    with pytest.raises(EpisodeError, match=r"limit 30, expected 31"):
+        run_episodes({"true": known}, puck_world(), [1], tmp_path, steps=31)
+    with pytest.raises(EpisodeError, match="starts elsewhere"):
+        run_episodes({"true": known}, World(PUCK, PUCK_TRUTH, spread=0.1), [1], tmp_path, steps=30)
+
+
+class Interrupted(Agent):
+    """Somebody presses Ctrl-C in the middle of its second action."""
+
+    name = "interrupted"
+    model = None
+
+    def observe(self, state, action, next_state) -> None:
+        self.seen = True
+
+    def act(self, state):
+        if hasattr(self, "seen"):
+            raise KeyboardInterrupt
+        return super().act(state)
+
+
+def test_an_interrupt_keeps_finished_episodes(tmp_path) -> None:
+    said: list[str] = []
+    agents = {"true": known, "other": lambda seed: Interrupted(PUCK, seed=seed)}
+    with pytest.raises(KeyboardInterrupt):
+        run_episodes(agents, puck_world(), [1], tmp_path, steps=30, progress=said.append)
+    assert [path.name for path in tmp_path.iterdir()] == ["true-1.nc"]
+    assert said[-1] == f"interrupted: 1 of 2 episodes are in {tmp_path}; run it again"
+
+
+def test_an_interrupted_search_ends_the_episode(monkeypatch) -> None:
+    """A* returns the best plan so far; nobody wants it acted on."""
+
+    def pressed(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pbrl_ppl.planning.astar._Search.expand", pressed)
+    with pytest.raises(KeyboardInterrupt):
+        run_episode(known(1), puck_world())
