@@ -30,6 +30,8 @@ ABSORBED = 1e-3
 #: A direction in which a size as the prior has it does less than this, in units of noise, is of the
 #: engine's rounding.
 _SHOWS = 1e-3
+#: Decimals of a p-value's logarithm; effects that are the same physics differ by rounding alone.
+_EQUAL = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +105,7 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
 
     # the noise's shape is never what is missing as long as an effect might be
     def order(signature: Signature) -> tuple[bool, float]:
-        return _of_noise(signature.attached), signature.log_p
+        return _of_noise(signature.attached), round(signature.log_p, _EQUAL)
 
     return sorted(map(score, candidates), key=order)
 
