@@ -159,6 +159,8 @@ PENDULUM = Kind(
         # to the angle's fourth power, a scaled angle moves as one with a spring does
         ("torsion_spring", "sensor_scale"),
     ),
+    # a centre of gravity beside the arm lets it hang askew
+    contain=(("com_offset", "gravity_tilt"), ("com_offset", "sensor_bias")),
 )
 
 BODIES = {"cart": CART, "puck": PUCK, "pendulum": PENDULUM}
