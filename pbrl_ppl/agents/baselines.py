@@ -19,7 +19,13 @@ Array = NDArray[np.float64]
 class _RegressionAgent(Agent):
     """Learns by regression, as it observes."""
 
-    _learner: LWR | OOLWR
+    _regression: ClassVar[type[LWR] | type[OOLWR]]
+
+    def __init__(
+        self, task: Task, *, learner: Mapping[str, Any] | None = None, **options: Any
+    ) -> None:
+        super().__init__(task, **options)
+        self._learner = self._regression(task.scene, **(learner or {}))
 
     @property
     def model(self) -> LWR | OOLWR | None:
@@ -51,12 +57,7 @@ class OOLWRAgent(_RegressionAgent):
     """
 
     name: ClassVar[str] = "OO-LWR"
-
-    def __init__(
-        self, task: Task, *, learner: Mapping[str, Any] | None = None, **options: Any
-    ) -> None:
-        super().__init__(task, **options)
-        self._learner = OOLWR(task.scene, **(learner or {}))
+    _regression = OOLWR
 
 
 @final
@@ -79,12 +80,7 @@ class LWRAgent(_RegressionAgent):
     """
 
     name: ClassVar[str] = "LWR"
-
-    def __init__(
-        self, task: Task, *, learner: Mapping[str, Any] | None = None, **options: Any
-    ) -> None:
-        super().__init__(task, **options)
-        self._learner = LWR(task.scene, **(learner or {}))
+    _regression = LWR
 
 
 @final

@@ -58,8 +58,7 @@ def along_trajectories(
     """
     history = problem.data.history
     states = first_states(history)
-    if longest_gap(history) > 1:
-        states = foreseen(problem.on(replace(problem.data, horizon=1, states=states)), phi)
+    states = foreseen(problem.on(replace(problem.data, horizon=1, states=states)), phi)
     if cells is None:
         cells = cells_of(problem.scene, history)
         medians = tuple(noise_medians(cells, history, states).tolist())
@@ -91,9 +90,7 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # no motion fits such data: stay where it was linearised last
         problem = replace(problem, data=replace(problem.data, states=states))
-        if longest_gap(problem.data.history) > 1:
-            data = replace(problem.data, states=foreseen(problem, phi))
-            problem = replace(problem, data=data)
+        problem = replace(problem, data=replace(problem.data, states=foreseen(problem, phi)))
         problem = problem.with_noise(trajectories=_sloped(problem, cells, phi, sigma, spread))
         shown = after[noise.seen.any(axis=1)]
         if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
@@ -117,7 +114,7 @@ def first_states(history: History) -> Array:
 
 
 def foreseen(problem: Problem, phi: Array) -> Array:
-    """Linearised states, but those that no row shows as predicted from the row before.
+    """Linearised states; in a sparse recording what no row shows as predicted from the row before.
 
     What a body meets on its way is nowhere near a straight line between far apart rows.
 
@@ -133,7 +130,10 @@ def foreseen(problem: Problem, phi: Array) -> Array:
     ndarray
         Shape (trajectory, time, body, 6), SI units.
     """
-    hidden, states = unseen(problem.data.history), problem.data.smoothed_states.copy()
+    history, states = problem.data.history, problem.data.smoothed_states
+    if longest_gap(history) == 1:
+        return states
+    hidden, states = unseen(history), states.copy()
     segments, inputs = problem.segments, problem.inputs
     for step in np.flatnonzero(hidden.any(axis=(0, 2))):
         now = np.flatnonzero(segments.step == step - 1)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError, HistoryError
+from pbrl_ppl.oomdp.frames import turned
 from pbrl_ppl.oomdp.rays import spans
 from pbrl_ppl.physics import Scenery, circles, scenery
 from pbrl_ppl.scene import WORLD, Scene
@@ -156,8 +157,8 @@ class SectorContacts:
         rays = self.directions[None]
         own = [spans(part, np.zeros((1, 2)), rays) for part in world.solids[body].parts]
         turn = poses[:, body, 2] - poses[:, other, 2]
-        origins = _turned(poses[:, body, :2] - poses[:, other, :2], -poses[:, other, 2])
-        directions = _turned(rays, turn[:, None])
+        origins = turned(poses[:, body, :2] - poses[:, other, :2], -poses[:, other, 2])
+        directions = turned(rays, turn[:, None])
         touched = np.zeros(directions.shape[:2], dtype=bool)
         for part in world.solids[other].parts:
             its = spans(part, origins, directions)
@@ -171,10 +172,3 @@ class SectorContacts:
 def condition(flags: Flags, objects: tuple[str, ...]) -> Condition:
     """A body's condition, from its predicates of shape (object, sector)."""
     return frozenset((objects[i], int(sector)) for i, sector in np.argwhere(flags))
-
-
-def _turned(vectors: Array, angle: Array) -> Array:
-    """Vectors (..., 2) turned by angles that broadcast with what is before their last axis."""
-    c, s = np.cos(angle), np.sin(angle)
-    x, y = vectors[..., 0], vectors[..., 1]
-    return np.stack([c * x - s * y, s * x + c * y], axis=-1)

@@ -64,6 +64,11 @@ def _both_turned(states: Array, angle: Array) -> Array:
 
 def _turned(triples: Array, angle: Array) -> Array:
     """A plane vector and what does not turn, (n, 3), turned by angles (n,)."""
+    return np.concatenate([turned(triples[:, :2], angle), triples[:, 2:]], axis=1)
+
+
+def turned(vectors: Array, angle: Array) -> Array:
+    """Vectors (..., 2) turned by angles that broadcast with what is before their last axis."""
     c, s = np.cos(angle), np.sin(angle)
-    x, y, same = triples.T
-    return np.stack([c * x - s * y, s * x + c * y, same], axis=-1)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)
