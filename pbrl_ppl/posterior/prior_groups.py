@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem
+from pbrl_ppl.model import Problem, noise_law
 from pbrl_ppl.parameters import Prior, beside, prior_draws
 
 Array = NDArray[np.float64]
@@ -41,7 +41,8 @@ def prior_groups(
     layout = problem.layout
     if problem.library is not None or layout.discrete.any():
         return {}
-    noise = _noise_priors(problem, posterior)
+    centre, spread = noise_law(problem)
+    noise = [Prior("log_normal", mu=float(mu), sigma=spread) for mu in centre]
     # apart from the generator of the predictions
     rng = np.random.default_rng([seed, 1])
     drawn = np.empty(phi.shape)
@@ -55,31 +56,11 @@ def prior_groups(
     }
 
 
-def _noise_priors(problem: Problem, posterior: xr.Dataset) -> list[Prior]:
-    """Of each noise parameter; of a single sigma for all dimensions, one."""
-    median, spread = problem.noise_prior
-    mu = np.log(median)
-    if sum(_width(posterior, name) for name in problem.noise_variables) == 1:
-        mu = mu.mean(keepdims=True)
-    return [Prior("log_normal", mu=float(each), sigma=spread) for each in mu]
-
-
-def _width(posterior: xr.Dataset, name: str) -> int:
-    """How many numbers a variable has in each draw."""
-    return posterior[name].isel(chain=0, draw=0).size
-
-
 def _like(problem: Problem, posterior: xr.Dataset, phi: Array, noise: Array) -> xr.Dataset:
     """Vectors (draw, p) and (draw, parameter) as the variables of the posterior."""
-    named = problem.layout.to_dict(phi)
-    begin = 0
-    for name in problem.noise_variables:
-        end = begin + _width(posterior, name)
-        named[name] = noise[:, begin:end]
-        begin = end
     return xr.Dataset(
         {
             name: posterior[name].copy(data=values.reshape(posterior[name].shape))
-            for name, values in named.items()
+            for name, values in problem.named(phi, noise).items()
         }
     )
