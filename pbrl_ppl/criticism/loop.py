@@ -44,8 +44,8 @@ MOST_ADDED = 5
 #: With more than this share of what was missing (of its square) left there are no names to be had;
 #: where what remains is small (a share of the bodies' acceleration), more may.
 LARGE_REMAINDER, SMALL, LARGE_IF_SMALL = 0.2, 0.01, 0.5
-#: Draws kept of each chain, those where that is not enough, and tuning draws at least.
-DRAWS, MORE_DRAWS, LEAST_TUNE = 300, 1000, 100
+#: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
+DRAWS, INDEPENDENT, LEAST_TUNE = (300, 1000), (125,), 100
 #: Draws from the prior, of which some must reach what was measured.
 PRIOR_DRAWS = 100
 #: Chains with a larger R-hat or fewer effective draws give no verdict.
@@ -80,7 +80,7 @@ def revise(
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
+        Posterior draws of each chain; by default 300, or 1000 where chains have not converged.
     method : str
         Of :func:`pbrl_ppl.fit`, for the posteriors; with ``laplace`` the verdict stands on modes.
     progress : callable, optional
@@ -223,7 +223,8 @@ class _Loop:
     def posterior(self, mode: Mode, draws: int | None) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
         model = build_model(mode.problem.with_physics(threads=1))
-        for n in (DRAWS, MORE_DRAWS) if draws is None else (draws,):
+        usual = INDEPENDENT if self.method == "laplace" else DRAWS
+        for n in usual if draws is None else (draws,):
             tune = max(LEAST_TUNE, 5 * n // 8)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")

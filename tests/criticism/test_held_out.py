@@ -40,7 +40,7 @@ def loops(frames, make_history):
     """Findings on one training history, judged by two test histories."""
     train = history(frames[0])
     _, other = box2d(make_history, 6, linear_drag=0.3)
-    options = {"catalogue": CATALOGUE, "seed": 1, "draws": 200}
+    options = {"catalogue": CATALOGUE, "seed": 1, "method": "laplace"}
     return tuple(revise(BOX, train, history(test), **options) for test in (frames[1], other))
 
 
