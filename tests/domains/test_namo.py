@@ -116,7 +116,7 @@ def test_only_what_moved_has_a_track(namo):
     np.testing.assert_allclose([line.get_xdata() for line in tracks], [[-2.4, -1.9, -1.4]])
 
 
-# -- the whole story: slow -------------------------------------------------------------------------
+# -- the whole story: long -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -150,7 +150,7 @@ def story(namo, tmp_path_factory):
     )  # fmt: skip
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_first_plan_moves_the_table_in_the_model(namo, story):
     assert namo.movable(story.before, "table") > 0.4
     assert story.plan.reached
@@ -159,14 +159,14 @@ def test_the_first_plan_moves_the_table_in_the_model(namo, story):
     assert way(story.expected, COUCH) < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_fails_where_the_table_is_bolted_down(story):
     assert not story.failed.reached
     assert opening(story.failed.states) is None
     assert way(story.failed.states, TABLE) < 0.02
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_failed_push_tells_that_the_table_does_not_move(namo, story):
     assert namo.movable(story.after, "table") < 0.05
     assert namo.movable(story.after, "couch") > 0.5  # of which it tells nothing
@@ -176,7 +176,7 @@ def test_the_failed_push_tells_that_the_table_does_not_move(namo, story):
     assert json.loads(story.after.attrs["updates"])[-1]["transitions"] == len(story.failed.wrenches)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_second_plan_goes_the_other_way_and_arrives(namo, story):
     states = story.done.states
     assert story.done.reached

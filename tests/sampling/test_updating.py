@@ -280,8 +280,13 @@ def test_other_data_are_fitted_anew(parts, first) -> None:
     agree(idata, quiet(fit, build_model(problem), seed=10, **QUICK))
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sigma", ["scalar", "per_dimension"])
+@pytest.mark.parametrize(
+    "sigma",
+    [
+        pytest.param("scalar", marks=pytest.mark.slow),
+        pytest.param("per_dimension", marks=pytest.mark.long),
+    ],
+)
 def test_a_cart(sigma) -> None:
     """Friction's kinks, a wheel, Student-t noise and a horizon: against the fit to all data.
 
