@@ -13,8 +13,27 @@ from tests.helpers.places import RECORDED, ROOT
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
 
-#: Rooms below the model: their tests are the same whatever generation of PyMC and ArviZ is there.
-BELOW_THE_MODEL = ("scene", "parameters", "history", "effects", "physics")
+#: Rooms that import neither PyMC nor ArviZ: their tests are the same whatever generation is there,
+#: but for those in which something is fitted.
+WITHOUT_PYMC = (
+    "scene", "parameters", "history", "effects", "physics", "modes", "planning", "oomdp",
+)  # fmt: skip
+FITTED = (
+    "modes/test_configurations.py",
+    "modes/test_index_priors.py",
+    "modes/test_joints.py",
+    "planning/test_planning_files.py",
+    "planning/test_planning_modes.py",
+)
+#: Of a room that does import them, the files whose tests stand on modes alone.
+ON_MODES = (
+    "criticism/test_criticism.py",
+    "criticism/test_cross_validation.py",
+    "criticism/test_misfit.py",
+    "criticism/test_resolution.py",
+    "criticism/test_scan.py",
+    "criticism/test_structure_search.py",
+)
 #: Files that take longest, longest first: workers begin with them, and fill up with the short ones.
 LONGEST = (
     "criticism/test_revision.py",
@@ -42,12 +61,16 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what one generation is enough for, and put the longest files first."""
     tests = ROOT / "tests"
 
+    def name_of(item: pytest.Item) -> str:
+        return item.path.relative_to(tests).as_posix() if tests in item.path.parents else ""
+
     def place(item: pytest.Item) -> int:
-        name = item.path.relative_to(tests).as_posix() if tests in item.path.parents else ""
+        name = name_of(item)
         return LONGEST.index(name) if name in LONGEST else len(LONGEST)
 
     for item in items:
-        if item.path.parent.parent == tests and item.path.parent.name in BELOW_THE_MODEL:
+        name = name_of(item)
+        if name in ON_MODES or (name.split("/")[0] in WITHOUT_PYMC and name not in FITTED):
             item.add_marker("one_stack")
     items.sort(key=place)
 
