@@ -3,6 +3,7 @@
 from .agents import Acted as Acted
 from .agents import Agent as Agent
 from .agents import Episode as Episode
+from .agents import LibraryAgent as LibraryAgent
 from .agents import LWRAgent as LWRAgent
 from .agents import OOLWRAgent as OOLWRAgent
 from .agents import Outcome as Outcome

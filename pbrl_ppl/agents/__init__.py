@@ -5,6 +5,7 @@ from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.baselines import LWRAgent, OOLWRAgent, TrueModelAgent
 from pbrl_ppl.agents.episode import Episode
 from pbrl_ppl.agents.experiment import run_episodes
+from pbrl_ppl.agents.library import LibraryAgent
 from pbrl_ppl.agents.online import run_episode
 from pbrl_ppl.agents.pbrl import PBRLAgent
 from pbrl_ppl.agents.task import Task
@@ -15,6 +16,7 @@ __all__ = [
     "Agent",
     "Episode",
     "LWRAgent",
+    "LibraryAgent",
     "OOLWRAgent",
     "Outcome",
     "PBRLAgent",

@@ -82,7 +82,7 @@ def run_episode(
     if agent.task != world.task:
         raise EpisodeError("episode: the agent and the world have different tasks; give both one")
     task = world.task
-    state = _checked(task, world.reset(seed), "reset")
+    state = checked(task, world.reset(seed), "reset")
     states, rewards, reached = [state], [task.reward(state)], task.reached(state)
     rows: dict[str, list[Any]] = {
         name: [] for name in ("action", "observed", "bumped", "planned", "seconds")
@@ -94,8 +94,8 @@ def run_episode(
         task.check_action(state, action)
         chosen = time.monotonic() - begin
         outcome = world.step(action)
-        after = _checked(task, outcome.state, "step")
-        observed = _checked(task, outcome.observed, "step")
+        after = checked(task, outcome.state, "step")
+        observed = checked(task, outcome.observed, "step")
         begin = time.monotonic()
         agent.observe(state, action, observed)
         agent.update()
@@ -123,8 +123,14 @@ def run_episode(
     )  # fmt: skip
 
 
-def _checked(task: Task, given: Any, what: str) -> Array:
-    """States that a world returned, shape (body, 6)."""
+def checked(task: Task, given: Any, what: str) -> Array:
+    """States that a world returned, shape (body, 6).
+
+    Raises
+    ------
+    EpisodeError
+        If they have another shape, or are not finite.
+    """
     state, expected = np.asarray(given, dtype=float), (len(task.scene.moving), len(STATE))
     if state.shape != expected or not np.isfinite(state).all():
         found = f"states of shape {state.shape}"

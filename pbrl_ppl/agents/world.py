@@ -139,8 +139,8 @@ class World:
         """
         action = np.asarray(action, dtype=float)
         self.task.check_action(self._state, action)
-        begin, last = self._state, self._last
-        state = self._truth.step(begin[None, None], action[None], last[None])[0, 0]
+        begin = self._state
+        state = self._play(begin, action)
         self._state, self._last = state, action
         noise = self.sigma * self._rng.standard_normal(state.shape)
         return Outcome(
@@ -150,3 +150,8 @@ class World:
             bumped=bool(touching(self.task.scene, begin[None], state[None])[0]),
             reached=self.task.reached(state),
         )
+
+    def _play(self, state: Array, action: Array) -> Array:
+        """State (body, 6) after an interval from another."""
+        after = self._truth.step(state[None, None], action[None], self._last[None])
+        return np.asarray(after[0, 0])

@@ -1,0 +1,243 @@
+"""A world that runs in Box2D, so that the agent's engine is not the world's."""
+
+from __future__ import annotations
+
+import cmath
+import warnings
+from collections.abc import Mapping
+from typing import Any, final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.agents.task import Task
+from pbrl_ppl.agents.world import World
+from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.physics import scenery
+from pbrl_ppl.scene import WORLD
+
+try:
+    with warnings.catch_warnings():  # its generated wrapper warns on import under newer Pythons
+        warnings.simplefilter("ignore", DeprecationWarning)
+        import Box2D
+except ImportError as error:  # an extra: the package has an engine of its own
+    raise EpisodeError(
+        f"Box2D world: {error}; install Box2D: pip install 'pbrl_ppl[agents]'"
+    ) from None
+
+Array = NDArray[np.float64]
+
+#: Box2D's tolerances are compiled in, for metres: below 1 length unit a second nothing bounces, and
+#: 0.005 units of overlap are let be. With the centimetre as unit they are 1 cm/s and 0.05 mm.
+_CM = 100.0
+#: Corners that a polygon of Box2D has at most.
+_CORNERS = 8
+#: Rounds of the solvers: the engine's, for velocities and positions, and the wheel's.
+_ROUNDS, _WHEEL_ROUNDS = (20, 10), 10
+
+
+@final
+class Box2DWorld(World):
+    """The true dynamics of a task by Box2D, with the floor's friction on wheels added to it.
+
+    The paper's worlds are of this kind. Wrenches and wheels act here, contacts and hinges are the
+    engine's, which rounds to single precision. Friction and restitution of two that touch are the
+    products of theirs, and walls carry 1, as in the package's own engine.
+
+    Parameters
+    ----------
+    task, parameters, sigma, spread
+        As of :class:`World`.
+    step : float
+        About what a step of the engine is (s).
+
+    Raises
+    ------
+    EpisodeError
+        As :class:`World`; if the scene declares effects, a joint that is no known hinge, a
+        kinematic body, or a convex part of more than eight corners, which there are not here.
+    ParameterError
+        If a parameter is missing, unknown or impossible.
+
+    Examples
+    --------
+    >>> from pbrl_ppl.planning import ActionSet, Goal
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> scene = Scene(time_step=0.2, bodies=(Body("puck", Shape.circle(0.2), pose=(0, 0, 0)),))
+    >>> pushes = ActionSet.box("puck", forces=(-4.0, 0.0, 4.0))
+    >>> task = Task(scene, Goal.of({"puck": (2.0, 0.0, None)}), pushes)
+    >>> world = Box2DWorld(task, {"mass": 2.0, "r": 0.0, "mu_c": 0.0})
+    >>> state = world.reset(seed=0)
+    >>> round(world.step(task.wrenches(state)[2]).reward, 2)  # pushed for 0.2 s
+    -1.96
+    """
+
+    def __init__(
+        self,
+        task: Task,
+        parameters: Mapping[str, object],
+        *,
+        sigma: float = 0.0,
+        spread: float = 0.0,
+        step: float = 0.001,
+    ) -> None:
+        scene = task.scene
+        if not 0 < step <= scene.time_step:
+            raise EpisodeError(
+                f"Box2D world: step is {step} s, expected above 0 and at most {scene.time_step:g} s"
+            )
+        for body in scene.bodies:
+            if body.effects or body.kinematic:
+                what = "declares effects" if body.effects else "is kinematic"
+                raise EpisodeError(f"Box2D world: {body.name} {what}; use World for such scenes")
+        if any(joint.kind != "hinge" or not joint.known for joint in scene.joints):
+            raise EpisodeError("Box2D world: a joint is no known hinge; use World for such scenes")
+        self._scenery = scenery(scene)
+        for solid in self._scenery.solids:
+            if any(len(corners) > _CORNERS for corners, _ in solid.parts):
+                raise EpisodeError(
+                    f"Box2D world: a convex part of {solid.name} has more than {_CORNERS} corners;"
+                    " use World for such scenes"
+                )
+        self._steps = max(1, round(scene.time_step / step))
+        super().__init__(task, parameters, sigma=sigma, spread=spread)
+        layout, phi = self._truth.layout, self._truth.phi[0]
+        given = dict(zip(layout.labels, phi.tolist(), strict=True))
+        self._values = [
+            {
+                name: float(given.get(f"{name}[{body.name}]", dict(body.known).get(name, 0.0)))
+                for name in ("mass", "r", "mu_c", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
+            }
+            for body in scene.moving
+        ]
+
+    def _play(self, state: Array, action: Array) -> Array:
+        engine, rigid = self._engine(state)
+        step = self.task.scene.time_step / self._steps
+        for i in range(self._steps):
+            # kick half, drift, kick half: of second order
+            self._kick(rigid, action, step if i else 0.5 * step)
+            engine.Step(step, *_ROUNDS)
+        self._kick(rigid, action, 0.5 * step)
+        out = np.array(
+            [
+                (*body.position, body.angle, *body.linearVelocity, body.angularVelocity)
+                for body in rigid
+            ]
+        )
+        out[:, [0, 1, 3, 4]] /= _CM
+        return out
+
+    def _engine(self, state: Array) -> tuple[Any, list[Any]]:
+        """A world of the engine in a state, and its moving bodies."""
+        scene = self.task.scene
+        rub = _Products()
+        engine = Box2D.b2World(
+            gravity=tuple(_CM * g for g in scene.gravity), doSleep=False, contactListener=rub,
+            continuousPhysics=False,
+        )  # fmt: skip
+        engine.rub = rub  # the engine keeps no reference of its own
+        ground = engine.CreateStaticBody()
+        rigid, by_name = [], {WORLD: ground}
+        for i, solid in enumerate(self._scenery.solids):
+            if i < len(state):
+                values = self._values[i]
+                place = {"position": tuple(_CM * state[i, :2]), "angle": float(state[i, 2])}
+                body = engine.CreateDynamicBody(
+                    **place, linearVelocity=tuple(_CM * state[i, 3:5]),
+                    angularVelocity=float(state[i, 5]),
+                )  # fmt: skip
+                rigid.append(body)
+            else:
+                values = {"mu_c": 1.0, "r": 1.0}
+                x, y, theta = self._scenery.fixed[i - len(state)]
+                body = ground
+                if solid.name != WORLD:
+                    body = engine.CreateStaticBody(position=(_CM * x, _CM * y), angle=theta)
+            by_name[solid.name] = body
+            _add_parts(body, solid, values)
+            if i < len(state):
+                moment = values["mass"] * scene.moving[i].shape.unit_moment
+                body.massData = Box2D.b2MassData(
+                    mass=values["mass"], center=(0, 0), I=moment * _CM**2
+                )
+        for joint in scene.joints:
+            first, second = (by_name[name] for name in joint.bodies or ())
+            anchors = [
+                tuple(_CM * a for a in point or ()) for point in (joint.anchor_a, joint.anchor_b)
+            ]
+            engine.CreateRevoluteJoint(
+                bodyA=first, bodyB=second, localAnchorA=anchors[0], localAnchorB=anchors[1],
+                collideConnected=False,
+            )  # fmt: skip
+        return engine, rigid
+
+    def _kick(self, rigid: list[Any], action: Array, step: float) -> None:
+        """Change velocities by the wrenches and the floor's friction on the wheels."""
+        scene = self.task.scene
+        for body, wrench, values, own in zip(
+            rigid, action, self._values, scene.moving, strict=True
+        ):
+            v = complex(*body.linearVelocity) / _CM
+            omega = body.angularVelocity
+            if not (v or omega or wrench.any()):
+                continue  # at rest: nothing to resist
+            mass = values["mass"]
+            inertia = mass * own.shape.unit_moment
+            v += complex(*wrench[:2]) / mass * step
+            omega += float(wrench[2]) / inertia * step
+            limit = mass * scene.normal_gravity * step
+            v, omega = _rolled(values, cmath.exp(1j * body.angle), mass, inertia, limit, v, omega)
+            body.linearVelocity = (v.real * _CM, v.imag * _CM)
+            body.angularVelocity = omega
+
+
+class _Products(Box2D.b2ContactListener):
+    """Mixes friction and restitution as products; the engine would take the root and the larger."""
+
+    def PreSolve(self, contact: Any, manifold: Any) -> None:
+        pair = contact.fixtureA.userData, contact.fixtureB.userData
+        contact.friction = pair[0]["mu_c"] * pair[1]["mu_c"]
+        contact.restitution = pair[0]["r"] * pair[1]["r"]
+
+
+def _add_parts(body: Any, solid: Any, values: dict[str, float]) -> None:
+    """Give a body of the engine its convex parts."""
+    for corners, radius in solid.parts:
+        points = [(float(x), float(y)) for x, y in _CM * corners]
+        if len(points) == 1:
+            shape = Box2D.b2CircleShape(pos=points[0], radius=_CM * radius)
+        elif len(points) == 2:
+            shape = Box2D.b2EdgeShape(vertices=points)
+        else:
+            shape = Box2D.b2PolygonShape(vertices=points)
+        body.CreateFixture(shape=shape, density=1.0, userData=values)
+
+
+def _rolled(
+    values: dict[str, float],
+    turn: complex,
+    mass: float,
+    inertia: float,
+    limit: float,
+    v: complex,
+    omega: float,
+) -> tuple[complex, float]:
+    """Velocities after the floor's friction on the wheel: along each axis at most mu times a limit.
+
+    The impulses that stop the wheel's point, clipped, round by round; the plane is the complex one.
+    """
+    arm = turn * complex(values["w_x"], values["w_y"])
+    along = turn * cmath.exp(1j * values["w_theta"])
+    axes = [(along, values["mu_x"]), (1j * along, values["mu_y"])]
+    levers = [(arm.conjugate() * axis).imag for axis, _ in axes]
+    impulse = [0.0, 0.0]
+    for _ in range(_WHEEL_ROUNDS):
+        for k, ((axis, mu), lever) in enumerate(zip(axes, levers, strict=True)):
+            speed = (v.conjugate() * axis).real + omega * lever
+            wanted = impulse[k] - speed / (1 / mass + lever**2 / inertia)
+            wanted = min(max(wanted, -mu * limit), mu * limit)
+            v += (wanted - impulse[k]) / mass * axis
+            omega += (wanted - impulse[k]) * lever / inertia
+            impulse[k] = wanted
+    return v, omega

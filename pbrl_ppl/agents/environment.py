@@ -1,0 +1,146 @@
+"""A world as a Gymnasium environment, for agents of other libraries."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.agents.online import AnyWorld, checked
+from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.state import STATE
+
+try:
+    import gymnasium
+    from gymnasium import spaces
+except ImportError as error:  # an extra: most users bring no agent of their own
+    raise EpisodeError(
+        f"environment: {error}; install Gymnasium: pip install 'pbrl_ppl[agents]'"
+    ) from None
+
+Array = NDArray[np.float64]
+
+
+class Environment(gymnasium.Env[Array, np.int64]):
+    """A world as a ``gymnasium.Env``.
+
+    An action is the number of one of the task's, which are wrenches in the bodies' frames. An
+    observation is the state of every body, with the world's noise; :meth:`reset` gives the exact
+    start. ``info`` has the exact ``state`` and whether a body ``bumped`` into something. The
+    episode ends (``terminated``) where the goal is reached.
+
+    Parameters
+    ----------
+    world : World
+        Or another with ``task``, ``reset(seed)`` and ``step(action)``.
+    steps : int, optional
+        Actions after which an episode is ``truncated``; never by default.
+
+    Attributes
+    ----------
+    world : World
+        The world.
+    observation_space : gymnasium.spaces.Box
+        States, shape (body, 6), SI units.
+    action_space : gymnasium.spaces.Discrete
+        Numbers of the task's actions.
+
+    Raises
+    ------
+    EpisodeError
+        If ``steps`` is below 1, an action is not in the action space, none can be taken because the
+        episode has not begun or has ended, or the world returns states of another shape or that are
+        not finite.
+
+    Examples
+    --------
+    >>> from pbrl_ppl.agents import Task, World
+    >>> from pbrl_ppl.planning import ActionSet, Goal
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> scene = Scene(time_step=0.2, bodies=(Body("puck", Shape.circle(0.2), pose=(0, 0, 0)),))
+    >>> pushes = ActionSet.box("puck", forces=(-4.0, 0.0, 4.0))
+    >>> task = Task(scene, Goal.of({"puck": (2.0, 0.0, None)}), pushes)
+    >>> environment = Environment(World(task, {"mass": 2.0, "r": 0.0, "mu_c": 0.0}), steps=50)
+    >>> observation, info = environment.reset(seed=0)
+    >>> observation, reward, terminated, truncated, info = environment.step(2)
+    >>> round(reward, 2), terminated, truncated
+    (-1.96, False, False)
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+
+    def __init__(self, world: AnyWorld, *, steps: int | None = None) -> None:
+        if steps is not None and steps < 1:
+            raise EpisodeError(f"environment: steps is {steps}, expected at least 1, or None")
+        self.world, self._limit = world, steps
+        shape = (len(world.task.scene.moving), len(STATE))
+        self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float64)
+        self.action_space = spaces.Discrete(len(world.task.actions.actions))
+        self._state: Array | None = None
+        self._taken = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Back to the start.
+
+        Parameters
+        ----------
+        seed : int, optional
+            That of the world, as of :func:`pbrl_ppl.run_episode`; drawn from the environment's
+            generator without it.
+        options : dict, optional
+            There are none.
+
+        Returns
+        -------
+        observation : ndarray
+            Exact states, shape (body, 6), SI units.
+        info : dict
+            As of :meth:`step`.
+        """
+        super().reset(seed=seed)
+        of_world = int(self.np_random.integers(2**31)) if seed is None else seed
+        self._state = checked(self.world.task, self.world.reset(of_world), "reset")
+        self._taken = 0
+        return self._state.copy(), {"state": self._state.copy(), "bumped": False}
+
+    def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Hold an action over one sampling interval.
+
+        Parameters
+        ----------
+        action : int
+            Number of one of the task's actions.
+
+        Returns
+        -------
+        observation : ndarray
+            Shape (body, 6), SI units, with the world's noise.
+        reward : float
+            Minus the L2 distance from the goal (m), as in the paper's section 5.
+        terminated, truncated : bool
+            Whether the goal is reached, and whether the limit of steps is.
+        info : dict
+            ``state``, exact, and ``bumped``.
+        """
+        if self._state is None:
+            raise EpisodeError("environment: no episode is under way; call reset first")
+        # a number of another type is no member of the space, and numpy's floats are none either
+        whole = isinstance(action, int | np.integer) and not isinstance(action, bool)
+        if not whole or not self.action_space.contains(int(action)):
+            raise EpisodeError(
+                f"environment: action {action!r} is outside its bounds, expected a whole number"
+                f" from 0 to {int(self.action_space.n) - 1}"
+            )
+        task = self.world.task
+        outcome = self.world.step(task.wrenches(self._state)[int(action)])
+        state = checked(task, outcome.state, "step")
+        observed = checked(task, outcome.observed, "step")
+        self._taken += 1
+        reached = bool(outcome.reached)
+        over = self._limit is not None and self._taken >= self._limit
+        self._state = None if reached or over else state
+        info = {"state": state.copy(), "bumped": bool(outcome.bumped)}
+        return observed.copy(), float(outcome.reward), reached, over and not reached, info
