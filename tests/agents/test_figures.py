@@ -44,7 +44,7 @@ def test_shopping_cart(tmp_path) -> None:
     assert "lwr-2.nc: this is not a NetCDF file" in broken.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_apartment(tmp_path) -> None:
     first = ran(tmp_path, "05_apartment.py", "--quick", "--only", "true", "oolwr")
     assert first.returncode == 0, first.stderr
