@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated
 
@@ -12,21 +12,41 @@ import typer
 from pbrl_ppl.cli.calibrate import calibrate
 from pbrl_ppl.cli.check import check
 from pbrl_ppl.cli.close_loop import close_loop
+from pbrl_ppl.cli.criticise import criticise
+from pbrl_ppl.cli.doctor import doctor
+from pbrl_ppl.cli.fit import fit
+from pbrl_ppl.cli.new import new
 from pbrl_ppl.cli.plan import plan
-from pbrl_ppl.cli.terminal import BAD_INPUT, interrupted, warnings_in_a_line
+from pbrl_ppl.cli.simulate import simulate
+from pbrl_ppl.cli.terminal import BAD_INPUT, in_options, interrupted, warnings_in_a_line
 from pbrl_ppl.cli.update import update
 from pbrl_ppl.errors import PbrlError
+
+#: The commands, in the order of use, and an example of each for its help.
+COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
+    "new": (new, "pbrl-ppl new scene.toml --history train.csv --body cart=box:0.9x0.55"),
+    "check": (check, "pbrl-ppl check scene.toml train.csv"),
+    "fit": (fit, "pbrl-ppl fit scene.toml train.csv -o cart.nc"),
+    "criticise": (criticise, "pbrl-ppl criticise scene.toml train.csv"),
+    "close-loop": (close_loop, "pbrl-ppl close-loop scene.toml train.csv -o report/"),
+    "update": (update, "pbrl-ppl update cart.nc since.csv -o new.nc"),
+    "plan": (plan, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv"),
+    "simulate": (simulate, "pbrl-ppl simulate cart.nc plan.csv -o foreseen.csv --draws 20"),
+    "calibrate": (calibrate, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4"),
+    "doctor": (doctor, "pbrl-ppl doctor --json"),
+}
 
 app = typer.Typer(
     name="pbrl-ppl",
     help="A physics engine as model prior, and a loop that closes on measured data.",
+    epilog="Example: pbrl-ppl new --from shopping_cart. Exit codes: 0; 1 for a calibration that"
+    " failed or a goal that was not reached; 2 for bad usage or input, with one message on stderr;"
+    " 3 where chains have not converged; 130 after an interrupt.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
-app.command("close-loop")(close_loop)
-for command in (check, calibrate, update, plan):
-    app.command()(command)
+for name, (command, example) in COMMANDS.items():
+    app.command(name, epilog=f"Example: {example}")(command)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -41,20 +61,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     int
         0; 1 for a calibration that failed or a goal that was not reached; 2 for bad usage or bad
-        input, with one message on stderr; 3 for a loop without a verdict; 130 if interrupted.
+        input, with one message on stderr; 3 where chains have not converged; 130 if interrupted.
     """
+    argv = sys.argv[1:] if argv is None else list(argv)
+    options = _options_of(argv)
     try:
-        with warnings_in_a_line():
-            app(args=None if argv is None else list(argv), prog_name="pbrl-ppl")
+        with warnings_in_a_line(options):
+            app(args=argv, prog_name="pbrl-ppl")
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else int(stop.code is not None)
     except KeyboardInterrupt:
         return interrupted()
     except PbrlError as error:
         # one line, whatever the message quotes from a file
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)  # noqa: T201
+        print(f"error: {in_options(str(error), options)}", file=sys.stderr)  # noqa: T201
         return BAD_INPUT
     return 0
+
+
+def _options_of(argv: Sequence[str]) -> set[str]:
+    """Options of the command that is asked for, such as ``--draws``."""
+    commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
+    asked = next((word for word in argv if word in commands), None)
+    return {name for option in commands[asked].params for name in option.opts} if asked else set()
 
 
 def _show_version(value: bool) -> None:

@@ -10,7 +10,18 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pbrl_ppl.cli.terminal import FAILED, SceneFile, Velocities, interruptible, load_files
+from pbrl_ppl.cli.answers import print_json
+from pbrl_ppl.cli.outputs import check_can_make
+from pbrl_ppl.cli.terminal import (
+    FAILED,
+    AsJson,
+    Quiet,
+    SceneFile,
+    Seed,
+    Velocities,
+    interruptible,
+    load_files,
+)
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -28,14 +39,16 @@ def calibrate(
         typer.Option("-o", "--output", metavar="DIR", help="Folder for results; goes on there."),
     ],
     replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
+    seed: Seed = 1,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     draws: Annotated[int, typer.Option(min=100, help="Posterior draws of each chain.")] = 1500,
     estimate_velocities: Velocities = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
     with interruptible(f"finished replications are in {output}; the same command goes on"):
+        check_can_make(output)
         declared, design = load_files(scene, history, estimate_velocities)
         os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report
@@ -51,8 +64,12 @@ def calibrate(
         write_atomically(output / "table.csv", result.table().to_csv)
         picture = report.png(report.plot_calibration(result))
         write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
-    typer.echo(_calibrated(result))
-    typer.echo(f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}")
+    if as_json:
+        table = {name: row.to_dict() for name, row in result.table().iterrows()}
+        print_json({"passed": result.passed, "parameters": table, "picture": output / "ranks.png"})
+    else:
+        typer.echo(_calibrated(result))
+        typer.echo(f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}")
     if not result.passed:
         raise typer.Exit(FAILED)
 

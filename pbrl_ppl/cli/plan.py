@@ -9,8 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli.terminal import FAILED, check_free, interruptible, stages
-from pbrl_ppl.errors import GoalError, OutputError
+from pbrl_ppl.cli.answers import print_json
+from pbrl_ppl.cli.outputs import check_file
+from pbrl_ppl.cli.terminal import FAILED, AsJson, Overwrite, Quiet, Seed, interruptible, stages
+from pbrl_ppl.errors import GoalError
 
 
 def plan(
@@ -58,15 +60,14 @@ def plan(
         float | None,
         typer.Option(help="Another limit (s); the plan then depends on the machine's load."),
     ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
+    seed: Seed = 1,
     animate: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Show the plan as a picture that moves (.gif)."),
     ] = None,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace files that exist.")
-    ] = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
     """Plan from a start to a goal with a posterior file, and nothing else."""
     with interruptible(), stages(quiet) as progress:
@@ -74,7 +75,7 @@ def plan(
             raise GoalError("plan: say where it should be written: -o plan.csv")
         for path, ending in ((output, ".csv"), (animate, ".gif")):
             if path is not None:
-                _check_output(path, ending, overwrite)
+                check_file(path, (ending,), overwrite)
         progress("reading the posterior")
         from pbrl_ppl.planning import ActionSet, Goal
         from pbrl_ppl.planning import plan as make_plan
@@ -110,9 +111,19 @@ def plan(
             from pbrl_ppl.report import animate_plan
 
             animate_plan(result, animate)
-    typer.echo(result.in_words())
-    for path in (output, animate):
-        if path is not None:
+    written = [path for path in (output, animate) if path is not None]
+    if as_json:
+        print_json(
+            {
+                "reached": result.reached,
+                "duration": result.duration,
+                "words": result.in_words(),
+                "written": written,
+            }
+        )
+    else:
+        typer.echo(result.in_words())
+        for path in written:
             typer.echo(f"plan: {path}")
     if not result.reached:
         raise typer.Exit(FAILED)
@@ -139,12 +150,3 @@ def _pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[floa
     if option == "--start" and None in values:
         raise GoalError(f"{option} {text}: a start has no free coordinates; give a number for -")
     return name.strip(), values  # type: ignore[return-value]
-
-
-def _check_output(path: Path, ending: str, overwrite: bool) -> None:
-    """Refuse an output before the long work whose result would be lost."""
-    if path.suffix != ending:
-        raise OutputError(f"{path}: expected a name that ends in {ending}")
-    check_free(path, overwrite)
-    if not path.parent.is_dir():
-        raise OutputError(f"{path}: there is no folder {path.parent}; make it, or choose another")

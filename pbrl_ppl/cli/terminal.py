@@ -1,19 +1,18 @@
-"""Helpers of the commands: reading files, progress, interrupts, and messages in a line."""
+"""Helpers of the commands: shared options, files, progress, interrupts, messages in a line."""
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-
-from pbrl_ppl.errors import OutputError
 
 if TYPE_CHECKING:
     from pbrl_ppl.history import History
@@ -24,6 +23,24 @@ if TYPE_CHECKING:
 FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.toml).")]
+HistoryFile = Annotated[
+    Path, typer.Argument(metavar="HISTORY", help="Measured history (.csv, .parquet, .nc).")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Same seed, same answer.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object, and nothing else.")]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
+Substeps = Annotated[
+    int | None, typer.Option(min=1, help="Engine steps per interval, for the scene's.")
+]
+Errors = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--noise",
+        metavar="NAME=SD",
+        help="Known error of measuring a state dimension (x=0.002, in m; repeat for others).",
+    ),
+]
 Velocities = Annotated[
     bool,
     typer.Option(
@@ -31,6 +48,12 @@ Velocities = Annotated[
         help="Start predictions from velocities estimated from positions, if none were measured.",
     ),
 ]
+
+#: What messages for Python advise besides, by the argument that it takes: left out of a command's
+#: messages if it has no such option.
+_ADVICE = {"thin": " or thin=", "resume": ", or go on with resume= this posterior"}
+#: An argument named in a message for Python.
+_ARGUMENT = re.compile(r"\b([a-z_]+)=(?:True\b)?(?=[\s,;.)]|$)")
 
 
 def load_files(scene: Path, history: Path, estimate_velocities: bool) -> tuple[Scene, History]:
@@ -43,38 +66,57 @@ def load_files(scene: Path, history: Path, estimate_velocities: bool) -> tuple[S
     return declared, History.load(history, declared, estimate_velocities=estimate_velocities)
 
 
-def stated_noise(scene: Scene, given: list[str]) -> Scene:
-    """The scene with errors of measuring from options such as ``x=0.002``."""
-    noise: dict[str, float | str] = dict(scene.noise)
-    for item in given:
-        name, _, value = item.partition("=")
+def named_numbers(given: list[str] | None, option: str, example: str) -> dict[str, float]:
+    """Numbers by name from options such as ``x=0.002``."""
+    numbers = {}
+    for item in given or []:
+        name, _, value = item.rpartition("=")
         try:
-            noise[name.strip()] = float(value)
+            numbers[name.strip()] = float(value)
         except ValueError:
+            name = ""
+        if not name.strip():
             raise typer.BadParameter(
-                f"{item!r} is not NAME=VALUE, such as x=0.002", param_hint="--noise"
-            ) from None
-    return scene.replace(noise=noise)
+                f"{item!r} is not NAME=VALUE, such as {example}", param_hint=option
+            )
+    return numbers
 
 
-def check_free(path: Path, overwrite: bool) -> None:
-    """Refuse to write where there is a file, unless that is wanted."""
-    if path.exists() and not overwrite:
-        raise OutputError(f"{path}: it exists; choose another file, or pass --overwrite")
+def stated_noise(scene: Scene, given: list[str] | None) -> Scene:
+    """The scene with errors of measuring from options such as ``x=0.002``."""
+    return scene.replace(noise=dict(scene.noise) | named_numbers(given, "--noise", "x=0.002"))
 
 
 @contextmanager
-def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Show stages on stderr: a status line on a terminal, one line each elsewhere."""
+def stages(
+    quiet: bool, shares: Mapping[str, float] | None = None
+) -> Iterator[Callable[[str], None]]:
+    """Show stages on stderr: a status line on a terminal, one line each elsewhere.
+
+    Parameters
+    ----------
+    quiet : bool
+        Show nothing.
+    shares : mapping of str to float, optional
+        Share of the whole time that is usually over when a stage begins; from it follow how far the
+        work is, and how long it will still take.
+    """
     console = Console(stderr=True, quiet=quiet, highlight=False, markup=False)
     begin = time.monotonic()
     with console.status("starting") as status:
 
         def progress(stage: str) -> None:
-            console.print(f"[{time.monotonic() - begin:5.1f} s] {stage}", soft_wrap=True)
-            status.update(stage)
+            spent = time.monotonic() - begin
+            far = _how_far(spent, (shares or {}).get(stage, 0.0))
+            console.print(f"[{spent:5.1f} s{far}] {stage}", soft_wrap=True)
+            status.update(f"{stage} ({far.removeprefix(', ')})" if far else stage)
 
         yield progress
+
+
+def _how_far(spent: float, share: float) -> str:
+    """How far the work is, and how long it will still take if it goes on so."""
+    return f", {share:3.0%}, about {spent / share - spent:.0f} s left" if share else ""
 
 
 @contextmanager
@@ -92,14 +134,42 @@ def interrupted(state: str = "nothing was written") -> int:
     return INTERRUPTED
 
 
+def in_options(message: str, options: Collection[str]) -> str:
+    """A message for Python in one line and in the words of a command: its options.
+
+    Parameters
+    ----------
+    message : str
+        Names arguments as ``draws=`` or ``estimate_velocities=True``.
+    options : collection of str
+        The command's, as ``--draws``.
+
+    Examples
+    --------
+    >>> in_options("raise draws= or thin=, or measure y", ["--draws"])
+    'raise --draws, or measure y'
+    """
+    message = " ".join(message.split())
+    for name, words in _ADVICE.items():
+        if f"--{name}" not in options:
+            message = message.replace(words, "")
+
+    def option(match: re.Match[str]) -> str:
+        name = f"--{match[1].replace('_', '-')}"
+        return name if name in options else match[0]
+
+    return _ARGUMENT.sub(option, message)
+
+
 @contextmanager
-def warnings_in_a_line() -> Iterator[None]:
-    """Show warnings without the line of code they are from."""
+def warnings_in_a_line(options: Collection[str] = ()) -> Iterator[None]:
+    """Show warnings without the line of code they are from, in a command's words."""
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
-        print(f"warning: {' '.join(str(message).split())}", file=sys.stderr)  # noqa: T201
+        print(f"warning: {in_options(str(message), options)}", file=sys.stderr)  # noqa: T201
 
     with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
         # for authors of libraries, not for users of a command
         for category in (DeprecationWarning, PendingDeprecationWarning, FutureWarning):
             warnings.simplefilter("ignore", category)

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pbrl_ppl.cli.terminal import Velocities, check_free, interruptible, stages
+from pbrl_ppl.cli.answers import print_json
+from pbrl_ppl.cli.outputs import check_file
+from pbrl_ppl.cli.terminal import (
+    UNDECIDED,
+    AsJson,
+    Overwrite,
+    Quiet,
+    Seed,
+    Velocities,
+    interruptible,
+    stages,
+)
+from pbrl_ppl.errors import ConvergenceWarning
 
 
 def update(
@@ -21,16 +34,18 @@ def update(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help="The new posterior file.")
     ],
-    seed: Annotated[int, typer.Option(min=0, help="Same seed, same answer.")] = 1,
-    overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Replace a file that exists.")
-    ] = False,
+    seed: Seed = 1,
     estimate_velocities: Velocities = False,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")] = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
 ) -> None:
-    """Bring a posterior up to date with new transitions, without a fit from scratch."""
+    """Bring a posterior up to date with new transitions, without a fit from scratch.
+
+    Exits with 3 if the new posterior has not converged.
+    """
     with interruptible(), stages(quiet) as progress:
-        check_free(output, overwrite)
+        check_file(output, (".nc",), overwrite)
         progress("reading the posterior and the history")
         from pbrl_ppl.history import History
         from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
@@ -40,11 +55,22 @@ def update(
         progress("updating")
         from pbrl_ppl.sampling import updating
 
-        idata = updating.update(idata, new, seed=seed, progress=False)
+        with warnings.catch_warnings(record=True) as caught:
+            idata = updating.update(idata, new, seed=seed, progress=False)
+        if "interrupted" in idata.attrs:  # half a posterior is no ground for the next update
+            raise KeyboardInterrupt
+        for warning in caught:
+            warnings.warn(warning.message, stacklevel=1)
         save_posterior(idata, output)
         (*_, last) = json.loads(idata.attrs["updates"])
-    typer.echo(
-        f"{last['did']}: {last['transitions']} transitions, the weights worth {last['share']:.0%}"
-        " of the draws"
-    )
-    typer.echo(f"posterior: {output}")
+    converged = not any(issubclass(warning.category, ConvergenceWarning) for warning in caught)
+    if as_json:
+        print_json(last | {"posterior": output, "converged": converged})
+    else:
+        typer.echo(
+            f"{last['did']}: {last['transitions']} transitions, the weights worth"
+            f" {last['share']:.0%} of the draws"
+        )
+        typer.echo(f"posterior: {output}")
+    if not converged:
+        raise typer.Exit(UNDECIDED)

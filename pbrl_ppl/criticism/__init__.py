@@ -7,6 +7,7 @@ from pbrl_ppl.criticism.prior_check import (
     prior_predictive_check,
     telling_horizon,
 )
+from pbrl_ppl.criticism.ranking import Ranking, criticise
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
@@ -26,8 +27,10 @@ __all__ = [
     "Errors",
     "Findings",
     "PriorCheck",
+    "Ranking",
     "ResidualTest",
     "Unexplained",
+    "criticise",
     "prior_predictive_check",
     "revise",
     "telling_horizon",

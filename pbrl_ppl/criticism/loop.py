@@ -16,7 +16,8 @@ from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.criticism.histories import checked_histories, named
 from pbrl_ppl.criticism.misfit import PRIOR, Misfit, find_misfit
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
-from pbrl_ppl.criticism.resolution import shift, with_enough_substeps
+from pbrl_ppl.criticism.ranking import declared_mode
+from pbrl_ppl.criticism.resolution import shift
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
@@ -31,8 +32,8 @@ from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, build_model, single_transitions
-from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import try_effect
 from pbrl_ppl.posterior import compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
@@ -216,9 +217,9 @@ class _Loop:
 
     def declared_mode(self, effects: tuple[Attached, ...], substeps: int | None) -> Mode:
         """Mode of the declared model along trajectories, the engine's error small."""
-        problem = Problem.of(self.scene, self.train, effects, substeps=substeps, threads=2)
-        mode = find_mode(single_transitions(problem), seed=self.seed)
-        return with_enough_substeps(trajectory_mode(problem, mode.phi), self.say)
+        return declared_mode(
+            self.scene, self.train, effects, seed=self.seed, substeps=substeps, say=self.say
+        )
 
     def posterior(self, mode: Mode, draws: int | None) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""

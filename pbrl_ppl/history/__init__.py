@@ -1,7 +1,7 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
 from pbrl_ppl.history.derived import derived_velocities, measured_alone
-from pbrl_ppl.history.files import write_atomically
+from pbrl_ppl.history.files import read_table, write_atomically
 from pbrl_ppl.history.gaps import longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
@@ -17,6 +17,7 @@ __all__ = [
     "lever",
     "longest_gap",
     "measured_alone",
+    "read_table",
     "segment_rows",
     "unseen",
     "write_atomically",

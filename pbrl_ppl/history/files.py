@@ -53,11 +53,12 @@ def _read_csv(path: Path) -> pd.DataFrame:
     lines = content.removeprefix(b"\xef\xbb\xbf").splitlines()
     if not any(line.strip() for line in lines):
         raise HistoryError(f"history {path}: the file is empty; expected a header and rows")
+    separator, decimal = _separators(lines[0], content)
     # pandas fills short rows with blanks without a word: a file that was cut off would pass.
     if b'"' not in content:
-        cells = lines[0].count(b",") + 1
+        cells = lines[0].count(separator) + 1
         for number, line in enumerate(lines, start=1):
-            found = line.count(b",") + 1
+            found = line.count(separator) + 1
             if found != cells and line.strip():
                 raise HistoryError(
                     f"history row {number}: {found} cells, expected {cells} as in the header; "
@@ -67,6 +68,8 @@ def _read_csv(path: Path) -> pd.DataFrame:
     try:
         frame: pd.DataFrame = pd.read_csv(
             io.BytesIO(content),
+            sep=separator.decode(),
+            decimal=decimal,
             dtype={"trajectory": "str", "body": "str"},
             keep_default_na=False,
             na_values=number_columns,
@@ -81,6 +84,12 @@ def _read_csv(path: Path) -> pd.DataFrame:
     if not isinstance(frame.index, pd.RangeIndex):
         raise HistoryError(f"history {path}: rows have more cells than the header; repair them")
     return frame
+
+
+def _separators(header: bytes, content: bytes) -> tuple[bytes, str]:
+    """What separates cells and decimals: a spreadsheet may write ``1,5;2,0``."""
+    separator = next((mark for mark in (b",", b";", b"\t") if mark in header), b",")
+    return separator, "," if separator != b"," and b"," in content else "."
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:

@@ -240,7 +240,7 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
     if not overwrite and any(folder.iterdir()):
         raise OutputError(
             f"output folder {folder}: it has content already; choose another, or allow"
-            " overwriting (--overwrite, overwrite=True)"
+            " overwriting: overwrite=True"
         )
     for name in FILES:
         if (folder / name).is_dir():

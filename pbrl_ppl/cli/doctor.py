@@ -1,0 +1,100 @@
+"""``pbrl-ppl doctor``."""
+
+from __future__ import annotations
+
+import os
+import platform
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from pbrl_ppl.cli.answers import print_json
+from pbrl_ppl.cli.terminal import FAILED, AsJson, Quiet, interruptible, stages
+
+#: The compiled and the plain path agree to rounding.
+_AGREE = 1e-9
+
+
+def doctor(as_json: AsJson = False, quiet: Quiet = False) -> None:
+    """Versions, whether the compiled engine loop works here, and how many threads there are.
+
+    Exits with 1 if the compiled loop is wrong; where there is none, a slow one serves.
+    """
+    with interruptible(), stages(quiet) as progress:
+        progress("loading the packages")
+        import threadpoolctl
+
+        from pbrl_ppl.model import Transition  # noqa: F401  # its libraries are looked at below
+        from pbrl_ppl.posterior import versions
+
+        found: dict[str, Any] = {"versions": versions(), "platform": platform.platform()}
+        progress("trying the engine")
+        found["engine"] = _engine()
+        found["threads"] = {
+            "processors": _processors(),
+            **{
+                str(pool["user_api"]): int(pool["num_threads"])
+                for pool in threadpoolctl.threadpool_info()
+            },
+        }
+        found["package"] = str(Path(__file__).parents[1])
+    wrong = found["engine"]["difference"] > _AGREE
+    if as_json:
+        print_json(found | {"ok": not wrong})
+    else:
+        _say(found)
+    if wrong:
+        typer.echo("error: the compiled engine loop is wrong here; please report this", err=True)
+        raise typer.Exit(FAILED)
+
+
+def _processors() -> int:
+    """Those that this process may use."""
+    if sys.platform == "linux":
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def _engine() -> dict[str, Any]:
+    """Which loop there is, how far it is from the plain one, and its time for a transition."""
+    import numpy as np
+
+    from pbrl_ppl.model import build_layout
+    from pbrl_ppl.physics import Simulator
+    from pbrl_ppl.scene import Body, Scene, Shape, Wall
+
+    # a puck that hits a wall, so that contacts are in it
+    puck = Body("puck", Shape.circle(0.1), known=(("r", 0.5), ("mu_c", 0.3)))
+    scene = Scene(time_step=0.1, bodies=(puck,), walls=(Wall((1.0, -1.0), (1.0, 1.0)),))
+    layout = build_layout(scene)
+    start = np.zeros((100, 1, 6))
+    start[:, 0, 0], start[:, 0, 3] = np.linspace(0.0, 0.8, 100), 2.0
+    actions = np.zeros((100, 1, 1, 3))
+    simulators = [Simulator(scene, layout, path=path) for path in (None, "plain")]
+    states = [simulator(np.ones(1), start, actions) for simulator in simulators]
+    begin = time.perf_counter()
+    simulators[0](np.ones(1), start, actions)
+    spent = time.perf_counter() - begin
+    return {
+        "path": simulators[0].path,
+        "difference": float(np.abs(states[0] - states[1]).max()),
+        "microseconds_per_transition": 1e6 * spent / len(start),
+    }
+
+
+def _say(found: dict[str, Any]) -> None:
+    for name, version in found["versions"].items():
+        typer.echo(f"{name:12} {version}")
+    typer.echo(f"{'platform':12} {found['platform']}")
+    engine = found["engine"]
+    slow = "" if engine["path"] == "compiled" else ": a Python loop, slow; no compiled one here"
+    typer.echo(
+        f"{'engine':12} {engine['path']}{slow}, {engine['microseconds_per_transition']:.1f} us a"
+        f" transition, {engine['difference']:.1g} from the plain loop"
+    )
+    threads = ", ".join(f"{number} {name}" for name, number in found["threads"].items())
+    typer.echo(f"{'threads':12} {threads}")
+    typer.echo(f"{'package':12} {found['package']}")

@@ -1,0 +1,217 @@
+"""``pbrl-ppl simulate``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pbrl_ppl.cli.answers import print_json
+from pbrl_ppl.cli.outputs import check_file
+from pbrl_ppl.cli.terminal import (
+    AsJson,
+    Errors,
+    HistoryFile,
+    Overwrite,
+    Quiet,
+    Seed,
+    Velocities,
+    interruptible,
+    named_numbers,
+    stages,
+)
+from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from pbrl_ppl.history import History
+    from pbrl_ppl.parameters import Layout
+    from pbrl_ppl.scene import Scene
+
+    Array = NDArray[np.float64]
+
+
+def simulate(
+    source: Annotated[
+        Path,
+        typer.Argument(metavar="SOURCE", help="Posterior file (.nc), or scene (.toml) with --set."),
+    ],
+    history: HistoryFile,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", metavar="FILE", help="The history (.csv, .parquet, .nc)."),
+    ],
+    given: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="A parameter (SI units): mass=8 for all bodies, or 'mass[cart]=8'; repeat.",
+        ),
+    ] = None,
+    draws: Annotated[
+        int | None,
+        typer.Option(min=1, help="Posterior draws, a copy of each trajectory for each; else MAP."),
+    ] = None,
+    noise: Errors = None,
+    seed: Seed = 1,
+    estimate_velocities: Velocities = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+    quiet: Quiet = False,
+) -> None:
+    """Simulate a recording: its start states and wrenches, under parameters that are given.
+
+    Each trajectory is followed from its first complete state to its end. With --noise, errors of
+    measuring are added; without, the states are the engine's.
+    """
+    with interruptible(), stages(quiet) as progress:
+        check_file(output, (".csv", ".parquet", ".nc"), overwrite)
+        values = named_numbers(given, "--set", "mass=8")
+        errors = named_numbers(noise, "--noise", "x=0.002")
+        progress("reading the parameters and the history")
+        scene, layout, phi, substeps = _parameters(source, values, draws, seed)
+        scene.replace(noise=errors)  # it is checked there
+        from pbrl_ppl.history import History
+
+        recorded = History.load(history, scene, estimate_velocities=estimate_velocities)
+        progress("simulating")
+        simulated = _simulated(scene, layout, phi, substeps, recorded)
+        result = _history(recorded, simulated, errors, seed, labelled=draws is not None)
+        result.save(output)
+    if as_json:
+        print_json(
+            {
+                "history": output,
+                "trajectories": result.n_trajectories,
+                "transitions": result.n_transitions,
+                "parameters": dict(zip(layout.labels, phi.T, strict=True)),
+            }
+        )
+    else:
+        typer.echo(f"history: {output} ({result.n_trajectories} trajectories)")
+
+
+def _parameters(
+    source: Path, values: Mapping[str, float], draws: int | None, seed: int
+) -> tuple[Scene, Layout, Array, int]:
+    """The scene, and parameter vectors, shape (draw, p), from a posterior or from the options."""
+    import numpy as np
+
+    if source.suffix == ".nc":
+        from pbrl_ppl.planning import Dynamics
+        from pbrl_ppl.posterior import load_posterior
+
+        idata = load_posterior(source)
+        dynamics = Dynamics.of(idata, draws, seed=seed)
+        scene, layout, phi = dynamics.scene, dynamics.layout, dynamics.phi.copy()
+        substeps = int(idata.attrs["substeps"])
+    elif draws is not None:
+        raise PosteriorError(f"--draws: {source} is no posterior file (.nc), and has no draws")
+    else:
+        from pbrl_ppl.scene import Scene
+
+        scene = Scene.load(source)
+        from pbrl_ppl.effects import attach
+        from pbrl_ppl.model import build_layout
+
+        layout, substeps = build_layout(scene, attach(scene)), scene.substeps
+        phi = np.full((1, layout.size), np.nan)
+    _set(layout, phi, values)
+    return scene, layout, phi, substeps
+
+
+def _set(layout: Layout, phi: Array, values: Mapping[str, float]) -> None:
+    """Put values into parameter vectors, in place: by label, or for all bodies that have one."""
+    import numpy as np
+
+    from pbrl_ppl.scene import nearest
+
+    for name, value in values.items():
+        places = [i for i, label in enumerate(layout.labels) if name in (label, _bare(label))]
+        if not places:
+            known = [*dict.fromkeys(map(_bare, layout.labels)), *layout.labels]
+            raise ParameterError(f'--set: there is no parameter "{name}"{nearest(name, known)}')
+        phi[:, places] = value
+    missing = [layout.labels[i] for i in np.flatnonzero(np.isnan(phi).any(axis=0))]
+    if missing:
+        raise ParameterError(
+            f"--set: no value for {', '.join(missing)}; give one, such as"
+            f" --set '{missing[0]}=...', or in the scene (known = ...)"
+        )
+
+
+def _bare(label: str) -> str:
+    return label.partition("[")[0]
+
+
+def _simulated(
+    scene: Scene, layout: Layout, phi: Array, substeps: int, recorded: History
+) -> list[Any]:
+    """Recorded states replaced by simulated ones, (trajectory, time, body, 6), for each draw."""
+    import numpy as np
+
+    from pbrl_ppl.effects import attach
+    from pbrl_ppl.physics import Simulator, check_history
+
+    # one piece a trajectory, which its end cuts short
+    segments = recorded.segments(int(recorded.dataset["n_rows"].max()) - 1)
+    lost = set(range(recorded.n_trajectories)) - set(segments.trajectory.tolist())
+    if lost:
+        label = recorded.dataset["trajectory"].to_numpy()[min(lost)]
+        raise HistoryError(
+            f"history: trajectory {label} has no complete state to start from; measure one, drop it"
+            " or pass estimate_velocities=True"
+        )
+    check_history(scene, recorded, segments)
+    simulator = Simulator(scene, layout, attach(scene), substeps=substeps, threads=2)
+    predicted = simulator(phi, segments.start, segments.inputs)
+    follows = recorded.dataset["kinematic"].to_numpy()
+    n_rows = recorded.dataset["n_rows"].to_numpy()
+    result = []
+    for own in predicted:
+        states = np.full(recorded.dataset["observed"].shape, np.nan)
+        states[:, :, follows] = recorded.dataset["start"].to_numpy()[:, :, follows]
+        for i, (trajectory, step) in enumerate(
+            zip(segments.trajectory, segments.step, strict=True)
+        ):
+            rows = np.arange(step + 1, n_rows[trajectory])
+            after = own[i, : len(rows)][:, ~follows]
+            if not np.isfinite(after).all():
+                raise SimulationError(
+                    "simulate: the engine diverged under these parameters; check them and their"
+                    " units, or use more substeps in the scene"
+                )
+            states[np.ix_([trajectory], [step], ~follows)] = segments.start[i][~follows]
+            states[np.ix_([trajectory], rows, ~follows)] = after
+        result.append(states)
+    return result
+
+
+def _history(
+    recorded: History, states: list[Any], errors: Mapping[str, float], seed: int, labelled: bool
+) -> History:
+    """A history of simulated states with errors of measuring; labels say which draw, if asked."""
+    import numpy as np
+    import xarray as xr
+
+    from pbrl_ppl.history import History
+    from pbrl_ppl.state import STATE
+
+    rng = np.random.default_rng(seed)
+    spread = np.array([errors.get(name, 0.0) for name in STATE])
+    free = ~recorded.dataset["kinematic"].to_numpy()[:, None]
+    copies = []
+    for draw, own in enumerate(states):
+        measured = own + free * spread * rng.standard_normal(own.shape)
+        copy = recorded.dataset.copy()
+        copy["observed"] = copy["observed"].copy(data=measured)
+        if labelled:
+            labels = [f"{name}/draw {draw}" for name in copy["trajectory"].to_numpy()]
+            copy = copy.assign_coords(trajectory=labels)
+        copies.append(copy)
+    return History(xr.concat(copies, dim="trajectory"))

@@ -1,0 +1,121 @@
+"""The score test of every candidate at the mode of the declared model, and nothing after it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from threadpoolctl import threadpool_limits
+
+from pbrl_ppl.criticism.histories import checked_histories, named
+from pbrl_ppl.criticism.resolution import with_enough_substeps
+from pbrl_ppl.criticism.results import Candidate
+from pbrl_ppl.criticism.score import rank_candidates
+from pbrl_ppl.criticism.unexplained import unexplained_acceleration
+from pbrl_ppl.effects import Attached, Effect, attach, candidates
+from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.history import History
+from pbrl_ppl.model import Problem, single_transitions
+from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.scene import Scene
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """Candidate effects by their score, at the mode of the declared model.
+
+    Parameters
+    ----------
+    candidates : tuple of Candidate
+        Best first.
+    mode : dict of str to float
+        The declared model's parameters there, by label, SI units.
+    unexplained_acceleration : dict of str to float
+        What a step adds beyond the declared model, m/s^2 and rad/s^2.
+    substeps : int
+        Engine steps an interval that were needed.
+    """
+
+    candidates: tuple[Candidate, ...]
+    mode: dict[str, float]
+    unexplained_acceleration: dict[str, float]
+    substeps: int
+
+
+def criticise(
+    scene: Scene,
+    history: History,
+    *,
+    catalogue: Iterable[Effect] = full_catalogue,
+    seed: int = 0,
+    substeps: int | None = None,
+    progress: Callable[[str], None] | None = None,
+) -> Ranking:
+    """Rank what a declared model might lack by the score test, without a refit.
+
+    A statistic says that the residual looks like the effect's signature; whether the effect
+    explains it, and helps on other data, :func:`pbrl_ppl.close_loop` finds out.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared model.
+    history : History
+        Measured transitions.
+    catalogue : iterable of Effect
+        Effects to consider.
+    seed : int
+        Of the search for the mode.
+    substeps : int, optional
+        Engine steps an interval to begin with; the scene's by default.
+    progress : callable, optional
+        Told the name of each stage.
+
+    Returns
+    -------
+    Ranking
+        The candidates, best first.
+
+    Raises
+    ------
+    HistoryError
+        If the history does not fit the scene.
+    EffectError
+        If the scene declares an unknown effect.
+    """
+    say = progress or (lambda stage: None)
+    catalogue = tuple(catalogue)
+    if substeps is not None:
+        scene.replace(substeps=substeps)  # it is checked there
+    # matrices are small: threads of linear algebra only get in each other's way
+    with threadpool_limits(1, "blas"):
+        history, _, derived = checked_histories(scene, history, history)
+        if derived.any():
+            say(f"taking {named(scene, derived)} for computed from positions, which count alone")
+        effects = attach(scene, (), catalogue)
+        say("fitting the declared model")
+        mode = declared_mode(scene, history, effects, seed=seed, substeps=substeps, say=say)
+        say("scoring what the model might lack")
+        ranked = rank_candidates(mode, candidates(scene, effects, catalogue))
+        left = unexplained_acceleration(mode)
+    return Ranking(
+        tuple(signature.candidate for signature in ranked),
+        dict(zip(mode.problem.layout.labels, mode.phi.tolist(), strict=True)),
+        dict(zip(left.names, left.size.tolist(), strict=True)),
+        mode.problem.physics.substeps,
+    )
+
+
+def declared_mode(
+    scene: Scene,
+    history: History,
+    effects: tuple[Attached, ...],
+    *,
+    seed: int,
+    substeps: int | None,
+    say: Callable[[str], None],
+) -> Mode:
+    """Mode of the declared model along trajectories, the engine's error small."""
+    problem = Problem.of(scene, history, effects, substeps=substeps, threads=2)
+    mode = find_mode(single_transitions(problem), seed=seed)
+    return with_enough_substeps(trajectory_mode(problem, mode.phi), say)

@@ -1,0 +1,401 @@
+"""The commands beside the loop: new, fit, criticise, simulate, doctor, and what all have alike."""
+
+import json
+import os
+import shlex
+import subprocess
+import sys
+import tomllib
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+
+from pbrl_ppl import report, sampling
+from pbrl_ppl.cli import main
+from pbrl_ppl.cli.app import COMMANDS, _options_of, app
+from pbrl_ppl.cli.scene_text import _HEAD
+from pbrl_ppl.cli.terminal import warnings_in_a_line
+from pbrl_ppl.errors import BoundWarning, ConvergenceWarning
+from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.model.table1 import table1
+from pbrl_ppl.posterior import load_posterior, record
+from pbrl_ppl.scene import Body, Scene, Shape
+from tests.helpers.places import MODELS, ROOT
+
+HEADER = "trajectory,step,time,body,x,y,theta,vx,vy,omega,force_x,force_y,torque\n"
+SCENE = """
+[world]
+time_step = 0.1
+substeps = 4
+
+[[body]]
+name = "puck"
+shape = { kind = "circle", radius = 0.1 }
+known = { r = 0.5, mu_c = 0.3 }
+"""
+
+
+@pytest.fixture
+def puck(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a puck of 2 kg that is pushed by 4 N, to run in; errors are a millionth."""
+    rng = np.random.default_rng(1)
+    rows = []
+    for i, force in enumerate((4.0, -2.0, 1.0, 3.0)):
+        for step in range(6):
+            time, a = 0.1 * step, force / 2.0
+            state = np.array([0.5 * a * time**2, 0.0, 0.0, a * time, 0.0, 0.0])
+            state += 1e-4 * rng.standard_normal(6)
+            wrench = ",," if step == 5 else f"{force},0,0"
+            rows.append(
+                f"{i},{step},{time:.1f},puck,{','.join(map(repr, state.tolist()))},{wrench}"
+            )
+    (tmp_path / "train.csv").write_text(HEADER + "\n".join(rows) + "\n")
+    (tmp_path / "scene.toml").write_text(SCENE)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def answer(capsys: pytest.CaptureFixture[str], *argv: str, code: int = 0) -> dict[str, Any]:
+    """Run with --json, and take what is on stdout, all of it, for one object."""
+    assert main([*argv, "--json"]) == code
+    result: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return result
+
+
+def message(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
+    """Run, and expect code 2 with one message and no result."""
+    assert main([*argv, "--quiet"]) == 2
+    captured = capsys.readouterr()
+    assert captured.out == "" and "Traceback" not in captured.err
+    return captured.err
+
+
+# what all have alike
+
+
+def test_every_help_has_an_example_that_parses() -> None:
+    group = typer.main.get_command(app)
+    assert set(group.commands) >= set(COMMANDS)
+    for name, command in group.commands.items():
+        assert command.epilog and command.epilog.startswith("Example: pbrl-ppl "), name
+        words = shlex.split(command.epilog.removeprefix("Example: "))
+        assert words[1] == name
+        command.make_context(name, words[2:])  # raises on what it does not know
+
+
+def test_options_are_alike() -> None:
+    """All can be quiet and answer in JSON; what is random has a seed."""
+    for name, command in typer.main.get_command(app).commands.items():
+        options = {option for parameter in command.params for option in parameter.opts}
+        if name in COMMANDS:
+            assert {"--json", "--quiet"} <= options, name
+        if "--draws" in options:
+            assert "--seed" in options, name
+    drawing = {"check", "fit", "close-loop", "plan", "simulate", "calibrate"}
+    commands = typer.main.get_command(app).commands
+    assert {
+        name for name in COMMANDS if any("--draws" in each.opts for each in commands[name].params)
+    } == drawing
+
+
+def test_exit_codes_are_documented() -> None:
+    readme = (ROOT / "README.md").read_text()
+    for code in ("0", "1", "2", "3", "130"):
+        assert f"| {code} |" in readme
+        assert f"{code} " in app.info.epilog or f"{code};" in app.info.epilog
+
+
+def test_shell_completion() -> None:
+    environment = os.environ | {
+        "PYTHONPATH": str(ROOT), "_PBRL_PPL_COMPLETE": "complete_bash",
+        "COMP_WORDS": "pbrl-ppl cri", "COMP_CWORD": "1",
+    }  # fmt: skip
+    code = "import sys; from pbrl_ppl.cli import main; sys.exit(main())"
+    got = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env=environment
+    )
+    assert got.stdout.split() == ["criticise"], got.stderr
+
+
+def test_reading_files_does_not_load_pymc() -> None:
+    folder = MODELS / "shopping_cart"
+    code = (
+        "import sys, time; begin = time.process_time(); import pbrl_ppl as pp;"
+        " print(time.process_time() - begin);"
+        f" scene = pp.Scene.load({str(folder / 'scene.toml')!r});"
+        f" pp.History.load({str(folder / 'recorded' / 'test.csv')!r}, scene); print(*sys.modules)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    said = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=True, env=environment
+    )
+    seconds, modules = said.stdout.splitlines()
+    assert float(seconds) < 1.0
+    assert not {"pymc", "pytensor", "arviz", "matplotlib", "numba"} & set(modules.split())
+
+
+# new
+
+
+@pytest.mark.usefixtures("puck")
+def test_three_commands_from_a_recording_to_criticism(capsys: pytest.CaptureFixture[str]) -> None:
+    """No scene is there, and no Python; the drag in the recording is not declared."""
+    Path("scene.toml").unlink()
+    slowed(Path("train.csv"))
+    written = answer(
+        capsys, "new", "scene.toml", "--history", "train.csv", "--body", "puck=circle:0.1"
+    )
+    assert written["scene"] == "scene.toml"
+    scene = Scene.load("scene.toml")
+    assert [body.name for body in scene.moving] == ["puck"] and scene.time_step == 0.1
+    contents = answer(capsys, "check", "scene.toml", "train.csv", "--no-prior")
+    assert contents["transitions"] == 20 and contents["missing"]["puck"]["x"] == 0
+    found = answer(capsys, "criticise", "scene.toml", "train.csv", "--quiet")
+    assert found["candidates"][0]["effect"] == "linear_drag"
+    assert found["candidates"][0]["estimate"]["coefficient"] == pytest.approx(2.0, rel=0.2)
+    assert found["mode"]["mass[puck]"] > 0
+
+
+def slowed(path: Path) -> None:
+    """The puck's recording with a drag of 2 kg/s, a rate of 1/s."""
+    lines = []
+    for line in path.read_text().splitlines()[1:]:
+        cells = line.split(",")
+        time, force = float(cells[2]), (4.0, -2.0, 1.0, 3.0)[int(cells[0])]
+        noise = 1e-5 * np.sin(37.0 * np.arange(2) + 91.0 * time + force)
+        cells[7] = repr(float(force / 2.0 * (1 - np.exp(-time)) + noise[0]))
+        cells[4] = repr(float(force / 2.0 * (time - 1 + np.exp(-time)) + noise[1]))
+        lines.append(",".join(cells))
+    path.write_text(HEADER + "\n".join(lines) + "\n")
+
+
+@pytest.mark.usefixtures("puck")
+def test_new_copies_a_model_with_its_recordings(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "exists" in message(capsys, "new", "--from", "pendulum")
+    assert Path("scene.toml").read_text() == SCENE
+    assert "train.csv: it exists" in message(capsys, "new", "a.toml", "--from", "pendulum")
+    assert not Path("a.toml").exists()
+    written = answer(capsys, "new", "--from", "pendulum", "--overwrite")["written"]
+    assert sorted(written) == ["scene.toml", "test.csv", "train.csv"]
+    History.load("train.csv", Scene.load("scene.toml"))
+    assert 'did you mean "shopping_cart"' in message(capsys, "new", "b.toml", "--from", "cart")
+
+
+@pytest.mark.usefixtures("puck")
+def test_new_says_what_it_needs(capsys: pytest.CaptureFixture[str]) -> None:
+    said = message(capsys, "new", "a.toml")  # no terminal to ask at
+    assert "--body NAME=" in said and "--time-step" in said
+    assert "not NAME=SHAPE" in message(capsys, "new", "a.toml", "--body", "puck=ball:1")
+    options = ("--history", "train.csv", "--body", "pock=circle:0.1")
+    assert "has no rows of 'pock'" in message(capsys, "new", "a.toml", *options)
+    assert not Path("a.toml").exists()
+
+
+@pytest.mark.usefixtures("puck")
+def test_new_asks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    answers = iter(["top", "box", "box:0.4x0.2", 0.02])
+    monkeypatch.setattr("sys.stdin.isatty", lambda: True)
+    monkeypatch.setattr(typer, "prompt", lambda *args, **options: next(answers))
+    monkeypatch.setattr(typer, "confirm", lambda *args: True)
+    assert main(["new", "a.toml", "--quiet"]) == 0
+    (body,) = Scene.load("a.toml").moving
+    assert (body.name, body.wheel) == ("box", True)
+    monkeypatch.setattr(
+        typer, "prompt", lambda *args, **options: (_ for _ in ()).throw(typer.Abort)
+    )
+    assert main(["new", "b.toml", "--quiet"]) == 130
+    assert "nothing was written" in capsys.readouterr().err and not Path("b.toml").exists()
+
+
+def test_table_1_is_told_as_it_is() -> None:
+    """In the README and in new scenes."""
+    priors = table1(Body("cart", Shape.box(1.0, 0.6)))
+    readme = (ROOT / "README.md").read_text()
+    for name in ("mass", "r", "mu_c"):
+        own = priors[name]
+        row = next(line for line in readme.splitlines() if line.startswith(f"| `{name}`"))
+        line = next(each for each in _HEAD.splitlines() if each.startswith(f"#   {name} "))
+        for text in (row, line):
+            assert f"mu = {own.mu}" in text and f"sigma = {own.sigma}" in text
+        assert ("logarithm" in row.lower()) == (own.family == "log_normal")
+    assert priors["mu_x"] == priors["mu_y"] == priors["mu_c"]
+    assert priors["w_x"].sigma == 1.0 and priors["w_theta"].kappa == 0.0
+
+
+def test_the_wheel_has_all_rooms_and_the_models() -> None:
+    tools = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    rooms = {path.parent.name for path in (ROOT / "pbrl_ppl").glob("*/__init__.py")}
+    expected = {"pbrl_ppl", *(f"pbrl_ppl.{name}" for name in rooms), "pbrl_ppl.models"}
+    assert set(tools["packages"]) == expected
+    assert tools["package-dir"] == {"pbrl_ppl.models": "models"}
+    for scene in MODELS.glob("*/scene.toml"):
+        own = {path for pattern in tools["package-data"]["pbrl_ppl.models"]
+               for path in MODELS.glob(pattern)}  # fmt: skip
+        assert {scene, *scene.parent.glob("recorded/*.csv")} <= own
+    assert (ROOT / "pbrl_ppl" / "py.typed").exists() and (ROOT / "CITATION.cff").exists()
+
+
+# fit and simulate
+
+
+@pytest.mark.usefixtures("puck")
+def test_fit_writes_a_posterior_and_simulate_takes_it(capsys: pytest.CaptureFixture[str]) -> None:
+    fit = ("fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q")
+    fitted = answer(capsys, *fit, "--method", "laplace", "--draws", "200", "--seed", "3")
+    assert fitted["converged"] and fitted["posterior"] == "puck.nc"
+    assert fitted["parameters"]["mass[puck]"]["mean"] == pytest.approx(2.0, rel=0.01)
+    idata = load_posterior("puck.nc")
+    assert idata.attrs["seed"] == 3 and "unexplained_acceleration[vx]" in fitted["parameters"]
+    assert "it exists" in message(capsys, *fit)
+    simulate = ("simulate", "puck.nc", "train.csv", "-q")
+    made = answer(capsys, *simulate, "-o", "again.csv", "--draws", "2", "--noise", "x=1e-9")
+    assert made["trajectories"] == 8 and made["transitions"] == 40
+    scene = Scene.load("scene.toml")
+    measured, again = (History.load(f"{name}.csv", scene) for name in ("train", "again"))
+    observed = [each.dataset["observed"].to_numpy() for each in (measured, again)]
+    assert np.abs(observed[1][:4] - observed[0]).max() < 1e-2
+    # the same from the scene, with twice the mass: half the speed that is gained
+    made = answer(capsys, "simulate", "scene.toml", "train.csv", "-o", "b.csv", "--set", "mass=4")
+    assert made["parameters"] == {"mass[puck]": [4.0]}
+    heavy = History.load("b.csv", scene).dataset["observed"].to_numpy()
+    gained = [each[:4, -1, 0, 3] - each[:4, 0, 0, 3] for each in (heavy, observed[0])]
+    assert gained[0] == pytest.approx(gained[1] / 2, abs=2e-3)
+
+
+@pytest.mark.usefixtures("puck")
+def test_simulate_says_what_it_needs(capsys: pytest.CaptureFixture[str]) -> None:
+    simulate = ("simulate", "scene.toml", "train.csv", "-o", "a.csv")
+    assert "no value for mass[puck]" in message(capsys, *simulate)
+    said = message(capsys, *simulate, "--set", "mas=1")
+    assert 'no parameter "mas"; did you mean "mass"' in said
+    assert "not NAME=VALUE" in message(capsys, *simulate, "--set", "mass")
+    assert "expected" in message(capsys, *simulate, "--set", "mass=-1")
+    assert "no draws" in message(capsys, *simulate, "--set", "mass=1", "--draws", "3")
+    assert not Path("a.csv").exists()
+
+
+@pytest.mark.usefixtures("puck")
+def test_fit_without_convergence_exits_with_3(capsys: pytest.CaptureFixture[str]) -> None:
+    fit = ("fit", "scene.toml", "train.csv", "-o", "puck.nc", "--draws", "5", "--method", "laplace")
+    assert answer(capsys, *fit, "--chains", "2", "-q", code=3)["converged"] is False
+    assert Path("puck.nc").exists()  # it may be looked at, and gone on with
+    assert "one of metropolis" in message(capsys, *fit[:4], "a.nc", "--method", "metropols")
+    said = message(capsys, *fit[:4], "a.nc", "--horizon", "3")
+    assert "--transitions" in said
+
+
+@pytest.mark.usefixtures("puck")
+def test_an_interrupted_fit_gives_one_answer(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = sampling.fit
+
+    def cut(*args: Any, **options: Any) -> Any:
+        idata = whole(*args, **options)
+        idata.attrs["interrupted"] = 1
+        return idata
+
+    monkeypatch.setattr(sampling, "fit", cut)
+    fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "map"]
+    assert main(fit) == 130
+    said = capsys.readouterr().err
+    assert said.count("interrupted") == 1 and "kept in puck.nc" in said
+    assert "nothing was written" not in said and Path("puck.nc").exists()
+
+
+def test_doctor(capsys: pytest.CaptureFixture[str]) -> None:
+    found = answer(capsys, "doctor", "--quiet")
+    assert found["ok"] and found["engine"]["path"] == "compiled"
+    assert found["threads"]["processors"] >= 1 and "pymc" in found["versions"]
+
+
+# messages
+
+
+@pytest.mark.usefixtures("puck")
+def test_cures_are_options(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = Path("train.csv").read_text().splitlines()
+    positions = [
+        ",".join([*line.split(",")[:7], "", "", "", *line.split(",")[10:]]) for line in text[1:]
+    ]
+    Path("poses.csv").write_text(HEADER + "\n".join(positions) + "\n")
+    said = message(capsys, "check", "scene.toml", "poses.csv")
+    assert "pass --estimate-velocities (" in said and "=True" not in said
+    Path("out").mkdir()
+    Path("out/a").touch()
+    said = message(capsys, "close-loop", "scene.toml", "train.csv", "-o", "out")
+    assert said.strip().endswith("or allow overwriting: --overwrite")
+
+
+def test_what_fits_warn_of_fits_the_command(capsys: pytest.CaptureFixture[str]) -> None:
+    """As the messages are made, not as they are copied here."""
+    scene = Scene.load(MODELS / "shopping_cart" / "scene.toml")
+    history = History.load(MODELS / "shopping_cart" / "recorded" / "test.csv", scene)
+    model = physics_model(scene, history)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        sampling.fit(model, method="laplace", draws=5, chains=2)
+    kinds = {warning.category for warning in caught}
+    assert ConvergenceWarning in kinds
+    said = {}
+    for command in ("fit", "close-loop", "update"):
+        with warnings_in_a_line(_options_of([command])):
+            for warning in caught:
+                if issubclass(warning.category, ConvergenceWarning | BoundWarning):
+                    warnings.warn(warning.message, stacklevel=1)
+        said[command] = capsys.readouterr().err
+        assert "close-loop" not in said[command] and "start=" not in said[command]
+    assert "raise --draws or --thin, or go on with --resume this" in said["fit"]
+    assert "raise --draws\n" in said["close-loop"] and "resume" not in said["close-loop"]
+
+
+@pytest.mark.usefixtures("puck")
+def test_convergence_is_judged_as_it_is_written(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = Scene.load("scene.toml")
+    model = physics_model(scene, History.load("train.csv", scene))
+    idata = sampling.fit(model, method="laplace", draws=1000, chains=2)
+    expected = {
+        (1.0104, 400.0): [],
+        (1.0106, 400.0): ["R-hat is 1.011 for m (want <= 1.01);"],
+        (1.0, 399.9): ["effective sample size is 399 for m (want >= 400);"],
+    }
+    for (r_hat, ess), words in expected.items():
+        values = {"m": r_hat}, {"m": ess}
+        monkeypatch.setattr(record, "convergence", lambda idata, values=values: values)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            record.checked(model.problem, idata)
+        said = [str(each.message) for each in caught if each.category is ConvergenceWarning]
+        assert len(said) == len(words)
+        assert all(f"not converged: {word}" in each for word, each in zip(words, said, strict=True))
+
+
+@pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize("name", ["x" * 300, "/proc/none/report"])
+def test_a_folder_that_cannot_be_made_is_refused_at_once(
+    name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(report, "close_loop", lambda *args, **options: pytest.fail("too late"))
+    for argv in (
+        ["close-loop", "scene.toml", "train.csv"],
+        ["calibrate", "scene.toml", "train.csv"],
+    ):
+        assert "cannot be made" in message(capsys, *argv, "-o", name)
+
+
+@pytest.mark.usefixtures("puck")
+def test_a_spreadsheet_s_commas_and_semicolons(capsys: pytest.CaptureFixture[str]) -> None:
+    before = Path("train.csv").read_text()
+    Path("german.csv").write_text(before.replace(",", ";").replace(".", ","))
+    scene = Scene.load("scene.toml")
+    hashes = {History.load(name, scene).data_sha256 for name in ("train.csv", "german.csv")}
+    assert len(hashes) == 1
+    Path("short.csv").write_text(before.replace(",", ";").replace(".", ",")[:-20] + "\n")
+    assert "cells, expected 13" in message(capsys, "check", "scene.toml", "short.csv")
