@@ -13,6 +13,7 @@ from pbrl_ppl.cli.calibrate import calibrate
 from pbrl_ppl.cli.check import check
 from pbrl_ppl.cli.close_loop import close_loop
 from pbrl_ppl.cli.plan import plan
+from pbrl_ppl.cli.report import report
 from pbrl_ppl.cli.terminal import BAD_INPUT, interrupted, warnings_in_a_line
 from pbrl_ppl.cli.update import update
 from pbrl_ppl.errors import PbrlError
@@ -25,7 +26,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 app.command("close-loop")(close_loop)
-for command in (check, calibrate, update, plan):
+for command in (check, calibrate, update, plan, report):
     app.command()(command)
 
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import typer
 
+from pbrl_ppl.cli.command_line import command_line
 from pbrl_ppl.cli.terminal import (
     UNDECIDED,
     SceneFile,
@@ -20,6 +21,7 @@ from pbrl_ppl.cli.terminal import (
 
 
 def close_loop(
+    context: typer.Context,
     scene: SceneFile,
     train: Annotated[
         Path, typer.Argument(metavar="TRAIN", help="Measured history (.csv, .parquet, .nc).")
@@ -84,7 +86,8 @@ def close_loop(
             progress=progress,
         )
         progress("writing the report")
-        loop.save(output, overwrite=overwrite)
+        source = report.Source(str(scene), str(train), str(test or ""), command_line(context))
+        loop.save(output, overwrite=overwrite, source=source)
     typer.echo(report.verdict_in_words(loop.findings))
     if unseen := report.unseen_in_words(loop.findings):
         typer.echo(unseen)

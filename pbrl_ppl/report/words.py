@@ -91,7 +91,7 @@ def number(value: float | None, digits: int = 3) -> str:
         return "–"
     if value != 0 and not 1e-4 <= abs(value) < 1e6:
         mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
-        return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}"
+        return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}".replace("-", "−")
     places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
     return f"{value:,.{max(places, 0)}f}".replace("-", "−")
 
