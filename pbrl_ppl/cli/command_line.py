@@ -24,7 +24,7 @@ def command_line(context: typer.Context) -> str:
         if parameter.param_type_name == "argument":
             words.append(str(value))
         elif value is True:
-            options.append(parameter.opts[-1])
+            options.append(parameter.opts[0])
         else:
             for each in value if isinstance(value, (list, tuple)) else (value,):
                 options += [parameter.opts[0], str(each)]

@@ -108,11 +108,13 @@ def render_page(
     for written in (number, chance, odds, plain, joined, change, quantity):
         environment.filters[written.__name__] = written
     environment.filters["data"] = _data
-    picture = {
-        name: {"wide": _address(draw(WIDE)), "narrow": _address(draw(NARROW))}
-        for name, draw in pictures.items()
-    }
+    picture = {name: _picture(draw) for name, draw in pictures.items()}
     return environment.get_template(template).render(picture=picture, digits_of=digits_of, **told)
+
+
+def _picture(draw: Callable[[float], Figure]) -> dict[str, str]:
+    """A picture in both widths."""
+    return {"wide": _address(draw(WIDE)), "narrow": _address(draw(NARROW))}
 
 
 def _address(figure: Figure) -> str:

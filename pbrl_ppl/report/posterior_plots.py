@@ -92,11 +92,15 @@ def plot_rank(of: Any, parameters: Sequence[str] | None = None, width: float = W
     """How evenly the ranks of each chain's draws are spread; arguments as of :func:`plot_trace`.
 
     A curve is the share of a chain's draws below each rank, less what an even spread gives. The
-    band is as wide as the effective sample size makes it, which the bands of independent draws are
-    not: chains that agree stay inside it 99 times of 100.
+    band is as wide as the chains' own effective sample sizes make it, which that of independent
+    draws is not: chains that agree stay inside it 99 times of 100.
     """
     draws = _chosen(of, parameters)
-    _, ess = convergence(from_groups({"posterior": draws}, {}))
+    # of each chain by itself: chains that differ have next to no effective draws together
+    alone = [
+        convergence(from_groups({"posterior": draws.isel(chain=[i])}, {}))[1]
+        for i in range(draws.sizes["chain"])
+    ]
     count = len(draws.data_vars)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
@@ -104,7 +108,8 @@ def plot_rank(of: Any, parameters: Sequence[str] | None = None, width: float = W
     for axes, (name, values) in zip(panels, draws.items(), strict=False):
         chains = values.to_numpy()
         ranks = rankdata(chains).reshape(chains.shape) / chains.size
-        edge = _WORST_SHIFT / np.sqrt(max(ess[str(name)] / len(chains), 1.0))
+        fewest = min(ess[str(name)] for ess in alone)
+        edge = _WORST_SHIFT / np.sqrt(max(fewest, 1.0)) if np.isfinite(fewest) else 1.0
         axes.axhspan(-edge, edge, color=BAND, zorder=0)
         grid = np.linspace(0.0, 1.0, 201)
         off = np.array([np.searchsorted(np.sort(own), grid) / len(own) - grid for own in ranks])
