@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import arviz as az
 import numpy as np
@@ -80,11 +80,11 @@ def most_dependent(posterior: Any, most: int = MOST_PAIRS) -> list[str]:
         return []
     strength = np.abs(np.nan_to_num(_correlations(draws, names)))
     np.fill_diagonal(strength, 0.0)
-    chosen = list(np.unravel_index(int(strength.argmax()), strength.shape))
+    chosen = list(divmod(int(strength.argmax()), len(names)))
     while len(chosen) < min(most, len(names)):
         rest = [i for i in range(len(names)) if i not in chosen]
-        chosen.append(max(rest, key=lambda i: strength[i, chosen].max()))
-    return [names[int(i)] for i in chosen]
+        chosen.append(max(rest, key=lambda i: float(strength[i, chosen].max())))
+    return [names[i] for i in chosen]
 
 
 def plot_pairs(posterior: Any, parameters: Sequence[str], width: float = WIDE) -> Figure:
@@ -124,7 +124,7 @@ def plot_predictions(posterior: Any, width: float = WIDE) -> Figure:
     grid = np.linspace(0.0, 1.0, 201)
     fewest = np.inf
     handles = []
-    marks = ("-", "--", ":")
+    marks: tuple[Literal["-", "--", ":"], ...] = ("-", "--", ":")
     for i, name in enumerate(str(state) for state in pit["state"].values):
         values = np.sort(pit.sel(state=name).to_numpy().ravel())
         values = values[np.isfinite(values)]

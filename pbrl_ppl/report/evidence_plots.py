@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pbrl_ppl.report.evidence import Evidence, Law, binned
+from pbrl_ppl.report.evidence import Evidence, binned
+from pbrl_ppl.report.laws import Law
 from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure
 
 Array = NDArray[np.float64]

@@ -84,7 +84,7 @@ def held_out_motions(
         motions.append(
             Motion(
                 labels[trajectory],
-                np.arange(length) * findings.scene.time_step,
+                np.arange(length, dtype=float) * findings.scene.time_step,
                 known[trajectory, step:end],
                 first[:length],
                 after[trajectory, step][:length],
@@ -195,4 +195,5 @@ def _outline(shape: Any) -> list[list[float]] | None:
 
 def _rounded(values: Array) -> Any:
     """Nested lists of five decimals, with None for what is not a number."""
-    return np.where(np.isfinite(values), np.round(values, 5).astype(object), None).tolist()
+    plain = np.round(values, 5).astype(object)
+    return np.where(np.isfinite(values), plain, np.array(None)).tolist()

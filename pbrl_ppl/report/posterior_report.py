@@ -167,8 +167,8 @@ def _predicts(covered: Any, missing: dict[str, str]) -> str:
     low, high = min(inside), max(inside)
     return (
         f"Intervals that should hold 94 % of measurements hold {100 * low:.0f} to"
-        f" {100 * high:.0f} % of them, in {len(covered)} state dimensions, each transition predicted"
-        " without itself."
+        f" {100 * high:.0f} % of them, in {len(covered)} state dimensions, each transition"
+        " predicted without itself."
     )
 
 

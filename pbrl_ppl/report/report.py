@@ -17,9 +17,10 @@ from pbrl_ppl.history import History
 from pbrl_ppl.posterior import group
 from pbrl_ppl.report.effect_plots import HARDLY, MOST_CANDIDATES, plot_added, plot_candidates
 from pbrl_ppl.report.error_plots import plot_errors, plot_residuals, plot_rollout
-from pbrl_ppl.report.evidence import find_evidence, find_laws
+from pbrl_ppl.report.evidence import find_evidence
 from pbrl_ppl.report.evidence_plots import plot_evidence, plot_laws
 from pbrl_ppl.report.glossary import STATISTICS
+from pbrl_ppl.report.laws import find_laws
 from pbrl_ppl.report.loop_tables import (
     acceleration_table,
     candidate_table,

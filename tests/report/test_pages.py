@@ -68,9 +68,11 @@ def opened(browser: Any, path: Path, width: int, **options: Any) -> tuple[Any, l
     page.on("pageerror", lambda error: wrong.append(str(error)))
     page.on(
         "request",
-        lambda request: wrong.append(request.url[:80])
-        if request.url != path.as_uri() and not request.url.startswith("data:")
-        else None,
+        lambda request: (
+            wrong.append(request.url[:80])
+            if request.url != path.as_uri() and not request.url.startswith("data:")
+            else None
+        ),
     )
     page.goto(path.as_uri())
     return page, wrong
