@@ -102,8 +102,8 @@ print(worst.round(3))
 tables["with drag"].round(4)
 
 # %% [markdown]
-# Trace plot: chains that mix look like noise about one level, and all alike. These are ArviZ's
-# pictures, laid out alike on its two generations; `az.plot_trace(idata, var_names=["mass"])`
+# Trace plot: chains that mix look like noise about one level, and all alike. This is ArviZ's
+# picture, laid out alike on its two generations; `az.plot_trace(idata, var_names=["mass"])`
 # works too.
 
 # %%
@@ -113,11 +113,9 @@ figure.savefig(OUT / "02_trace.png", dpi=100)
 figure
 
 # %% [markdown]
-# Rank plot: of each chain, how its draws rank among all. Chains that have converged have ranks
-# that are spread evenly: flat bars in ArviZ 0.x, in 1.x lines that stay near the middle. Where
-# ArviZ 1.x marks a line in black, ranks are less even than those of independent draws would be.
-# Draws of a Markov chain depend on each other, so a mark beside a good R-hat and effective sample
-# size is no cause for alarm.
+# Rank plot: of each chain, how its draws rank among all, less what an even spread gives. Chains
+# that have converged stay in the grey band. Draws of a Markov chain depend on each other, so it is
+# as wide as their effective sample size makes it; `az.plot_rank` compares with independent draws.
 
 # %%
 figure = plot_rank(posteriors["with drag"], shown)

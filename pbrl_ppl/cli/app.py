@@ -17,6 +17,7 @@ from pbrl_ppl.cli.doctor import doctor
 from pbrl_ppl.cli.fit import fit
 from pbrl_ppl.cli.new import new
 from pbrl_ppl.cli.plan import plan
+from pbrl_ppl.cli.report import report
 from pbrl_ppl.cli.simulate import simulate
 from pbrl_ppl.cli.terminal import BAD_INPUT, in_options, interrupted, warnings_in_a_line
 from pbrl_ppl.cli.update import update
@@ -29,6 +30,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "fit": (fit, "pbrl-ppl fit scene.toml train.csv -o cart.nc"),
     "criticise": (criticise, "pbrl-ppl criticise scene.toml train.csv"),
     "close-loop": (close_loop, "pbrl-ppl close-loop scene.toml train.csv -o report/"),
+    "report": (report, "pbrl-ppl report cart.nc"),
     "update": (update, "pbrl-ppl update cart.nc since.csv -o new.nc"),
     "plan": (plan, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv"),
     "simulate": (simulate, "pbrl-ppl simulate cart.nc plan.csv -o foreseen.csv --draws 20"),

@@ -9,6 +9,7 @@ from typing import Annotated
 import typer
 
 from pbrl_ppl.cli.answers import print_json
+from pbrl_ppl.cli.command_line import command_line
 from pbrl_ppl.cli.outputs import check_can_make
 from pbrl_ppl.cli.terminal import (
     UNDECIDED,
@@ -40,6 +41,7 @@ SHARES = {
 
 
 def close_loop(
+    context: typer.Context,
     scene: SceneFile,
     train: Annotated[
         Path, typer.Argument(metavar="TRAIN", help="Measured history (.csv, .parquet, .nc).")
@@ -97,7 +99,8 @@ def close_loop(
             progress=progress,
         )
         progress("writing the report")
-        loop.save(output, overwrite=overwrite)
+        source = report.Source(str(scene), str(train), str(test or ""), command_line(context))
+        loop.save(output, overwrite=overwrite, source=source)
     if as_json:
         print_json(loop.findings.to_dict() | {"report": output / "report.html"})
     else:

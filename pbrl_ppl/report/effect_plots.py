@@ -14,7 +14,7 @@ from scipy.stats import chi2, gaussian_kde
 from pbrl_ppl.criticism import Findings
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import scalars
-from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, blank_figure
+from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, legend
 from pbrl_ppl.report.words import plain
 
 #: Candidates are called significant below this corrected p-value.
@@ -25,7 +25,7 @@ HARDLY = 0.01
 MOST_CANDIDATES, MOST_ADDED = 20, 12
 
 
-def plot_candidates(findings: Findings) -> Figure:
+def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
     """Score statistic of the candidates, best on top, with the threshold of each."""
     added = {(addition.effect, addition.body) for addition in findings.added}
     shown = [
@@ -33,7 +33,7 @@ def plot_candidates(findings: Findings) -> Figure:
         for place, candidate in enumerate(findings.candidates)
         if place < MOST_CANDIDATES or (candidate.effect, candidate.body) in added
     ]
-    figure, (axes,) = blank_figure(8.0, 0.9 + 0.3 * max(len(shown), 3), 1, 1, grid="x")
+    figure, (axes,) = blank_figure(width, 0.9 + 0.3 * max(len(shown), 3), 1, 1, grid="x")
     several = len({candidate.body for candidate in shown}) > 1
     total = max(len(findings.candidates), 1)
     thresholds = [
@@ -78,11 +78,11 @@ def plot_candidates(findings: Findings) -> Figure:
         Patch(facecolor=PLAIN, edgecolor="white", hatch="////", label="hardly identifiable"),
         Line2D([], [], color=BEFORE, linewidth=2, label="1 % threshold"),
     ]
-    figure.legend(handles=handles, loc="outside upper center", ncols=4, frameon=False)
+    legend(figure, handles)
     return figure
 
 
-def plot_added(findings: Findings) -> Figure:
+def plot_added(findings: Findings, width: float = WIDE) -> Figure:
     """Posterior of every parameter of the added effects, with the value that means no effect."""
     shown = [
         (added, name, estimate)
@@ -91,7 +91,8 @@ def plot_added(findings: Findings) -> Figure:
     ][:MOST_ADDED]
     columns = min(max(len(shown), 1), 2)
     rows = max(-(-len(shown) // columns), 1)
-    figure, panels = blank_figure(8.0 if columns > 1 else 5.0, 2.6 * rows, rows, columns, grid="x")
+    width = width if columns > 1 else min(width, 5.0)
+    figure, panels = blank_figure(width, 2.6 * rows, rows, columns, grid="x")
     draws = scalars(findings.posterior_after)
     nulls = {(effect.name, p.name): p.null for effect in catalogue for p in effect.parameters}
     for axes, (added, name, estimate) in zip(panels, shown, strict=False):

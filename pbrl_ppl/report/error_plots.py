@@ -13,15 +13,15 @@ from scipy.stats import norm
 
 from pbrl_ppl.criticism import Findings
 from pbrl_ppl.posterior import HDI_PROB
-from pbrl_ppl.report.style import AFTER, BAND, BEFORE, UNITS, blank_figure
+from pbrl_ppl.report.style import AFTER, BAND, BEFORE, UNITS, WIDE, blank_figure, legend
 
 Array = NDArray[np.float64]
 
 
-def plot_residuals(findings: Findings) -> Figure:
+def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
     """Held-out residuals of each state dimension before and after, in units of noise."""
     names = list(findings.residuals_before)
-    figure, (axes,) = blank_figure(8.0, 3.6, 1, 1)
+    figure, (axes,) = blank_figure(width, 3.6, 1, 1)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
     axes.axhspan(-edge, edge, color=BAND, zorder=0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
@@ -54,11 +54,11 @@ def plot_residuals(findings: Findings) -> Figure:
     axes.set_ylabel("residual / noise")
     handles: list[Any] = [Line2D([], [], color=c, linewidth=3, label=n) for _, c, n, _ in shown]
     handles.append(Patch(color=BAND, label=f"noise alone, {100 * HDI_PROB:.0f} %"))
-    figure.legend(handles=handles, loc="outside upper center", ncols=3, frameon=False)
+    legend(figure, handles)
     return figure
 
 
-def plot_errors(findings: Findings) -> Figure:
+def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
     """Held-out errors before and after, one step ahead and at the end of a rollout."""
     kinds = [
         ("one_step_rmse", "one step ahead"),
@@ -67,7 +67,7 @@ def plot_errors(findings: Findings) -> Figure:
     kinds = [(kind, title) for kind, title in kinds if getattr(findings.before, kind)]
     names = [list(getattr(findings.before, kind)) for kind, _ in kinds]
     height = 1.2 + 0.42 * max((len(states) for states in names), default=1)
-    figure, panels = blank_figure(8.0, height, 1, max(len(kinds), 1), grid="x")
+    figure, panels = blank_figure(width, height, 1, max(len(kinds), 1), grid="x")
     for axes, (kind, title), dims in zip(panels, kinds, names, strict=False):
         before, after, floor = (
             getattr(e, kind) for e in (findings.before, findings.after, findings.noise_floor)
@@ -101,17 +101,17 @@ def plot_errors(findings: Findings) -> Figure:
     labels = ["before", "after"] if findings.added else ["declared model"]
     colours = [BEFORE, AFTER] if findings.added else [AFTER]
     handles = [Patch(color=c, label=n) for c, n in zip(colours, labels, strict=True)]
-    figure.legend(handles=handles, loc="outside upper center", ncols=2, frameon=False)
+    legend(figure, handles)
     return figure
 
 
-def plot_rollout(findings: Findings) -> Figure:
+def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
     """One held-out trajectory: measured, and predicted before and after."""
     rollout = findings.rollout
     count = len(rollout.names)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
-    figure, panels = blank_figure(8.0, 0.8 + 1.9 * rows, rows, columns)
+    figure, panels = blank_figure(width, 0.8 + 1.9 * rows, rows, columns)
     lines: list[tuple[Array, str, Literal["-", "--"], str]] = [
         (rollout.before, BEFORE, "--", "before"),
         (rollout.after, AFTER, "-", "after"),
@@ -137,7 +137,7 @@ def plot_rollout(findings: Findings) -> Figure:
     handles = [Line2D([], [], color="black", marker="o", linestyle="", markersize=3)]
     handles += [Line2D([], [], color=c, linestyle=s) for _, c, s, _ in lines]
     names = ["measured", *(name for *_, name in lines)]
-    figure.legend(handles, names, loc="outside upper center", ncols=3, frameon=False)
+    legend(figure, handles, names)
     return figure
 
 

@@ -16,6 +16,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.posterior import save_posterior
+from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.report import render
 from pbrl_ppl.report.words import verdict_in_words
 from pbrl_ppl.scene import Scene
@@ -35,9 +36,15 @@ class Loop:
     ----------
     findings : Findings
         What was found.
+    held_out : History, optional
+        What errors were measured on; reports play it.
+    catalogue : tuple of Effect
+        Where the names of effects are looked up.
     """
 
     findings: Findings
+    held_out: History | None = None
+    catalogue: tuple[Effect, ...] = tuple(full_catalogue)
 
     @property
     def verdict(self) -> str:
@@ -82,27 +89,30 @@ class Loop:
     def __repr__(self) -> str:
         return f"Loop({verdict_in_words(self.findings)})"
 
-    def report(self, path: str | Path) -> Path:
+    def page(self, source: Source | None = None) -> str:
+        """The report as one self-contained page of HTML."""
+        return render(self.findings, self.held_out, self.catalogue, source)
+
+    def report(self, path: str | Path, *, source: Source | None = None) -> Path:
         """Write the report as one self-contained page and return its path.
+
+        Parameters
+        ----------
+        path : str or pathlib.Path
+            Written whole or not at all.
+        source : Source, optional
+            Names of the files, and the command that makes the page again.
 
         Raises
         ------
         OutputError
             If the file cannot be written.
         """
-        path = Path(path)
-        page = render(self.findings)
-        temporary = path.with_name(f".{path.name}.{os.getpid()}")
-        try:
-            temporary.write_text(page, encoding="utf-8")
-            temporary.replace(path)
-        except OSError as error:
-            raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-        finally:
-            temporary.unlink(missing_ok=True)
-        return path
+        return write_page(path, self.page(source))
 
-    def save(self, folder: str | Path, overwrite: bool = False) -> Path:
+    def save(
+        self, folder: str | Path, overwrite: bool = False, *, source: Source | None = None
+    ) -> Path:
         """Write report.html, report.json, before.nc and after.nc, all or nothing.
 
         Parameters
@@ -111,6 +121,8 @@ class Loop:
             Made if missing; other files in it are left alone.
         overwrite : bool
             Whether a folder that has content may be written to.
+        source : Source, optional
+            Names of the files, and the command that makes them again, for the report.
 
         Returns
         -------
@@ -129,7 +141,7 @@ class Loop:
             with tempfile.TemporaryDirectory(prefix=".pbrl-ppl-", dir=nearest) as temporary:
                 made = Path(temporary) / "result"
                 made.mkdir()
-                (made / "report.html").write_text(render(self.findings), encoding="utf-8")
+                (made / "report.html").write_text(self.page(source), encoding="utf-8")
                 text = json.dumps(self.findings.to_dict(), indent=1, allow_nan=False)
                 (made / "report.json").write_text(text + "\n", encoding="utf-8")
                 save_posterior(self.findings.posterior_before, made / "before.nc")
@@ -203,6 +215,10 @@ def close_loop(
         loop.verdict  # 'effects-added'
         loop.report("report.html")
     """
+    catalogue = tuple(catalogue)
+    if test is None:
+        # as revise does it, so that the report can play what was held out
+        train, test = train.split(0.25, seed)
     found = revise(
         scene,
         train,
@@ -214,7 +230,27 @@ def close_loop(
         method=method,
         progress=progress,
     )
-    return Loop(found)
+    return Loop(found, test, catalogue)
+
+
+def write_page(path: str | Path, page: str) -> Path:
+    """Write a page whole or not at all, and return its path.
+
+    Raises
+    ------
+    OutputError
+        If the file cannot be written.
+    """
+    path = Path(path)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    try:
+        temporary.write_text(page, encoding="utf-8")
+        temporary.replace(path)
+    except OSError as error:
+        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
 
 
 def check_folder(folder: Path, overwrite: bool) -> Path:

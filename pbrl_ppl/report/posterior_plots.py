@@ -1,4 +1,4 @@
-"""Pictures of posteriors, by ArviZ, and its summary of them."""
+"""Pictures of chains, and ArviZ's summary of posteriors."""
 
 from __future__ import annotations
 
@@ -12,13 +12,16 @@ import pandas as pd
 import xarray as xr
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
+from scipy.stats import rankdata
 
 from pbrl_ppl.criticism import Findings
-from pbrl_ppl.posterior import DATATREE, HDI_PROB, scalars
-from pbrl_ppl.report.style import blank_figure
+from pbrl_ppl.posterior import DATATREE, HDI_PROB, convergence, from_groups, scalars
+from pbrl_ppl.report.style import BAND, NARROW, WIDE, blank_figure
 
 #: Parameters in one picture, at most; the report's tables show all.
 MOST_PARAMETERS = 6
+#: Kolmogorov's distance of an even sample from evenness, times the root of its size, at 1 %.
+_WORST_SHIFT = 1.63
 
 
 def summary(posterior: Any) -> pd.DataFrame:
@@ -65,7 +68,7 @@ def most_interesting(of: Any, table: pd.DataFrame | None = None) -> list[str]:
     return list(dict.fromkeys([*(n for n in own if n in table.index), *worst]))[:MOST_PARAMETERS]
 
 
-def plot_trace(of: Any, parameters: Sequence[str] | None = None) -> Figure:
+def plot_trace(of: Any, parameters: Sequence[str] | None = None, width: float = WIDE) -> Figure:
     """ArviZ's trace of some parameters, laid out alike on every ArviZ.
 
     Parameters
@@ -75,56 +78,85 @@ def plot_trace(of: Any, parameters: Sequence[str] | None = None) -> Figure:
     parameters : sequence of str, optional
         Labels such as ``mass[cart]``; by default those of most interest: of added effects, and with
         the worst R-hat.
+    width : float
+        Of the figure (inches).
     """
-    return _arviz(of, "trace", parameters)
-
-
-def plot_rank(of: Any, parameters: Sequence[str] | None = None) -> Figure:
-    """ArviZ's rank picture of some parameters; arguments as of :func:`plot_trace`."""
-    return _arviz(of, "rank", parameters)
-
-
-def _arviz(of: Any, kind: str, parameters: Sequence[str] | None) -> Figure:
-    posterior = of.posterior_after if isinstance(of, Findings) else of
-    names = most_interesting(of) if parameters is None else list(parameters)
-    draws = scalars(posterior)[names]
+    draws = _chosen(of, parameters)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # ArviZ uses what newer Matplotlib deprecates, and a constant parameter makes it complain
         warnings.simplefilter("ignore")
-        return _arviz_figure(draws, kind)
+        return _trace(draws, width)
 
 
-def _arviz_figure(draws: xr.Dataset, kind: str) -> Figure:
-    """Draw with ArviZ: the one place that knows how 0.x and 1.x differ in that."""
+def plot_rank(of: Any, parameters: Sequence[str] | None = None, width: float = WIDE) -> Figure:
+    """How evenly the ranks of each chain's draws are spread; arguments as of :func:`plot_trace`.
+
+    A curve is the share of a chain's draws below each rank, less what an even spread gives. The
+    band is as wide as the chains' own effective sample sizes make it, which that of independent
+    draws is not: chains that agree stay inside it 99 times of 100.
+    """
+    draws = _chosen(of, parameters)
+    # of each chain by itself: chains that differ have next to no effective draws together
+    alone = [
+        convergence(from_groups({"posterior": draws.isel(chain=[i])}, {}))[1]
+        for i in range(draws.sizes["chain"])
+    ]
     count = len(draws.data_vars)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
-    size = (8.0, 0.6 + 1.7 * rows)
+    figure, panels = blank_figure(width, 0.6 + 1.7 * rows, rows, columns)
+    for axes, (name, values) in zip(panels, draws.items(), strict=False):
+        chains = values.to_numpy()
+        ranks = rankdata(chains).reshape(chains.shape) / chains.size
+        fewest = min(ess[str(name)] for ess in alone)
+        edge = _WORST_SHIFT / np.sqrt(max(fewest, 1.0)) if np.isfinite(fewest) else 1.0
+        axes.axhspan(-edge, edge, color=BAND, zorder=0)
+        grid = np.linspace(0.0, 1.0, 201)
+        off = np.array([np.searchsorted(np.sort(own), grid) / len(own) - grid for own in ranks])
+        for own in off:
+            axes.plot(grid, own, linewidth=1.1)
+        outside = bool(np.abs(off).max() > edge)
+        axes.set_title(f"{name}{': chains differ' if outside else ''}", fontsize=9)
+        largest = max(1.4 * edge, 1.1 * float(np.abs(off).max()))
+        axes.set_ylim(-largest, largest)
+        axes.set_xlabel("rank among all draws", fontsize=8)
+    for axes in panels[count:]:
+        axes.set_visible(False)
+    return figure
+
+
+def _chosen(of: Any, parameters: Sequence[str] | None) -> xr.Dataset:
+    """Draws of the parameters to show."""
+    names = most_interesting(of) if parameters is None else list(parameters)
+    return scalars(of.posterior_after if isinstance(of, Findings) else of)[names]
+
+
+def _trace(draws: xr.Dataset, width: float) -> Figure:
+    """Draw with ArviZ: the one place that knows how 0.x and 1.x differ in that."""
+    count = len(draws.data_vars)
     if not DATATREE:
-        if kind == "trace":
-            figure, panels = blank_figure(8.0, 0.6 + 1.5 * count, count, 2, grid=None)
-            grid = np.array(panels, dtype=object).reshape(count, 2)
-            az.plot_trace(draws, axes=grid, compact=False, trace_kwargs={"linewidth": 0.5})
-        else:
-            figure, panels = blank_figure(8.0, 0.6 + 2.0 * rows, rows, columns, grid=None)
-            az.plot_rank(draws, ax=np.array(panels[:count], dtype=object))
-            for axes in panels[count:]:
-                axes.set_visible(False)
+        figure, panels = blank_figure(width, 0.6 + 1.5 * count, count, 2, grid=None)
+        grid = np.array(panels, dtype=object).reshape(count, 2)
+        az.plot_trace(draws, axes=grid, compact=False, trace_kwargs={"linewidth": 0.5})
         for axes in panels:
             axes.title.set_fontsize(9)
             axes.xaxis.label.set_fontsize(9)
             axes.yaxis.label.set_fontsize(9)
         return figure
-    draw = az.plot_trace if kind == "trace" else az.plot_rank
-    visuals: dict[str, dict[str, Any]] = {"title": {"size": 9}, "xlabel": {"size": 8}}
-    if kind == "trace":
-        visuals["trace"] = {"alpha": 0.5, "width": 0.5}
-    collection = draw(
+    columns = 1 if count == 1 or width <= NARROW else 2
+    collection = az.plot_trace(
         draws,
         backend="matplotlib",
-        visuals=visuals,
+        visuals={
+            "title": {"size": 9},
+            "xlabel": {"size": 8},
+            "trace": {"alpha": 0.5, "width": 0.5},
+        },
         col_wrap=columns,
-        figure_kwargs={"figsize": size, "layout": "constrained"},
+        figure_kwargs={
+            "figsize": (width, 0.6 + 1.7 * -(-count // columns)),
+            "layout": "constrained",
+        },
     )
     result: Figure = collection.viz["figure"].item()
     plt.close(result)  # ArviZ 1.x registers it with pyplot, which would keep it for ever

@@ -1,117 +1,146 @@
-"""Report: the findings as a page of HTML."""
+"""Report: the findings of a closed loop as a page of HTML."""
 
 from __future__ import annotations
 
-import base64
-from importlib import resources
+from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any
 
-import jinja2
-import pandas as pd
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import Findings
-from pbrl_ppl.effects import catalogue
-from pbrl_ppl.parameters import BODY_PARAMETERS
+from pbrl_ppl.effects import Effect
+from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.history import History
+from pbrl_ppl.posterior import group
 from pbrl_ppl.report.effect_plots import HARDLY, MOST_CANDIDATES, plot_added, plot_candidates
 from pbrl_ppl.report.error_plots import plot_errors, plot_residuals, plot_rollout
-from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
-from pbrl_ppl.report.residual_plots import plot_correlations, plot_growth
-from pbrl_ppl.report.style import UNITS, png
-from pbrl_ppl.report.words import (
-    chance,
-    change,
-    digits_of,
-    joined,
-    number,
-    odds,
-    plain,
-    quantity,
-    unseen_in_words,
-    verdict_in_words,
+from pbrl_ppl.report.evidence import find_evidence
+from pbrl_ppl.report.evidence_plots import plot_evidence, plot_laws
+from pbrl_ppl.report.glossary import STATISTICS
+from pbrl_ppl.report.laws import find_laws
+from pbrl_ppl.report.loop_tables import (
+    acceleration_table,
+    candidate_table,
+    carrier_table,
+    error_tables,
+    loo_table,
+    residual_test_table,
 )
+from pbrl_ppl.report.motion import animation, held_out_motions
+from pbrl_ppl.report.page import Source, render_page
+from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
+from pbrl_ppl.report.posterior_rows import (
+    parameter_table,
+    posterior_rows,
+    sampler_in_words,
+    width_table,
+)
+from pbrl_ppl.report.residual_plots import plot_correlations, plot_growth
+from pbrl_ppl.report.scene_plots import plot_recording
+from pbrl_ppl.report.style import UNITS
+from pbrl_ppl.report.words import gains_in_words, unseen_in_words, verdict_in_words
 
-#: A chain mix is good enough below this R-hat and above this effective sample size.
-GOOD_R_HAT, GOOD_ESS = 1.01, 400.0
+Array = NDArray[np.float64]
 
 
-def render(findings: Findings) -> str:
-    """Render the report: one page of HTML that needs nothing else."""
+def render(
+    findings: Findings,
+    held_out: History | None = None,
+    effects: Iterable[Effect] = full_catalogue,
+    source: Source | None = None,
+) -> str:
+    """Render the report: one page of HTML that needs nothing else.
+
+    Parameters
+    ----------
+    findings : Findings
+        What was found.
+    held_out : History, optional
+        What errors were measured on, for the moving picture; without it, the findings' own
+        trajectory is played.
+    effects : iterable of Effect
+        Where the names of effects are looked up.
+    source : Source, optional
+        Names of the files, and the command that makes the page again.
+    """
+    effects = tuple(effects)
     table = summary(findings.posterior_after)
     parameters = most_interesting(findings, table)
-    pictures = {
-        "rollout": plot_rollout(findings),
-        "errors": plot_errors(findings),
-        "residuals": plot_residuals(findings),
-        "correlations": plot_correlations(findings),
-        "growth": plot_growth(findings),
-        "trace": plot_trace(findings, parameters),
-        "rank": plot_rank(findings, parameters),
-    }
-    if findings.candidates:
-        pictures["candidates"] = plot_candidates(findings)
-    if findings.added:
-        pictures["added"] = plot_added(findings)
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters.update(
-        number=number,
-        chance=chance,
-        odds=odds,
-        plain=plain,
-        joined=joined,
-        change=change,
-        quantity=quantity,
-    )
-    template = resources.files("pbrl_ppl.report").joinpath("report.html.jinja").read_text("utf-8")
-    return environment.from_string(template).render(
-        findings=findings,
-        verdict=verdict_in_words(findings),
-        unseen=unseen_in_words(findings),
-        posterior=_posterior_rows(findings, table),
-        units=UNITS,
-        shown=parameters,
-        added={(added.effect, added.body) for added in findings.added},
-        best=_largest_fall(findings),
-        digits_of=digits_of,
-        good={"r_hat": GOOD_R_HAT, "ess": GOOD_ESS},
-        hardly=HARDLY,
-        most=MOST_CANDIDATES,
-        picture={
-            name: "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
-            for name, figure in pictures.items()
-        },
-    )
-
-
-def _posterior_rows(findings: Findings, table: pd.DataFrame) -> list[dict[str, Any]]:
-    """One row per parameter of the revised model: its summary, unit, and what is wrong with it."""
-    units = dict(BODY_PARAMETERS) | {
+    units = {
         f"{added.effect}_{name}": e.unit
         for added in findings.added
         for name, e in added.parameters.items()
     }
-    units |= {effect.variable(p): p.unit for effect in catalogue for p in effect.parameters}
-    rows = []
-    for label, values in table.iterrows():
-        name, _, place = str(label).rstrip("]").partition("[")
-        ess = min(values["ess_bulk"], values["ess_tail"])
-        wrong = []
-        # written so that a value that is not a number counts as bad
-        if not values["r_hat"] <= GOOD_R_HAT:
-            wrong.append(f"R-hat {number(values['r_hat'], 4)}")
-        if not ess >= GOOD_ESS:
-            wrong.append(f"effective sample size {number(ess)}")
-        unit = UNITS.get(place, "") if name == "sigma" else units.get(name, "")
-        rows.append({"label": label, "unit": unit.removesuffix("1"), "wrong": wrong, **values})
-    return rows
+    rows = posterior_rows(table, effects, units)
+    evidence, laws = find_evidence(findings, effects), find_laws(findings, effects)
+    poses = recorded_poses(findings.posterior_before)
+    pictures: dict[str, Callable[[float], Figure]] = {
+        "rollout": partial(_drawn, plot_rollout, findings),
+        "errors": partial(_drawn, plot_errors, findings),
+        "residuals": partial(_drawn, plot_residuals, findings),
+        "correlations": partial(_drawn, plot_correlations, findings),
+        "growth": partial(_drawn, plot_growth, findings),
+        "trace": partial(plot_trace, findings, parameters),
+        "rank": partial(plot_rank, findings, parameters),
+    }
+    if poses is not None:
+        later = None if held_out is None else held_out.dataset["start"].to_numpy()[..., :3]
+        pictures["scene"] = partial(plot_recording, findings.scene, poses, later)
+    if evidence is not None:
+        pictures["evidence"] = partial(_drawn, plot_evidence, evidence)
+    if laws:
+        pictures["laws"] = partial(_drawn, plot_laws, laws)
+    if findings.candidates:
+        pictures["candidates"] = partial(_drawn, plot_candidates, findings)
+    if findings.added:
+        pictures["added"] = partial(_drawn, plot_added, findings)
+    said = findings.identifiability
+    return render_page(
+        "report.html.jinja",
+        pictures,
+        findings=findings,
+        source=source or Source(),
+        motion=animation(findings, held_out_motions(findings, held_out, effects)),
+        verdict=verdict_in_words(findings),
+        unseen=unseen_in_words(findings),
+        gains=gains_in_words(findings.before.rollout_rmse, findings.after.rollout_rmse, UNITS),
+        evidence=evidence,
+        carriers=None if evidence is None else carrier_table(evidence),
+        laws=laws,
+        errors=error_tables(findings),
+        loo=loo_table(findings),
+        acceleration=acceleration_table(findings),
+        tests=residual_test_table(findings),
+        candidates=candidate_table(findings),
+        posterior=parameter_table(rows, "Posterior of all parameters"),
+        count=len(rows),
+        bad=[row for row in rows if row["failed"]],
+        sampled=sampler_in_words(rows),
+        widths=said
+        and width_table(
+            findings.posterior_after, said, {row["label"]: row["unit"] for row in rows}
+        ),
+        shown=parameters,
+        hardly=HARDLY,
+        most=MOST_CANDIDATES,
+        meanings={row["label"]: row["meaning"] for row in rows if row["meaning"]},
+        statistics=STATISTICS,
+    )
 
 
-def _largest_fall(findings: Findings) -> dict[str, Any] | None:
-    """Find the state dimension whose error at the end of a rollout fell by the largest share."""
-    before, after = findings.before.rollout_rmse, findings.after.rollout_rmse
-    shares = {d: after[d] / before[d] for d in before if d in after and before[d] > 0}
-    if not shares:
+def recorded_poses(posterior: Any) -> Array | None:
+    """Poses of the recording that a posterior holds, shape (trajectory, time, body, 3)."""
+    if "scene" not in posterior.attrs:
         return None
-    best = min(shares, key=lambda dimension: shares[dimension])
-    return {"name": best, "before": before[best], "after": after[best]}
+    given = group(posterior, "constant_data")
+    if "recorded_start" in given:
+        return np.asarray(given["recorded_start"].to_numpy()[..., :3])
+    # of single transitions: where each starts, one after the other
+    return np.asarray(given["start"].to_numpy()[None, ..., :3])
+
+
+def _drawn(plot: Callable[..., Figure], of: Any, width: float) -> Figure:
+    return plot(of, width=width)

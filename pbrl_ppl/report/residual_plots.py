@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pbrl_ppl.criticism import Findings
-from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, blank_figure
+from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, WIDE, blank_figure
 
 Array = NDArray[np.float64]
 
@@ -19,11 +19,11 @@ CHANCE = 0.01
 _NAMED = 4
 
 
-def plot_correlations(findings: Findings) -> Figure:
+def plot_correlations(findings: Findings, width: float = WIDE) -> Figure:
     """Correlations of errors with those before and with commands, and the band of noise alone."""
     told = findings.correlations
     panels = 2 if told.commands else 1
-    figure, axes = blank_figure(8.0, 3.2, 1, panels)
+    figure, axes = blank_figure(width, 3.2, 1, panels)
     lags = np.arange(1, len(told.own) + 1)
     _panel(axes[0], lags, told.own, told.pairs, list(told.cells))
     axes[0].set_xlabel("intervals before")
@@ -63,11 +63,11 @@ def _panel(
     axes.set_xticks(lags)
 
 
-def plot_growth(findings: Findings) -> Figure:
+def plot_growth(findings: Findings, width: float = WIDE) -> Figure:
     """Errors of forecasts over their length, in units of what noise alone makes at each length."""
     growth = findings.growth
     names = [name for name in growth.floor[-1] if growth.floor[-1][name] > 0]
-    figure, (axes,) = blank_figure(8.0, 3.2, 1, 1)
+    figure, (axes,) = blank_figure(width, 3.2, 1, 1)
     axes.axhline(1.0, color="black", linewidth=0.8)
     for i, name in enumerate(names):
         ratio = [

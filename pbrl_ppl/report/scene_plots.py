@@ -9,11 +9,13 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import write_atomically
 from pbrl_ppl.planning import Goal, Plan, Target
+from pbrl_ppl.report.style import NARROW, WIDE, blank_figure, legend
 from pbrl_ppl.scene import Body, Scene
 
 Array = NDArray[np.float64]
@@ -85,6 +87,48 @@ def draw_motion(axes: Axes, scene: Scene, states: Array) -> None:
         x, y = states[:, i, :2].T
         if np.hypot(x - x[0], y - y[0]).max() > _STILL:
             axes.plot(x, y, color=_colour(i), linewidth=1.5, zorder=3)
+
+
+def plot_recording(
+    scene: Scene, poses: Array, held_out: Array | None = None, width: float = WIDE
+) -> Figure:
+    """Draw a scene from above, with the bodies' recorded paths.
+
+    Parameters
+    ----------
+    scene : Scene
+        Shapes and walls.
+    poses : ndarray
+        x, y, theta (m, m, rad) that were fitted, shape (trajectory, time, body, 3 or more); NaN
+        where there are none.
+    held_out : ndarray, optional
+        Those that were not.
+    width : float
+        Of the figure (inches).
+    """
+    figure, (axes,) = blank_figure(width, 0.62 * width if width > NARROW else width, 1, 1)
+    for each, style, alpha in ((poses, "-", 0.8), (held_out, ":", 1.0)):
+        for states in () if each is None else each:
+            for i in range(states.shape[1]):
+                axes.plot(*states[:, i, :2].T, style, color=_colour(i), linewidth=1.4, alpha=alpha)
+    shown = np.isfinite(poses[..., :3]).all(axis=(2, 3))
+    if shown.any():  # the first moment at which all bodies were seen
+        trajectory, time = np.argwhere(shown)[0]
+        draw_scene(axes, scene, poses[trajectory, time], names=True)
+    places = poses[..., :2].reshape(-1, 2)
+    reach = max(body.shape.bounding_radius for body in scene.moving)
+    low, high = np.nanmin(places, axis=0) - 1.5 * reach, np.nanmax(places, axis=0) + 1.5 * reach
+    # as wide and high as the figure is
+    share = figure.get_figheight() / figure.get_figwidth()
+    middle, half = (low + high) / 2, (high - low) / 2
+    half = np.maximum(half, [half[1] / share, half[0] * share])
+    axes.set_xlim(middle[0] - half[0], middle[0] + half[0])
+    axes.set_ylim(middle[1] - half[1], middle[1] + half[1])
+    handles = [Line2D([], [], color="black", label="fitted")]
+    if held_out is not None:
+        handles.append(Line2D([], [], color="black", linestyle=":", label="held out"))
+    legend(figure, handles)
+    return figure
 
 
 def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -91,7 +91,7 @@ def number(value: float | None, digits: int = 3) -> str:
         return "–"
     if value != 0 and not 1e-4 <= abs(value) < 1e6:
         mantissa, _, exponent = f"{value:.{digits - 1}e}".partition("e")
-        return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}"
+        return f"{mantissa} × 10{str(int(exponent)).translate(_RAISED)}".replace("-", "−")
     places = digits - 1 - int(np.floor(np.log10(abs(value)))) if value else 0
     return f"{value:,.{max(places, 0)}f}".replace("-", "−")
 
@@ -144,6 +144,31 @@ def change(before: float, after: float) -> str:
     if not np.isfinite(share) or abs(share) < 0.005:
         return "did not change"
     return f"{'fell' if share > 0 else 'rose'} by {abs(share) * 100:.0f} %"
+
+
+def gains_in_words(
+    before: Mapping[str, float], after: Mapping[str, float], units: Mapping[str, str]
+) -> str:
+    """Say how the errors of all state dimensions changed: how many fell, the most and the least.
+
+    Examples
+    --------
+    >>> gains_in_words({"x": 0.2, "omega": 1.0}, {"x": 0.1, "omega": 0.1}, {"x": "m"})
+    'fell in 2 of 2 state dimensions: most in omega (by 90 %, from 1.00 to 0.100), least in x (by 50 %, from 0.200 to 0.100 m)'
+    """  # noqa: E501
+    shares = {d: after[d] / before[d] for d in before if d in after and before[d] > 0}
+    if not shares:
+        return ""
+    order = sorted(shares, key=lambda dimension: shares[dimension])
+    fell = sum(share < 0.995 for share in shares.values())
+
+    def told(name: str) -> str:
+        size = f"from {number(before[name])} to {quantity(after[name], units.get(name, ''))}"
+        part = change(before[name], after[name]).removeprefix("fell ")
+        return f"{name} ({part}, {size})"
+
+    text = f"fell in {fell} of {len(shares)} state dimensions: most in {told(order[0])}"
+    return text if len(order) == 1 else f"{text}, least in {told(order[-1])}"
 
 
 def joined(parts: Iterable[str], word: str = "and") -> str:

@@ -4,7 +4,6 @@ import copy
 import inspect
 import json
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -13,79 +12,47 @@ import pytest
 
 from pbrl_ppl.criticism.results import Errors
 from pbrl_ppl.errors import OutputError
+from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.posterior.comparison import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.report import loop as loop_module
+from pbrl_ppl.report import page as page_module
 from pbrl_ppl.report.error_plots import plot_rollout, unwrap
+from pbrl_ppl.report.glossary import PARAMETERS
 from pbrl_ppl.report.loop import FILES, Loop, close_loop
+from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.report import render
 from pbrl_ppl.report.words import number, verdict_in_words
+from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
-
-
-class Page(HTMLParser):
-    """What a browser would fetch, run or show."""
-
-    def __init__(self, html: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.references: list[str] = []
-        self.words: list[str] = []
-        self.open: list[str] = []
-        self.feed(html)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-        if tag not in ("meta", "img", "br"):
-            self.open.append(tag)
-        self.references += [v or "" for k, v in attrs if k in ("href", "src", "srcset", "action")]
-        if tag == "img":
-            assert dict(attrs)["alt"]
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if self.open[-1:] != ["style"]:
-            self.words.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join(" ".join(self.words).split())
 
 
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Figures are made but not drawn, which takes two of a page's three seconds."""
-    monkeypatch.setattr("pbrl_ppl.report.report.png", lambda figure: b"")
-
-
-PAGES: dict[str, str] = {}
+    """A page without its pictures, which take nearly all of its time."""
+    nothing = "data:image/png;base64,"
+    monkeypatch.setattr(page_module, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
 
 
 def page(verdict: str) -> Page:
-    if verdict not in PAGES:  # drawing takes a second
-        PAGES[verdict] = render(made_up(verdict))
-    return Page(PAGES[verdict])
+    return Page(render(made_up(verdict)))
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("verdict", ["adequate", "effects-added", "unexplained"])
 def test_page_stands_alone(verdict: str) -> None:
-    got = page(verdict)
-    assert not got.open
-    assert not {"script", "link", "iframe", "object"} & set(got.tags)
-    assert got.references
-    for reference in got.references:
-        assert reference.startswith(("data:image/png;base64,", "#"))
-    assert "url(" not in PAGES[verdict] and "@import" not in PAGES[verdict]
-    assert "://" not in PAGES[verdict]
-    assert len([tag for tag in got.tags if tag == "img"]) == (
-        9 if verdict == "effects-added" else 8
-    )
+    stands_alone(html := render(made_up(verdict)), pictures=9 if verdict == "effects-added" else 8)
+    motion = Page(html).motion
+    assert motion["models"] == (["before", "after"] if verdict == "effects-added" else ["before"])
+    (played,) = motion["motions"]
+    assert np.shape(played["measured"]) == (31, 1, 3) == np.shape(played["before"])
+    assert played["measured"][10][0][1] is None  # it was not measured there
+    assert played["time"] == sorted(played["time"])
+    assert (played["distance"][0] > 0.2) == (verdict == "effects-added")
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_page_of_an_added_effect() -> None:
     text = page("effects-added").text
     assert f"Something was missing: {DRAG} (linear drag) on the cart." in text
@@ -97,7 +64,8 @@ def test_page_of_an_added_effect() -> None:
     )
     assert "fits them no better than quadratic drag would" in text
     assert "fell by 57 %, from 2.40 to 1.02 times" in text
-    assert "Predicting 2.00 s ahead, the error of" in text
+    assert "Predicting 2.00 s ahead, the error fell in 6 of 6 state dimensions: most in x" in text
+    assert "Scene: of cart. Recording: given in Python; held out: part of the same." in text
     assert "gained 210 ± 19.0" in text
     assert "10 engine steps" in text and "40 steps were used instead" in text
     assert "force x 0.200 N, force y −0.100 N" in text
@@ -105,15 +73,38 @@ def test_page_of_an_added_effect() -> None:
     assert "did not converge" not in text and "Not converged" not in text
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_page_names_its_files_and_its_command() -> None:
+    source = Source("cart.toml", "train.csv", "test.csv", "pbrl-ppl close-loop cart.toml")
+    text = Page(render(made_up(), source=source)).text
+    assert "Scene: cart.toml. Recording: train.csv; held out: test.csv." in text
+    assert "This page is made again by pbrl-ppl close-loop cart.toml" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_page_explains_its_words() -> None:
+    text = page("effects-added").text
+    for name, said in (
+        ("w_x[cart]", "place of the wheel along the body"),
+        ("linear_drag_coefficient[cart]", "coefficient of the effect linear drag"),
+        ("sigma[omega]", "typical error of measuring it"),
+        ("score", "How strongly the model's errors look as a missing effect would"),
+    ):
+        assert f"{name} {said}" in text
+    assert set(BODY_PARAMETERS) <= set(PARAMETERS)
+
+
+@pytest.mark.usefixtures("undrawn")
 def test_page_where_nothing_is_missing() -> None:
     text = page("adequate").text
     assert "Nothing was found missing: what the declared model leaves passed all tests of" in text
     assert "These data would not show: linear drag below 0.0200 kg/s; quadratic drag below" in text
     assert "chance alone brings one that close in 37 % of all cases" in text
-    assert "fell by" not in text and "After" not in text
+    assert "fell by" not in text and "After:" not in text
     assert "Where it remains" not in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_page_where_something_is_unexplained() -> None:
     text = page("unexplained").text
     assert "Something is missing that no effect in the catalogue explains: its omega is off" in text
@@ -123,6 +114,7 @@ def test_page_where_something_is_unexplained() -> None:
     assert "These data would not show" not in text
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_verdict_without_converged_chains_is_none() -> None:
     findings = made_up("not-converged")
     assert verdict_in_words(findings).startswith("No verdict: the chains have not converged.")
@@ -144,6 +136,7 @@ def test_page_says_what_the_data_do_not() -> None:
     assert "nothing about inertia_scale_scale[cart]: record the body turning" in words
     assert "mass[cart] up with push_gain_gain[cart] down" in words
     assert "say nothing beyond the prior" in words
+    assert "mass[cart] – 6.3" in words and "kg 1 % inform it" in words  # all in kg
     kept = findings.to_dict()["identifiability"]
     assert kept["parameters"][1] == {
         "parameter": "r[cart]",
@@ -186,7 +179,7 @@ def test_page_compares_by_leave_one_out() -> None:
     assert "unreliable" not in text
     # where it cannot be computed, the report does without
     assert made_up().to_dict()["loo"] is None
-    assert "Leave-one-out" not in page("effects-added").text
+    assert "Leave-one-out cross-validation on" not in page("effects-added").text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -201,7 +194,7 @@ def test_names_from_files_are_escaped() -> None:
     findings = made_up("unexplained")
     remains = replace(findings.unexplained, body="<script>alert(1)</script>", sentence="a<b>&")
     html = render(replace(findings, unexplained=remains))
-    assert "script" not in Page(html).tags
+    assert Page(html).tags.count("script") == 2  # the motion's data, and what plays them
     assert "a<b>&" in Page(html).text
 
 
@@ -224,7 +217,8 @@ def test_added_effects_with_a_rest() -> None:
     assert "A pattern remains that nothing explains: its omega is off" in verdict_in_words(noted)
 
 
-def test_odd_findings_still_make_a_page() -> None:
+def test_odd_findings_still_make_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page_module, "png", lambda figure: b"")
     findings = made_up()
     nothing = Errors({}, {}, float("nan"), float("nan"))
     many = tuple(replace(c, body=f"b{i}") for i in range(9) for c in findings.candidates)
@@ -321,6 +315,7 @@ def test_close_loop_hands_over_what_it_got(monkeypatch: pytest.MonkeyPatch) -> N
     assert list(ours.values()) == list(theirs.values())
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_save_writes_the_contract(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "out"
     assert Loop(made_up()).save(folder) == folder
@@ -383,7 +378,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> None:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(loop_module, "save_posterior", fail)
-    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
 
 
 @pytest.mark.usefixtures("broken")
@@ -406,7 +401,7 @@ def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         loop_module, "save_posterior", lambda posterior, path: path.write_bytes(b"nc")
     )
-    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
     loop = Loop(made_up())
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"has content already.*--overwrite"):
@@ -431,7 +426,7 @@ def test_folder_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop_module, "render", lambda findings: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
     path = Loop(made_up()).report(tmp_path / "report.html")
     assert path.read_text() == "a page"
     for place in (tmp_path, tmp_path / "none" / "report.html"):

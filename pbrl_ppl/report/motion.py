@@ -1,0 +1,199 @@
+"""Held-out motions, measured and predicted, as the moving picture of a report has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.criticism import Findings
+from pbrl_ppl.effects import Effect
+from pbrl_ppl.history import History
+from pbrl_ppl.model import Problem
+from pbrl_ppl.posterior import group, parameter_draws, problem_of
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import wrapped
+
+Array = NDArray[np.float64]
+
+#: Motions in one page, and their rows in all, at most: those that the declared model has worst.
+MOST, _MOST_ROWS = 6, 3000
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Poses of all moving bodies in one held-out trajectory.
+
+    Parameters
+    ----------
+    name : str
+        Which trajectory.
+    time : ndarray
+        Seconds since the first pose, shape (time,).
+    measured, before, after : ndarray
+        x, y, theta (m, m, rad), shape (time, body, 3); NaN where not measured. Predictions begin at
+        the first measured state and see none after it.
+    """
+
+    name: str
+    time: Array
+    measured: Array
+    before: Array
+    after: Array
+
+
+def likeliest(problem: Problem, posterior: Any) -> tuple[Array, Array]:
+    """The draw of highest likelihood: phi, shape (p,), and the noise parameters."""
+    likelihood = group(posterior, "log_likelihood")["next_state"].sum("transition")
+    best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
+    phi, sigma = parameter_draws(problem, posterior)
+    return phi[best], sigma[best]
+
+
+def held_out_motions(
+    findings: Findings, held_out: History | None, effects: Iterable[Effect]
+) -> list[Motion]:
+    """Play held-out trajectories under the likeliest draws before and after, worst before first.
+
+    Parameters
+    ----------
+    findings : Findings
+        With posteriors as files have them.
+    held_out : History or None
+        Without it, the findings' one trajectory of one body, if its whole pose was measured.
+    effects : iterable of Effect
+        Where effects are looked up.
+    """
+    if held_out is None:
+        return _of_rollout(findings)
+    effects = tuple(effects)
+    before = _played(findings.posterior_before, held_out, effects)
+    after = before
+    if findings.posterior_after is not findings.posterior_before:
+        after = _played(findings.posterior_after, held_out, effects)
+    dataset = held_out.dataset
+    known, rows = dataset["start"].to_numpy()[..., :3], dataset["n_rows"].to_numpy()
+    labels = [str(label) for label in dataset["trajectory"].to_numpy()]
+    motions = []
+    for (trajectory, step), first in before.items():
+        end = int(min(rows[trajectory], step + len(first)))
+        length = end - step
+        motions.append(
+            Motion(
+                labels[trajectory],
+                np.arange(length, dtype=float) * findings.scene.time_step,
+                known[trajectory, step:end],
+                first[:length],
+                after[trajectory, step][:length],
+            )
+        )
+    shown: list[Motion] = []
+    for motion in sorted(motions, key=lambda each: -distance(findings.scene, each, each.before)):
+        if shown and sum(len(each.time) for each in [*shown, motion]) > _MOST_ROWS:
+            break
+        shown.append(motion)
+    return shown[:MOST]
+
+
+def distance(scene: Scene, motion: Motion, predicted: Array) -> float:
+    """Root mean square distance (m) of outlines from where they were measured."""
+    reach = np.array([body.shape.bounding_radius for body in scene.moving])
+    if len(reach) != motion.measured.shape[1]:  # one body of several
+        reach = np.array([reach.max()])
+    off = predicted - motion.measured
+    square = off[..., 0] ** 2 + off[..., 1] ** 2 + (reach * wrapped(off[..., 2])) ** 2
+    return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else 0.0
+
+
+def _played(
+    posterior: Any, history: History, effects: Sequence[Effect]
+) -> dict[tuple[int, int], Array]:
+    """Poses that a posterior predicts, by trajectory and the step that they start from."""
+    problem = problem_of(posterior, effects)
+    phi, _ = likeliest(problem, posterior)
+    longest = int(history.dataset["n_rows"].max()) - 1
+    problem = problem.with_data(history=history, states=None, horizon=longest)
+    segments = problem.segments
+    states = problem.predict(phi, problem.one_world)[..., :3]
+    states = np.concatenate([segments.start[:, None, :, :3], states], axis=1)
+    keys = zip(segments.trajectory.tolist(), segments.step.tolist(), strict=True)
+    return dict(zip(keys, states, strict=True))
+
+
+def _of_rollout(findings: Findings) -> list[Motion]:
+    """The findings' own trajectory of one body."""
+    rollout = findings.rollout
+    if not {"x", "y", "theta"} <= set(rollout.names):
+        return []
+    own = [rollout.names.index(name) for name in ("x", "y", "theta")]
+    measured, before, after = (
+        values[:, None, own] for values in (rollout.measured, rollout.before, rollout.after)
+    )
+    return [Motion("held out", rollout.time, measured, before, after)]
+
+
+def animation(findings: Findings, motions: Sequence[Motion]) -> dict[str, Any] | None:
+    """What the page's script draws, as plain values; None where there is no motion to show.
+
+    Lengths are in m with five digits, angles in rad.
+    """
+    if not motions:
+        return None
+    scene = findings.scene
+    bodies = list(scene.moving)
+    if len(bodies) != motions[0].measured.shape[1]:
+        bodies = [body for body in bodies if body.name == findings.rollout.body]
+    reach = max(body.shape.bounding_radius for body in bodies)
+    return {
+        "models": ["before", "after"] if findings.added else ["before"],
+        "bodies": [
+            {"name": body.name, "outline": _outline(body.shape), "radius": body.shape.radius}
+            for body in bodies
+        ],
+        "static": [
+            {"outline": _outline(body.shape), "radius": body.shape.radius, "pose": list(body.pose)}
+            for body in scene.bodies
+            if body.static and body.pose is not None
+        ],
+        "walls": [[list(wall.start), list(wall.end)] for wall in scene.walls],
+        "motions": [
+            {
+                "name": motion.name,
+                "box": _box(motion, 1.2 * reach),
+                "time": _rounded(motion.time),
+                "measured": _rounded(motion.measured),
+                "before": _rounded(motion.before),
+                "after": _rounded(motion.after),
+                "distance": [
+                    _rounded(np.array(distance(scene, motion, poses)))
+                    for poses in (motion.before, motion.after)
+                ],
+            }
+            for motion in motions
+        ],
+    }
+
+
+def _box(motion: Motion, margin: float) -> list[list[float]]:
+    """Corners of what is shown: the measured places, and as much around them for predictions."""
+    places = motion.measured[..., :2].reshape(-1, 2)
+    low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
+    spare = 0.7 * float((high - low).max()) + margin
+    every = np.concatenate([motion.before, motion.after])[..., :2].reshape(-1, 2)
+    every = np.clip(every, low - spare, high + spare)
+    low = np.minimum(low, np.nanmin(every, axis=0)) - margin
+    high = np.maximum(high, np.nanmax(every, axis=0)) + margin
+    return [low.round(5).tolist(), high.round(5).tolist()]
+
+
+def _outline(shape: Any) -> list[list[float]] | None:
+    return None if shape.outline is None else [list(map(float, point)) for point in shape.outline]
+
+
+def _rounded(values: Array) -> Any:
+    """Nested lists of five decimals, with None for what is not a number."""
+    plain = np.round(values, 5).astype(object)
+    return np.where(np.isfinite(values), plain, np.array(None)).tolist()

@@ -1,0 +1,130 @@
+"""Pages of HTML that need nothing else: their template, tables and pictures."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jinja2
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from pbrl_ppl.report.style import NARROW, WIDE, png
+from pbrl_ppl.report.words import (
+    chance,
+    change,
+    digits_of,
+    joined,
+    number,
+    odds,
+    plain,
+    quantity,
+)
+
+#: What a cell of a table shows, and what is written small beside it.
+Cell = str | tuple[str, str]
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where findings come from, for a reader who wants to make them again.
+
+    Parameters
+    ----------
+    scene, train, test : str
+        Names of the files, empty where there are none.
+    command : str
+        What makes the page again, at a shell or in Python.
+    """
+
+    scene: str = ""
+    train: str = ""
+    test: str = ""
+    command: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table as a page shows it; on a telephone each row becomes a card.
+
+    Parameters
+    ----------
+    caption : str
+        What it is about.
+    columns : sequence of str
+        Their heads.
+    rows : sequence of sequence
+        Cells, as many as there are columns.
+    words : tuple of int
+        Columns that hold words; others hold numbers, and the first one the row's name.
+    marks : sequence of str
+        ``added`` or ``bad`` for rows that stand out; as many as rows, or none.
+    """
+
+    caption: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[Cell]]
+    words: tuple[int, ...] = ()
+    marks: Sequence[str] = ()
+
+    @property
+    def marked(self) -> list[tuple[str, list[tuple[int, str, str, str]]]]:
+        """Rows with their mark: place, head, text and note of each cell."""
+        marks = self.marks or [""] * len(self.rows)
+        result = []
+        for mark, row in zip(marks, self.rows, strict=True):
+            cells = []
+            for place, (head, cell) in enumerate(zip(self.columns, row, strict=True)):
+                text, note = cell if isinstance(cell, tuple) else (cell, "")
+                cells.append((place, head, text, note))
+            result.append((mark, cells))
+        return result
+
+
+def render_page(
+    template: str, pictures: Mapping[str, Callable[[float], Figure]], **told: Any
+) -> str:
+    """Fill a template; pictures are drawn twice, for a page and for a telephone.
+
+    Parameters
+    ----------
+    template : str
+        Its name in this folder.
+    pictures : dict of str to callable
+        Draws a picture at a width (inches).
+    **told : object
+        What the template shows.
+    """
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("pbrl_ppl", "report"),
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    for written in (number, chance, odds, plain, joined, change, quantity):
+        environment.filters[written.__name__] = written
+    environment.filters["data"] = _data
+    picture = {name: _picture(draw) for name, draw in pictures.items()}
+    return environment.get_template(template).render(picture=picture, digits_of=digits_of, **told)
+
+
+def _picture(draw: Callable[[float], Figure]) -> dict[str, str]:
+    """A picture in both widths."""
+    return {"wide": _address(draw(WIDE)), "narrow": _address(draw(NARROW))}
+
+
+def _address(figure: Figure) -> str:
+    """A picture as an address that holds it."""
+    return "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
+
+
+def _data(value: Any) -> Markup:
+    """JSON for a script element, which no text in it can end."""
+    text = json.dumps(value, separators=(",", ":"), allow_nan=False)
+    for sign in "<>&":
+        text = text.replace(sign, f"\\u{ord(sign):04x}")
+    return Markup(text)

@@ -1,0 +1,264 @@
+"""Report of any posterior file: what is known, whether it can be relied on, and how it predicts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from pbrl_ppl.effects import Effect
+from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.errors import PbrlError, PosteriorError
+from pbrl_ppl.posterior import compare, group, groups, identify, scalars, scene_of
+from pbrl_ppl.report.comparison_plots import (
+    MOST_PRIORS,
+    coverage,
+    most_dependent,
+    pareto_k,
+    plot_pairs,
+    plot_pareto,
+    plot_predictions,
+    plot_prior,
+)
+from pbrl_ppl.report.glossary import STATISTICS
+from pbrl_ppl.report.page import Source, Table, render_page
+from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
+from pbrl_ppl.report.posterior_rows import (
+    parameter_table,
+    posterior_rows,
+    sampler_in_words,
+    width_table,
+)
+from pbrl_ppl.report.report import recorded_poses
+from pbrl_ppl.report.scene_plots import plot_recording
+from pbrl_ppl.report.words import number
+
+#: With fewer there is nothing to say of chains, densities or cross-validation.
+LEAST_DRAWS = 100
+
+
+def render_posterior(
+    posterior: Any, effects: Iterable[Effect] = full_catalogue, source: Source | None = None
+) -> str:
+    """Render the report of a posterior: one page of HTML that needs nothing else.
+
+    Parameters
+    ----------
+    posterior : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`, :func:`pbrl_ppl.update` or read from a file.
+    effects : iterable of Effect
+        Where the names of its effects are looked up; add your own to the package's.
+    source : Source, optional
+        The command that makes the page again.
+
+    Returns
+    -------
+    str
+        The page.
+
+    Raises
+    ------
+    PosteriorError
+        If it lacks a group, or has fewer than 100 draws, as one of a mode alone.
+
+    Examples
+    --------
+    ::
+
+        page = render_posterior(pp.load_posterior("cart.nc"))
+        Path("cart.html").write_text(page, encoding="utf-8")
+    """
+    effects = tuple(effects)
+    scene = scene_of(posterior)
+    sizes = group(posterior, "posterior").sizes
+    if sizes["chain"] * sizes["draw"] < LEAST_DRAWS:
+        raise PosteriorError(
+            f"posterior: it has {sizes['chain'] * sizes['draw']} draws, a report needs at least"
+            f" {LEAST_DRAWS}; fit with a method that draws, and more draws"
+        )
+    table = summary(posterior)
+    rows = posterior_rows(table, effects)
+    shown, pairs = most_interesting(posterior, table), most_dependent(posterior)
+    moving = [row["label"] for row in rows if row["sd"] > 0]
+    priors = (moving or [row["label"] for row in rows])[:MOST_PRIORS]
+    missing: dict[str, str] = {}
+    said = _or_why(lambda: identify(posterior, effects=effects), "identifiability", missing)
+    covered = _or_why(lambda: coverage(posterior), "predictions", missing)
+    k = _or_why(lambda: pareto_k(posterior), "loo", missing)
+    pictures: dict[str, Callable[[float], Figure]] = {
+        "prior": partial(plot_prior, posterior, priors),
+        "trace": partial(plot_trace, posterior, shown),
+        "rank": partial(plot_rank, posterior, shown),
+    }
+    if pairs:
+        pictures["pairs"] = partial(plot_pairs, posterior, pairs)
+    if covered:
+        pictures["predictions"] = partial(plot_predictions, posterior)
+    if k is not None:
+        pictures["pareto"] = partial(plot_pareto, *k)
+    poses = recorded_poses(posterior)
+    if poses is not None and np.isfinite(poses[..., :2]).any():
+        pictures["scene"] = partial(plot_recording, scene, poses, None)
+    units = {row["label"]: row["unit"] for row in rows}
+    return render_page(
+        "posterior.html.jinja",
+        pictures,
+        bodies=[body.name for body in scene.moving],
+        headline=_headline(posterior, said),
+        sampled=sampler_in_words(rows),
+        bad=[row for row in rows if row["failed"]],
+        sentences=() if said is None else said.sentences,
+        predicts=_predicts(covered, missing),
+        warnings=_warned(posterior, said is not None),
+        about=_about(posterior),
+        posterior=parameter_table(rows, "Posterior of all parameters"),
+        count=len(rows),
+        has_prior="prior" in groups(posterior),
+        shown_priors=priors,
+        pairs=pairs,
+        widths=said and width_table(posterior, said, units),
+        shown=shown,
+        covered=covered and _covered(covered),
+        loo=_loo(posterior) if k is not None else None,
+        missing=missing,
+        meanings={row["label"]: row["meaning"] for row in rows if row["meaning"]},
+        statistics=STATISTICS,
+        source=source or Source(command="render_posterior(pp.load_posterior(...))"),
+        refit=_refit(posterior),
+        origin=_origin(posterior),
+        scene_toml=scene.to_toml(),
+    )
+
+
+def _or_why(compute: Callable[[], Any], name: str, missing: dict[str, str]) -> Any:
+    """What is computed, or None, with the reason kept for the page."""
+    try:
+        return compute()
+    except PbrlError as error:
+        missing[name] = f"Not to be had: {error}"
+        return None
+
+
+def _headline(posterior: Any, said: Any) -> str:
+    scene, attrs = scene_of(posterior), posterior.attrs
+    bodies = ", ".join(body.name for body in scene.dynamic)
+    effects = [f"{name.replace('_', ' ')} of {body}" for name, body in _effects(attrs)]
+    text = f"Posterior of {bodies}{' with ' + ', '.join(effects) if effects else ''}"
+    if said is None:
+        return f"{text}: {len(scalars(posterior).data_vars)} parameters"
+    verdicts = [width.verdict for width in said.parameters]
+    counts = (
+        (verdicts.count("informed"), "the data inform"),
+        (verdicts.count("weak"), "weakly"),
+        (verdicts.count("prior only"), "not beyond the prior"),
+    )
+    parts = [f"{count} {words}" for count, words in counts if count]
+    return f"{text}: of {len(verdicts)} parameters {', '.join(parts)}"
+
+
+def _predicts(covered: Any, missing: dict[str, str]) -> str:
+    if not covered:
+        return missing.get("predictions", "It holds no predictions.")
+    inside = [wide for _, wide, _ in covered.values()]
+    low, high = min(inside), max(inside)
+    return (
+        f"Intervals that should hold 94 % of measurements hold {100 * low:.0f} to"
+        f" {100 * high:.0f} % of them, in {len(covered)} state dimensions, each transition"
+        " predicted without itself."
+    )
+
+
+def _warned(posterior: Any, told: bool) -> list[str]:
+    """Warnings of the fit, without those that the page says in its own words."""
+    every = json.loads(str(posterior.attrs.get("warnings", "[]")))
+    own = ("have not converged", *(("say nothing about",) if told else ()))
+    return [each for each in every if not any(words in each for words in own)]
+
+
+def _about(posterior: Any) -> str:
+    attrs, sizes = posterior.attrs, group(posterior, "posterior").sizes
+    given = group(posterior, "constant_data")
+    transitions = group(posterior, "observed_data").sizes["transition"]
+    horizon = int(attrs.get("horizon", 1))
+    likelihood = "whole trajectories" if "smoothed" in given else "transitions, Eq. 11"
+    if horizon > 1:
+        likelihood = f"segments of {horizon} intervals"
+    return (
+        f"{transitions} transitions; likelihood of {likelihood}; sampler"
+        f" {attrs.get('method', 'unknown')}, {sizes['chain']} chains of {sizes['draw']} draws."
+    )
+
+
+def _covered(covered: dict[str, tuple[float, float, int]]) -> Table:
+    return Table(
+        "Measurements inside leave-one-out predictions",
+        ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements"),
+        [
+            (name, f"{100 * half:.1f} %", f"{100 * wide:.1f} %", str(count))
+            for name, (half, wide, count) in covered.items()
+        ],
+    )
+
+
+def _loo(posterior: Any) -> Table | None:
+    found = compare(posterior, posterior)
+    if found is None:
+        return None
+    one = found.before
+    return Table(
+        f"Leave-one-out cross-validation of {found.transitions} transitions (az.loo)",
+        ("Measure", "Value"),
+        [
+            ("elpd_loo (nats; more is better)", number(one.elpd_loo, 4)),
+            ("Standard error", number(one.se)),
+            ("p_loo, the effective number of parameters", number(one.p_loo)),
+            (f"How many have a Pareto k above {number(one.good_k, 2)}", str(one.high_pareto_k)),
+        ],
+    )
+
+
+def _effects(attrs: Any) -> list[tuple[str, str]]:
+    return [(str(name), str(body)) for name, body in json.loads(str(attrs.get("effects", "[]")))]
+
+
+def _refit(posterior: Any) -> str:
+    """Lines of Python that make the posterior again from its recording."""
+    attrs, draws = posterior.attrs, group(posterior, "posterior")
+    options = []
+    if "smoothed" in group(posterior, "constant_data"):
+        options.append("trajectories=True")
+    if int(attrs.get("horizon", 1)) > 1:
+        options.append(f"horizon={int(attrs['horizon'])}")
+    if draws["sigma"].ndim == 2:
+        options.append('sigma="scalar"')
+    if "nu" in attrs:
+        options.append(f"nu={float(attrs['nu']):g}")
+    if "library" in attrs:
+        options.append("library=...")
+    options.append(f"substeps={int(attrs['substeps'])}")
+    lines = [
+        "import pbrl_ppl as pp",
+        "scene = pp.Scene.load(...)  # as below",
+        "history = pp.History.load(..., scene)",
+        f"model = pp.physics_model(scene, history, {', '.join(options)})",
+        f"idata = pp.fit(model, method={str(attrs.get('method', 'metropolis'))!r},"
+        f" seed={int(attrs['seed'])}, draws={draws.sizes['draw']}, chains={draws.sizes['chain']})",
+    ]
+    if "updates" in attrs:
+        lines.append("# and updates since, which attrs['updates'] lists")
+    return "\n".join(lines)
+
+
+def _origin(posterior: Any) -> dict[str, str]:
+    """Attributes that say where a posterior is from."""
+    attrs = posterior.attrs
+    told = {"seed": str(attrs["seed"]), "data_sha256": str(attrs.get("data_sha256", ""))}
+    for name in ("method", "substeps", "horizon", "updates"):
+        if name in attrs:
+            told[name] = str(attrs[name])
+    versions = json.loads(str(attrs.get("versions", "{}")))
+    return told | {"versions": ", ".join(f"{name} {number}" for name, number in versions.items())}

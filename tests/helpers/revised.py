@@ -1,0 +1,53 @@
+"""Findings with posteriors of a real fit, of a puck that drags, in seconds."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+
+from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
+from pbrl_ppl.effects import catalogue
+from pbrl_ppl.history import History
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.sampling import fit
+from tests.helpers.free_puck import DISC, Disc
+from tests.helpers.made_up import made_up
+
+DRAG = 0.8
+
+
+@cache
+def recordings() -> tuple[History, History]:
+    """A recording to fit and one to judge by."""
+    dragged = Disc(trajectories=6, intervals=12, drag=DRAG)
+    frames = (dragged.frame(np.random.default_rng(seed)) for seed in (1, 2))
+    train, test = (History.from_dataframe(frame, DISC) for frame in frames)
+    return train, test
+
+
+@cache
+def revised() -> Findings:
+    """Findings as made up, with the posteriors of a puck without drag and with it."""
+    train, _ = recordings()
+    drag = [effect for effect in catalogue if effect.name == "linear_drag"]
+    models = (physics_model(DISC, train, e, trajectories=True) for e in ((), drag))
+    before, after = (fit(m, method="laplace", seed=1, draws=100, progress=False) for m in models)
+    size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
+    added = Added("linear_drag", "puck", "a drag", 99.0, 1e-9, {"coefficient": size}, (), 9.0, 1.0)
+    return replace(
+        made_up(), scene=DISC, added=(added,), posterior_before=before, posterior_after=after
+    )
+
+
+def unexplained() -> Findings:
+    """The same where no effect has a name."""
+    left = Unexplained("puck", "vx", "velocity x", 0.5, 0.001, "vx of puck depends on velocity x")
+    before = revised().posterior_before
+    return replace(
+        made_up("unexplained"),
+        scene=DISC,
+        unexplained=left,
+        posterior_before=before,
+        posterior_after=before,
+    )

@@ -1,0 +1,101 @@
+"""Where the evidence is, which law is wanted, and the motions that a report plays."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.criticism.results import Unexplained
+from pbrl_ppl.effects import catalogue
+from pbrl_ppl.posterior import compare
+from pbrl_ppl.report.evidence import binned, find_evidence
+from pbrl_ppl.report.evidence_plots import plot_evidence, plot_laws
+from pbrl_ppl.report.laws import find_laws
+from pbrl_ppl.report.motion import animation, distance, held_out_motions
+from tests.helpers.made_up import made_up
+from tests.helpers.revised import DRAG, recordings, revised, unexplained
+
+pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+
+
+def test_evidence_adds_up_and_is_where_the_drag_is() -> None:
+    findings = revised()
+    evidence = find_evidence(findings, catalogue)
+    gain = compare(findings.posterior_before, findings.posterior_after).elpd_difference
+    assert evidence.nats.shape == (72, 6)
+    assert evidence.nats.sum() == pytest.approx(gain, rel=0.1)  # of likeliest draws, not left out
+    assert sum(evidence.by_cell.values()) == pytest.approx(evidence.nats.sum())
+    assert set(list(evidence.by_cell)[:2]) == {"vx", "vy"}
+    # a drag is seen where the puck is fast
+    fast = evidence.speed > np.median(evidence.speed)
+    assert evidence.by_transition[fast].mean() > 1.4 * evidence.by_transition[~fast].mean()
+    carriers = evidence.carriers()
+    gains = np.maximum(evidence.by_transition, 0.0)
+    assert gains[carriers].sum() >= 0.8 * gains.sum() > gains[carriers[:-1]].sum()
+    assert not evidence.touching.any()
+    assert evidence.trajectory[12] == "1" and evidence.time[12] == 0.0
+    assert f"{evidence.nats.sum():,.0f} nats likelier" in evidence.in_words()
+    assert len(plot_evidence(evidence).axes) == 7  # with the map's scale
+
+
+def test_no_evidence_where_nothing_was_added_or_recorded() -> None:
+    assert find_evidence(unexplained(), catalogue) is None
+    assert find_evidence(made_up(), catalogue) is None
+    assert find_laws(revised(), catalogue) == []
+    assert find_laws(made_up("unexplained"), catalogue) == []
+
+
+def test_the_law_that_is_wanted_is_the_drag() -> None:
+    laws = find_laws(unexplained(), catalogue)
+    first = laws[0]
+    assert (first.quantity, first.dimension, first.y_unit) == ("velocity x", "vx", "N")
+    assert first.curve_share > 0.8
+    slope = np.polyfit(first.x, first.y, 1)[0]
+    assert slope == pytest.approx(-DRAG, rel=0.25)
+    assert "q" in first.form
+    assert len(plot_laws(laws).axes) == len(laws)
+    # named by nobody, it is found all the same
+    left = Unexplained("puck", "y", "nothing that was recorded", 0.5, 0.001, "y is off")
+    others = find_laws(replace(unexplained(), unexplained=left), catalogue)
+    assert (others[0].quantity, others[0].dimension) == ("velocity y", "vy")
+    nowhere = replace(left, body="")
+    assert find_laws(replace(unexplained(), unexplained=nowhere), catalogue) == []
+
+
+def test_bins_hold_about_as_many_and_equal_values_share_one() -> None:
+    which, bins = binned(np.arange(100.0))
+    assert bins == 10 and np.bincount(which).tolist() == [10] * 10
+    which, bins = binned(np.repeat([0.0, 1.0], 50))
+    assert bins == 2 and len(set(which[:50])) == 1
+
+
+def test_motions_are_those_of_the_recording_worst_first() -> None:
+    findings, (_, test) = revised(), recordings()
+    motions = held_out_motions(findings, test, catalogue)
+    before = [distance(findings.scene, motion, motion.before) for motion in motions]
+    after = [distance(findings.scene, motion, motion.after) for motion in motions]
+    assert len(motions) == 6 and before == sorted(before, reverse=True)
+    assert before[0] > 0.2 and max(after) < 0.3 * before[0]
+    places = {str(label): i for i, label in enumerate(test.dataset["trajectory"].values)}
+    for motion in motions:
+        measured = test.dataset["observed"].values[places[motion.name], :, :, :3]
+        np.testing.assert_array_equal(motion.measured, measured)
+        np.testing.assert_array_equal(motion.before[0], measured[0])
+        np.testing.assert_array_equal(motion.after[0], measured[0])
+    data = animation(findings, motions)
+    assert data["models"] == ["before", "after"]
+    assert data["bodies"] == [{"name": "puck", "outline": None, "radius": 0.2}]
+    for drawn, motion in zip(data["motions"], motions, strict=True):
+        np.testing.assert_allclose(drawn["after"], motion.after, atol=1e-5)
+        low, high = np.array(drawn["box"])
+        assert (low < motion.measured[..., :2].min(axis=(0, 1))).all()
+        assert (high > motion.measured[..., :2].max(axis=(0, 1))).all()
+
+
+def test_without_a_recording_the_findings_own_trajectory_is_played() -> None:
+    (motion,) = held_out_motions(made_up(), None, catalogue)
+    assert motion.before.shape == (31, 1, 3)
+    rollout = made_up().rollout
+    blind = replace(made_up(), rollout=replace(rollout, names=("q", *rollout.names[1:])))
+    assert held_out_motions(blind, None, catalogue) == []
+    assert animation(blind, []) is None

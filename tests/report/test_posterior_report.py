@@ -1,0 +1,105 @@
+"""Reports of posterior files: all diagnostics, on files of both generations."""
+
+import shlex
+import warnings
+
+import pytest
+
+from pbrl_ppl.cli import main
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.posterior import DATATREE, from_groups, groups, load_posterior
+from pbrl_ppl.report import page as page_module
+from pbrl_ppl.report import plot_rank, render_posterior
+from pbrl_ppl.report.comparison_plots import coverage, most_dependent, plot_pairs, plot_prior
+from tests.helpers.html import Page, stands_alone
+from tests.helpers.made_up import made_up_posterior
+from tests.helpers.revised import revised
+from tests.helpers.stacks import GENERATIONS, file
+
+pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page without its pictures, which take nearly all of its time."""
+    nothing = "data:image/png;base64,"
+    monkeypatch.setattr(page_module, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("generation", GENERATIONS)
+def test_page_of_a_file(generation: str) -> None:
+    html = render_posterior(load_posterior(file(generation)))
+    stands_alone(html, pictures=7)
+    text = Page(html).text
+    assert "Posterior of puck: of 1 parameters 1 the data inform" in text
+    assert "Did the sampler work? Yes. The chains agree" in text
+    assert "This file holds no draws from the prior." in text
+    assert "In the central 94 %" in text and "elpd_loo (nats; more is better)" in text
+    assert "Pareto k above" in text and "mass[puck] mass 2." in text
+    assert "pp.fit(model, method='metropolis', seed=3, draws=500, chains=2)" in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_page_of_whole_trajectories() -> None:
+    html = render_posterior(revised().posterior_after)
+    stands_alone(html, pictures=7)
+    text = Page(html).text
+    assert "Posterior of puck with linear drag of puck: of 2 parameters 2 the data inform" in text
+    assert "likelihood of whole trajectories; sampler laplace" in text
+    assert "trajectories=True" in text and "no draws from the prior" not in text
+    for shares in coverage(revised().posterior_after).values():
+        assert shares[1] == pytest.approx(0.94, abs=0.08) and shares[2] == 72
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_what_cannot_be_had_is_said() -> None:
+    whole = load_posterior(file("5"))
+    parts = {k: v for k, v in groups(whole).items() if k != "posterior_predictive"}
+    text = Page(render_posterior(from_groups(parts, whole.attrs))).text
+    assert "Not to be had: posterior: it has no group 'posterior_predictive'" in text
+    short = {
+        k: v.isel(draw=slice(20)) if "draw" in v.sizes else v for k, v in groups(whole).items()
+    }
+    with pytest.raises(PosteriorError, match="it has 40 draws, a report needs at least 100"):
+        render_posterior(from_groups(short, whole.attrs))
+    warned = from_groups(groups(whole), {**whole.attrs, "warnings": '["mass is pressed"]'})
+    assert "Warning of the fit. mass is pressed" in Page(render_posterior(warned)).text
+
+
+def test_ranks_that_differ_are_said_and_others_are_not() -> None:
+    fine, stuck = (
+        [axes.get_title() for axes in plot_rank(made_up_posterior(stuck)).axes]
+        for stuck in (False, True)
+    )
+    assert not any("chains differ" in title for title in fine)
+    assert [title for title in stuck if "differ" in title] == ["w_x[cart]: chains differ"]
+
+
+def test_pairs_are_those_that_depend_on_each_other() -> None:
+    posterior = made_up_posterior()
+    parts = groups(posterior)
+    parts["posterior"]["twin"] = 2 * parts["posterior"]["mass"] + 1
+    names = most_dependent(from_groups(parts, {}))
+    assert set(names[:2]) == {"mass[cart]", "twin[cart]"} and len(names) == 4
+    figure = plot_pairs(from_groups(parts, {}), names)
+    assert [axes.get_title() for axes in figure.axes].count("+1.00") == 1
+    assert plot_prior(posterior, ["mass[cart]"]).axes[0].get_title() == "mass[cart]"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_command(tmp_path, capsys) -> None:
+    page = tmp_path / "a page.html"
+    source = file("6" if DATATREE else "5")
+    command = ["report", str(source), "-o", str(page)]
+    with warnings.catch_warnings():
+        assert main([*command, "-q"]) == 0
+    html = page.read_text(encoding="utf-8")
+    assert capsys.readouterr().out == f"report: {page}\n"
+    assert shlex.join(["pbrl-ppl", *command, "--quiet"]) in Page(html).text
+    assert main([*command, "-q"]) == 2  # it is there
+    assert "pass --overwrite" in capsys.readouterr().err
+    for wrong in (tmp_path / "none.nc", page):
+        assert main(["report", str(wrong), "-q", "-o", str(tmp_path / "new.html")]) == 2
+        assert capsys.readouterr().err.startswith("error: ")
+    assert [path.name for path in tmp_path.iterdir()] == ["a page.html"]
