@@ -7,6 +7,7 @@ from pbrl_ppl.agents.episode import Episode
 from pbrl_ppl.agents.experiment import run_episodes
 from pbrl_ppl.agents.online import run_episode
 from pbrl_ppl.agents.pbrl import PBRLAgent
+from pbrl_ppl.agents.revision import Revision
 from pbrl_ppl.agents.task import Task
 from pbrl_ppl.agents.world import Outcome, World
 
@@ -18,6 +19,7 @@ __all__ = [
     "OOLWRAgent",
     "Outcome",
     "PBRLAgent",
+    "Revision",
     "Task",
     "TrueModelAgent",
     "World",

@@ -82,6 +82,8 @@ class PBRLAgent(Agent):
         As :func:`pbrl_ppl.fit` made it last.
     fits : int
         How often it was fitted.
+    looks : int
+        How often it looked for what its model lacks.
     added : tuple of Revision
         Effects that it found missing and plans with, each with when it was added and how sure that
         was; their parameters are among the estimates from then on.
@@ -115,7 +117,7 @@ class PBRLAgent(Agent):
         self._sigma = np.empty(0)
         self.posterior: Any = None
         self.added: tuple[Revision, ...] = ()
-        self.fits = self._fitted = self._looks = self._looked = 0
+        self.fits = self._fitted = self.looks = self._looked = 0
 
     @property
     def model(self) -> Dynamics | None:
@@ -182,8 +184,8 @@ class PBRLAgent(Agent):
         def search(effects: tuple[Attached, ...]) -> Mode:
             return find_mode(self._model(effects, free).problem, seed=self.seed)
 
-        self._looks, self._looked = self._looks + 1, len(free)
-        level = _LEVEL / (self._looks * (self._looks + 1))
+        self.looks, self._looked = self.looks + 1, len(free)
+        level = _LEVEL / (self.looks * (self.looks + 1))
         found, mode = select_effects(
             search, self._declared, self.added, self._catalogue, level=level, floor=_FORETOLD
         )

@@ -148,9 +148,7 @@ class _Step:
     level: float
     floor: float
 
-    def addition(
-        self, mode: Mode, known: Mapping[Attached, Mode]
-    ) -> tuple[Revision, Mode] | None:
+    def addition(self, mode: Mode, known: Mapping[Attached, Mode]) -> tuple[Revision, Mode] | None:
         """The best of the leading candidates that cross-validation confirms, and the mode with it.
 
         ``known`` are modes with a candidate that were found before.
