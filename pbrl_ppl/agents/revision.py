@@ -155,26 +155,33 @@ class _Step:
         """
         missing = candidates(mode.problem.scene, mode.problem.physics.effects, self.catalogue)
         ranked = rank_candidates(mode, missing)
-        leading = _significant(mode, ranked, self.level)[:TRIED]
+        leading = _significant(mode, ranked, missing, self.level)[:TRIED]
         if not leading:
             return None
-        order = [attached.effect.name for attached in missing]
         fits = {each: known.get(each.attached) or _climbed(mode, each) for each in leading}
 
-        def searched(signature: Signature) -> Mode:
-            if signature.attached in known:
-                return fits[signature]
-            whole = self.search((*mode.problem.physics.effects, signature.attached))
-            return max(fits[signature], whole, key=lambda each: each.log_posterior)
+        def rank(signature: Signature) -> int:
+            return missing.index(signature.attached)
 
-        # a climb that ends short of the top must not choose another name than the score's
-        first = leading[0]
-        fits[first] = searched(first)
+        sure = {each for each in leading if each.attached in known}
+
+        def search(signature: Signature) -> None:
+            """Look for the top elsewhere than where the climb led."""
+            if signature not in sure:
+                sure.add(signature)
+                whole = self.search((*mode.problem.physics.effects, signature.attached))
+                fits[signature] = max(fits[signature], whole, key=lambda each: each.log_posterior)
+
+        # a climb that ends short of the top must not choose another name than the score's, nor
+        # than the simplest of those that the data cannot tell from that
+        alike = {leading[0].attached.effect.name, *inseparable(leading[0], leading)}
+        search(leading[0])
+        search(min((each for each in leading if each.attached.effect.name in alike), key=rank))
         heights = {each: _height(fits[each], each, self.floor) for each in leading}
         while heights:
             top = max(heights.values())
             tied = [each for each, height in heights.items() if height > top - _TIE]
-            best = min(tied, key=lambda each: order.index(each.attached.effect.name))
+            best = min(tied, key=rank)
             del heights[best]
             gain, error = self.gain(fits[best], mode)
             if _worth_it(gain, error):
@@ -186,7 +193,8 @@ class _Step:
                     error,
                     inseparable(best, ranked),
                 )
-                return revision, fits[best] if best is first else searched(best)
+                search(best)
+                return revision, fits[best]
         return None
 
     def gain(self, mode: Mode, without: Mode) -> tuple[float, float]:
@@ -199,14 +207,16 @@ class _Step:
         return float(gains.sum()), standard_error(gains)
 
 
-def _significant(mode: Mode, ranked: list[Signature], level: float) -> list[Signature]:
+def _significant(
+    mode: Mode, ranked: list[Signature], missing: tuple[Attached, ...], level: float
+) -> list[Signature]:
     """Significant candidates, best first; of twins, the earlier in the catalogue."""
     kept: list[Signature] = []
-    for signature in ranked:
+    for signature in sorted(ranked, key=lambda each: missing.index(each.attached)):
         chance = _p_value(mode, signature) * len(ranked)
         if chance < level and not any(twins(signature, earlier) for earlier in kept):
             kept.append(signature)
-    return kept
+    return sorted(kept, key=ranked.index)
 
 
 def _p_value(mode: Mode, signature: Signature) -> float:
@@ -259,5 +269,5 @@ def _floored(mode: Mode, floor: float) -> Mode:
     precision = jacobian.T @ jacobian + np.diag(prior_slopes(priors, mode.phi) ** 2)
     angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
     precision[angles, angles] += _CIRCLE
-    covariance = np.linalg.pinv(precision, hermitian=True)
+    covariance = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=float)
     return replace(mode, sigma=sigma, jacobian=jacobian, covariance=covariance)
