@@ -8,6 +8,7 @@ from pbrl_ppl.agents.experiment import run_episodes
 from pbrl_ppl.agents.library import LibraryAgent
 from pbrl_ppl.agents.online import run_episode
 from pbrl_ppl.agents.pbrl import PBRLAgent
+from pbrl_ppl.agents.revision import Revision
 from pbrl_ppl.agents.task import Task
 from pbrl_ppl.agents.world import Outcome, World
 
@@ -20,6 +21,7 @@ __all__ = [
     "OOLWRAgent",
     "Outcome",
     "PBRLAgent",
+    "Revision",
     "Task",
     "TrueModelAgent",
     "World",

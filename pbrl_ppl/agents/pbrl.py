@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any, ClassVar, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import Agent
+from pbrl_ppl.agents.revision import Revision, select_effects
 from pbrl_ppl.agents.task import Task
+from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, FitError, UninformedWarning
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.model import physics_model
+from pbrl_ppl.modes import Mode, find_mode
+from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit
@@ -25,6 +31,9 @@ Array = NDArray[np.float64]
 _FORETOLD = 1e-4
 #: Errors of this many sigma are a surprise.
 _SURPRISE = 4.0
+#: Transitions that a model is criticised with at least, and the chance of trying an effect in all
+#: of a clean episode.
+_LEAST, _LEVEL = 4, 0.01
 
 
 @final
@@ -51,6 +60,12 @@ class PBRLAgent(Agent):
         By what share the data grow before a fit where nothing surprised it.
     sigma : str
         ``scalar``, as in Eq. 11, or ``per_dimension``.
+    effects : iterable of Effect or Attached
+        Effects that it knows of, beside those that the scene declares.
+    revise : bool
+        Whether it looks for what its model lacks.
+    catalogue : iterable of Effect
+        Where it looks.
     **options
         As of :class:`Agent`.
 
@@ -58,6 +73,8 @@ class PBRLAgent(Agent):
     ------
     FitError
         If ``draws`` is below 1 or ``growth`` negative.
+    EffectError
+        If an effect does not apply to the scene, or is given twice.
 
     Attributes
     ----------
@@ -65,6 +82,11 @@ class PBRLAgent(Agent):
         As :func:`pbrl_ppl.fit` made it last.
     fits : int
         How often it was fitted.
+    looks : int
+        How often it looked for what its model lacks.
+    added : tuple of Revision
+        Effects that it found missing and plans with, each with when it was added and how sure that
+        was; their parameters are among the estimates from then on.
     """
 
     name: ClassVar[str] = "PBRL"
@@ -76,6 +98,9 @@ class PBRLAgent(Agent):
         draws: int | None = None,
         growth: float = 0.2,
         sigma: str = "scalar",
+        effects: Iterable[Effect | Attached] = (),
+        revise: bool = False,
+        catalogue: Iterable[Effect] = full_catalogue,
         **options: Any,
     ) -> None:
         if (draws is not None and draws < 1) or not growth >= 0:
@@ -84,12 +109,15 @@ class PBRLAgent(Agent):
             )
         super().__init__(task, **options)
         self.draws, self.growth = draws, growth
-        self._noise = sigma
+        self._noise, self.revise = sigma, revise
+        self._catalogue = tuple(catalogue)
+        self._declared = attach(task.scene, effects, self._catalogue)
         self._transitions: list[tuple[Array, Array, Array]] = []
         self._dynamics: Dynamics | None = None
         self._sigma = np.empty(0)
         self.posterior: Any = None
-        self.fits = self._fitted = 0
+        self.added: tuple[Revision, ...] = ()
+        self.fits = self._fitted = self.looks = self._looked = 0
 
     @property
     def model(self) -> Dynamics | None:
@@ -114,29 +142,70 @@ class PBRLAgent(Agent):
             self._fit()
 
     def _due(self) -> bool:
-        new = self._transitions[self._fitted :]
-        if not new or self._dynamics is None:
-            return bool(new)
-        state, action, after = (np.array(each) for each in zip(*new, strict=True))
-        foretold = self._dynamics.step(np.repeat(state[None], self._dynamics.draws, 0), action)
+        if len(self._transitions) == self._fitted or self._dynamics is None:
+            return len(self._transitions) > self._fitted
+        state, inputs, after = (each[self._fitted :] for each in self._data())
+        action, previous = inputs[..., :3], inputs[..., 3:6]
+        states = np.repeat(state[None], self._dynamics.draws, 0)
+        foretold = self._dynamics.step(states, action, previous)
         error = abs(after - foretold.mean(axis=0))
         error[..., THETA] = abs(wrapped(error[..., THETA]))
         if (error <= _FORETOLD).all():
             return False
-        grown = len(self._transitions) >= (1.0 + self.growth) * self._fitted
         surprised = not (error <= np.maximum(_SURPRISE * self._sigma, _FORETOLD)).all()
-        return grown or surprised
+        return self._grown(self._fitted) or surprised
+
+    def _grown(self, since: int) -> bool:
+        return len(self._transitions) >= (1.0 + self.growth) * since
+
+    def _data(self) -> tuple[Array, Array, Array]:
+        """States, what acted from them, as in `pbrl_ppl.state.INPUT`, and where that led."""
+        state, action, after = (np.array(each) for each in zip(*self._transitions, strict=True))
+        before = np.concatenate([np.zeros_like(action[:1]), action[:-1]])
+        begin = self.task.scene.time_step * np.arange(len(action))
+        clock = np.stack([0 * begin, begin, begin + self.task.scene.time_step], axis=1)
+        clock = np.repeat(clock[:, None], action.shape[1], axis=1)
+        return state, np.concatenate([action, before, clock], axis=2), after
+
+    def _model(self, effects: tuple[Attached, ...], chosen: Any = slice(None)) -> Any:
+        """The model of the transitions chosen."""
+        state, inputs, after = (each[chosen] for each in self._data())
+        history = from_segments(self.task.scene, state, inputs[:, None], after[:, None])
+        extra = effects[len(attach(self.task.scene, (), self._catalogue)) :]
+        return physics_model(self.task.scene, history, extra, sigma=self._noise)
+
+    def _revised(self) -> Mode | None:
+        """Look for what the declared model lacks; the mode found, if it is one of all data."""
+        state, _, after = self._data()
+        free = ~touching(self.task.scene, state, after)
+        if free.sum() < _LEAST or not self._grown(self._looked):
+            return None
+
+        def search(effects: tuple[Attached, ...]) -> Mode:
+            return find_mode(self._model(effects, free).problem, seed=self.seed)
+
+        self.looks, self._looked = self.looks + 1, len(free)
+        level = _LEVEL / (self.looks * (self.looks + 1))
+        found, mode = select_effects(
+            search, self._declared, self.added, self._catalogue, level=level, floor=_FORETOLD
+        )
+        known = {revision.attached: revision.transitions for revision in self.added}
+        self.added = tuple(
+            replace(each, transitions=known.get(each.attached, len(free))) for each in found
+        )
+        return mode if free.all() else None
 
     def _fit(self) -> None:
-        state, action, after = (np.array(each) for each in zip(*self._transitions, strict=True))
-        history = from_segments(self.task.scene, state, action[:, None], after[:, None])
-        model = physics_model(self.task.scene, history, sigma=self._noise)
+        start = self._revised() if self.revise else None
+        model = self._model((*self._declared, *(each.attached for each in self.added)))
         method = "map" if self.draws is None else "laplace"
         with warnings.catch_warnings():
             # that the data do not say everything yet is why it is still learning
             warnings.simplefilter("ignore", UninformedWarning)
             warnings.simplefilter("ignore", BoundWarning)
-            self.posterior = fit(model, seed=self.seed, method=method, progress=False)
-        self._dynamics = Dynamics.of(self.posterior, self.draws, seed=self.seed, threads=1)
+            self.posterior = fit(model, seed=self.seed, method=method, start=start, progress=False)
+        self._dynamics = Dynamics.of(
+            self.posterior, self.draws, seed=self.seed, effects=self._catalogue, threads=1
+        )
         self._sigma = np.median(group(self.posterior, "posterior")["sigma"].to_numpy(), axis=(0, 1))
         self.fits, self._fitted = self.fits + 1, len(self._transitions)

@@ -1,5 +1,6 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
+from pbrl_ppl.criticism.cross_validation import cross_validated, folds, standard_error
 from pbrl_ppl.criticism.findings import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
 from pbrl_ppl.criticism.loop import revise
 from pbrl_ppl.criticism.prior_check import (
@@ -16,10 +17,15 @@ from pbrl_ppl.criticism.results import (
     ResidualTest,
     Unexplained,
 )
+from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
+from pbrl_ppl.criticism.selection import MIN_ELPD, MIN_ELPD_SE, TRIED
 
 __all__ = [
     "ADEQUATE",
+    "MIN_ELPD",
+    "MIN_ELPD_SE",
     "NOT_CONVERGED",
+    "TRIED",
     "UNEXPLAINED",
     "Acceleration",
     "Added",
@@ -29,9 +35,16 @@ __all__ = [
     "PriorCheck",
     "Ranking",
     "ResidualTest",
+    "Signature",
     "Unexplained",
     "criticise",
+    "cross_validated",
+    "folds",
+    "inseparable",
     "prior_predictive_check",
+    "rank_candidates",
     "revise",
+    "standard_error",
     "telling_horizon",
+    "twins",
 ]

@@ -44,6 +44,17 @@ def test_shopping_cart(tmp_path) -> None:
     assert "lwr-2.nc: this is not a NetCDF file" in broken.stderr
 
 
+@pytest.mark.slow
+def test_wrong_model(tmp_path) -> None:
+    done = ran(tmp_path, "06_wrong_model.py", "--quick", "--json", "result.json")
+    assert done.returncode == 0, done.stderr
+    assert "6/6 PBRL" in done.stdout and "online_loop_return_ratio" in done.stdout
+    result = json.loads((tmp_path / "result.json").read_text())
+    assert 0.5 < result["online_loop_return_ratio"] < 2.0 and result["step_seconds"] > 0
+    (picture,) = (tmp_path / "out" / "wrong_model_quick").rglob("wrong_model.png")
+    assert picture.stat().st_size > 10_000
+
+
 @pytest.mark.long
 def test_apartment(tmp_path) -> None:
     first = ran(tmp_path, "05_apartment.py", "--quick", "--only", "true", "oolwr")

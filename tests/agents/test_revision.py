@@ -1,0 +1,94 @@
+"""An agent that finds in the middle of an episode what its model lacks."""
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.agents import PBRLAgent, Revision, World
+from pbrl_ppl.effects import catalogue
+from pbrl_ppl.errors import EffectError
+from tests.helpers.tasks import CART, CART_TRUTH
+
+EFFECTS = {effect.name: effect for effect in catalogue}
+SIZES = {
+    "linear_drag": {"linear_drag_coefficient": 4.0},
+    "constant_force": {"constant_force_force_x": 0.0, "constant_force_force_y": 4.0},
+    "actuator_rotation": {"actuator_rotation_angle": 0.4},
+}
+
+
+def pushed(agent: PBRLAgent, effect: str | None, *, sigma: float, steps: int, seed: int) -> list:
+    """Show an agent one episode of random pushes; what it had added after each step.
+
+    It learns from the fourth on: before, it does not look for what is missing.
+    """
+    truth = CART_TRUTH | (SIZES[effect] if effect else {})
+    world = World(CART, truth, (EFFECTS[effect],) if effect else (), sigma=sigma)
+    rng, state, seen = np.random.default_rng(seed), world.reset(seed), []
+    for i in range(steps):
+        wrenches = CART.wrenches(state)
+        if i % 3 == 0:
+            chosen = rng.integers(len(wrenches))
+        outcome = world.step(wrenches[chosen])
+        agent.observe(state, wrenches[chosen], outcome.observed)
+        if i >= 3:
+            agent.update()
+        state = outcome.state
+        seen.append([each.effect for each in agent.added])
+    return seen
+
+
+@pytest.mark.parametrize("effect", ["constant_force", "actuator_rotation"])
+def test_names_what_is_missing(effect) -> None:
+    agent = PBRLAgent(CART, seed=1, revise=True, growth=0.5)
+    seen = pushed(agent, effect, sigma=0.0, steps=8, seed=1)
+    assert seen[-1] == [effect]
+    (found,) = agent.added
+    assert found.body == "cart" and 4 <= found.transitions <= 8 and found.p_value < 0.01
+    assert found.elpd_difference > 2 * found.elpd_difference_se
+    for label, size in SIZES[effect].items():
+        assert agent.estimates[f"{label}[cart]"] == pytest.approx(size, rel=0.01, abs=0.01)
+
+
+def test_adds_nothing_to_a_true_model() -> None:
+    agent = PBRLAgent(CART, seed=2, revise=True, growth=0.5)
+    seen = pushed(agent, None, sigma=0.01, steps=6, seed=2)
+    assert not any(seen) and agent.looks == 2
+
+
+def test_drops_what_later_data_do_not_bear_out() -> None:
+    agent = PBRLAgent(CART, seed=1, revise=True, growth=10.0)
+    drag = EFFECTS["quadratic_drag"].on("cart")
+    agent.added = (Revision(drag, 4, 0.001, 10.0, 3.0, ()),)
+    pushed(agent, "linear_drag", sigma=0.0, steps=5, seed=1)
+    assert [each.effect for each in agent.added] == ["linear_drag"]
+    agent = PBRLAgent(CART, seed=1, revise=True, growth=10.0)
+    agent.added = (Revision(drag, 4, 0.001, 10.0, 3.0, ()),)
+    pushed(agent, None, sigma=0.01, steps=5, seed=1)
+    assert agent.added == () and "quadratic_drag_coefficient[cart]" not in agent.estimates
+
+
+def test_an_effect_that_it_knows_of() -> None:
+    agent = PBRLAgent(CART, seed=1, effects=(EFFECTS["linear_drag"],), revise=True)
+    pushed(agent, "linear_drag", sigma=0.0, steps=5, seed=1)
+    assert agent.estimates["linear_drag_coefficient[cart]"] == pytest.approx(4.0, rel=0.02)
+    assert agent.added == ()
+    with pytest.raises(EffectError, match="applies to no body"):
+        PBRLAgent(CART, effects=(EFFECTS["pivot_friction"],))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("effect", list(SIZES))
+def test_names_what_is_missing_under_noise(effect) -> None:
+    agent = PBRLAgent(CART, seed=1, revise=True)
+    seen = pushed(agent, effect, sigma=0.01, steps=25, seed=1)
+    assert seen[-1] == [effect]
+
+
+@pytest.mark.long
+def test_false_alarms() -> None:
+    """One clean episode in ten at most; the level is one in a hundred."""
+    alarms = 0
+    for seed in range(20):
+        agent = PBRLAgent(CART, seed=seed, revise=True)
+        alarms += any(pushed(agent, None, sigma=(0.01, 0.1)[seed % 2], steps=20, seed=seed))
+    assert alarms <= 2
