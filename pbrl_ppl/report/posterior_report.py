@@ -81,7 +81,7 @@ def render_posterior(
             f" {LEAST_DRAWS}; fit with a method that draws, and more draws"
         )
     table = summary(posterior)
-    rows = posterior_rows(table, effects)
+    rows = posterior_rows(table, effects, method=str(posterior.attrs.get("method", "")))
     shown, pairs = most_interesting(posterior, table), most_dependent(posterior)
     moving = [row["label"] for row in rows if row["sd"] > 0]
     priors = (moving or [row["label"] for row in rows])[:MOST_PRIORS]

@@ -29,9 +29,17 @@ _TOLD = {
 
 
 def posterior_rows(
-    table: pd.DataFrame, effects: Iterable[Effect], units: Mapping[str, str] | None = None
+    table: pd.DataFrame,
+    effects: Iterable[Effect],
+    units: Mapping[str, str] | None = None,
+    *,
+    method: str = "",
 ) -> list[dict[str, Any]]:
-    """One row per parameter: its summary, unit, meaning, and what is wrong with its chains."""
+    """One row per parameter: its summary, unit, meaning, and what is wrong with its chains.
+
+    Draws of Laplace's approximation are independent, and there are no chains to compare.
+    """
+    chains = method != "laplace"
     effects = tuple(effects)
     known = {**BODY_PARAMETERS, **JOINT_ANCHORS, **(units or {})}
     known |= {effect.variable(p): p.unit for effect in effects for p in effect.parameters}
@@ -41,9 +49,9 @@ def posterior_rows(
         ess = min(values["ess_bulk"], values["ess_tail"])
         wrong = []
         # written so that a value that is not a number counts as bad
-        if not values["r_hat"] <= GOOD_R_HAT:
+        if chains and not values["r_hat"] <= GOOD_R_HAT:
             wrong.append(f"R-hat {number(values['r_hat'], 4)}")
-        if not ess >= GOOD_ESS:
+        if chains and not ess >= GOOD_ESS:
             wrong.append(f"effective sample size {number(ess)}")
         unit = known.get(name, "")
         if name == "sigma":
@@ -56,7 +64,8 @@ def posterior_rows(
                 "meaning": meaning(str(label), effects),
                 "unit": unit.removesuffix("1"),
                 "wrong": wrong,
-                "failed": not (values["r_hat"] <= ROUGH_R_HAT and ess >= ROUGH_ESS),
+                "failed": chains and not (values["r_hat"] <= ROUGH_R_HAT and ess >= ROUGH_ESS),
+                "chains": chains,
                 **values,
             }
         )
@@ -92,6 +101,8 @@ def _digits(row: Mapping[str, Any]) -> int:
 
 def sampler_in_words(rows: list[dict[str, Any]]) -> tuple[str, str]:
     """Say whether the sampler worked, by the worst of its diagnostics: in a word, and in full."""
+    if not all(row["chains"] for row in rows):
+        return "No chains.", "Independent draws of Laplace's approximation: as good as that is."
     hats = [row["r_hat"] if np.isfinite(row["r_hat"]) else np.inf for row in rows]
     sizes = [min(row["ess_bulk"], row["ess_tail"]) for row in rows]
     failed, rough = (sum(bool(row[name]) for row in rows) for name in ("failed", "wrong"))

@@ -74,7 +74,9 @@ def render(
         for added in findings.added
         for name, e in added.parameters.items()
     }
-    rows = posterior_rows(table, effects, units)
+    rows = posterior_rows(
+        table, effects, units, method=str(findings.posterior_after.attrs.get("method", ""))
+    )
     evidence, laws = find_evidence(findings, effects), find_laws(findings, effects)
     poses = recorded_poses(findings.posterior_before)
     pictures: dict[str, Callable[[float], Figure]] = {

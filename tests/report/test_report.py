@@ -65,7 +65,7 @@ def test_page_of_an_added_effect() -> None:
     assert "fits them no better than quadratic drag would" in text
     assert "fell by 57 %, from 2.40 to 1.02 times" in text
     assert "Predicting 2.00 s ahead, the error fell in 6 of 6 state dimensions: most in x" in text
-    assert "Scene: of cart. Recording: given in Python; held out: part of the same." in text
+    assert "Scene: of cart. Recording: given in Python; held out: other trajectories." in text
     assert "gained 210 ± 19.0" in text
     assert "10 engine steps" in text and "40 steps were used instead" in text
     assert "force x 0.200 N, force y −0.100 N" in text
