@@ -135,7 +135,7 @@ def _revised(
     say("looking whether the prior could have made the data")
     prior = _prior_test(scene, train, effects, seed)
     say("fitting the declared model")
-    declared = loop.declared_mode(effects, substeps)
+    declared = declared_mode(scene, train, effects, seed=seed, substeps=substeps, say=say)
     say("scoring what the model might lack")
     first = rank_candidates(declared, selection.missing(declared))
     current, ranked = declared, first
@@ -214,12 +214,6 @@ class _Loop:
     seed: int
     method: str
     say: Callable[[str], None]
-
-    def declared_mode(self, effects: tuple[Attached, ...], substeps: int | None) -> Mode:
-        """Mode of the declared model along trajectories, the engine's error small."""
-        return declared_mode(
-            self.scene, self.train, effects, seed=self.seed, substeps=substeps, say=self.say
-        )
 
     def posterior(self, mode: Mode, draws: int | None) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
