@@ -86,7 +86,7 @@ def test_names_what_is_missing_under_noise(effect) -> None:
 
 @pytest.mark.long
 def test_false_alarms() -> None:
-    """One clean episode in ten at most; the level is one in a hundred."""
+    """At most 2 clean episodes of 20; the level of trying is one in a hundred."""
     alarms = 0
     for seed in range(20):
         agent = PBRLAgent(CART, seed=seed, revise=True)
