@@ -404,7 +404,7 @@ def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
     loop = Loop(made_up())
     (tmp_path / "notes.txt").write_text("mine")
-    with pytest.raises(OutputError, match=r"has content already.*--overwrite"):
+    with pytest.raises(OutputError, match=r"has content already.*overwrite=True"):
         loop.save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
     loop.save(tmp_path, overwrite=True)
