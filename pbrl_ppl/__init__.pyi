@@ -23,6 +23,7 @@ from .effects import catalogue as catalogue
 from .errors import PbrlError as PbrlError
 from .history import History as History
 from .history import Segments as Segments
+from .history import from_mujoco as from_mujoco
 from .model import ParameterLibrary as ParameterLibrary
 from .model import SimulatorOp as SimulatorOp
 from .model import Transition as Transition

@@ -53,6 +53,10 @@ class MeetingWarning(UserWarning):
     """A fit in which bodies meet that were thought apart: it was made again with them together."""
 
 
+class ResamplingWarning(UserWarning):
+    """A history whose samples were not evenly spaced, and were interpolated."""
+
+
 class FitError(PbrlError, ValueError):
     """A model that cannot be fitted as asked."""
 
