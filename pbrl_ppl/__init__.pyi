@@ -52,10 +52,14 @@ from .posterior import save_posterior as save_posterior
 from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
 from .report import Loop as Loop
+from .report import ManyLoops as ManyLoops
 from .report import close_loop as close_loop
+from .report import close_loop_many as close_loop_many
 from .sampling import Calibration as Calibration
+from .sampling import Pooled as Pooled
 from .sampling import calibrate as calibrate
 from .sampling import fit as fit
+from .sampling import pool as pool
 from .sampling import update as update
 from .scene import Body as Body
 from .scene import Joint as Joint

@@ -45,7 +45,12 @@ def load_files(scene: Path, history: Path, estimate_velocities: bool) -> tuple[S
 
 def stated_noise(scene: Scene, given: list[str]) -> Scene:
     """The scene with errors of measuring from options such as ``x=0.002``."""
-    noise: dict[str, float | str] = dict(scene.noise)
+    return scene.replace(noise=dict(scene.noise) | noise_of(given))
+
+
+def noise_of(given: list[str]) -> dict[str, float]:
+    """Errors of measuring by state dimension, from options such as ``x=0.002``."""
+    noise = {}
     for item in given:
         name, _, value = item.partition("=")
         try:
@@ -54,7 +59,7 @@ def stated_noise(scene: Scene, given: list[str]) -> Scene:
             raise typer.BadParameter(
                 f"{item!r} is not NAME=VALUE, such as x=0.002", param_hint="--noise"
             ) from None
-    return scene.replace(noise=noise)
+    return noise
 
 
 def check_free(path: Path, overwrite: bool) -> None:
