@@ -281,9 +281,12 @@ def _in_words(
     if between.any():
         text += (
             f"; {between.mean():.0%} are interpolated (positions by cubics, velocities linearly;"
-            f" wrenches are means), which leaves {left:.0%} of the velocities' noise, and"
-            f" {shared / max(pairs, 1):.0%} of neighbouring rows share a sample, so that errors"
-            " look smaller and less independent than they are, and intervals come out too narrow"
+            f" wrenches are means), which leaves {left:.0%} of the velocities' noise"
+        )
+    if shared:
+        text += (
+            f"; {shared / pairs:.0%} of neighbouring rows share a sample: their errors are less"
+            " independent than they look, and intervals come out too narrow"
         )
     if empty:
         text += f"; {empty} rows have empty cells, in gaps of more than {REACH * dt:.4g} s"

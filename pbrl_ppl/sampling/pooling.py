@@ -20,7 +20,7 @@ from scipy.stats import norm
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.model import build_layout
-from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws
+from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws, prior_draws, wheels
 from pbrl_ppl.posterior import HDI_PROB, moment_matched, scalars, scene_of
 from pbrl_ppl.sampling.population import Population, population
 from pbrl_ppl.scene import Scene
@@ -35,6 +35,8 @@ _INFORMS = 0.2
 _MIDDLE, _ENDS = 0.5, ((1 - HDI_PROB) / 2, (1 + HDI_PROB) / 2)
 #: An angle of which nothing is known has this width; a von Mises this concentration at most.
 _ANY_ANGLE, _SHARPEST = np.pi / np.sqrt(3), 1e6
+#: For the moments of a wheel's prior once it is described in one way.
+_PRIOR_DRAWS = 4000
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,15 +180,17 @@ def pool(
     shared = [label for label in drawn[0] if all(label in own for own in drawn)]
     every = dict.fromkeys(label for own in drawn for label in own)
     populations, families, single, priors = {}, {}, {}, {}
+    every_prior = [_priors(layout) for layout in layouts]
     for label in shared:
-        own = [dict(zip(layout.labels, layout.priors, strict=True))[label] for layout in layouts]
+        own = [each[label] for each in every_prior]
         draws = [each[label] for each in drawn]
-        found, reference = _pooled(own, draws, spread)
+        family = layouts[0].priors[layouts[0].labels.index(label)]
+        found, reference = _pooled(own, draws, spread, family.uniform)
         populations[label] = found
         families[label] = (_scale(own[0]), reference)
         single[label] = np.array([_moments(prior, x) for prior, x in zip(own, draws, strict=True)])
         if found.informed.any():
-            priors[label] = _next_prior(own[0], found, reference)
+            priors[label] = _next_prior(family, found, reference)
     left_out = tuple(label for label in every if label not in shared)
     scene = _scene(scenes, priors, left_out)
     return Pooled(names, scene, populations, left_out, families, single)
@@ -220,6 +224,17 @@ def _drawn(
     return result
 
 
+def _priors(layout: Layout) -> dict[str, Prior]:
+    """Priors by label; those of a wheel are of the description that was chosen among equal ones."""
+    priors = dict(zip(layout.labels, layout.priors, strict=True))
+    for wheel in wheels(layout):
+        if wheel.period < 4:
+            drawn = prior_draws(wheel.priors, np.random.default_rng(0), _PRIOR_DRAWS)
+            folded = fold_draws(layout, dict(zip(wheel.labels, drawn.T, strict=True)))
+            priors |= {label: moment_matched(priors[label], x) for label, x in folded.items()}
+    return priors
+
+
 def _scale(prior: Prior) -> str:
     return {"log_normal": "logarithm", "von_mises": "angle"}.get(prior.family, "itself")
 
@@ -232,11 +247,13 @@ def _moments(prior: Prior, draws: Array) -> tuple[float, float]:
     return mean, float(wrapped(draws - mean).std())
 
 
-def _pooled(priors: list[Prior], draws: list[Array], spread: float) -> tuple[Population, float]:
+def _pooled(
+    priors: list[Prior], draws: list[Array], spread: float, free: bool
+) -> tuple[Population, float]:
     """The population of a parameter, and the angle that its scale is about."""
     matched = [moment_matched(prior, x) for prior, x in zip(priors, draws, strict=True)]
     if priors[0].family == "von_mises":
-        return _pooled_angles(priors, matched, spread)
+        return _pooled_angles(priors, matched, spread, free)
     before = np.array([prior.sigma**-2.0 for prior in priors])
     after = np.array([each.sigma**-2.0 for each in matched])
     # a product of normals has the sum of the precisions: what the data said is the difference
@@ -254,22 +271,26 @@ def _pooled(priors: list[Prior], draws: list[Array], spread: float) -> tuple[Pop
 
 
 def _pooled_angles(
-    priors: list[Prior], matched: list[Prior], spread: float
+    priors: list[Prior], matched: list[Prior], spread: float, free: bool
 ) -> tuple[Population, float]:
-    """As normal about their mean direction, which they are where the data inform."""
-    before, after = (
-        np.array([each.kappa * np.exp(1j * each.mu) for each in of]) for of in (priors, matched)
-    )
-    said = after - before
+    """As normal about their mean direction, which they are where the data inform.
+
+    A ``free`` angle is uniform a priori: what its prior has of concentration is from the choice
+    among a wheel's equal descriptions, and about the angle itself.
+    """
+    towards = np.array([each.mu for each in matched])
+    about = towards if free else np.array([prior.mu for prior in priors])
+    before = np.array([prior.kappa for prior in priors]) * np.exp(1j * about)
+    said = np.array([each.kappa for each in matched]) * np.exp(1j * towards) - before
     kappa = np.abs(said)
     informed = kappa > np.maximum(1.0, _INFORMS * np.abs(before))
     reference = float(np.angle((said * informed).sum())) if informed.any() else 0.0
     least = priors[int(np.abs(before).argmin())]
-    width = min(_ANY_ANGLE, max(least.kappa, 1e-9) ** -0.5)
+    width = _ANY_ANGLE if free else min(_ANY_ANGLE, max(least.kappa, 1e-9) ** -0.5)
     sd = np.where(informed, np.where(informed, kappa, 1.0) ** -0.5, np.inf)
     found = population(
         wrapped(np.angle(said) - reference), sd, width=width, spread=spread * width,
-        centre=0.0 if least.uniform else float(wrapped(least.mu - reference)),
+        centre=0.0 if free else float(wrapped(least.mu - reference)),
     )  # fmt: skip
     return found, reference
 

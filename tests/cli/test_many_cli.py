@@ -107,6 +107,7 @@ def test_bad_usage(
     assert not logs and not Path("out").exists()
 
 
+@pytest.mark.filterwarnings("default::pbrl_ppl.errors.ResamplingWarning")
 def test_own_tables_of_one_log(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -128,11 +129,11 @@ def test_own_tables_of_one_log(
     assert main([*argv, *own, "-q"]) == 2
     assert "resample" in capsys.readouterr().err
     assert main([*argv, *own, "--time-step", "0.15", "-q"]) == 130
+    assert "warning: history capture.csv: samples are 0.09 to 0.12 s" in capsys.readouterr().err
     scene, train = seen[0]
     assert scene.time_step == 0.15
     observed = train.dataset["observed"].to_numpy()[0, :, 0]
     np.testing.assert_allclose(observed[:, 0], 0.5 * 0.15 * np.arange(3), atol=1e-12)
-    assert "warning: history capture.csv: samples are 0.09 to 0.12 s" in capsys.readouterr().err
 
 
 def test_a_process_that_dies_takes_no_other_with_it(tmp_path: Path) -> None:
