@@ -180,7 +180,8 @@ def pool(
     shared = [label for label in drawn[0] if all(label in own for own in drawn)]
     every = dict.fromkeys(label for own in drawn for label in own)
     populations, families, single, priors = {}, {}, {}, {}
-    every_prior = [_priors(layout) for layout in layouts]
+    by_layout = {layout: _priors(layout) for layout in layouts}  # most are the same
+    every_prior = [by_layout[layout] for layout in layouts]
     for label in shared:
         own = [each[label] for each in every_prior]
         draws = [each[label] for each in drawn]

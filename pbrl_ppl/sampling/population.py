@@ -7,12 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
-from scipy.stats import chi2, norm
+from scipy.special import ndtr
+from scipy.stats import chi2
 
 Array = NDArray[np.float64]
 
 #: The grid of the spread, in units of its prior's scale.
 _LEAST, _MOST, _POINTS = 1e-6, 6.0, 800
+#: A point of the grid that is less probable changes no quantile.
+_NOTHING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,5 +115,11 @@ def population(
 
 def _quantile(weights: Array, mean: Array, sd: Array, q: float) -> float:
     """Quantile of a mixture of normals."""
+    some = weights > _NOTHING
+    weights, mean, sd = weights[some] / weights[some].sum(), mean[some], sd[some]
     low, high = float((mean - 9 * sd).min()), float((mean + 9 * sd).max())
-    return float(brentq(lambda x: weights @ norm.cdf((x - mean) / sd) - q, low, high, xtol=1e-12))
+
+    def excess(x: float) -> float:
+        return float(weights @ ndtr((x - mean) / sd)) - q
+
+    return float(brentq(excess, low, high, xtol=1e-9 * (high - low)))

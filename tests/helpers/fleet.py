@@ -5,8 +5,12 @@ import os
 import signal
 import time
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+import pytest
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.report.loop import FILES
@@ -23,6 +27,19 @@ def made_logs(folder: Path, **what: str) -> list[Log]:
     for name, text in what.items():
         (folder / f"{name}.csv").write_text(text)
     return [Log(name, folder / "scene.toml", folder / f"{name}.csv") for name in what]
+
+
+@contextmanager
+def cluster(folder: Path) -> Iterator[Any]:
+    """A client of a Dask cluster of two worker processes."""
+    distributed = pytest.importorskip("distributed")
+    with (
+        distributed.LocalCluster(
+            n_workers=2, threads_per_worker=1, dashboard_address=":0", local_directory=folder
+        ) as workers,
+        distributed.Client(workers) as client,
+    ):
+        yield client
 
 
 def lines(folder: Path, name: str) -> list[str]:

@@ -15,7 +15,7 @@ import pytest
 from pbrl_ppl.errors import ManifestError, OutputError
 from pbrl_ppl.report import close_loop_many, read_manifest
 from pbrl_ppl.report.loop import FILES
-from tests.helpers.fleet import BEGUN, KEPT, lines, made_logs, pretend
+from tests.helpers.fleet import BEGUN, KEPT, cluster, lines, made_logs, pretend
 
 
 def run(logs: Any, folder: Path, **options: Any) -> Any:
@@ -164,18 +164,8 @@ def test_a_lost_worker_fails_its_log_alone(tmp_path) -> None:
 @pytest.mark.slow
 def test_a_cluster_that_loses_a_worker(tmp_path) -> None:
     """Nothing is lost and nothing done twice, but for what the worker was at."""
-    distributed = pytest.importorskip("distributed")
     logs = made_logs(tmp_path, **{f"log{i}": "wait" for i in range(8)})
-    out = tmp_path / "out"
-    with (
-        distributed.LocalCluster(
-            n_workers=2,
-            threads_per_worker=1,
-            dashboard_address=None,
-            local_directory=tmp_path / "d",
-        ) as cluster,
-        distributed.Client(cluster) as client,
-    ):
+    with cluster(tmp_path / "dask") as client:
         processes = list(client.run(os.getpid).values())
         assert len(set(processes)) == 2
 
@@ -183,9 +173,9 @@ def test_a_cluster_that_loses_a_worker(tmp_path) -> None:
             if said.startswith("4/8"):
                 os.kill(processes[0], signal.SIGKILL)
 
-        loops = run(logs, out, executor=client.get_executor(pure=False), progress=kill)
-        after = list(client.run(os.getpid).values())
-    assert processes[0] not in after
+        executor = client.get_executor(pure=False)
+        loops = run(logs, tmp_path / "out", executor=executor, progress=kill)
+        assert processes[0] not in client.run(os.getpid).values()
     assert not loops.failed
     assert set(loops.table()["status"]) == {"done"}
     assert Counter(lines(tmp_path, KEPT)) == dict.fromkeys((log.name for log in logs), 1)
