@@ -24,6 +24,7 @@ from .effects import catalogue as catalogue
 from .errors import PbrlError as PbrlError
 from .history import History as History
 from .history import Segments as Segments
+from .history import from_mujoco as from_mujoco
 from .model import ParameterLibrary as ParameterLibrary
 from .model import SimulatorOp as SimulatorOp
 from .model import Transition as Transition
@@ -52,10 +53,14 @@ from .posterior import save_posterior as save_posterior
 from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
 from .report import Loop as Loop
+from .report import ManyLoops as ManyLoops
 from .report import close_loop as close_loop
+from .report import close_loop_many as close_loop_many
 from .sampling import Calibration as Calibration
+from .sampling import Pooled as Pooled
 from .sampling import calibrate as calibrate
 from .sampling import fit as fit
+from .sampling import pool as pool
 from .sampling import update as update
 from .scene import Body as Body
 from .scene import Joint as Joint

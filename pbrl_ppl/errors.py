@@ -53,6 +53,10 @@ class MeetingWarning(UserWarning):
     """A fit in which bodies meet that were thought apart: it was made again with them together."""
 
 
+class ResamplingWarning(UserWarning):
+    """A history whose samples were not evenly spaced, and were interpolated."""
+
+
 class FitError(PbrlError, ValueError):
     """A model that cannot be fitted as asked."""
 
@@ -63,3 +67,7 @@ class GoalError(PbrlError, ValueError):
 
 class EpisodeError(PbrlError, ValueError):
     """A world, an agent or an episode file that does not fit its task."""
+
+
+class ManifestError(PbrlError, ValueError):
+    """A manifest of logs that cannot be read, or that names one of them twice."""

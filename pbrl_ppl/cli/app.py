@@ -62,8 +62,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0; 1 for a calibration that failed or a goal that was not reached; 2 for bad usage or bad
-        input, with one message on stderr; 3 where chains have not converged; 130 if interrupted.
+        0; 1 for a calibration that failed, a goal that was not reached, or some of many logs that
+        failed; 2 for bad usage or bad input, with one message on stderr; 3 where chains have not
+        converged; 130 if interrupted.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
     options = _options_of(argv)

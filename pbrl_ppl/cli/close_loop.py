@@ -10,18 +10,19 @@ import typer
 
 from pbrl_ppl.cli.answers import print_json
 from pbrl_ppl.cli.command_line import command_line
+from pbrl_ppl.cli.many import close_loop_many
 from pbrl_ppl.cli.outputs import check_can_make
+from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, columns_of, load_own, units_of
 from pbrl_ppl.cli.terminal import (
     UNDECIDED,
     AsJson,
     Errors,
     Quiet,
-    SceneFile,
     Seed,
     Substeps,
     Velocities,
     interruptible,
-    load_files,
+    named_numbers,
     stages,
     stated_noise,
 )
@@ -42,13 +43,16 @@ SHARES = {
 
 def close_loop(
     context: typer.Context,
-    scene: SceneFile,
-    train: Annotated[
-        Path, typer.Argument(metavar="TRAIN", help="Measured history (.csv, .parquet, .nc).")
-    ],
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")
     ],
+    scene: Annotated[
+        Path | None, typer.Argument(metavar="SCENE", help="Scene file (.toml).")
+    ] = None,
+    train: Annotated[
+        Path | None,
+        typer.Argument(metavar="TRAIN", help="Measured history (.csv, .parquet, .nc)."),
+    ] = None,
     test: Annotated[
         Path | None,
         typer.Option(
@@ -58,7 +62,11 @@ def close_loop(
     ] = None,
     seed: Seed = 1,
     overwrite: Annotated[
-        bool, typer.Option("--overwrite", help="Write to a folder that has content.")
+        bool,
+        typer.Option(
+            "--overwrite",
+            help="Write to a folder that has content; with --many, run finished logs again.",
+        ),
     ] = False,
     substeps: Substeps = None,
     draws: Annotated[
@@ -66,20 +74,51 @@ def close_loop(
     ] = None,
     noise: Errors = None,
     estimate_velocities: Velocities = False,
+    columns: Columns = None,
+    units: Units = None,
+    time_step: TimeStep = None,
+    many: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MANIFEST",
+            help="Many logs in place of SCENE and TRAIN: a CSV file with the columns name, scene,"
+            " train, test, kind. The same command goes on after an interrupt.",
+        ),
+    ] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Logs at a time, with --many.")] = 1,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="A Dask scheduler that has the workers, for --many."),
+    ] = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
-    Exits with 3 if the chains have not converged: then there is no verdict.
+    Exits with 3 if the chains have not converged: then there is no verdict. With --many, exits with
+    1 if some logs failed.
     """
+    names, measures = columns_of(columns or []), units_of(units or [])
+    if many is not None:
+        if not (scene is train is test is None):
+            raise typer.BadParameter("SCENE, TRAIN and --test are in the manifest, with --many")
+        close_loop_many(
+            many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
+            again=overwrite, seed=seed, substeps=substeps, draws=draws,
+            noise=named_numbers(noise, "--noise", "x=0.002"), columns=names, units=measures,
+            time_step=time_step, estimate_velocities=estimate_velocities,
+        )  # fmt: skip
+        return
+    if scene is None or train is None:
+        raise typer.BadParameter("expected SCENE and TRAIN, or --many MANIFEST")
+    if jobs > 1 or scheduler is not None:
+        raise typer.BadParameter("--jobs and --scheduler are for --many")
     with interruptible(), stages(quiet, SHARES) as progress:
         check_can_make(output)  # before the long work, which would be lost
         progress("reading the scene and the histories")
-        declared, history = load_files(scene, train, estimate_velocities)
-        held_out = None
-        if test is not None:
-            _, held_out = load_files(scene, test, estimate_velocities)
+        declared, history, held_out = load_own(
+            scene, train, test, estimate_velocities, names, measures, time_step
+        )
         declared = stated_noise(declared, noise)
         if substeps is not None:
             declared = declared.replace(substeps=substeps)

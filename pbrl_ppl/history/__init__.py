@@ -4,14 +4,18 @@ from pbrl_ppl.history.derived import derived_velocities, measured_alone
 from pbrl_ppl.history.files import read_table, write_atomically
 from pbrl_ppl.history.gaps import longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
+from pbrl_ppl.history.mujoco import from_mujoco
+from pbrl_ppl.history.reading import Reading
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
 from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
 
 __all__ = [
     "History",
+    "Reading",
     "Segments",
     "derived_velocities",
     "fill_hinges",
+    "from_mujoco",
     "from_segments",
     "hung_bodies",
     "lever",

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import secrets
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +26,27 @@ _EXACT: dict[str, Any] = {} if _PANDAS >= (3, 1) else {"float_precision": "round
 _MISSING = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None"]
 
 
-def read_table(path: Path) -> pd.DataFrame:
+def read_table(path: Path, names: Mapping[str, object] | None = None) -> pd.DataFrame:
     """Return the rows of a history file, as they are.
+
+    Parameters
+    ----------
+    path : Path
+        Its suffix says its kind.
+    names : mapping of str to object, optional
+        Its values are columns of the file that have names of their own.
 
     Raises
     ------
     HistoryError
         If the file is missing, of an unknown kind, or damaged.
     """
-    readers = {".csv": _read_csv, ".parquet": _read_parquet, ".nc": _read_netcdf}
+    others = tuple(each for each in (names or {}).values() if isinstance(each, str))
+    readers: dict[str, Callable[[Path], pd.DataFrame]] = {
+        ".csv": partial(_read_csv, others=others),
+        ".parquet": _read_parquet,
+        ".nc": _read_netcdf,
+    }
     reader = readers.get(path.suffix.lower())
     if reader is None:
         raise HistoryError(
@@ -48,7 +61,7 @@ def read_table(path: Path) -> pd.DataFrame:
         raise HistoryError(f"history {path}: cannot be read: {error}") from None
 
 
-def _read_csv(path: Path) -> pd.DataFrame:
+def _read_csv(path: Path, others: tuple[str, ...]) -> pd.DataFrame:
     content = path.read_bytes()
     lines = content.removeprefix(b"\xef\xbb\xbf").splitlines()
     if not any(line.strip() for line in lines):
@@ -64,7 +77,7 @@ def _read_csv(path: Path) -> pd.DataFrame:
                     f"history row {number}: {found} cells, expected {cells} as in the header; "
                     f"repair or drop the row (file {path})"
                 )
-    number_columns = {name: _MISSING for name in ("step", "time", *STATE, *WRENCH)}
+    number_columns = {name: _MISSING for name in ("step", "time", *STATE, *WRENCH, *others)}
     try:
         frame: pd.DataFrame = pd.read_csv(
             io.BytesIO(content),

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Unpack
 
 import numpy as np
 import numpy.typing as npt
@@ -14,9 +13,11 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.digest import hashed
 from pbrl_ppl.history.files import read_table, to_table, write_dataset
 from pbrl_ppl.history.paths import kinematic_bodies, path_velocities
 from pbrl_ppl.history.pieces import cut
+from pbrl_ppl.history.reading import Reading, as_history
 from pbrl_ppl.history.rows import arrays
 from pbrl_ppl.history.start import complete_start
 from pbrl_ppl.scene import Scene
@@ -101,7 +102,14 @@ class History:
         self.dataset = dataset
 
     @classmethod
-    def load(cls, path: str | Path, scene: Scene, *, estimate_velocities: bool = False) -> History:
+    def load(
+        cls,
+        path: str | Path,
+        scene: Scene,
+        *,
+        estimate_velocities: bool = False,
+        **reading: Unpack[Reading],
+    ) -> History:
         """Read a history from a CSV, Parquet or NetCDF file, by suffix.
 
         Parameters
@@ -113,6 +121,9 @@ class History:
         estimate_velocities : bool
             Whether velocities that were never measured are estimated from positions for ``start``
             (by a local polynomial); they stay missing in ``observed``.
+        **reading
+            For tables of others, as of `Reading`: ``columns={"x": "pos_x", "force_x": 0.0}`` (their
+            names, or numbers), ``units={"x": "mm"}``, ``resample=True`` for uneven samples.
 
         Raises
         ------
@@ -121,10 +132,11 @@ class History:
         """
         path = Path(path)
         return cls.from_dataframe(
-            read_table(path),
+            read_table(path, reading.get("columns")),
             scene,
             estimate_velocities=estimate_velocities,
             source=f"history {path}",
+            **reading,
         )
 
     @classmethod
@@ -135,6 +147,7 @@ class History:
         *,
         estimate_velocities: bool = False,
         source: str = "history",
+        **reading: Unpack[Reading],
     ) -> History:
         """Build a history from a table; arguments and errors as `load`.
 
@@ -142,6 +155,7 @@ class History:
         """
         if not isinstance(frame, pd.DataFrame):
             raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
+        frame = as_history(frame, scene, source, **reading)
         table = arrays(frame, scene, source)
         start = complete_start(table.state, scene, estimate_velocities=estimate_velocities)
         state_dims = ("trajectory", "time", "body", "state")
@@ -171,7 +185,7 @@ class History:
             },
             attrs={"time_step": scene.time_step},
         )
-        return cls(_hashed(dataset))
+        return cls(hashed(dataset))
 
     def to_dataframe(self) -> pd.DataFrame:
         """Return the measured rows, one for each (trajectory, step, body); steps count from 0."""
@@ -304,7 +318,7 @@ class History:
             raise HistoryError(f"trajectories {positions} asked for; expected each once")
         chosen = self.dataset.isel(trajectory=positions)
         chosen = chosen.isel(time=slice(int(chosen["n_rows"].max())))
-        return History(_hashed(chosen))
+        return History(hashed(chosen))
 
     @property
     def n_trajectories(self) -> int:
@@ -331,18 +345,3 @@ class History:
             f"History({self.n_trajectories} trajectories, {self.n_transitions} transitions, "
             f"bodies {', '.join(self.bodies)}, sha256 {self.data_sha256[:12]})"
         )
-
-
-def _hashed(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the dataset with the hash of its measured arrays among its attributes."""
-    digest = hashlib.sha256()
-    for name in ("trajectory", "body"):
-        digest.update("\0".join(str(label) for label in dataset[name].to_numpy()).encode())
-        digest.update(b"\1")
-    digest.update(dataset["n_rows"].to_numpy().astype("<i8").tobytes())
-    for name in ("clock", "observed", "action"):
-        values: Any = dataset[name].to_numpy()
-        # One NaN and one zero: both have several bit patterns.
-        canonical = np.where(np.isnan(values), np.nan, values + 0.0)
-        digest.update(np.ascontiguousarray(canonical, dtype="<f8").tobytes())
-    return dataset.assign_attrs(data_sha256=digest.hexdigest())

@@ -128,7 +128,8 @@ def _raise_time(rows: Rows, row: int, kind: str, change: float, jump: int, scene
         "two times": f"step {step} has two times, {change:.6g} s apart, in {of}; expected one; "
         "give every body the same time at a step",
         "unequal": f"{change:.6g} s since the step before in {of}; expected {dt:.6g} s, the "
-        "scene's time_step, within 1 %; resample the history evenly, or correct time_step",
+        "scene's time_step, within 1 %; correct time_step, or have the history resampled "
+        "(resample=True, --time-step)",
     }
     raise HistoryError(f"{at}: {messages[kind]}")
 

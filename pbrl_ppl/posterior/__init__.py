@@ -30,7 +30,7 @@ from pbrl_ppl.posterior.store import (
     scene_of,
     smoothed,
 )
-from pbrl_ppl.posterior.updated_prior import updated_scene
+from pbrl_ppl.posterior.updated_prior import moment_matched, updated_scene
 
 __all__ = [
     "DATATREE",
@@ -54,6 +54,7 @@ __all__ = [
     "library_probabilities",
     "load_posterior",
     "loo_pit",
+    "moment_matched",
     "parameter_draws",
     "predicted_rows",
     "prior_groups",

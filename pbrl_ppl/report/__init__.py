@@ -4,6 +4,8 @@ from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
 from pbrl_ppl.report.effect_plots import plot_candidates
 from pbrl_ppl.report.error_plots import plot_errors, plot_rollout
 from pbrl_ppl.report.loop import Loop, check_folder, close_loop, write_page
+from pbrl_ppl.report.manifest import Log, read_manifest
+from pbrl_ppl.report.many import ManyLoops, close_loop_many, in_words
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
 from pbrl_ppl.report.posterior_report import render_posterior
@@ -12,14 +14,18 @@ from pbrl_ppl.report.style import png
 from pbrl_ppl.report.words import unseen_in_words, verdict_in_words
 
 __all__ = [
+    "Log",
     "Loop",
+    "ManyLoops",
     "Source",
     "animate_plan",
     "check_folder",
     "close_loop",
+    "close_loop_many",
     "draw_goal",
     "draw_motion",
     "draw_scene",
+    "in_words",
     "plot_calibration",
     "plot_candidates",
     "plot_errors",
@@ -28,6 +34,7 @@ __all__ = [
     "plot_rollout",
     "plot_trace",
     "png",
+    "read_manifest",
     "render_posterior",
     "summary",
     "unseen_in_words",

@@ -2,7 +2,8 @@
 
 from pbrl_ppl.sampling.calibration import calibrate
 from pbrl_ppl.sampling.fitting import fit
+from pbrl_ppl.sampling.pooling import Pooled, pool
 from pbrl_ppl.sampling.ranks import Calibration, bins
 from pbrl_ppl.sampling.updating import update
 
-__all__ = ["Calibration", "bins", "calibrate", "fit", "update"]
+__all__ = ["Calibration", "Pooled", "bins", "calibrate", "fit", "pool", "update"]

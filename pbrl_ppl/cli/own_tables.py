@@ -1,0 +1,93 @@
+"""Options of histories that have names, units or time stamps of their own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from pbrl_ppl.history import History
+    from pbrl_ppl.scene import Scene
+
+Columns = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=COLUMN,...",
+        help="The files' own column names (x=pos_x,time=t), or numbers (force_x=0); with several"
+        " bodies in a row, cart.x=cart_px. Other columns are left out.",
+    ),
+]
+Units = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="NAME=UNIT,...", help="What columns are measured in, if not SI (x=mm,theta=deg)."
+    ),
+]
+TimeStep = Annotated[
+    float | None,
+    typer.Option(
+        min=1e-9,
+        metavar="SECONDS",
+        help="In place of the scene's time_step; uneven samples are interpolated to it.",
+    ),
+]
+
+
+def columns_of(given: list[str]) -> dict[str, str | float]:
+    """Column names, or numbers, from options such as ``x=pos_x,force_x=0``."""
+    columns: dict[str, str | float] = {}
+    for name, value in _pairs(given, "--columns", "x=pos_x"):
+        try:
+            columns[name] = float(value)
+        except ValueError:
+            columns[name] = value
+    return columns
+
+
+def units_of(given: list[str]) -> dict[str, str]:
+    """Units from options such as ``x=mm,theta=deg``."""
+    return dict(_pairs(given, "--units", "x=mm"))
+
+
+def _pairs(given: list[str], option: str, example: str) -> list[tuple[str, str]]:
+    pairs = []
+    for item in ",".join(given).split(",") if given else ():
+        name, equals, value = (part.strip() for part in item.partition("="))
+        if not (name and equals and value):
+            raise typer.BadParameter(
+                f"{item!r} is not NAME=VALUE, such as {example}", param_hint=option
+            )
+        pairs.append((name, value))
+    return pairs
+
+
+def load_own(
+    scene: Path,
+    train: Path,
+    test: Path | None,
+    estimate_velocities: bool,
+    columns: dict[str, str | float],
+    units: dict[str, str],
+    time_step: float | None,
+) -> tuple[Scene, History, History | None]:
+    """Read a scene, with another time step if given, and one or two histories of it."""
+    from pbrl_ppl.scene import Scene
+
+    declared = Scene.load(scene)  # its errors come before pandas is loaded
+    if time_step is not None:
+        declared = declared.replace(time_step=time_step)
+    from pbrl_ppl.history import History
+
+    def load(path: Path) -> History:
+        return History.load(
+            path,
+            declared,
+            estimate_velocities=estimate_velocities,
+            columns=columns,
+            units=units,
+            resample=time_step is not None,
+        )
+
+    return declared, load(train), None if test is None else load(test)

@@ -1,0 +1,158 @@
+"""Tables of others: their column names and units, turned into a history's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import pandas as pd
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.files import COLUMNS
+from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.state import STATE, WRENCH
+
+_LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
+_TIME = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0}
+_ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "rev": 2 * np.pi}
+_FORCE = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "lbf": 4.4482216152605}
+
+
+def _rates(of: Mapping[str, float]) -> dict[str, float]:
+    return {f"{a}/{b}": size / time for a, size in of.items() for b, time in _TIME.items()}
+
+
+_TORQUE = {
+    f"{a}{mark}{b}": force * length
+    for a, force in _FORCE.items()
+    for b, length in _LENGTH.items()
+    for mark in (" ", "", "*")
+}
+#: What each column may be measured in, in SI units.
+_UNITS: Mapping[str, Mapping[str, float]] = {
+    "time": _TIME,
+    "x": _LENGTH,
+    "y": _LENGTH,
+    "theta": _ANGLE,
+    "vx": _rates(_LENGTH),
+    "vy": _rates(_LENGTH),
+    "omega": _rates(_ANGLE) | {"rpm": 2 * np.pi / 60},
+    "force_x": _FORCE,
+    "force_y": _FORCE,
+    "torque": _TORQUE,
+}
+
+
+def renamed(
+    frame: pd.DataFrame, scene: Scene, columns: Mapping[str, str | float], source: str
+) -> pd.DataFrame:
+    """Return a table with a history's column names; others are left out.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        Any columns.
+    scene : Scene
+        Names the bodies; with one that moves, the body's column may be missing.
+    columns : mapping of str to str or float
+        From a history's column to the table's, such as ``{"x": "pos_x"}``, or to a number that
+        holds on all rows, such as ``{"force_x": 0.0}``. With several bodies side by side in a row,
+        from a body's column, such as ``{"cart.x": "cart_px"}``. Columns that have a history's name
+        already need not be named; without a trajectory's column, there is one trajectory.
+    source : str
+        What to call the table in messages.
+
+    Raises
+    ------
+    HistoryError
+        If a column or a body is unknown, or one body of several has no columns.
+    """
+    if any(name is not None for name in frame.index.names):
+        frame = frame.reset_index()
+    frame = frame.set_axis([str(name).strip() for name in frame.columns], axis=1)
+    if frame.columns.has_duplicates:
+        name = frame.columns[frame.columns.duplicated()][0]
+        raise HistoryError(f'{source}: column "{name}" is there twice; drop one')
+    names = [body.name for body in scene.moving]
+    shared: dict[str, str | float] = {name: name for name in COLUMNS if name in frame}
+    own: dict[str, dict[str, str | float]] = {}
+    for key, column in columns.items():
+        body, dot, name = key.rpartition(".")
+        if name not in COLUMNS or (dot and name not in (*STATE, *WRENCH)):
+            raise HistoryError(
+                f'columns: "{key}" is no column of a history{nearest(name, COLUMNS)}'
+                f" expected {', '.join(COLUMNS)}, or one of a body such as {names[0]}.x"
+            )
+        if dot and body not in names:
+            raise HistoryError(f'columns: "{key}": the scene has {", ".join(names)}')
+        constant = not isinstance(column, str) or (name == "body" and column in names)
+        if not constant and column not in frame:
+            raise HistoryError(
+                f'{source}: it has no column "{column}" for {key}'
+                f"{nearest(column, list(frame.columns))} It has {', '.join(frame.columns)}"
+            )
+        (own.setdefault(body, {}) if dot else shared)[name] = column
+    shared.setdefault("trajectory", 0)
+    if own:
+        if lacking := [name for name in names if name not in own]:
+            raise HistoryError(
+                f"columns: {lacking[0]} has none, and {next(iter(own))} has; name each body's"
+            )
+        shared.pop("body", None)
+        parts = [_picked(frame, shared | own[name]).assign(body=name) for name in names]
+        # side by side in a row is one below the other in a history
+        return pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
+    if len(names) == 1:
+        shared.setdefault("body", names[0])
+    return _picked(frame, shared)
+
+
+def _picked(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> pd.DataFrame:
+    """The columns by their new names; what is no column is the same on all rows."""
+    frame = frame.reset_index(drop=True)
+    return pd.DataFrame(
+        {
+            name: frame[column] if isinstance(column, str) and column in frame else column
+            for name, column in columns.items()
+        },
+        index=frame.index,
+    )
+
+
+def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
+    """Return a history's table in SI units.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        With a history's column names.
+    units : mapping of str to str
+        What columns are measured in, such as ``{"x": "mm", "theta": "deg"}``; the others are in SI
+        units.
+
+    Raises
+    ------
+    HistoryError
+        If a column or a unit is unknown.
+
+    Examples
+    --------
+    >>> in_si(pd.DataFrame({"x": [1500.0], "omega": [180.0]}), {"x": "mm", "omega": "deg/s"})
+         x     omega
+    0  1.5  3.141593
+    """
+    frame = frame.copy()
+    for name, unit in units.items():
+        if name not in _UNITS:
+            raise HistoryError(f'units: "{name}" has none{nearest(name, _UNITS)}')
+        if unit not in _UNITS[name]:
+            known = [each for each in _UNITS[name] if "*" not in each]
+            raise HistoryError(
+                f'units: "{unit}" is none of {name}; expected one of {", ".join(known[:12])}'
+            )
+        if name not in frame:
+            raise HistoryError(f'units: "{name}" is in {unit}, and the table has no such column')
+        values = pd.to_numeric(frame[name], errors="coerce")
+        # what is no number stays, for the message that says so
+        frame[name] = (values * _UNITS[name][unit]).where(values.notna(), frame[name])
+    return frame

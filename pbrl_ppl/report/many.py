@@ -1,0 +1,296 @@
+"""Many robots, many logs: the loop closed on each over any executor, and one page of it all."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
+from concurrent.futures import Executor, as_completed
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pandas as pd
+
+from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED
+from pbrl_ppl.effects import Effect
+from pbrl_ppl.errors import OutputError, PbrlError
+from pbrl_ppl.history import write_atomically
+from pbrl_ppl.posterior import load_posterior
+from pbrl_ppl.report.loop import check_folder
+from pbrl_ppl.report.manifest import Log, read_manifest
+from pbrl_ppl.report.many_page import effect_table, page, summary_table
+from pbrl_ppl.report.one_log import (
+    FAILED,
+    Run,
+    Settings,
+    close_log,
+    failed,
+    inputs_sha256,
+    row_of,
+    settle,
+)
+from pbrl_ppl.sampling import Pooled, pool
+
+#: The files of all logs together; the first says what the folder is.
+_SUMMARY, _TABLE, _EFFECTS, _PAGE = "summary.json", "summary.csv", "effects.csv", "index.html"
+_KIND = "pbrl_ppl logs 1"
+
+
+@dataclass(frozen=True, eq=False)
+class ManyLoops:
+    """What was found in many logs.
+
+    Parameters
+    ----------
+    folder : Path
+        Has ``index.html``, ``summary.csv``, ``effects.csv``, ``summary.json``, and each log's
+        folder.
+    rows : tuple of dict
+        One a log, in the manifest's order: its status (``done``, ``failed``, ``waiting``), verdict
+        and effects, or what went wrong.
+    pooled : mapping of str to Pooled
+        By kind, hyper-parameters that its robots share, and each robot's parameters given these.
+    not_pooled : mapping of str to str
+        Why a kind's robots were not.
+    """
+
+    folder: Path
+    rows: tuple[Mapping[str, Any], ...]
+    pooled: Mapping[str, Pooled]
+    not_pooled: Mapping[str, str]
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """Names of the logs that failed."""
+        return tuple(row["name"] for row in self.rows if row["status"] == "failed")
+
+    def table(self) -> pd.DataFrame:
+        """One row a log: status, verdict, effects, errors before and after, message, folder."""
+        return summary_table(self.rows)
+
+    def effects(self) -> pd.DataFrame:
+        """Which effects were found where: one row an effect and log, with its estimate."""
+        return effect_table(self.rows)
+
+    def __repr__(self) -> str:
+        return f"ManyLoops({in_words(self.rows)})"
+
+
+def close_loop_many(
+    manifest: str | Path | Iterable[Log],
+    folder: str | Path,
+    *,
+    executor: Executor | None = None,
+    seed: int = 0,
+    substeps: int | None = None,
+    draws: int | None = None,
+    method: str = "metropolis",
+    catalogue: Iterable[Effect] | None = None,
+    noise: Mapping[str, float] | None = None,
+    estimate_velocities: bool = False,
+    columns: Mapping[str, str | float] | None = None,
+    units: Mapping[str, str] | None = None,
+    time_step: float | None = None,
+    again: bool = False,
+    run: Run = close_log,
+    progress: Callable[[str], None] | None = None,
+) -> ManyLoops:
+    """Close the loop on each log of a manifest, and write a page of which effects are where.
+
+    Each log gets a folder of its own with what :meth:`Loop.save` writes. A log whose folder has a
+    report of the same files and settings is not run again, so the same call goes on after an
+    interrupt; one that fails leaves ``error.json`` there, does not stop the rest, and is tried
+    again by the next call.
+
+    Parameters
+    ----------
+    manifest : str, Path or iterable of Log
+        As of :func:`read_manifest`.
+    folder : str or Path
+        Of all results; made if missing.
+    executor : concurrent.futures.Executor, optional
+        Where the loops are closed; by default here, one after another. ``client.get_executor()`` of
+        Dask is one, whose workers must see the files by the same paths. A process works on one log
+        at a time.
+    seed, substeps, draws, method, catalogue : optional
+        As of :func:`pbrl_ppl.close_loop`; each log is what that gives with this seed.
+    noise : mapping of str to float, optional
+        Known errors of measuring, ``{"x": 0.002}``; they replace those of the scenes.
+    estimate_velocities, columns, units : optional
+        As of :meth:`History.load`.
+    time_step : float, optional
+        In place of the scenes' (s); uneven samples are interpolated to it.
+    again : bool
+        Whether finished logs are run again too.
+    run : callable
+        What closes the loop on a log, if not the package.
+    progress : callable, optional
+        Told of each log that is finished.
+
+    Returns
+    -------
+    ManyLoops
+        Rows, and for each kind of the manifest the robots' shared hyper-parameters. Logs without
+        an adequate model at the end (``unexplained``, ``not-converged``) take no part in those.
+
+    Raises
+    ------
+    ManifestError
+        If the manifest cannot be used.
+    OutputError
+        If the folder cannot be written, or has content of another kind.
+
+    Examples
+    --------
+    ::
+
+        with distributed.Client("tcp://scheduler:8786") as client:
+            loops = pp.close_loop_many("logs.csv", "out", executor=client.get_executor())
+        loops.effects()
+        loops.pooled["cart"].scene  # the next cart's, with what is known of carts
+    """
+    logs = read_manifest(manifest) if isinstance(manifest, str | Path) else tuple(manifest)
+    folder = _opened(Path(folder))
+    settings = Settings(
+        seed, substeps, draws, method, None if catalogue is None else tuple(catalogue),
+        dict(noise or {}), estimate_velocities, dict(columns or {}), dict(units or {}), time_step,
+    )  # fmt: skip
+    tell = progress or (lambda _: None)
+    inputs = {log.name: inputs_sha256(log, settings) for log in logs}
+    rows: dict[str, dict[str, Any]] = {}
+    for log in logs:
+        if again:
+            (folder / log.name / "report.json").unlink(missing_ok=True)
+        elif row := row_of(log, folder, inputs[log.name]):
+            rows[log.name] = row
+            (folder / log.name / FAILED).unlink(missing_ok=True)
+    if rows:
+        tell(f"{len(rows)} of {len(logs)} logs are in {folder}")
+    left = [log for log in logs if log.name not in rows]
+    tasks = {log: partial(settle, log, folder, settings, inputs[log.name], run) for log in left}
+    _write_summary(folder, _ordered(logs, rows), {}, {})
+    try:
+        with closing(_results(tasks, executor)) as results:
+            for log, result in results:
+                try:
+                    row = result()
+                except Exception as error:  # its worker died, or it could not be sent there
+                    row = failed(log, folder, error)
+                rows[log.name] = row
+                tell(f"{len(rows)}/{len(logs)} {_row_in_words(row)}")
+                _write_summary(folder, _ordered(logs, rows), {}, {})
+    except KeyboardInterrupt:
+        tell(f"interrupted: {len(rows)} of {len(logs)} logs are in {folder}; run it again")
+        raise
+    pooled, not_pooled = _pooled(logs, rows, folder)
+    ordered = _ordered(logs, rows)
+    _write_summary(folder, ordered, pooled, not_pooled)
+    return ManyLoops(folder, ordered, pooled, not_pooled)
+
+
+def in_words(rows: Iterable[Mapping[str, Any]]) -> str:
+    """One line: how many logs had which end."""
+    ends = Counter(str(row.get("verdict", row["status"])) for row in rows)
+    return ", ".join(f"{count} {end}" for end, count in sorted(ends.items()))
+
+
+def _row_in_words(row: Mapping[str, Any]) -> str:
+    if row["status"] == "failed":
+        return f"{row['name']}: failed: {row['message']}"
+    found = ", ".join(f"{each['effect']}[{each['body']}]" for each in row["effects"])
+    return f"{row['name']}: {row['verdict']}{f' ({found})' if found else ''}, {row['seconds']:g} s"
+
+
+def _results(tasks: Mapping[Log, Callable[[], Any]], executor: Executor | None) -> Any:
+    """Each task's log, and a call that gives its row or raises its error."""
+    if executor is None:
+        yield from tasks.items()
+        return
+    futures = {executor.submit(task): log for log, task in tasks.items()}
+    try:
+        for future in as_completed(futures):
+            yield futures[future], future.result
+    finally:
+        for future in futures:
+            future.cancel()
+
+
+def _ordered(logs: Iterable[Log], rows: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
+    """Rows in the manifest's order; logs without one are waiting."""
+    waiting = {"status": "waiting"}
+    return tuple(rows.get(log.name, {"name": log.name, "kind": log.kind} | waiting) for log in logs)
+
+
+def _opened(folder: Path) -> Path:
+    """Make the folder of many logs, or check that it is one."""
+    check_folder(folder, overwrite=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        summary = folder / _SUMMARY
+        if not summary.is_file() and any(folder.iterdir()):
+            raise OutputError(
+                f"output folder {folder}: it has content that is not of many logs; choose another"
+            )
+        if summary.is_file() and json.loads(summary.read_text("utf-8"))["contents"] != _KIND:
+            raise KeyError("contents")
+    except (ValueError, KeyError, TypeError):
+        raise OutputError(
+            f"output folder {folder}: its {_SUMMARY} is not of many logs; choose another"
+        ) from None
+    except OutputError:
+        raise
+    except OSError as error:
+        raise OutputError(f"output folder {folder}: cannot be written: {error}") from error
+    return folder.absolute()
+
+
+def _pooled(
+    logs: Iterable[Log], rows: Mapping[str, Mapping[str, Any]], folder: Path
+) -> tuple[dict[str, Pooled], dict[str, str]]:
+    """Hyper-parameters of each kind with two adequate models or more."""
+    kinds: dict[str, list[str]] = {}
+    for log in logs:
+        own = kinds.setdefault(log.kind, [])
+        row = rows[log.name]
+        if row["status"] == "done" and row["verdict"] not in (UNEXPLAINED, NOT_CONVERGED):
+            own.append(log.name)
+    kinds.pop("", None)
+    found, reasons = {}, {}
+    for kind, names in kinds.items():
+        if len(names) < 2:
+            reasons[kind] = f"{len(names)} adequate model(s), expected at least 2"
+            continue
+        try:
+            found[kind] = pool({name: load_posterior(folder / name / "after.nc") for name in names})
+        except PbrlError as error:
+            reasons[kind] = str(error)
+    return found, reasons
+
+
+def _write_summary(
+    folder: Path,
+    rows: tuple[Mapping[str, Any], ...],
+    pooled: Mapping[str, Pooled],
+    not_pooled: Mapping[str, str],
+) -> None:
+    """Write what concerns all logs, each file whole or not at all."""
+    contents = {
+        "contents": _KIND,
+        "logs": rows,
+        "pooled": {kind: each.to_dict() for kind, each in pooled.items()},
+        "not_pooled": not_pooled,
+    }
+    texts = {
+        _SUMMARY: json.dumps(contents, indent=1, default=dict) + "\n",
+        _TABLE: summary_table(rows).to_csv(index=False, lineterminator="\n"),
+        _EFFECTS: effect_table(rows).to_csv(index=False, lineterminator="\n"),
+        _PAGE: page(rows, pooled, not_pooled, in_words(rows)),
+    }
+    for kind, each in pooled.items():
+        texts[f"kind-{kind}.toml"] = each.scene.to_toml()
+        texts[f"kind-{kind}.csv"] = each.robots().to_csv(index=False, lineterminator="\n")
+    for name, text in texts.items():
+        write_atomically(folder / name, partial(Path.write_text, data=text, encoding="utf-8"))

@@ -1,0 +1,325 @@
+"""Partial pooling: hyper-parameters that robots of one kind share, from their single posteriors.
+
+Each single posterior, its prior divided out, is a normal likelihood of that robot's parameter on
+the scale on which the prior is normal. The robots' parameters are normal about a mean, with a
+spread; both are integrated over, so that few robots give wide answers and not a spread of zero, as
+its maximum of likelihood would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from pbrl_ppl.effects import Effect, attach, catalogue
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.model import build_layout
+from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws, prior_draws, wheels
+from pbrl_ppl.posterior import HDI_PROB, moment_matched, scalars, scene_of
+from pbrl_ppl.sampling.population import Population, population
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import wrapped
+
+Array = NDArray[np.float64]
+
+#: A robot informs where its data say at least this share of what the prior says (of precision);
+#: less is within the error of a posterior's width.
+_INFORMS = 0.2
+#: Quantiles: the middle, and the ends of the usual interval.
+_MIDDLE, _ENDS = 0.5, ((1 - HDI_PROB) / 2, (1 + HDI_PROB) / 2)
+#: An angle of which nothing is known has this width; a von Mises this concentration at most.
+_ANY_ANGLE, _SHARPEST = np.pi / np.sqrt(3), 1e6
+#: For the moments of a wheel's prior once it is described in one way.
+_PRIOR_DRAWS = 4000
+
+
+@dataclass(frozen=True, eq=False)
+class Pooled:
+    """Robots of one kind: what they share, each one given the others, and the next.
+
+    Parameters
+    ----------
+    names : tuple of str
+        The robots.
+    scene : Scene
+        For the next robot of the kind: the effects that all of these have, and in ``prior`` what is
+        known of the kind.
+    populations : mapping of str to Population
+        By parameter, such as ``mass[cart]``.
+    left_out : tuple of str
+        Parameters of effects that some robots have and some lack. Those that lack it had too little
+        to be found, so the mean of the others would be too large.
+    """
+
+    names: tuple[str, ...]
+    scene: Scene
+    populations: Mapping[str, Population]
+    left_out: tuple[str, ...]
+    _families: Mapping[str, tuple[str, float]]
+    _single: Mapping[str, Array]
+
+    def table(self) -> pd.DataFrame:
+        """One row a parameter, in its own unit; the spread is on ``scale`` (of logarithms: shares).
+
+        ``mean`` is the median of the kind's mean, ``next`` that of a further robot; with 94 %
+        intervals. ``p_same`` as of :class:`Population`, ``informed`` how many robots inform.
+        """
+        rows = []
+        for name, found in self.populations.items():
+            row: dict[str, Any] = {"parameter": name, "scale": self._families[name][0]}
+            for key, of, natural in (
+                ("mean", found.mean, True),
+                ("spread", found.deviation, False),
+                ("next", found.next, True),
+            ):
+                middle = "next_median" if key == "next" else key
+                for label, q in ((middle, _MIDDLE), (f"{key}_low", _ENDS[0]),
+                                 (f"{key}_high", _ENDS[1])):  # fmt: skip
+                    row[label] = self._natural(name, of(q)) if natural else of(q)
+            rows.append(row | {"informed": int(found.informed.sum()), "p_same": found.p_same})
+        return pd.DataFrame(rows)
+
+    def robots(self) -> pd.DataFrame:
+        """One row a robot and parameter: its single posterior, and that given all robots."""
+        rows = [
+            {
+                "robot": robot,
+                "parameter": name,
+                "single_mean": self._single[name][number, 0],
+                "single_sd": self._single[name][number, 1],
+                "informed": bool(found.informed[number]),
+                **{
+                    label: self._natural(name, found.robot(number, q))
+                    for label, q in (("median", _MIDDLE), ("low", _ENDS[0]), ("high", _ENDS[1]))
+                },
+            }
+            for name, found in self.populations.items()
+            for number, robot in enumerate(self.names)
+        ]
+        return pd.DataFrame(rows)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; not a number is None."""
+        table = self.table().astype(object)
+        return {
+            "robots": list(self.names),
+            "parameters": table.where(table.notna(), None).to_dict("records"),
+            "left_out": list(self.left_out),
+        }
+
+    def _natural(self, name: str, value: float) -> float:
+        """A value on the scale of the prior, in the parameter's unit and support."""
+        scale, reference = self._families[name]
+        if scale == "logarithm":
+            return float(np.exp(value))
+        return float(wrapped(value + reference)) if scale == "angle" else value
+
+
+def pool(
+    posteriors: Mapping[str, Any],
+    *,
+    spread: float = 0.5,
+    effects: Iterable[Effect] = catalogue,
+) -> Pooled:
+    """Estimate what robots of one kind share from their single posteriors.
+
+    Parameters
+    ----------
+    posteriors : mapping of str to InferenceData or DataTree
+        By robot, two at least, each of the same scene but for priors and effects.
+    spread : float
+        How different robots of a kind may be: the scale of the half-normal prior of their standard
+        deviation, as a share of that of the scene's prior. With few robots it matters.
+    effects : iterable of Effect
+        Where the names of the models' effects are looked up; add your own to the package's.
+
+    Returns
+    -------
+    Pooled
+        Dependence between parameters is not kept. Truncation is neglected in the population, which
+        matters where robots lie within a standard deviation of a bound.
+
+    Raises
+    ------
+    PosteriorError
+        If there are fewer than two posteriors, their scenes differ in bodies or unknowns, or a
+        posterior's draws do not vary.
+    ValueError
+        If ``spread`` is not above 0.
+
+    Examples
+    --------
+    ::
+
+        robots = {name: pp.load_posterior(f"out/{name}/after.nc") for name in ("cart1", "cart2")}
+        pooled = pp.pool(robots)
+        pooled.table()
+        pp.physics_model(pooled.scene, history_of_cart3)
+    """
+    if not spread > 0:
+        raise ValueError(f"spread is {spread}, expected more than 0")
+    if len(posteriors) < 2:
+        raise PosteriorError(f"pool: {len(posteriors)} posterior(s), expected at least 2 robots")
+    effects = tuple(effects)
+    names = tuple(posteriors)
+    scenes = [scene_of(idata) for idata in posteriors.values()]
+    layouts = [build_layout(scene, attach(scene, (), effects)) for scene in scenes]
+    for name, layout in zip(names, layouts, strict=True):
+        if _table1(layout) != _table1(layouts[0]):
+            raise PosteriorError(
+                f"pool: {name} has the unknowns {', '.join(_table1(layout))}, {names[0]} has"
+                f" {', '.join(_table1(layouts[0]))}; expected the same scene"
+            )
+    drawn = _drawn(names, list(posteriors.values()), layouts)
+    shared = [label for label in drawn[0] if all(label in own for own in drawn)]
+    every = dict.fromkeys(label for own in drawn for label in own)
+    populations, families, single, priors = {}, {}, {}, {}
+    by_layout = {layout: _priors(layout) for layout in layouts}  # most are the same
+    every_prior = [by_layout[layout] for layout in layouts]
+    for label in shared:
+        own = [each[label] for each in every_prior]
+        draws = [each[label] for each in drawn]
+        family = layouts[0].priors[layouts[0].labels.index(label)]
+        found, reference = _pooled(own, draws, spread, family.uniform)
+        populations[label] = found
+        families[label] = (_scale(own[0]), reference)
+        single[label] = np.array([_moments(prior, x) for prior, x in zip(own, draws, strict=True)])
+        if found.informed.any():
+            priors[label] = _next_prior(family, found, reference)
+    left_out = tuple(label for label in every if label not in shared)
+    scene = _scene(scenes, priors, left_out)
+    return Pooled(names, scene, populations, left_out, families, single)
+
+
+def _table1(layout: Layout) -> list[str]:
+    """Labels of the parameters that are no effect's."""
+    return [f"{b.name}[{owner}]" for b in layout.blocks if b.effect is None for owner in b.owners]
+
+
+def _drawn(
+    names: tuple[str, ...], posteriors: list[Any], layouts: list[Layout]
+) -> list[dict[str, Array]]:
+    """Each robot's draws of its bodies' parameters; equal wheels are described alike in all."""
+    result: list[dict[str, Array]] = []
+    first: Array | None = None
+    for name, idata, layout in zip(names, posteriors, layouts, strict=True):
+        posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
+        if lacking := [label for label in layout.labels if label not in posterior]:
+            raise PosteriorError(f"pool: {name} has no {lacking[0]}, which its scene asks for")
+        folded = fold_draws(layout, posterior)
+        phi = np.stack([folded[label] for label in layout.labels], axis=1)
+        first = phi if first is None else first
+        phi = beside(layout, phi, first)  # Table 1 comes first in all
+        own = dict(zip(layout.labels, phi.T, strict=True))
+        of_bodies = [f"{b.name}[{o}]" for b in layout.blocks if b.of == "body" for o in b.owners]
+        for label in of_bodies:
+            if not np.ptp(own[label]) > 0:
+                raise PosteriorError(f"pool: the draws of {label} of {name} do not vary")
+        result.append({label: own[label] for label in of_bodies})
+    return result
+
+
+def _priors(layout: Layout) -> dict[str, Prior]:
+    """Priors by label; those of a wheel are of the description that was chosen among equal ones."""
+    priors = dict(zip(layout.labels, layout.priors, strict=True))
+    for wheel in wheels(layout):
+        if wheel.period < 4:
+            drawn = prior_draws(wheel.priors, np.random.default_rng(0), _PRIOR_DRAWS)
+            folded = fold_draws(layout, dict(zip(wheel.labels, drawn.T, strict=True)))
+            priors |= {label: moment_matched(priors[label], x) for label, x in folded.items()}
+    return priors
+
+
+def _scale(prior: Prior) -> str:
+    return {"log_normal": "logarithm", "von_mises": "angle"}.get(prior.family, "itself")
+
+
+def _moments(prior: Prior, draws: Array) -> tuple[float, float]:
+    """Mean and standard deviation of draws, of an angle about its mean direction."""
+    if prior.family != "von_mises":
+        return float(draws.mean()), float(draws.std())
+    mean = float(np.angle(np.exp(1j * draws).mean()))
+    return mean, float(wrapped(draws - mean).std())
+
+
+def _pooled(
+    priors: list[Prior], draws: list[Array], spread: float, free: bool
+) -> tuple[Population, float]:
+    """The population of a parameter, and the angle that its scale is about."""
+    matched = [moment_matched(prior, x) for prior, x in zip(priors, draws, strict=True)]
+    if priors[0].family == "von_mises":
+        return _pooled_angles(priors, matched, spread, free)
+    before = np.array([prior.sigma**-2.0 for prior in priors])
+    after = np.array([each.sigma**-2.0 for each in matched])
+    # a product of normals has the sum of the precisions: what the data said is the difference
+    precision = after - before
+    informed = precision > _INFORMS * before
+    weighted = np.array([each.mu for each in matched]) * after
+    weighted -= np.array([prior.mu for prior in priors]) * before
+    safe = np.where(informed, precision, 1.0)
+    sd = np.where(informed, safe**-0.5, np.inf)
+    widest = priors[int(before.argmin())]
+    found = population(
+        weighted / safe, sd, centre=widest.mu, width=widest.sigma, spread=spread * widest.sigma
+    )
+    return found, 0.0
+
+
+def _pooled_angles(
+    priors: list[Prior], matched: list[Prior], spread: float, free: bool
+) -> tuple[Population, float]:
+    """As normal about their mean direction, which they are where the data inform.
+
+    A ``free`` angle is uniform a priori: what its prior has of concentration is from the choice
+    among a wheel's equal descriptions, and about the angle itself.
+    """
+    towards = np.array([each.mu for each in matched])
+    about = towards if free else np.array([prior.mu for prior in priors])
+    before = np.array([prior.kappa for prior in priors]) * np.exp(1j * about)
+    said = np.array([each.kappa for each in matched]) * np.exp(1j * towards) - before
+    kappa = np.abs(said)
+    informed = kappa > np.maximum(1.0, _INFORMS * np.abs(before))
+    reference = float(np.angle((said * informed).sum())) if informed.any() else 0.0
+    least = priors[int(np.abs(before).argmin())]
+    width = _ANY_ANGLE if free else min(_ANY_ANGLE, max(least.kappa, 1e-9) ** -0.5)
+    sd = np.where(informed, np.where(informed, kappa, 1.0) ** -0.5, np.inf)
+    found = population(
+        wrapped(np.angle(said) - reference), sd, width=width, spread=spread * width,
+        centre=0.0 if free else float(wrapped(least.mu - reference)),
+    )  # fmt: skip
+    return found, reference
+
+
+def _next_prior(prior: Prior, found: Population, reference: float) -> dict[str, float]:
+    """Hyper-parameters with the median and the 94 % interval of a robot that was not seen."""
+    middle, low, high = (found.next(q) for q in (_MIDDLE, *_ENDS))
+    sigma = (high - low) / float(np.diff(norm.ppf(_ENDS))[0])
+    if prior.family == "von_mises":
+        return {"mu": float(wrapped(middle + reference)), "kappa": min(sigma**-2, _SHARPEST)}
+    lower, upper = (-np.inf, np.inf) if prior.family == "log_normal" else prior.support
+    return {"mu": float(np.clip(middle, lower - 5 * sigma, upper + 5 * sigma)), "sigma": sigma}
+
+
+def _scene(
+    scenes: list[Scene], priors: Mapping[str, dict[str, float]], left_out: tuple[str, ...]
+) -> Scene:
+    """The first scene with the effects that all have, and these priors."""
+    dropped = {tuple(label.rstrip("]").split("[")) for label in left_out}
+    bodies = []
+    for body in scenes[0].bodies:
+        others = [set(scene.body(body.name).effects) for scene in scenes]
+        kept = tuple(name for name in body.effects if all(name in own for own in others))
+        prior = {name: hyper for name, hyper in body.prior if (name, body.name) not in dropped}
+        prior |= {
+            label.partition("[")[0]: tuple(hyper.items())
+            for label, hyper in priors.items()
+            if label.endswith(f"[{body.name}]")
+        }
+        bodies.append(replace(body, effects=kept, prior=tuple(prior.items())))
+    return scenes[0].replace(bodies=tuple(bodies))
