@@ -27,12 +27,13 @@ import pytensor
 import pytensor.tensor as pt
 
 from pbrl_ppl import Body, Scene, Shape, Simulator, SimulatorOp
+from pbrl_ppl.effects import attach
 from pbrl_ppl.history import fill_hinges
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import calls, pointers
 from pbrl_ppl.physics.world import World
-from pbrl_ppl.scene import Wall
+from pbrl_ppl.scene import Joint, Wall
 
 APARTMENT = Path(__file__).parents[2] / "models" / "apartment" / "scene.toml"
 G, TIME_STEP, SUBSTEPS, TRANSITIONS = 9.81, 0.1, 10, 100
@@ -108,6 +109,42 @@ def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.nda
     layout = build_layout(scene)
     phi = np.array([prior.centre for prior in layout.priors])
     return phi, hung(scene, start), rng.normal(0, [60.0, 60.0, 10.0], (n, 1, k, 3))
+
+
+def arms_scene() -> Scene:
+    """Two hinged arms in a vertical plane, each with a moment and a centre of mass of its own."""
+    effects = ("inertia_scale", "com_offset")
+    bodies = (
+        Body("upper", Shape.box(0.05, 0.2), effects=effects),
+        Body("lower", Shape.box(0.05, 0.3), effects=effects),
+    )
+    joints = (
+        Joint("hinge", ("upper", "world"), (0.0, 0.1), (0.0, 0.0)),
+        Joint("hinge", ("upper", "lower"), (0.0, -0.1), (0.0, 0.15)),
+    )
+    return Scene(time_step=0.01, gravity=(0.0, -G), substeps=20, bodies=bodies, joints=joints)
+
+
+def arms_sides(n: int) -> tuple[Callable[[], float], Callable[[], float]]:
+    """A prediction of ``n`` transitions of the arms in the contact-free lane, and by the engine."""
+    scene = arms_scene()
+    attached = attach(scene)
+    layout = build_layout(scene, attached)
+    phi = np.array([prior.centre for prior in layout.priors])
+    rng = np.random.default_rng(4)
+    start = np.zeros((n, 2, 6))
+    start[..., 2], start[..., 5] = rng.normal(0, 1, (n, 2)), rng.normal(0, 4, (n, 2))
+    start, actions = hung(scene, start), np.zeros((n, 1, 2, 3))
+    actions[..., 2] = rng.normal(0, 0.3, (n, 1, 2))
+    lane, engine = Simulator(scene, layout, attached), Simulator(scene, layout, attached)
+    engine(phi, start[:1], actions[:1])
+    for worlds in engine._worlds.values():
+        for world in worlds:
+            world.chain = None
+    np.testing.assert_allclose(
+        lane(phi, start, actions), engine(phi, start, actions), rtol=1e-9, atol=1e-9
+    )
+    return timed(lambda: lane(phi, start, actions)), timed(lambda: engine(phi, start, actions))
 
 
 def naive(
@@ -220,6 +257,8 @@ def rows() -> list[Row]:
         Row("apartment_per_body", f"{bodies}-body apartment, a transition and body / single body",
             "<= 2", lambda: seconds(lambda: rooms(*furniture)) / bodies,
             timed(lambda: plain(phi, start, actions))),
+        Row("chain_lane_over_engine", "3600 transitions of a double pendulum: lane / engine",
+            "<= 0.1", *arms_sides(3600)),
         Row("proposals_30", "30 proposals in one call / 30 calls",
             "<= 1.0", timed(lambda: usual(proposals, start, actions)),
             timed(lambda: [usual(proposal, start, actions) for proposal in proposals])),

@@ -11,9 +11,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics import calls, compiled, lockstep
+from pbrl_ppl.physics import calls, compiled, lockstep, lockstep_chain
 from pbrl_ppl.physics.lockstep import free_bodies
 from pbrl_ppl.physics.pointers import pointers
+from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.world import World
 
 Array = NDArray[np.float64]
@@ -78,6 +79,7 @@ class Engine:
     def _renew(self) -> None:
         self.world = self._build()
         self.pointers, self.free = pointers(self.world), free_bodies(self.world)
+        self.chain = lockstep_chain.chain_of(self.world)
 
     def rollout(
         self, batch: Batch, alone: tuple[Batch, ...], first: int, last: int, out: Array
@@ -100,6 +102,8 @@ class Engine:
             blocks = range(first, last, _BLOCK)
             left = [self._apart(alone, b, min(b + _BLOCK, last), out) for b in blocks]
             items = items[np.concatenate([np.zeros(0, dtype=bool), *left])]
+        elif self.chain is not None and len(items):
+            items = self._joined(self.chain, batch, items, out)
         while len(items):
             done = compiled.rollout(calls.FUNCTIONS, self.pointers, *batch, items, out)
             if done < len(items):  # diverged: that world is spoilt, and the item is lost
@@ -126,6 +130,17 @@ class Engine:
             reach = self.free[i].radius + self.free[j].radius
             lockstep.meet(trails[i], trails[j], reach, left)
         return left
+
+    def _joined(
+        self, chain: lockstep_chain.Chain, batch: Batch, items: NDArray[np.int64], out: Array
+    ) -> NDArray[np.int64]:
+        """Predict joined bodies where they come near nothing, and say which items are left."""
+        mass = batch.given[0][:, 0, chain.chained, COLUMN["mass"]]
+        ratio = mass.max(axis=1) / mass.min(axis=1)  # as iterations go
+        items = items[np.argsort(ratio[items // len(batch.inputs)], kind="stable")]
+        left = np.zeros(len(items), dtype=bool)
+        lockstep_chain.rollout(chain, *batch, items, out, left)
+        return np.sort(items[left])
 
 
 def share_out(run: Callable[[Engine, int, int], None], engines: list[Engine], n: int) -> None:

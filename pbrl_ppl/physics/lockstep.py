@@ -14,54 +14,33 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.physics import lockstep_bodies as lanes
 from pbrl_ppl.physics import lockstep_solver as solver
 from pbrl_ppl.physics.compiled import act
 from pbrl_ppl.physics.lockstep_solver import (
     AX,
     AY,
     COEF,
-    FX,
-    FY,
-    GX,
-    GY,
     II,
-    JX_MAX,
-    JY_MAX,
     LANES,
     LINK_ROWS,
-    MI,
+    OX,
+    OY,
     POINT_ROWS,
     PX,
     PY,
     ROWS,
     T_MAX,
-    VX,
-    VY,
-    WC,
-    WS,
-    WX,
-    WY,
-    A,
-    C,
+    X0,
+    Y0,
     L,
-    S,
-    T,
-    W,
-    X,
-    Y,
 )
 from pbrl_ppl.physics.properties import COLUMN, JOINT_COLUMNS
-from pbrl_ppl.physics.world import DIVERGED, RING, World
+from pbrl_ppl.physics.world import RING, World
 
-_MASS, _MOMENT, _W_X, _W_Y, _W_THETA, _MU_X, _MU_Y, _TORQUE, _DAMPING, _MU, _RADIUS = (
-    COLUMN[name]
-    for name in (
-        "mass", "moment", "w_x", "w_y", "w_theta", "mu_x", "mu_y", "pivot_torque", "pivot_damping",
-        "patch_mu", "patch_radius",
-    )
-)  # fmt: skip
-_EXTRA_X, _EXTRA_Y = COLUMN["extra_gravity_x"], COLUMN["extra_gravity_y"]
-_COM_X, _COM_Y = COLUMN["com_x"], COLUMN["com_y"]
+_TORQUE, _DAMPING, _MU, _RADIUS = (
+    COLUMN[name] for name in ("pivot_torque", "pivot_damping", "patch_mu", "patch_radius")
+)
 _A_X, _A_Y, _B_X, _B_Y, _LENGTH = range(len(JOINT_COLUMNS))
 
 
@@ -113,14 +92,8 @@ def _free_body(world: World, index: int) -> FreeBody:
 
 @numba.njit(nogil=True, cache=True)
 def _set_properties(z, links, free, i, row, joints, normal_gravity, step):  # type: ignore[no-untyped-def]
-    """Give lane ``i`` its numbers for an interval; what is stored in joints stays."""
-    z[MI + i], z[II + i] = 1.0 / row[_MASS], 1.0 / row[_MOMENT]
-    z[GX + i], z[GY + i] = row[_MASS] * row[_EXTRA_X], row[_MASS] * row[_EXTRA_Y]
-    if free.wheel:
-        load = row[_MASS] * normal_gravity
-        z[WX + i], z[WY + i] = row[_W_X], row[_W_Y]
-        z[WC + i], z[WS + i] = math.cos(row[_W_THETA]), math.sin(row[_W_THETA])
-        z[JX_MAX + i], z[JY_MAX + i] = row[_MU_X] * load * step, row[_MU_Y] * load * step
+    """Give lane ``i`` its numbers for an interval, and say whether its centre is off its origin."""
+    shifted = lanes.set_body(z, i, row, free.wheel, normal_gravity, step)
     if free.pivot:
         z[T_MAX + i] = row[_TORQUE] * step
         z[COEF + i] = 1.0 - math.exp(-row[_DAMPING] * step * z[II + i])
@@ -129,48 +102,11 @@ def _set_properties(z, links, free, i, row, joints, normal_gravity, step):  # ty
         near, far = (joint[_A_X], joint[_A_Y]), (joint[_B_X], joint[_B_Y])
         if not free.link_first[j]:
             near, far = far, near
-        own[AX + i], own[AY + i] = near
+        own[AX + i], own[AY + i] = near[0] - z[OX + i], near[1] - z[OY + i]
         own[PX + i] = pose[0] + pose[2] * far[0] - pose[3] * far[1]
         own[PY + i] = pose[1] + pose[3] * far[0] + pose[2] * far[1]
         own[L + i] = joint[_LENGTH]
-
-
-@numba.njit(nogil=True, cache=True)
-def _set_wrench(z, i, wrench):  # type: ignore[no-untyped-def]
-    """Give lane ``i`` the accelerations of a wrench and of the weight beside it."""
-    z[FX + i] = (wrench[0] + z[GX + i]) * z[MI + i]
-    z[FY + i] = (wrench[1] + z[GY + i]) * z[MI + i]
-    z[T + i] = wrench[2] * z[II + i]
-
-
-@numba.njit(nogil=True, cache=True)
-def _lose(z, touched):  # type: ignore[no-untyped-def]
-    """Mark the lanes that have diverged."""
-    for i in range(LANES):
-        speed = abs(z[VX + i]) + abs(z[VY + i]) + abs(z[W + i])
-        touched[i] |= not speed < DIVERGED  # also true of NaN
-
-
-@numba.njit(nogil=True, cache=True)
-def _watch(z, radius, obstacles, discs, touched):  # type: ignore[no-untyped-def]
-    """Mark the lanes whose body comes near an obstacle."""
-    for j in range(len(obstacles)):
-        a_x, a_y, size = obstacles[j, 0], obstacles[j, 1], obstacles[j, 4]
-        d_x, d_y = obstacles[j, 2] - a_x, obstacles[j, 3] - a_y
-        length = d_x * d_x + d_y * d_y
-        scale, reach = 1.0 / length if length > 0.0 else 0.0, radius + size
-        for i in range(LANES):
-            x, y = z[X + i] - a_x, z[Y + i] - a_y
-            t = (x * d_x + y * d_y) * scale
-            t = 0.0 if t < 0.0 else t
-            t = 1.0 if t > 1.0 else t
-            x, y = x - t * d_x, y - t * d_y
-            touched[i] |= x * x + y * y <= reach * reach
-    for j in range(discs.shape[1]):
-        for i in range(LANES):
-            x, y, reach = z[X + i] - discs[i, j, 0], z[Y + i] - discs[i, j, 1], discs[i, j, 2]
-            reach = radius + reach if reach > 0.0 else -1.0
-            touched[i] |= (x * x + y * y <= reach * reach) & (reach > 0.0)
+    return shifted
 
 
 @numba.njit(nogil=True, cache=True)
@@ -211,21 +147,22 @@ def rollout(  # type: ignore[no-untyped-def]
 
     All arrays are of one body, and ``out``, shape (last - first, H, 1, 6), of these items.
     ``trail``, if it has rows, is given x and y after every step of every number of substeps, shape
-    (last - first, step, 2). ``left``, shape (last - first,), says which items come near something,
-    are lost, or have their mass elsewhere than at the origin: the engine is for them.
+    (last - first, step, 2). ``left``, shape (last - first,), says which items come near something
+    or are lost: the engine is for them.
     """
     bodies, joints, discs, command_parameters, force_parameters = given
     n, horizon = len(inputs), inputs.shape[1]
     timed = bodies.shape[1] > 1
     acting = len(commands[0]) + len(forces[0]) > 0
     watch = len(free.obstacles) + discs.shape[1] > 0
-    z, rows = np.zeros(ROWS), (X, Y, A, VX, VY, W)
+    z = np.zeros(ROWS)
     links = np.zeros((len(free.link_joint), LINK_ROWS))
     points = np.zeros((len(free.ring), POINT_ROWS))
     slowing, patch_radius = np.zeros(LANES), np.zeros(LANES)
     own_discs = np.zeros((LANES, discs.shape[1], 3))
     touched = np.zeros(LANES, dtype=np.bool_)
     state, signal = np.empty((1, 6)), np.empty(8)
+    own = state[0]  # once: a view costs as much as what is done with it
     previous, command, wrench = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 3))
     for begin in range(first, last, LANES):
         width = min(LANES, last - begin)
@@ -235,52 +172,54 @@ def rollout(  # type: ignore[no-untyped-def]
             substeps, weight = counts[level], weights[level]
             step = time_step / substeps
             z[:], links[:], points[:] = 0.0, 0.0, 0.0
-            for i in range(LANES):
-                item = begin + min(i, width - 1)  # lanes to spare repeat the last
-                p, t = item // n, item % n
-                for d in range(6):
-                    z[rows[d] + i] = start[p if len(start) > 1 else 0, t, 0, d]
-                own_discs[i] = discs[p]
+            shifted = False
             for h in range(horizon):
                 for i in range(LANES):
-                    item = begin + min(i, width - 1)
+                    item = begin + min(i, width - 1)  # lanes to spare repeat the last
                     p, t = item // n, item % n
-                    row = bodies[p, t * horizon + h if timed else 0, 0]
-                    touched[i] |= (row[_COM_X] != 0.0) | (row[_COM_Y] != 0.0)
                     if timed or h == 0:
-                        _set_properties(z, links, free, i, row, joints[p], normal_gravity, step)
+                        row = bodies[p, t * horizon + h if timed else 0, 0]
+                        if h == 0:
+                            for d in range(6):
+                                own[d] = start[p if len(start) > 1 else 0, t, 0, d]
+                            own_discs[i] = discs[p]
+                        else:
+                            lanes.get_state(z, i, own)
+                        shifted |= _set_properties(
+                            z, links, free, i, row, joints[p], normal_gravity, step
+                        )
+                        lanes.set_state(z, i, own)
                         slowing[i], patch_radius[i] = row[_MU] * normal_gravity, row[_RADIUS]
-                    z[C + i], z[S + i] = math.cos(z[A + i]), math.sin(z[A + i])
-                    _set_wrench(z, i, inputs[t, h, 0])
+                    else:
+                        lanes.align(z, i)
+                    lanes.set_wrench(z, i, inputs[t, h, 0])
                 for s in range(substeps):
                     if acting:
                         for i in range(width):
                             p, t = (begin + i) // n, (begin + i) % n
-                            for d in range(6):
-                                state[0, d] = z[rows[d] + i]
+                            lanes.get_state(z, i, own)
                             act(
                                 state, inputs[t, h], commands, command_parameters[p], forces,
                                 force_parameters[p], s / substeps, (s + 1) / substeps, signal,
                                 previous, command, wrench,
                             )  # fmt: skip
-                            _set_wrench(z, i, wrench[0])
+                            lanes.set_wrench(z, i, wrench[0])
+                    if shifted:
+                        lanes.lever(z)
                     _substep(z, links, points, free, slowing, patch_radius, step)
-                    _lose(z, touched)
+                    lanes.lose(z, touched)
+                    if watch or len(trail):
+                        lanes.locate(z)
                     if len(trail):
                         for i in range(width):
-                            trail[begin - first + i, steps, 0] = z[X + i]
-                            trail[begin - first + i, steps, 1] = z[Y + i]
+                            trail[begin - first + i, steps, 0] = z[X0 + i]
+                            trail[begin - first + i, steps, 1] = z[Y0 + i]
                         steps += 1
                     if watch:
-                        _watch(z, free.radius, free.obstacles, own_discs, touched)
+                        lanes.watch(z, free.radius, free.obstacles, own_discs, touched)
                 for i in range(width):
-                    at = out[begin - first + i, h, 0]
-                    for d in range(6):
-                        value = z[rows[d] + i]
-                        if len(counts) == 1:
-                            at[d] = value
-                        else:
-                            at[d] = weight * value + (at[d] if level else 0.0)
+                    lanes.get_state(z, i, own)
+                    lanes.add(out[begin - first + i, h, 0], own, weight, level, len(counts))
         left[begin - first : begin - first + width] = touched[:width]
 
 

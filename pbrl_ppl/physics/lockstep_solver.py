@@ -1,7 +1,8 @@
 """A substep of bodies side by side: Chipmunk's ``cpSpaceStep`` where nothing touches, in its order.
 
 Numba's cache looks at the file of the function called from Python alone: after an edit here, the
-cached `pbrl_ppl.physics.lockstep.rollout` is stale until ``__pycache__`` is removed.
+cached rollouts of `pbrl_ppl.physics.lockstep` and `pbrl_ppl.physics.lockstep_chain` are stale until
+``__pycache__`` is removed. The same goes for `lockstep_bodies` and `lockstep_joints`.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ NX, NY, CX, CY, MX, MY = (i * LANES for i in range(21, 27))
 T_MAX, TJ, COEF, AIM = (i * LANES for i in range(27, 31))
 # Weight that the body has beyond the scene's gravity.
 GX, GY = (i * LANES for i in range(31, 33))
-ROWS = 33 * LANES
+# Centre of mass in the body's frame; place of the origin; wrench on it.
+OX, OY, X0, Y0, UX, UY, UT = (i * LANES for i in range(33, 40))
+ROWS = 40 * LANES
 # A link: anchor on the body, the point it is held at, length; arm, stored impulse, bias; a hinge's
 # inverse tensor, of which a rod's mass is the first; a rod's direction.
 AX, AY, PX, PY, L, RX, RY, LX, LY, BX, BY, K, KXY, KYY, DX, DY = (i * LANES for i in range(16))
@@ -73,7 +76,7 @@ def accelerate(z, gravity, step):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True)
-def _limited(impulse, most):  # type: ignore[no-untyped-def]
+def limited(impulse, most):  # type: ignore[no-untyped-def]
     """An impulse no larger than ``most`` either way."""
     impulse = most if impulse > most else impulse
     return -most if impulse < -most else impulse
@@ -104,14 +107,14 @@ def solve_wheel(z):  # type: ignore[no-untyped-def]
         n_x, n_y, along, across = z[NX + i], z[NY + i], z[CX + i], z[CY + i]
         mass, moment, v_x, v_y, w = z[MI + i], z[II + i], z[VX + i], z[VY + i], z[W + i]
         most, old = z[JX_MAX + i], z[JX + i]
-        new = _limited(old + (n_x * v_x + n_y * v_y + along * w) * z[MX + i], most)
+        new = limited(old + (n_x * v_x + n_y * v_y + along * w) * z[MX + i], most)
         z[JX + i] = new
         j = new - old
         v_x -= n_x * j * mass
         v_y -= n_y * j * mass
         w -= moment * along * j
         most, old = z[JY_MAX + i], z[JY + i]
-        new = _limited(old + (n_x * v_y - n_y * v_x + across * w) * z[MY + i], most)
+        new = limited(old + (n_x * v_y - n_y * v_x + across * w) * z[MY + i], most)
         z[JY + i] = new
         j = new - old
         z[VX + i] = v_x + n_y * j * mass
@@ -200,7 +203,7 @@ def solve_pivot(z):  # type: ignore[no-untyped-def]
     """Friction in a hinge: the motor, then the damper."""
     for i in range(LANES):
         most, old, w = z[T_MAX + i], z[TJ + i], z[W + i]
-        new = _limited(old + w / z[II + i], most)
+        new = limited(old + w / z[II + i], most)
         z[TJ + i] = new
         w -= (new - old) * z[II + i]
         change = (z[AIM + i] - w) * z[COEF + i]
@@ -214,7 +217,8 @@ def place_patch(z, points, ring, slowing, radius, step):  # type: ignore[no-unty
     for p in range(len(ring)):
         own = points[p]
         for i in range(LANES):
-            at_x, at_y, c, s = ring[p, 0] * radius[i], ring[p, 1] * radius[i], z[C + i], z[S + i]
+            c, s = z[C + i], z[S + i]
+            at_x, at_y = ring[p, 0] * radius[i] - z[OX + i], ring[p, 1] * radius[i] - z[OY + i]
             r_x, r_y = c * at_x - s * at_y, s * at_x + c * at_y
             own[RX + i], own[RY + i] = r_x, r_y
             d_x, d_y = z[VX + i] - z[W + i] * r_y, z[VY + i] + z[W + i] * r_x
@@ -261,6 +265,6 @@ def solve_patch(z, points):  # type: ignore[no-untyped-def]
         for i in range(LANES):
             n_x, n_y, most, old = own[DX + i], own[DY + i], own[R_MAX + i], own[RJ + i]
             v = n_x * z[VX + i] + n_y * z[VY + i] + own[CROSS + i] * z[W + i]
-            new = _limited(old - v * own[RM + i], most)
+            new = limited(old - v * own[RM + i], most)
             own[RJ + i] = new
             _push(z, own, i, n_x * (new - old), n_y * (new - old))

@@ -163,14 +163,21 @@ def _state(world: World, i: int) -> Array:
     return np.array([*body.position, body.angle, *velocity, turn], dtype=float)
 
 
+def _centre(world: World, i: int) -> Array:
+    """As the state, of the centre of mass, which goes straight within a substep."""
+    body = world.bodies[i]
+    place = body.local_to_world(body.center_of_gravity)
+    return np.array([*place, body.angle, *body.velocity, body.angular_velocity], dtype=float)
+
+
 def _place_wheels(world: World, bodies: Array, step: float) -> None:
     """Put the rods' ends on the wheels' axes, as they will be when the engine solves for forces."""
     for wheel in world.wheels:
         row = bodies[wheel.body]
-        at_x, at_y, angle, v_x, v_y, omega = _state(world, wheel.body)
+        at_x, at_y, angle, v_x, v_y, omega = _centre(world, wheel.body)
         theta = angle + omega * step
         c, s = math.cos(theta), math.sin(theta)
-        x, y = row[COLUMN["w_x"]], row[COLUMN["w_y"]]
+        x, y = row[COLUMN["w_x"]] - row[COLUMN["com_x"]], row[COLUMN["w_y"]] - row[COLUMN["com_y"]]
         at_x, at_y = at_x + v_x * step + c * x - s * y, at_y + v_y * step + s * x + c * y
         c, s = math.cos(theta + row[COLUMN["w_theta"]]), math.sin(theta + row[COLUMN["w_theta"]])
         wheel.along_x.anchor_b, wheel.along_y.anchor_b = (at_x + c, at_y + s), (at_x - s, at_y + c)
@@ -180,14 +187,14 @@ def _place_patches(world: World, bodies: Array, step: float) -> None:
     """Put each point's rod along its velocity, and share its friction with what holds it."""
     for patch in world.patches:
         row = bodies[patch.body]
-        at_x, at_y, angle, v_x, v_y, omega = _state(world, patch.body)
+        at_x, at_y, angle, v_x, v_y, omega = _centre(world, patch.body)
         radius = row[COLUMN["patch_radius"]]
         slowing = row[COLUMN["patch_mu"]] * world.scene.normal_gravity
         most = slowing * row[COLUMN["mass"]] / len(RING)
         theta = angle + omega * step
         c, s = math.cos(theta), math.sin(theta)
         for (x, y), hold, rod in zip(RING, patch.holds, patch.rods, strict=True):
-            x, y = x * radius, y * radius
+            x, y = x * radius - row[COLUMN["com_x"]], y * radius - row[COLUMN["com_y"]]
             x, y = c * x - s * y, s * x + c * y
             along_x, along_y = v_x - omega * y, v_y + omega * x
             speed = math.sqrt(along_x * along_x + along_y * along_y)

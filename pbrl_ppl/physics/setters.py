@@ -80,6 +80,13 @@ def arm(row, theta):  # type: ignore[no-untyped-def]
 
 
 @numba.njit(nogil=True, cache=True)
+def _centre(row, state):  # type: ignore[no-untyped-def]
+    """Place and velocity of the centre of mass, which goes straight within a substep."""
+    x, y = arm(row, state[2])
+    return state[0] + x, state[1] + y, state[3] - state[5] * y, state[4] + state[5] * x
+
+
+@numba.njit(nogil=True, cache=True)
 def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
     """Put the bodies in a state: the engine's velocity is that of the centre of mass."""
     for i in range(len(world.bodies)):
@@ -135,9 +142,9 @@ def place_wheels(fn, world, bodies, state, axes, step):  # type: ignore[no-untyp
         i = world.wheel_body[j]
         theta = state[i, 2] + state[i, 5] * step
         c, s = math.cos(theta), math.sin(theta)
-        w_x, w_y = bodies[i, _W_X], bodies[i, _W_Y]
-        x = state[i, 0] + state[i, 3] * step + c * w_x - s * w_y
-        y = state[i, 1] + state[i, 4] * step + s * w_x + c * w_y
+        x, y, v_x, v_y = _centre(bodies[i], state[i])
+        w_x, w_y = bodies[i, _W_X] - bodies[i, _COM_X], bodies[i, _W_Y] - bodies[i, _COM_Y]
+        x, y = x + v_x * step + c * w_x - s * w_y, y + v_y * step + s * w_x + c * w_y
         c, s = c * axes[j, 0] - s * axes[j, 1], s * axes[j, 0] + c * axes[j, 1]
         call2(fn.cpPinJointSetAnchorB, world.wheels[0, j], x + c, y + s)
         call2(fn.cpPinJointSetAnchorB, world.wheels[1, j], x - s, y + c)
@@ -152,17 +159,19 @@ def place_patches(fn, world, bodies, state, step, normal_gravity):  # type: igno
         most = slowing * bodies[i, MASS] / len(world.ring)
         theta = state[i, 2] + state[i, 5] * step
         c, s = math.cos(theta), math.sin(theta)
+        at_x, at_y, v_x, v_y = _centre(bodies[i], state[i])
         for point in range(len(world.ring)):
-            x, y = world.ring[point, 0] * radius, world.ring[point, 1] * radius
+            x = world.ring[point, 0] * radius - bodies[i, _COM_X]
+            y = world.ring[point, 1] * radius - bodies[i, _COM_Y]
             x, y = c * x - s * y, s * x + c * y
-            along_x, along_y = state[i, 3] - state[i, 5] * y, state[i, 4] + state[i, 5] * x
+            along_x, along_y = v_x - state[i, 5] * y, v_y + state[i, 5] * x
             speed = math.sqrt(along_x * along_x + along_y * along_y)
             slow = STICKING * slowing * step
             share = 1.0 if speed >= slow else speed / slow
             if speed == 0.0:
                 along_x, speed = 1.0, 1.0
-            x = state[i, 0] + state[i, 3] * step + x + along_x / speed
-            y = state[i, 1] + state[i, 4] * step + y + along_y / speed
+            x = at_x + v_x * step + x + along_x / speed
+            y = at_y + v_y * step + y + along_y / speed
             call2(fn.cpPinJointSetAnchorB, world.patches[1, j, point], x, y)
             call1(fn.cpConstraintSetMaxForce, world.patches[0, j, point], (1.0 - share) * most)
             call1(fn.cpConstraintSetMaxForce, world.patches[1, j, point], share * most)
