@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.hinge import is_pivoted
 from pbrl_ppl.effects.stages import Disc, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -16,6 +17,8 @@ Array = NDArray[np.float64]
 
 #: Intervals in which the velocity changes most that are looked at, and discs tried at most.
 _HITS, _LOOKS = 16, 60
+#: A hinge changes a velocity all the time: a hit changes it by more than so many times the median.
+_STANDS_OUT = 3.0
 #: Radii of discs that a single hit suggests, as shares of the body's own.
 _SIZES = (0.25, 0.75, 2.0)
 #: Friction turns an impulse from the outline's normal: cosines and sines of what is tried.
@@ -41,7 +44,10 @@ def _scan(scene: Scene, history: History, body: Body) -> Any:
     begin, end = begin[seen], end[seen]
     change = np.linalg.norm(end[:, 3:5] - begin[:, 3:5], axis=1)
     order = np.argsort(-change)[:_HITS]
-    order = order[change[order] > 1e-9 * np.abs(begin[:, 3:5]).max(initial=0.0)]
+    least = 1e-9 * np.abs(begin[:, 3:5]).max(initial=0.0)
+    if is_pivoted(scene, body) and len(change):
+        least = max(least, _STANDS_OUT * float(np.median(change)))
+    order = order[change[order] > least]
     point, inward = _hits(body.shape, begin[order], end[order], scene.time_step)
     reach = body.shape.bounding_radius
     found = []

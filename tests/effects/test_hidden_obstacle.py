@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from pbrl_ppl.history import History
-from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.worlds import BY_NAME, body, predict, state
 
 SCAN = BY_NAME["hidden_obstacle"].scan
@@ -63,3 +63,21 @@ def test_a_hit_that_was_not_measured_is_left_out() -> None:
     table = history.to_dataframe()
     table.loc[table["step"] > 2, ["vx", "vy"]] = np.nan
     assert SCAN(scene, History.from_dataframe(table, scene), scene.bodies[0]).shape == (0, 3)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_swing_hits_nothing_unless_it_is_stopped(stopped) -> None:
+    """A hinge changes the velocity all the time; where a stop reverses it, something is there."""
+    arm = Body("arm", Shape.box(0.04, 0.4))
+    hinge = Joint("hinge", ("arm", "world"), (0.0, 0.18), (0.0, 0.0))
+    scene = Scene(time_step=DT, gravity=(0.0, -9.81), bodies=(arm,), joints=(hinge,))
+    time = DT * np.arange(60)
+    theta, omega = 0.5 * np.cos(4.0 * time), -2.0 * np.sin(4.0 * time)
+    if stopped:  # at the bottom, where it is fastest
+        omega *= np.sign(theta)
+        theta = abs(theta)
+    table = pd.DataFrame({"trajectory": 0, "time": time, "body": "arm", "theta": theta})
+    table = table.assign(omega=omega, force_x=0.0, force_y=0.0, torque=0.0)
+    history = History.from_dataframe(table, scene)
+    found = np.asarray(SCAN(scene, history, arm))
+    assert (len(found) > 0) == stopped
