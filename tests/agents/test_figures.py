@@ -44,7 +44,7 @@ def test_shopping_cart(tmp_path) -> None:
     assert "lwr-2.nc: this is not a NetCDF file" in broken.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wrong_model(tmp_path) -> None:
     done = ran(tmp_path, "06_wrong_model.py", "--quick", "--json", "result.json")
     assert done.returncode == 0, done.stderr
