@@ -12,6 +12,7 @@ import typer
 
 from pbrl_ppl.cli.answers import print_json
 from pbrl_ppl.cli.outputs import check_can_make
+from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
 from pbrl_ppl.cli.terminal import (
     FAILED,
     AsJson,
@@ -20,7 +21,6 @@ from pbrl_ppl.cli.terminal import (
     Seed,
     Velocities,
     interruptible,
-    load_files,
 )
 
 if TYPE_CHECKING:
@@ -43,13 +43,19 @@ def calibrate(
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     draws: Annotated[int, typer.Option(min=100, help="Posterior draws of each chain.")] = 1500,
     estimate_velocities: Velocities = False,
+    columns: Columns = None,
+    units: Units = None,
+    time_step: TimeStep = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
     """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
     with interruptible(f"finished replications are in {output}; the same command goes on"):
         check_can_make(output)
-        declared, design = load_files(scene, history, estimate_velocities)
+        declared, (design,) = load_own(
+            scene, history, estimate_velocities=estimate_velocities, columns=columns,
+            units=units, time_step=time_step,
+        )  # fmt: skip
         os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report
         from pbrl_ppl.history import write_atomically

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pbrl_ppl.cli.answers import print_json
+from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
 from pbrl_ppl.cli.terminal import (
     AsJson,
     HistoryFile,
@@ -17,7 +18,6 @@ from pbrl_ppl.cli.terminal import (
     Seed,
     Velocities,
     interruptible,
-    load_files,
     stages,
 )
 from pbrl_ppl.state import STATE
@@ -31,6 +31,9 @@ def check(
     scene: SceneFile,
     history: HistoryFile,
     estimate_velocities: Velocities = False,
+    columns: Columns = None,
+    units: Units = None,
+    time_step: TimeStep = None,
     prior: Annotated[
         bool, typer.Option(help="Whether to compare the data with draws from the prior.")
     ] = True,
@@ -41,7 +44,10 @@ def check(
 ) -> None:
     """Read a scene and a history: what is in them, what is missing, whether the prior fits."""
     with interruptible(), stages(quiet) as progress:
-        declared, loaded = load_files(scene, history, estimate_velocities)
+        declared, (loaded,) = load_own(
+            scene, history, estimate_velocities=estimate_velocities, columns=columns,
+            units=units, time_step=time_step,
+        )  # fmt: skip
         import numpy as np
 
         from pbrl_ppl.history import derived_velocities

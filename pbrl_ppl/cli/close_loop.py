@@ -98,15 +98,15 @@ def close_loop(
     Exits with 3 if the chains have not converged: then there is no verdict. With --many, exits with
     1 if some logs failed.
     """
-    names, measures = columns_of(columns or []), units_of(units or [])
     if many is not None:
         if not (scene is train is test is None):
             raise typer.BadParameter("SCENE, TRAIN and --test are in the manifest, with --many")
         close_loop_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
-            noise=named_numbers(noise, "--noise", "x=0.002"), columns=names, units=measures,
-            time_step=time_step, estimate_velocities=estimate_velocities,
+            noise=named_numbers(noise, "--noise", "x=0.002"), columns=columns_of(columns or []),
+            units=units_of(units or []), time_step=time_step,
+            estimate_velocities=estimate_velocities,
         )  # fmt: skip
         return
     if scene is None or train is None:
@@ -116,9 +116,11 @@ def close_loop(
     with interruptible(), stages(quiet, SHARES) as progress:
         check_can_make(output)  # before the long work, which would be lost
         progress("reading the scene and the histories")
-        declared, history, held_out = load_own(
-            scene, train, test, estimate_velocities, names, measures, time_step
-        )
+        declared, histories = load_own(
+            scene, train, *([] if test is None else [test]),
+            estimate_velocities=estimate_velocities, columns=columns, units=units,
+            time_step=time_step,
+        )  # fmt: skip
         declared = stated_noise(declared, noise)
         if substeps is not None:
             declared = declared.replace(substeps=substeps)
@@ -131,8 +133,7 @@ def close_loop(
         report.check_folder(output, overwrite)
         loop = report.close_loop(
             declared,
-            history,
-            held_out,
+            *histories,
             seed=seed,
             draws=draws,
             progress=progress,

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import typer
 
 from pbrl_ppl.cli.answers import print_json, print_table
+from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
 from pbrl_ppl.cli.terminal import (
     AsJson,
     Errors,
@@ -17,7 +18,6 @@ from pbrl_ppl.cli.terminal import (
     Substeps,
     Velocities,
     interruptible,
-    load_files,
     stages,
     stated_noise,
 )
@@ -33,6 +33,9 @@ def criticise(
     substeps: Substeps = None,
     seed: Seed = 1,
     estimate_velocities: Velocities = False,
+    columns: Columns = None,
+    units: Units = None,
+    time_step: TimeStep = None,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -43,7 +46,10 @@ def criticise(
     """
     with interruptible(), stages(quiet) as progress:
         progress("reading the scene and the history")
-        declared, loaded = load_files(scene, history, estimate_velocities)
+        declared, (loaded,) = load_own(
+            scene, history, estimate_velocities=estimate_velocities, columns=columns,
+            units=units, time_step=time_step,
+        )  # fmt: skip
         declared = stated_noise(declared, noise)
         progress("loading the model")
         from pbrl_ppl import criticism

@@ -15,6 +15,7 @@ import typer
 
 from pbrl_ppl.cli.answers import print_json, print_table
 from pbrl_ppl.cli.outputs import check_file
+from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
 from pbrl_ppl.cli.terminal import (
     INTERRUPTED,
     UNDECIDED,
@@ -28,7 +29,6 @@ from pbrl_ppl.cli.terminal import (
     Substeps,
     Velocities,
     interruptible,
-    load_files,
     stages,
     stated_noise,
 )
@@ -77,6 +77,9 @@ def fit(
     ] = None,
     seed: Seed = 1,
     estimate_velocities: Velocities = False,
+    columns: Columns = None,
+    units: Units = None,
+    time_step: TimeStep = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -91,7 +94,10 @@ def fit(
         if trajectories and (horizon > 1 or scalar):
             raise FitError("--horizon and --scalar-sigma are of single transitions: --transitions")
         progress("reading the scene and the history")
-        declared, loaded = load_files(scene, history, estimate_velocities)
+        declared, (loaded,) = load_own(
+            scene, history, estimate_velocities=estimate_velocities, columns=columns,
+            units=units, time_step=time_step,
+        )  # fmt: skip
         declared = stated_noise(declared, noise)
         progress("loading the sampler")
         os.environ.setdefault("MPLBACKEND", "Agg")

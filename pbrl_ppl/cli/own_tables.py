@@ -34,6 +34,10 @@ TimeStep = Annotated[
     ),
 ]
 
+Resample = Annotated[
+    bool, typer.Option("--resample", help="Interpolate uneven samples to the scene's time step.")
+]
+
 
 def columns_of(given: list[str]) -> dict[str, str | float]:
     """Column names, or numbers, from options such as ``x=pos_x,force_x=0``."""
@@ -65,29 +69,29 @@ def _pairs(given: list[str], option: str, example: str) -> list[tuple[str, str]]
 
 def load_own(
     scene: Path,
-    train: Path,
-    test: Path | None,
-    estimate_velocities: bool,
-    columns: dict[str, str | float],
-    units: dict[str, str],
-    time_step: float | None,
-) -> tuple[Scene, History, History | None]:
-    """Read a scene, with another time step if given, and one or two histories of it."""
+    *histories: Path,
+    estimate_velocities: bool = False,
+    columns: list[str] | None = None,
+    units: list[str] | None = None,
+    time_step: float | None = None,
+) -> tuple[Scene, list[History]]:
+    """Read a scene, with another time step if given, and histories of it."""
     from pbrl_ppl.scene import Scene
 
+    names, measures = columns_of(columns or []), units_of(units or [])
     declared = Scene.load(scene)  # its errors come before pandas is loaded
     if time_step is not None:
         declared = declared.replace(time_step=time_step)
     from pbrl_ppl.history import History
 
-    def load(path: Path) -> History:
-        return History.load(
+    return declared, [
+        History.load(
             path,
             declared,
             estimate_velocities=estimate_velocities,
-            columns=columns,
-            units=units,
+            columns=names,
+            units=measures,
             resample=time_step is not None,
         )
-
-    return declared, load(train), None if test is None else load(test)
+        for path in histories
+    ]

@@ -10,6 +10,7 @@ import typer
 
 from pbrl_ppl.cli.answers import print_json
 from pbrl_ppl.cli.outputs import check_file
+from pbrl_ppl.cli.own_tables import Columns, Resample, Units, columns_of, units_of
 from pbrl_ppl.cli.terminal import (
     AsJson,
     Errors,
@@ -60,6 +61,9 @@ def simulate(
     noise: Errors = None,
     seed: Seed = 1,
     estimate_velocities: Velocities = False,
+    columns: Columns = None,
+    units: Units = None,
+    resample: Resample = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -69,6 +73,7 @@ def simulate(
     Each trajectory is followed from its first complete state to its end. With --noise, errors of
     measuring are added; without, the states are the engine's.
     """
+    names, measures = columns_of(columns or []), units_of(units or [])
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".csv", ".parquet", ".nc"), overwrite)
         values = named_numbers(given, "--set", "mass=8")
@@ -78,7 +83,10 @@ def simulate(
         scene.replace(noise=errors)  # it is checked there
         from pbrl_ppl.history import History
 
-        recorded = History.load(history, scene, estimate_velocities=estimate_velocities)
+        recorded = History.load(
+            history, scene, estimate_velocities=estimate_velocities, columns=names, units=measures,
+            resample=resample,
+        )  # fmt: skip
         progress("simulating")
         simulated = _simulated(scene, layout, phi, substeps, recorded)
         result = _history(recorded, simulated, errors, seed, labelled=draws is not None)

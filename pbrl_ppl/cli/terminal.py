@@ -15,7 +15,6 @@ import typer
 from rich.console import Console
 
 if TYPE_CHECKING:
-    from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
 
 #: Exit codes: a failed calibration, a failed log, or a goal that was not reached; bad input as for
@@ -54,16 +53,6 @@ Velocities = Annotated[
 _ADVICE = {"thin": " or thin=", "resume": ", or go on with resume= this posterior"}
 #: An argument named in a message for Python.
 _ARGUMENT = re.compile(r"\b([a-z_]+)=(?:True\b)?(?=[\s,;.)]|$)")
-
-
-def load_files(scene: Path, history: Path, estimate_velocities: bool) -> tuple[Scene, History]:
-    """Read a scene and a history of it."""
-    from pbrl_ppl.scene import Scene
-
-    declared = Scene.load(scene)  # its errors come before pandas is loaded
-    from pbrl_ppl.history import History
-
-    return declared, History.load(history, declared, estimate_velocities=estimate_velocities)
 
 
 def named_numbers(given: list[str] | None, option: str, example: str) -> dict[str, float]:

@@ -11,6 +11,7 @@ import typer
 
 from pbrl_ppl.cli.answers import print_json
 from pbrl_ppl.cli.outputs import check_file
+from pbrl_ppl.cli.own_tables import Columns, Resample, Units, columns_of, units_of
 from pbrl_ppl.cli.terminal import (
     UNDECIDED,
     AsJson,
@@ -36,6 +37,9 @@ def update(
     ],
     seed: Seed = 1,
     estimate_velocities: Velocities = False,
+    columns: Columns = None,
+    units: Units = None,
+    resample: Resample = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -44,6 +48,7 @@ def update(
 
     Exits with 3 if the new posterior has not converged.
     """
+    names, measures = columns_of(columns or []), units_of(units or [])
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
         progress("reading the posterior and the history")
@@ -51,7 +56,10 @@ def update(
         from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
 
         idata = load_posterior(posterior)
-        new = History.load(history, scene_of(idata), estimate_velocities=estimate_velocities)
+        new = History.load(
+            history, scene_of(idata), estimate_velocities=estimate_velocities, columns=names,
+            units=measures, resample=resample,
+        )  # fmt: skip
         progress("updating")
         from pbrl_ppl.sampling import updating
 

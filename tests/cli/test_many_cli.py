@@ -136,6 +136,29 @@ def test_own_tables_of_one_log(
     np.testing.assert_allclose(observed[:, 0], 0.5 * 0.15 * np.arange(3), atol=1e-12)
 
 
+@pytest.mark.filterwarnings("default::pbrl_ppl.errors.ResamplingWarning")
+def test_every_command_that_reads_a_recording_takes_own_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("scene.toml").write_text(SCENE)
+    rows = [f"{90 * i},{45 * i},500,0" for i in range(5)]
+    Path("capture.csv").write_text("\n".join(["t,px,vx,yaw", *rows]) + "\n")
+    columns = "time=t,x=px,y=0,theta=yaw,vx=vx,vy=0,omega=0,force_x=0,force_y=0,torque=0"
+    own = ["--columns", columns, "--units", "time=ms,x=mm,vx=mm/s"]
+    files = ["scene.toml", "capture.csv"]
+    assert main(["check", *files, *own, "--time-step", "0.09", "--no-prior", "--json"]) == 0
+    assert '"transitions": 4' in capsys.readouterr().out
+    for command in (["fit", *files, "-o", "new.nc"], ["criticise", *files],
+                    ["calibrate", *files, "-o", "sbc"], ["update", "a.nc", files[1], "-o", "b.nc"],
+                    ["simulate", *files, "-o", "new.csv"]):  # fmt: skip
+        assert main([*command, "--columns", "x"]) == 2, command
+        assert "is not NAME=VALUE" in " ".join(capsys.readouterr().err.replace("│", " ").split())
+    simulated = ["simulate", *files, *own, "--resample", "-o", "new.csv", "--set", "mass=1"]
+    assert main([*simulated, "--set", "r=0.1", "--set", "mu_c=0.1"]) == 0
+    assert Path("new.csv").is_file()
+
+
 def test_a_process_that_dies_takes_no_other_with_it(tmp_path: Path) -> None:
     folders = [tmp_path / f"{times}" for times in range(3)]
     for folder in folders:
