@@ -27,6 +27,8 @@ FITTED = (
 )
 #: Of a room that does import them, the files whose tests stand on modes alone.
 ON_MODES = (
+    "agents/test_box2d_world.py",
+    "agents/test_revision.py",
     "criticism/test_criticism.py",
     "criticism/test_cross_validation.py",
     "criticism/test_misfit.py",

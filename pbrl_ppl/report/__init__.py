@@ -1,6 +1,7 @@
 """Plots and reports; the only place that imports matplotlib."""
 
 from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
+from pbrl_ppl.report.contact_plots import draw_contacts
 from pbrl_ppl.report.effect_plots import plot_candidates
 from pbrl_ppl.report.error_plots import plot_errors, plot_rollout
 from pbrl_ppl.report.loop import Loop, check_folder, close_loop, write_page
@@ -22,6 +23,7 @@ __all__ = [
     "check_folder",
     "close_loop",
     "close_loop_many",
+    "draw_contacts",
     "draw_goal",
     "draw_motion",
     "draw_scene",

@@ -55,6 +55,20 @@ def test_wrong_model(tmp_path) -> None:
     assert picture.stat().st_size > 10_000
 
 
+@pytest.mark.slow
+@pytest.mark.one_stack
+def test_scaling(tmp_path) -> None:
+    done = ran(tmp_path, "07_scaling.py", "--quick")
+    assert done.returncode == 0, done.stderr
+    with xr.open_dataset(tmp_path / "out" / "scaling" / "scaling.nc", engine="h5netcdf") as kept:
+        # a body of one object and four sectors, then two of two objects each
+        assert kept["conditions"].values.tolist() == [16.0, 2 * 256.0]
+        met, needed = (kept[name].values[0] for name in ("conditions_met", "observations_needed"))
+        assert (met > 1).all() and (met <= kept["conditions"].values).all()
+        assert needed[0] <= needed[1] < 50  # each box has to be pushed
+    assert (tmp_path / "out" / "scaling" / "scaling.png").stat().st_size > 10_000
+
+
 @pytest.mark.long
 def test_apartment(tmp_path) -> None:
     first = ran(tmp_path, "05_apartment.py", "--quick", "--only", "true", "oolwr")

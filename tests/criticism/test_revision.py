@@ -102,6 +102,7 @@ def test_an_effect_outside_the_catalogue_gets_no_wrong_name(make_history) -> Non
     assert found.unexplained.body == "puck"
 
 
+@pytest.mark.one_stack
 @pytest.mark.parametrize(
     ("name", "size", "richer"),
     [

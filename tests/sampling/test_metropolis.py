@@ -86,6 +86,7 @@ def test_correlated_gaussian_from_a_wrong_guess(factor: float) -> None:
             check(product, COVARIANCE[i, j])
 
 
+@pytest.mark.one_stack
 def test_learned_proposal_makes_large_moves() -> None:
     """On a Gaussian the adapted sampler beats a random walk's best by far."""
     found = sample(gaussian(), mean=MEAN, covariance=COVARIANCE)["x"]
@@ -98,6 +99,7 @@ def rough_gaussian(q: np.ndarray) -> float:
     return -0.5 * float((((q - MEAN - 0.5 * SD) / (1.5 * SD)) ** 2).sum())
 
 
+@pytest.mark.one_stack
 def test_a_bad_look_ahead_is_put_right() -> None:
     """The draws are exact whatever the cheap posterior is."""
     guess = {"mean": MEAN, "covariance": COVARIANCE}
@@ -107,6 +109,7 @@ def test_a_bad_look_ahead_is_put_right() -> None:
         check((found[..., i] - MEAN[i]) ** 2, COVARIANCE[i, i])
 
 
+@pytest.mark.one_stack
 def test_a_good_look_ahead_gives_nearly_independent_draws() -> None:
     precision = np.linalg.inv(COVARIANCE)
 
@@ -117,6 +120,7 @@ def test_a_good_look_ahead_gives_nearly_independent_draws() -> None:
     assert float(az.ess(found[..., 1], method="bulk")) > 0.8 * found[..., 1].size
 
 
+@pytest.mark.one_stack
 def test_blocks_that_depend_on_each_other() -> None:
     """Correlated variables in blocks of their own: slower, and still exact."""
     blocks = [block(MEAN[:1], COVARIANCE[:1, :1]), block(MEAN[1:], COVARIANCE[1:, 1:], first=1)]
@@ -141,6 +145,7 @@ def test_log_normal_and_beta() -> None:
     assert ((draws["share"] > 0) & (draws["share"] < 1)).all()
 
 
+@pytest.mark.one_stack
 def test_banana() -> None:
     """x ~ N(0, 1), y | x ~ N(x^2 / 2, 0.7^2): no Gaussian is close to it."""
     with pm.Model() as model:
@@ -154,6 +159,7 @@ def test_banana() -> None:
     check((draws["y"] - draws["x"] ** 2 / 2) ** 2, 0.7**2)
 
 
+@pytest.mark.one_stack
 def test_jumps_weigh_hills_that_no_walk_connects() -> None:
     """A narrow hill with 0.3 of the mass and a wide one 20 of its widths away; all start on one.
 

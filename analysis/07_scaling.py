@@ -1,0 +1,220 @@
+"""What the baselines and the physics prior have to learn, against the number of objects.
+
+    python analysis/07_scaling.py            # one to eight objects, ten seeds, in out/scaling
+    python analysis/07_scaling.py --quick    # one and two objects, a seed, for CI
+
+Boxes on casters stand in a square room, close together: one of them is pushed at a time, at random.
+Left: OO-LWR has a model for each condition of each body, of which there are 2^(|O| n_s) (section
+3.1.3 of the paper); shown are the bound and how many of them 1000 observations have met. Right: how
+many observations PBRL needs until the mass of every box is known to 5 % (the mode of the posterior
+against the truth, noise as of a motion capture). What is kept is in scaling.nc.
+"""
+
+from __future__ import annotations
+
+import argparse
+import warnings
+from importlib.metadata import version
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+import pbrl_ppl as pp
+from pbrl_ppl.history import write_atomically
+from pbrl_ppl.model import build_layout
+from pbrl_ppl.modes import find_mode
+from pbrl_ppl.physics import Simulator
+from pbrl_ppl.scene import Body, Scene, Shape, Wall
+from pbrl_ppl.state import STATE, WRENCH
+
+OUT = Path("out") / "scaling"
+#: Errors of measuring: m, m, rad, m/s, m/s, rad/s.
+NOISE = np.array([0.001, 0.001, 0.002, 0.005, 0.005, 0.01])
+#: Side of a box, and space between two (m).
+SIDE, GAP = 0.5, 0.3
+OBSERVED = 1000
+#: Observations of an episode, each from the start.
+LENGTH = 25
+TOLERANCE = 0.05
+CONTACTS = pp.SectorContacts()
+
+
+def room(objects: int) -> tuple[Scene, np.ndarray]:
+    """A room with so many boxes in rows, and their poses, shape (body, 3)."""
+    side = int(np.ceil(np.sqrt(objects)))
+    half = 0.5 * side * (SIDE + GAP) + 0.5
+    corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
+    walls = tuple(Wall(a, b) for a, b in zip(corners, corners[1:] + corners[:1], strict=True))
+    # where the wheel is, and what contacts are like, is known: what is left is a mass a body
+    known = {
+        "r": 0.2,
+        "mu_c": 0.3,
+        "w_x": 0.0,
+        "w_y": 0.0,
+        "w_theta": 0.0,
+        "mu_x": 0.05,
+        "mu_y": 0.3,
+    }
+    bodies = tuple(
+        Body(f"box{i + 1}", Shape.box(SIDE, SIDE), wheel=True, known=known) for i in range(objects)
+    )
+    place = np.arange(side) - 0.5 * (side - 1)
+    grid = np.array([(x, y, 0.0) for y in place for x in place])[:objects]
+    grid[:, :2] *= SIDE + GAP
+    scene = Scene(normal_gravity=9.81, time_step=0.25, substeps=10, bodies=bodies, walls=walls)
+    return scene, grid
+
+
+def explore(
+    objects: int, observations: int, seed: int
+) -> tuple[Scene, dict[str, float], pd.DataFrame]:
+    """So many random pushes, one box at a time: scene, true masses, and what was seen."""
+    rng = np.random.default_rng([seed, objects])
+    scene, grid = room(objects)
+    layout = build_layout(scene)
+    masses = rng.uniform(5.0, 20.0, objects)
+    simulator = Simulator(scene, layout, substeps=40)
+    rows: list[dict[str, object]] = []
+    for episode in range(-(-observations // LENGTH)):
+        state = np.zeros((objects, 6))
+        state[:, :3] = grid
+        for step in range(min(LENGTH, observations - episode * LENGTH) + 1):
+            last = step == min(LENGTH, observations - episode * LENGTH)
+            wrench = np.zeros((objects, 3))
+            wrench[rng.integers(objects)] = rng.normal(0.0, (60.0, 60.0, 6.0))
+            seen = state + NOISE * rng.standard_normal(state.shape)
+            for i, body in enumerate(scene.moving):
+                row = {"trajectory": episode, "step": step, "time": 0.25 * step, "body": body.name}
+                row |= dict(zip(STATE, seen[i], strict=True))
+                row |= dict(zip(WRENCH, np.full(3, np.nan) if last else wrench[i], strict=True))
+                rows.append(row)
+            if not last:
+                (state,) = simulator(masses, state[None], wrench[None, None])[:, 0]
+    return scene, dict(zip(layout.labels, masses, strict=True)), pd.DataFrame(rows)
+
+
+def conditions_met(scene: Scene, seen: pd.DataFrame) -> int:
+    """Pairs of a body and a condition, among the states from which something was pushed."""
+    pushed = seen[seen["force_x"].notna()]
+    poses = pushed[["x", "y", "theta"]].to_numpy().reshape(-1, len(scene.moving), 3)
+    found = CONTACTS.conditions(scene, poses)
+    return len({(i, condition) for state in found for i, condition in enumerate(state)})
+
+
+def observations_needed(scene: Scene, masses: dict[str, float], seen: pd.DataFrame) -> float:
+    """The least number of first observations whose mode has every mass to 5 %, by doubling."""
+    history = pp.History.from_dataframe(seen, scene)
+    truth = np.array(list(masses.values()))
+
+    def known(count: int) -> bool:
+        whole, rest = divmod(count, LENGTH)
+        frame = seen[
+            (seen["trajectory"] < whole) | ((seen["trajectory"] == whole) & (seen["step"] <= rest))
+        ]
+        if rest == 0:
+            frame = frame[frame["trajectory"] < whole]
+        frame = frame.copy()
+        ends = frame.groupby("trajectory")["step"].transform("max") == frame["step"]
+        frame.loc[ends, list(WRENCH)] = np.nan
+        part = pp.History.from_dataframe(frame, scene)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            mode = find_mode(pp.physics_model(scene, part, sigma="per_dimension").problem, seed=1)
+        return bool((np.abs(mode.phi / truth - 1.0) < TOLERANCE).all())
+
+    low, high = 0, 1
+    while not known(high):
+        low, high = high, 2 * high
+        if high > history.n_transitions:
+            return float("nan")
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if known(middle) else (middle, high)
+    return float(high)
+
+
+def measured(counts: list[int], seeds: list[int], observed: int) -> xr.Dataset:
+    """Everything the figure shows."""
+    met = np.empty((len(seeds), len(counts)))
+    needed = np.full(met.shape, np.nan)
+    for j, objects in enumerate(counts):
+        for i, seed in enumerate(seeds):
+            scene, masses, seen = explore(objects, observed, seed)
+            met[i, j] = conditions_met(scene, seen)
+            needed[i, j] = observations_needed(scene, masses, seen)
+            print(
+                f"{objects} objects, seed {seed}: {met[i, j]:.0f} conditions, "
+                f"{needed[i, j]:.0f} observations",
+                flush=True,
+            )
+    touchable = np.array(counts)  # the other boxes, and the walls
+    bound = np.array(counts) * 2.0 ** (touchable * CONTACTS.sectors)
+    return xr.Dataset(
+        {
+            "conditions_met": (("seed", "objects"), met),
+            "observations_needed": (("seed", "objects"), needed),
+            "conditions": ("objects", bound),
+        },
+        {"seed": seeds, "objects": counts},
+        {
+            "command": "python analysis/07_scaling.py",
+            "observations": observed,
+            "tolerance": TOLERANCE,
+            "pbrl_ppl": version("pbrl_ppl"),
+        },
+    )
+
+
+def drawn(found: xr.Dataset, path: Path) -> None:
+    """The two panels."""
+    figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
+    objects = found["objects"]
+    left.semilogy(
+        objects, found["conditions"], "o-", color="#D55E00", label="possible: $|O|\\,2^{|O| n_s}$"
+    )
+    for name, axes, label in (
+        ("conditions_met", left, f"met in {found.attrs['observations']} observations"),
+        ("observations_needed", right, "PBRL, every mass to 5 %"),
+    ):
+        middle = found[name].median("seed")
+        low, high = (found[name].quantile(q, "seed") for q in (0.0, 1.0))
+        axes.errorbar(
+            objects,
+            middle,
+            [middle - low, high - middle],
+            fmt="o-",
+            color="#0072B2",
+            capsize=3,
+            label=label,
+        )
+    left.set(xlabel="objects", ylabel="models of OO-LWR")
+    right.set(xlabel="objects", ylabel="observations", ylim=(0, None))
+    for axes in (left, right):
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.legend(frameon=False)
+    figure.savefig(path, dpi=130)
+
+
+def main() -> None:
+    """Measure, keep and draw."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--quick", action="store_true", help="one and two objects, a seed")
+    parser.add_argument("--out", type=Path, default=OUT)
+    options = parser.parse_args()
+    counts, seeds, observed = (
+        ([1, 2], [1], 50) if options.quick else (list(range(1, 9)), list(range(1, 11)), OBSERVED)
+    )
+    options.out.mkdir(parents=True, exist_ok=True)
+    found = measured(counts, seeds, observed)
+    write_atomically(
+        options.out / "scaling.nc", lambda path: found.to_netcdf(path, engine="h5netcdf")
+    )
+    drawn(found, options.out / "scaling.png")
+    print(f"figure: {options.out / 'scaling.png'}")
+
+
+if __name__ == "__main__":
+    main()
