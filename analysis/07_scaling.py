@@ -76,7 +76,7 @@ def explore(
     scene, grid = room(objects)
     layout = build_layout(scene)
     masses = rng.uniform(5.0, 20.0, objects)
-    simulator = Simulator(scene, layout, substeps=40)
+    simulator = Simulator(scene, layout, substeps=100)
     rows: list[dict[str, object]] = []
     for episode in range(-(-observations // LENGTH)):
         state = np.zeros((objects, 6))
@@ -84,7 +84,7 @@ def explore(
         for step in range(min(LENGTH, observations - episode * LENGTH) + 1):
             last = step == min(LENGTH, observations - episode * LENGTH)
             wrench = np.zeros((objects, 3))
-            wrench[rng.integers(objects)] = rng.normal(0.0, (60.0, 60.0, 6.0))
+            wrench[rng.integers(objects)] = rng.normal(0.0, (25.0, 25.0, 2.0))
             seen = state + NOISE * rng.standard_normal(state.shape)
             for i, body in enumerate(scene.moving):
                 row = {"trajectory": episode, "step": step, "time": 0.25 * step, "body": body.name}

@@ -42,7 +42,7 @@ from tests.helpers.histories import simulated_history
 
 KNOWN = {"r": 0.2, "mu_c": 0.3}
 PUCKS = {"mass": [2.0, 3.0], "linear_drag_coefficient": [0.5, 1.0]}
-QUICK = {"draws": 600, "tune": 300, "chains": 2, "cores": 1, "progress": False}
+QUICK = {"draws": 1000, "tune": 300, "chains": 2, "cores": 1, "progress": False}
 
 
 def pucks(names="ab") -> Scene:
