@@ -6,7 +6,7 @@ PYTEST_ARGS ?=
 BIN := $(VENV)/bin
 CART := models/shopping_cart
 
-.PHONY: demo test test-fast test-generation test-long lint notebooks clean
+.PHONY: demo test test-fast test-generation test-long lint notebooks docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
@@ -44,6 +44,10 @@ notebooks: $(VENV)/.installed-docs
 	    $(BIN)/jupytext --to ipynb --set-kernel python3 --execute --run-path . --output $$page $$notebook \
 	        && $(BIN)/jupyter-nbconvert --to html $$page || exit 1; \
 	done
+
+# warnings are errors; notebooks have their pictures where `make notebooks` was run before
+docs: $(VENV)/.installed-docs
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file analysis/docs/mkdocs.yml
 
 clean:
 	rm -rf .venv .venv-next build out *.egg-info

@@ -52,6 +52,14 @@ def test_all_are_run_here_and_in_the_index() -> None:
     assert [name for name in NOTEBOOKS if f'run("{name}"' in here] == NOTEBOOKS
 
 
+@pytest.mark.parametrize("name", NOTEBOOKS)
+def test_figures_of_the_package_are_shown(name) -> None:
+    """They are not pyplot's: a kernel that has not drawn yet would print `<Figure size ...>`."""
+    text = (FOLDER / name).read_text()
+    if re.search(r"^from pbrl_ppl\.report import .*\bplot_", text, re.M):
+        assert "# %%\n# %matplotlib inline\n" in text
+
+
 def test_from_a_log_to_a_posterior(run, tmp_path) -> None:
     names = run("01_log_to_posterior.py", TRAJECTORIES=3, METHOD="laplace", DRAWS=100)
     # the castor's resistance is not in this model, and passes for a little mass
@@ -76,11 +84,14 @@ def test_bayesian_workflow(run, tmp_path) -> None:
 
 def test_closing_the_loop(run, tmp_path, capsys) -> None:
     none = tmp_path / "nowhere"
-    names = run("03_closing_the_loop.py", TRAJECTORIES=3, METHOD="laplace", PENDULUM=none)
+    absent = {"PENDULUM": none, "BLOCK": none}
+    names = run("03_closing_the_loop.py", TRAJECTORIES=3, METHOD="laplace", **absent)
     cart = names["cart"]
     assert [added.effect for added in cart.added] == ["angular_drag"]
     assert cart.added[0].parameters["coefficient"].mean == pytest.approx(1.2, rel=0.1)
-    assert "skipped: the measured pendulum is not here" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "skipped: the measured pendulum is not here" in said
+    assert "skipped: the measured block is not here" in said
     assert (tmp_path / "03_cart.html").is_file()
     assert pictures(tmp_path) == {"03_candidates", "03_errors", "03_rollout"}
 
@@ -102,3 +113,33 @@ def test_planning(run, tmp_path) -> None:
     assert float(names["end"].sel(state="x").mean()) == pytest.approx(2.0, abs=0.3)
     assert "scene" not in names
     assert pictures(tmp_path) == {"05_plan"}
+
+
+def test_figures_of_the_paper(run, tmp_path) -> None:
+    """What its text says of the kept episodes is what they say."""
+    names = run("06_figures_of_the_paper.py", RESAMPLES=99)
+    free, noisy = (names["tables"][panel] for panel in "ab")
+    assert list(free["reached the goal"]) == [10, 10, 7, 4]
+    assert list(noisy["reached the goal"]) == [10, 10, 2, 2]
+    bumps = "steps with bumps, mean"
+    assert free.loc["OO-LWR", bumps] < free.loc["PBRL", bumps]
+    assert noisy.loc["OO-LWR", bumps] > noisy.loc["PBRL", bumps]
+    steps = free["steps, median of those"]
+    assert 4 <= steps["PBRL"] - steps["true model"] < 5 and steps["OO-LWR"] > 2 * steps["PBRL"]
+    assert names["right_after_two"] == 9
+    first = names["first"].dropna("seed")
+    assert (first.size, float(first.min()), float(first.max())) == (9, 7, 10)
+    assert pictures(tmp_path) == {"06_figure_4ab", "06_learned", "06_bumps"}
+
+
+def test_many_robots(run, tmp_path, monkeypatch) -> None:
+    """The robots' reports have no pictures here: drawing those takes most of the time."""
+    monkeypatch.setattr("pbrl_ppl.report.page._picture", lambda draw: {"wide": "", "narrow": ""})
+    names = run("07_many_robots.py", ROBOTS=2, TRAJECTORIES=4, INTERVALS=10)
+    assert names["found"] == names["dragged"] == ["puck2"]
+    assert list(names["loops"].table()["verdict"]) == ["adequate", "effects-added"]
+    assert names["pooled"].left_out == ("linear_drag_coefficient[puck]",)
+    assert names["robots"]["median"].to_numpy() == pytest.approx(names["true_mass"], rel=0.03)
+    width = names["known"]["97 %"] / names["known"]["3 %"]
+    assert width["the kind"] < 0.1 * width["Table 1"]
+    assert pictures(tmp_path) == {"07_masses"}

@@ -20,7 +20,7 @@ import xarray as xr
 from scipy import stats
 
 KEPT = Path(__file__).parents[1] / "results"
-#: True values of what the cart's pushes can tell (its wheel never slides sideways: mu_y is open).
+#: True values of what two steps can tell (mu_y is open until the wheel slides sideways).
 TRUTH = {"mass[cart]": 8.0, "w_x[cart]": -0.25, "mu_x[cart]": 0.04}
 #: Steps after which parameters are looked at, and how near is right (a share).
 LEARNED, RIGHT = 2, 0.03

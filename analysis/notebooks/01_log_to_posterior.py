@@ -5,6 +5,7 @@
 # reads both, checks them, infers what is not known, looks at the result and saves it as a file.
 
 # %%
+# %matplotlib inline
 import warnings
 from pathlib import Path
 

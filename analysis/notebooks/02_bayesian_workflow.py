@@ -10,6 +10,7 @@
 # rotation.
 
 # %%
+# %matplotlib inline
 import warnings
 from pathlib import Path
 

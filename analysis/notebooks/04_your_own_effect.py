@@ -6,6 +6,7 @@
 # report. It is passed in; there is no registry.
 
 # %%
+# %matplotlib inline
 import warnings
 from pathlib import Path
 

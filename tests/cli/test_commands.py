@@ -213,12 +213,12 @@ def test_new_asks(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
 
 
 def test_table_1_is_told_as_it_is() -> None:
-    """In the README and in new scenes."""
+    """In the docs and in new scenes."""
     priors = table1(Body("cart", Shape.box(1.0, 0.6)))
-    readme = (ROOT / "README.md").read_text()
+    page = (ROOT / "analysis" / "docs" / "pages" / "reference" / "formats.md").read_text()
     for name in ("mass", "r", "mu_c"):
         own = priors[name]
-        row = next(line for line in readme.splitlines() if line.startswith(f"| `{name}`"))
+        row = next(line for line in page.splitlines() if line.startswith(f"| `{name}`"))
         line = next(each for each in _HEAD.splitlines() if each.startswith(f"#   {name} "))
         for text in (row, line):
             assert f"mu = {own.mu}" in text and f"sigma = {own.sigma}" in text

@@ -1,0 +1,124 @@
+"""Pages that are made of the repository's files, and links between files as links between pages."""
+
+import ast
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import jupytext
+import nbformat
+import typer
+from mkdocs.structure.files import File, Files
+from nbconvert import MarkdownExporter
+
+ROOT = Path(__file__).parents[2]
+NOTEBOOKS = ROOT / "analysis" / "notebooks"
+#: Executed ones, where `make notebooks` was run.
+EXECUTED = ROOT / "out" / "notebooks"
+#: Files that are pages too.
+PAGES = {
+    "README.md": "index.md",
+    "analysis/benchmarks/README.md": "results/benchmarks.md",
+    "analysis/paper.md": "results/paper.md",
+    "analysis/notebooks/README.md": "notebooks/index.md",
+    "CONTRIBUTING.md": "project/contributing.md",
+    "CHANGELOG.md": "project/changelog.md",
+    **{f"models/{path.parent.name}/README.md": f"models/{path.parent.name}.md"
+       for path in ROOT.glob("models/*/README.md")},
+}  # fmt: skip
+_LINK = re.compile(r"(?<=\]\()(?![a-z]+:|[#/])([^)\s#]+)")
+
+
+def on_files(files: Files, config: Any) -> Files:
+    """Add what is made of other files."""
+    for source, page in PAGES.items():
+        files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
+    for script in sorted(NOTEBOOKS.glob("*.py")):
+        for uri, content in notebook(script).items():
+            files.append(File.generated(config, uri, content=content))
+    for room, content in rooms().items():
+        files.append(File.generated(config, f"reference/{room}.md", content=content))
+    files.append(File.generated(config, "reference/commands.md", content=commands()))
+    return files
+
+
+def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
+    """Turn links to the repository's files; what has no page is copied beside the pages."""
+    if not page.file.abs_src_path:
+        return markdown
+    folder = Path(page.file.abs_src_path).parent
+    pages = {ROOT / source: uri for source, uri in PAGES.items()}
+    pages |= {path: f"notebooks/{path.stem}.md" for path in NOTEBOOKS.glob("*.py")}
+    pages |= {Path(file.abs_src_path): file.src_uri for file in files if file.abs_src_path}
+
+    def turned(match: re.Match[str]) -> str:
+        target = (folder / match[1]).resolve()
+        if target not in pages:
+            if not target.is_file() or not target.is_relative_to(ROOT):
+                return match[0]  # which the build then complains of
+            uri = f"files/{target.relative_to(ROOT)}"
+            # as text, so that a browser shows it
+            shown = uri + ".txt" if target.suffix in (".py", ".toml", ".md") else uri
+            pages[target] = shown
+            files.append(File.generated(config, shown, content=target.read_bytes()))
+        return os.path.relpath(pages[target], Path(page.file.src_uri).parent)
+
+    return _LINK.sub(turned, markdown)
+
+
+def notebook(script: Path) -> dict[str, str | bytes]:
+    """A notebook's page and its pictures; without what it shows if it was not run as it is now."""
+    book, run = jupytext.read(script), EXECUTED / f"{script.stem}.ipynb"
+    note = "*Not run when this page was made: `make notebooks docs` shows its pictures and tables.*"
+    if run.is_file():
+        executed = nbformat.read(run, as_version=4)
+        if [cell.source for cell in executed.cells] == [cell.source for cell in book.cells]:
+            book, note = executed, ""
+    text, resources = MarkdownExporter().from_notebook_node(
+        book, {"unique_key": script.stem, "output_files_dir": "."}
+    )
+    text = re.sub(r"<style scoped>.*?</style>", "", text, flags=re.S)
+    text = re.sub(r"\x1b\[[0-9;]*m", "", text)
+    heading, rest = text.lstrip().split("\n", 1)
+    kept = f"files/analysis/notebooks/{script.name}.txt"
+    outputs = {f"notebooks/{Path(name).name}": it for name, it in resources["outputs"].items()}
+    page = f"{heading}\n\n[The script](../{kept}). {note}\n{rest}"
+    return {f"notebooks/{script.stem}.md": page, kept: script.read_text(), **outputs}
+
+
+def rooms() -> dict[str, str]:
+    """The reference's pages: the public names of each room, and the errors."""
+    found: dict[str, list[str]] = {}
+    for statement in ast.parse((ROOT / "pbrl_ppl" / "__init__.pyi").read_text()).body:
+        if isinstance(statement, ast.ImportFrom):
+            names = found.setdefault(str(statement.module), [])
+            names += [alias.name for alias in statement.names]
+    tree = ast.parse((ROOT / "pbrl_ppl" / "errors.py").read_text())
+    found["errors"] = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
+    pages = {}
+    for room, names in found.items():
+        path = ROOT / "pbrl_ppl" / room
+        code = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+        said = ast.get_docstring(ast.parse(code.read_text())) or ""
+        where = "pbrl_ppl.errors" if room == "errors" else "pbrl_ppl"
+        blocks = "".join(f"::: {where}.{name}\n\n" for name in names)
+        pages[room] = f"# {room.capitalize()}\n\n{said}\n\n{blocks}"
+    return pages
+
+
+def commands() -> str:
+    """Every command with its arguments and options."""
+    from pbrl_ppl.cli.app import COMMANDS, app
+
+    text = ["# Commands", "", app.info.epilog or ""]
+    made = typer.main.get_command(app).commands
+    for name, (_, example) in COMMANDS.items():
+        text += ["", f"## pbrl-ppl {name}", "", made[name].help or "", "", f"    {example}", ""]
+        text += ["| argument or option | |", "|---|---|"]
+        for each in made[name].params:
+            flags = each.opts + each.secondary_opts
+            shown = ", ".join(flags) if flags[0].startswith("-") else str(each.name).upper()
+            said = " ".join((getattr(each, "help", None) or "").split()).replace("|", "\\|")
+            text.append(f"| `{shown}` | {said} |")
+    return "\n".join(text)
