@@ -17,11 +17,13 @@ from pbrl_ppl.criticism.results import (
     ResidualTest,
     Unexplained,
 )
-from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
+from pbrl_ppl.criticism.rivals import Rival, fit_rivals, kept_groups, named_effects
+from pbrl_ppl.criticism.score import DECISIVE, Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.criticism.selection import MIN_ELPD, MIN_ELPD_SE, TRIED
 
 __all__ = [
     "ADEQUATE",
+    "DECISIVE",
     "MIN_ELPD",
     "MIN_ELPD_SE",
     "NOT_CONVERGED",
@@ -35,12 +37,16 @@ __all__ = [
     "PriorCheck",
     "Ranking",
     "ResidualTest",
+    "Rival",
     "Signature",
     "Unexplained",
     "criticise",
     "cross_validated",
+    "fit_rivals",
     "folds",
     "inseparable",
+    "kept_groups",
+    "named_effects",
     "prior_predictive_check",
     "rank_candidates",
     "revise",
