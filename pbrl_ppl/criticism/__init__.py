@@ -9,6 +9,7 @@ from pbrl_ppl.criticism.prior_check import (
     telling_horizon,
 )
 from pbrl_ppl.criticism.ranking import Ranking, criticise
+from pbrl_ppl.criticism.remainder import learn_remainder
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
@@ -46,6 +47,7 @@ __all__ = [
     "folds",
     "inseparable",
     "kept_groups",
+    "learn_remainder",
     "named_effects",
     "prior_predictive_check",
     "rank_candidates",

@@ -110,6 +110,26 @@ def named_effects(
     return found
 
 
+def likeliest_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
+    """The mode of a posterior's model, from its likeliest draw on.
+
+    Raises
+    ------
+    PosteriorError
+        If the posterior is of single transitions.
+    """
+    problem = problem_of(posterior, catalogue).with_physics(threads=2)
+    if problem.trajectories is None:
+        raise PosteriorError(
+            "posterior: it is of single transitions, which do not tell errors of measuring from"
+            " unexplained motion; take after.nc of close_loop, or fit with trajectories=True"
+        )
+    phi, sigma = parameter_draws(problem, posterior)
+    likelihood = group(posterior, "log_likelihood")["next_state"].sum("transition")
+    best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
+    return trajectory_mode(problem, phi[best], sigma[best])
+
+
 def fit_rivals(
     posterior: Any, effects: Sequence[Attached], catalogue: Iterable[Effect], draws: int, seed: int
 ) -> list[Rival]:
@@ -136,28 +156,19 @@ def fit_rivals(
     PosteriorError
         If the posterior is of single transitions, or holds fewer draws.
     """
-    problem = problem_of(posterior, catalogue)
-    if problem.trajectories is None:
-        raise PosteriorError(
-            "posterior: it is of single transitions, which do not tell errors of measuring from"
-            " unexplained motion; take after.nc of close_loop, or fit with trajectories=True"
-        )
+    own = likeliest_mode(posterior, catalogue)
+    problem = own.problem
     phi, sigma = parameter_draws(problem, posterior)
     if not 1 <= draws <= len(phi):
         raise PosteriorError(f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}")
-    likelihood = group(posterior, "log_likelihood")["next_state"].sum("transition")
-    best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
-    problem = problem.with_physics(threads=2)
     rng = np.random.default_rng(seed)
     present = [one for one in problem.physics.effects if one in effects]
-    own = trajectory_mode(problem, phi[best], sigma[best])
     base = own
     if present:
         others = tuple(one for one in problem.physics.effects if one not in effects)
         without = problem.with_physics(effects=others)
-        base = trajectory_mode(
-            without, without.layout.from_layout(problem.layout, phi[best]), sigma[best]
-        )
+        begin = without.layout.from_layout(problem.layout, own.phi)
+        base = trajectory_mode(without, begin, own.sigma)
     usual = np.median(sigma, axis=0)
     found = []
     for attached in effects:
