@@ -40,9 +40,11 @@ from .planning import ActionSet as ActionSet
 from .planning import Dynamics as Dynamics
 from .planning import Goal as Goal
 from .planning import Plan as Plan
+from .planning import Suggestion as Suggestion
 from .planning import Target as Target
 from .planning import TransitionModel as TransitionModel
 from .planning import plan as plan
+from .planning import suggest_actions as suggest_actions
 from .posterior import Identifiability as Identifiability
 from .posterior import identify as identify
 from .posterior import learned_library as learned_library

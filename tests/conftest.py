@@ -22,6 +22,7 @@ FITTED = (
     "modes/test_configurations.py",
     "modes/test_index_priors.py",
     "modes/test_joints.py",
+    "planning/test_experiments.py",
     "planning/test_planning_files.py",
     "planning/test_planning_modes.py",
 )

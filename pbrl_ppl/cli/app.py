@@ -19,6 +19,7 @@ from pbrl_ppl.cli.new import new
 from pbrl_ppl.cli.plan import plan
 from pbrl_ppl.cli.report import report
 from pbrl_ppl.cli.simulate import simulate
+from pbrl_ppl.cli.suggest import suggest
 from pbrl_ppl.cli.terminal import BAD_INPUT, in_options, interrupted, warnings_in_a_line
 from pbrl_ppl.cli.update import update
 from pbrl_ppl.errors import PbrlError
@@ -30,6 +31,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "fit": (fit, "pbrl-ppl fit scene.toml train.csv -o cart.nc"),
     "criticise": (criticise, "pbrl-ppl criticise scene.toml train.csv"),
     "close-loop": (close_loop, "pbrl-ppl close-loop scene.toml train.csv -o report/"),
+    "suggest": (suggest, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv"),
     "report": (report, "pbrl-ppl report cart.nc"),
     "update": (update, "pbrl-ppl update cart.nc since.csv -o new.nc"),
     "plan": (plan, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv"),
@@ -42,8 +44,9 @@ app = typer.Typer(
     name="pbrl-ppl",
     help="A physics engine as model prior, and a loop that closes on measured data.",
     epilog="Example: pbrl-ppl new --from shopping_cart. Exit codes: 0; 1 for a calibration that"
-    " failed or a goal that was not reached; 2 for bad usage or input, with one message on stderr;"
-    " 3 where chains have not converged; 130 after an interrupt.",
+    " failed, a goal that was not reached or effects that stay inseparable; 2 for bad usage or"
+    " input, with one message on stderr; 3 where chains have not converged; 130 after an"
+    " interrupt.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
@@ -62,9 +65,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        0; 1 for a calibration that failed, a goal that was not reached, or some of many logs that
-        failed; 2 for bad usage or bad input, with one message on stderr; 3 where chains have not
-        converged; 130 if interrupted.
+        0; 1 for a calibration that failed, a goal that was not reached, effects that no allowed
+        actions are expected to tell apart, or some of many logs that failed; 2 for bad usage or bad
+        input, with one message on stderr; 3 where chains have not converged; 130 if interrupted.
     """
     argv = sys.argv[1:] if argv is None else list(argv)
     options = _options_of(argv)

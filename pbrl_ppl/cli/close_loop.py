@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -26,6 +27,9 @@ from pbrl_ppl.cli.terminal import (
     stages,
     stated_noise,
 )
+
+if TYPE_CHECKING:
+    from pbrl_ppl.report import Loop
 
 #: Share of the time that is over when a stage begins, as measured on a recorded cart.
 SHARES = {
@@ -90,6 +94,14 @@ def close_loop(
         str | None,
         typer.Option(metavar="ADDRESS", help="A Dask scheduler that has the workers, for --many."),
     ] = None,
+    learn_remainder: Annotated[
+        bool,
+        typer.Option(
+            "--learn-remainder",
+            help="Where something stays unexplained, learn a force for it, into remainder.nc; it"
+            " gets no name.",
+        ),
+    ] = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -101,6 +113,8 @@ def close_loop(
     if many is not None:
         if not (scene is train is test is None):
             raise typer.BadParameter("SCENE, TRAIN and --test are in the manifest, with --many")
+        if learn_remainder:
+            raise typer.BadParameter("--learn-remainder is for one log; leave it, or --many")
         close_loop_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
@@ -141,12 +155,34 @@ def close_loop(
         progress("writing the report")
         source = report.Source(str(scene), str(train), str(test or ""), command_line(context))
         loop.save(output, overwrite=overwrite, source=source)
+        remainder = _remainder(loop, output, seed, progress) if learn_remainder else {}
     if as_json:
-        print_json(loop.findings.to_dict() | {"report": output / "report.html"})
+        print_json(loop.findings.to_dict() | {"report": output / "report.html"} | remainder)
     else:
         typer.echo(report.verdict_in_words(loop.findings))
         if unseen := report.unseen_in_words(loop.findings):
             typer.echo(unseen)
+        if remainder:
+            typer.echo(remainder["learned_remainder"]["words"])
         typer.echo(f"report: {output / 'report.html'}")
     if loop.verdict == NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
+
+
+def _remainder(
+    loop: Loop, folder: Path, seed: int, progress: Callable[[str], None]
+) -> dict[str, dict[str, Any]]:
+    """Learn what is left into a posterior file beside the others, or say why there is nothing."""
+    from pbrl_ppl.errors import FitError
+    from pbrl_ppl.posterior import save_posterior
+    from pbrl_ppl.report import remainder_in_words
+
+    path = folder / "remainder.nc"
+    path.unlink(missing_ok=True)  # of an earlier run
+    try:
+        learned = loop.learn_remainder(seed=seed, progress=progress)
+    except FitError as error:
+        return {"learned_remainder": {"words": str(error), "posterior": None}}
+    save_posterior(learned, path)
+    words = remainder_in_words(loop.posterior_after, learned)
+    return {"learned_remainder": {"words": words, "posterior": path}}

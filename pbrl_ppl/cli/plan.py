@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,6 +10,7 @@ import typer
 
 from pbrl_ppl.cli.answers import print_json
 from pbrl_ppl.cli.outputs import check_file
+from pbrl_ppl.cli.poses import pose
 from pbrl_ppl.cli.terminal import FAILED, AsJson, Overwrite, Quiet, Seed, interruptible, stages
 from pbrl_ppl.errors import GoalError
 
@@ -94,8 +94,8 @@ def plan(
                 raise GoalError("--goal: a file has the whole goal; drop the other options of it")
             wanted = Goal.load(goal[0])
         else:
-            wanted = Goal.of(dict(_pose(text, only, "--goal") for text in goal or ()), **given)
-        places = dict(_pose(text, only, "--start") for text in start or ())
+            wanted = Goal.of(dict(pose(text, only, "--goal") for text in goal or ()), **given)
+        places = dict(pose(text, only, "--start") for text in start or ())
         allowed = None if actions is None else ActionSet.load(actions)
         limit: dict[str, Any] = {} if nodes is None else {"nodes": nodes}
         progress("planning")
@@ -127,26 +127,3 @@ def plan(
             typer.echo(f"plan: {path}")
     if not result.reached:
         raise typer.Exit(FAILED)
-
-
-def _pose(text: str, bodies: Sequence[str], option: str) -> tuple[str, list[float]]:
-    """A body and its numbers from ``BODY=X,Y,THETA``; the body may be left out if there is one.
-
-    A coordinate that is free, ``-``, is None.
-    """
-    name, separator, numbers = text.rpartition("=")
-    if not separator:
-        if len(bodies) > 1:
-            raise GoalError(f"{option} {text}: say which body: {bodies[0]}={text}")
-        name = bodies[0]
-    values = []
-    for number in numbers.split(","):
-        try:
-            values.append(None if number.strip() == "-" else float(number))
-        except ValueError:
-            raise GoalError(
-                f"{option} {text}: {number.strip()!r} is not a number; expected BODY=X,Y,THETA"
-            ) from None
-    if option == "--start" and None in values:
-        raise GoalError(f"{option} {text}: a start has no free coordinates; give a number for -")
-    return name.strip(), values  # type: ignore[return-value]

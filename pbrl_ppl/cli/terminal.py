@@ -17,8 +17,9 @@ from rich.console import Console
 if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
 
-#: Exit codes: a failed calibration, a failed log, or a goal that was not reached; bad input as for
-#: bad usage; no verdict, for the chains have not converged; an interrupt as the shell has it.
+#: Exit codes: a failed calibration, a failed log, a goal that was not reached, or effects that stay
+#: inseparable; bad input as for bad usage; no verdict, for the chains have not converged; an
+#: interrupt as the shell has it.
 FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 
 SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.toml).")]

@@ -9,6 +9,7 @@ from pbrl_ppl.criticism.prior_check import (
     telling_horizon,
 )
 from pbrl_ppl.criticism.ranking import Ranking, criticise
+from pbrl_ppl.criticism.remainder import learn_remainder
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
@@ -17,11 +18,13 @@ from pbrl_ppl.criticism.results import (
     ResidualTest,
     Unexplained,
 )
-from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
+from pbrl_ppl.criticism.rivals import Rival, fit_rivals, kept_groups, named_effects
+from pbrl_ppl.criticism.score import DECISIVE, Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.criticism.selection import MIN_ELPD, MIN_ELPD_SE, TRIED
 
 __all__ = [
     "ADEQUATE",
+    "DECISIVE",
     "MIN_ELPD",
     "MIN_ELPD_SE",
     "NOT_CONVERGED",
@@ -35,12 +38,17 @@ __all__ = [
     "PriorCheck",
     "Ranking",
     "ResidualTest",
+    "Rival",
     "Signature",
     "Unexplained",
     "criticise",
     "cross_validated",
+    "fit_rivals",
     "folds",
     "inseparable",
+    "kept_groups",
+    "learn_remainder",
+    "named_effects",
     "prior_predictive_check",
     "rank_candidates",
     "revise",

@@ -26,6 +26,7 @@ from pbrl_ppl.criticism.results import (
     Numerical,
     ResidualTest,
 )
+from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
@@ -257,6 +258,8 @@ class _Loop:
             verdict = findings.UNEXPLAINED
         if not all(map(_converged, (models.before, models.after))):
             verdict = findings.NOT_CONVERGED
+        added = tuple(_added(step, revised, models.after) for step in steps)
+        keep_groups(models.after, added)
         return Findings(
             scene=self.scene,
             verdict=verdict,
@@ -264,7 +267,7 @@ class _Loop:
                 self.scene.substeps, revised.problem.physics.substeps, shift(revised)
             ),
             candidates=tuple(signature.candidate for signature in first),
-            added=tuple(_added(step, revised, models.after) for step in steps),
+            added=added,
             unexplained=misfit.unexplained,
             before=before,
             after=after,

@@ -76,7 +76,7 @@ class Selection:
                 signature for signature in waiting if signature.candidate.statistic >= enough
             ]
             waiting = [signature for signature in waiting if signature.candidate.statistic < enough]
-            fits = [(signature, self._refit(mode, signature)) for signature in leading]
+            fits = [(signature, refitted(mode, signature)) for signature in leading]
             ranks = {item: rank(item) for item in fits}
             while ranks:
                 best = max(ranks.values())
@@ -87,19 +87,6 @@ class Selection:
                 if step is not None:
                     return step
         return None
-
-    def _refit(self, mode: Mode, signature: Signature) -> Mode:
-        """Mode with the candidate in the model, under the same noise structure."""
-        attached = signature.attached
-        estimate = np.array(list(signature.candidate.estimate.values()))
-        if isinstance(attached.effect.stage, Structure):
-            return structure_mode(mode, attached, estimate)
-        effects = (*mode.problem.physics.effects, attached)
-        problem = mode.problem.with_physics(effects=effects)
-        layout = problem.layout
-        phi = layout.from_layout(mode.problem.layout, mode.phi)
-        phi[[layout.labels.index(label) for label in attached.labels]] = estimate
-        return trajectory_mode(problem, inside(layout.priors, phi), mode.sigma)
 
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
@@ -129,6 +116,20 @@ class Selection:
         problem = mode.problem.with_physics(effects=kept)
         phi = problem.layout.from_layout(mode.problem.layout, mode.phi)
         return trajectory_mode(problem, phi, mode.sigma)
+
+
+def refitted(mode: Mode, signature: Signature) -> Mode:
+    """Mode with the candidate in the model, under the same noise structure."""
+    attached = signature.attached
+    estimate = np.array(list(signature.candidate.estimate.values()))
+    if isinstance(attached.effect.stage, Structure):
+        return structure_mode(mode, attached, estimate)
+    effects = (*mode.problem.physics.effects, attached)
+    problem = mode.problem.with_physics(effects=effects)
+    layout = problem.layout
+    phi = layout.from_layout(mode.problem.layout, mode.phi)
+    phi[[layout.labels.index(label) for label in attached.labels]] = estimate
+    return trajectory_mode(problem, inside(layout.priors, phi), mode.sigma)
 
 
 def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:

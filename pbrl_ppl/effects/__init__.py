@@ -4,6 +4,11 @@ from pbrl_ppl.effects.attachment import attach, candidates
 from pbrl_ppl.effects.catalogue import catalogue
 from pbrl_ppl.effects.effect import Attached, Effect, EffectParameter, at_stage, needs_inputs
 from pbrl_ppl.effects.hinge import hanging_body
+from pbrl_ppl.effects.learned_remainder import (
+    LEARNED_REMAINDER,
+    LearnedRemainder,
+    learned_remainder,
+)
 from pbrl_ppl.effects.stages import (
     Clock,
     Command,
@@ -18,6 +23,7 @@ from pbrl_ppl.effects.stages import (
 )
 
 __all__ = [
+    "LEARNED_REMAINDER",
     "Attached",
     "Clock",
     "Command",
@@ -26,6 +32,7 @@ __all__ = [
     "EffectParameter",
     "Force",
     "Law",
+    "LearnedRemainder",
     "Noise",
     "Properties",
     "Sensor",
@@ -36,5 +43,6 @@ __all__ = [
     "candidates",
     "catalogue",
     "hanging_body",
+    "learned_remainder",
     "needs_inputs",
 ]

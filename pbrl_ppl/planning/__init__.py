@@ -2,6 +2,7 @@
 
 from pbrl_ppl.planning.actions import Action, ActionSet
 from pbrl_ppl.planning.dynamics import Dynamics
+from pbrl_ppl.planning.experiments import Suggestion, suggest_actions
 from pbrl_ppl.planning.goals import Goal, Target
 from pbrl_ppl.planning.planner import Plan, plan, start_state
 from pbrl_ppl.planning.transition_model import TransitionModel, rollout
@@ -12,9 +13,11 @@ __all__ = [
     "Dynamics",
     "Goal",
     "Plan",
+    "Suggestion",
     "Target",
     "TransitionModel",
     "plan",
     "rollout",
     "start_state",
+    "suggest_actions",
 ]

@@ -16,7 +16,7 @@ from pbrl_ppl.physics import Simulator, after_recording
 from pbrl_ppl.planning.noise import StepNoise, step_noise
 from pbrl_ppl.planning.transition_model import rollout
 from pbrl_ppl.posterior import draws as all_draws
-from pbrl_ppl.posterior import group, parameter_draws, problem_of
+from pbrl_ppl.posterior import group, known_effects, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH
 
@@ -103,7 +103,7 @@ class Dynamics:
         PosteriorError
             If it holds fewer draws.
         """
-        effects = tuple(effects)
+        effects = known_effects(idata, effects)
         problem = problem_of(idata, effects)  # all of its effects are declared in its scene
         phi, sigma = parameter_draws(problem, idata)
         if draws is None:

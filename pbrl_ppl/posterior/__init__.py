@@ -2,6 +2,7 @@
 
 from pbrl_ppl.posterior.comparison import Comparison, compare
 from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
+from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
 from pbrl_ppl.posterior.loo_pit import loo_pit
 from pbrl_ppl.posterior.origin import problem_of, versions
@@ -50,6 +51,7 @@ __all__ = [
     "groups",
     "identify",
     "interval",
+    "known_effects",
     "learned_library",
     "library_probabilities",
     "load_posterior",

@@ -10,11 +10,12 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Effect, attach, catalogue
+from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, attach, catalogue
 from pbrl_ppl.model import Observations, build_layout, whiten
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
 from pbrl_ppl.physics import Simulator
+from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.store import group, scalars, scene_of
 from pbrl_ppl.state import STATE
 
@@ -224,7 +225,7 @@ def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[st
         If the posterior holds no scene.
     """
     scene = scene_of(idata)
-    layout = build_layout(scene, attach(scene, (), effects))
+    layout = build_layout(scene, attach(scene, (), known_effects(idata, effects)))
     widths = _widths(layout, _prior_draws(layout), _flat(idata))
     return tuple(width.parameter for width in widths if width.verdict == PRIOR_ONLY)
 
@@ -243,7 +244,7 @@ def _prior_draws(layout: Layout) -> dict[str, Array]:
         f"{block.name}[{owner}]": prior.sample(rng, _PRIOR_DRAWS)
         for block in layout.blocks
         for owner, prior in zip(block.owners, block.priors, strict=True)
-        if owner not in free or block.of != "joint"
+        if (owner not in free or block.of != "joint") and LEARNED_REMAINDER not in block.name
     }
     return fold_draws(layout, draws)
 
@@ -320,7 +321,7 @@ def _sparse(rows: Array) -> Array:
 def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array, Array]:
     """Layout, the likeliest draw, and the whitened residual's derivative there."""
     scene = scene_of(idata)
-    attached = attach(scene, (), effects)
+    attached = attach(scene, (), known_effects(idata, effects))
     layout = build_layout(scene, attached)
     simulator = Simulator(scene, layout, attached, substeps=int(idata.attrs["substeps"]), threads=2)
     data, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]

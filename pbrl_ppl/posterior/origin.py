@@ -10,7 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.effects import Effect, attach, catalogue
+from pbrl_ppl.effects import (
+    LEARNED_REMAINDER,
+    Effect,
+    LearnedRemainder,
+    attach,
+    catalogue,
+)
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.model import (
     Noise,
@@ -20,6 +26,7 @@ from pbrl_ppl.model import (
     along_trajectories,
     sigma_prior,
 )
+from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.recording import with_recording
 from pbrl_ppl.posterior.store import attributes, draws, group, scene_of
 from pbrl_ppl.state import INPUT, STATE
@@ -45,6 +52,11 @@ def origin(problem: Problem, seed: int) -> dict[str, Any]:
         horizon=problem.data.horizon,
         **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
         **({} if problem.library is None else {"library": problem.library.to_json()}),
+        **dict(
+            (LEARNED_REMAINDER, attached.effect.table)
+            for attached in problem.physics.effects
+            if isinstance(attached.effect, LearnedRemainder)
+        ),
         substeps=problem.physics.substeps,
         together=list(problem.physics.together),
         sigma_prior=[[float(value) for value in median], float(spread)],
@@ -113,7 +125,7 @@ def problem_of(
     problem = Problem.of(
         scene,
         history,
-        attach(scene, (), effects),
+        attach(scene, (), known_effects(idata, effects)),
         horizon=int(attrs["horizon"]),
         substeps=int(attrs["substeps"]),
         columns=columns,

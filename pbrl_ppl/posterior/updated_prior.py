@@ -13,11 +13,12 @@ from scipy.optimize import brentq, least_squares
 from scipy.special import i0e, i1e
 from scipy.stats import truncnorm
 
-from pbrl_ppl.effects import Effect, attach, catalogue
+from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.model import build_layout, index_priors
 from pbrl_ppl.modes import ATTRIBUTE, index_law
 from pbrl_ppl.parameters import JOINT_INDICES, Prior, fold_draws
+from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.store import scalars, scene_of
 from pbrl_ppl.scene import Joint, Scene
 
@@ -64,12 +65,13 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
         model = pp.physics_model(scene, pp.History.load("tuesday.csv", scene))
     """
     scene = scene_of(idata)
-    layout = build_layout(scene, attach(scene, (), effects))
+    layout = build_layout(scene, attach(scene, (), known_effects(idata, effects)))
     posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
     draws = fold_draws(layout, posterior)
     found: dict[str, dict[str, dict[str, float]]] = {body.name: {} for body in scene.bodies}
     for block in layout.blocks:
-        if block.of != "body":
+        # a remainder is of one recording, and no physics that a scene could declare
+        if block.of != "body" or LEARNED_REMAINDER in block.name:
             continue
         for owner, prior in zip(block.owners, block.priors, strict=True):
             label = f"{block.name}[{owner}]"
@@ -85,7 +87,9 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
     bodies = []
     for body in scene.bodies:
         new = {name: tuple(hyper.items()) for name, hyper in found[body.name].items()}
-        bodies.append(replace(body, prior=tuple((dict(body.prior) | new).items())))
+        laws = tuple(name for name in body.effects if name != LEARNED_REMAINDER)
+        known = tuple((dict(body.prior) | new).items())
+        bodies.append(replace(body, prior=known, effects=laws))
     return scene.replace(bodies=tuple(bodies), joints=_joints(idata, scene))
 
 

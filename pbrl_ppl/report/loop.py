@@ -10,10 +10,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pbrl_ppl.criticism import Added, Candidate, Errors, Findings, Unexplained, revise
+from pbrl_ppl.criticism import (
+    UNEXPLAINED,
+    Added,
+    Candidate,
+    Errors,
+    Findings,
+    Unexplained,
+    learn_remainder,
+    revise,
+)
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import OutputError
+from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.posterior import save_posterior
 from pbrl_ppl.report.page import Source
@@ -85,6 +94,53 @@ class Loop:
     def posterior_after(self) -> Any:
         """Posterior of the revised model; the same where nothing was added."""
         return self.findings.posterior_after
+
+    def learn_remainder(
+        self,
+        body: str | None = None,
+        *,
+        seed: int = 0,
+        progress: Callable[[str], None] | None = None,
+    ) -> Any:
+        """Learn a force for what stays unexplained; the verdict and what was added stay.
+
+        Parameters
+        ----------
+        body : str, optional
+            Which body lacks it; where it shows most by default.
+        seed : int
+            The same seed gives the same posterior.
+        progress : callable, optional
+            Told the name of each stage.
+
+        Returns
+        -------
+        InferenceData or DataTree
+            The posterior with the effect ``learned_remainder``, to save, plan with and update; see
+            :func:`pbrl_ppl.criticism.learn_remainder`.
+
+        Raises
+        ------
+        FitError
+            If nothing is unexplained, or what is does not follow the body's velocity.
+
+        Examples
+        --------
+        ::
+
+            loop.verdict  # 'unexplained'
+            pp.save_posterior(loop.learn_remainder(seed=1), "remainder.nc")
+        """
+        if self.verdict != UNEXPLAINED:
+            raise FitError(f"nothing to learn: the verdict is {self.verdict}")
+        found = self.unexplained.body if self.unexplained is not None else ""
+        bodies = [moving.name for moving in self.findings.scene.dynamic]
+        body = body or found or (bodies[0] if len(bodies) == 1 else "")
+        if not body:
+            raise FitError(f"remainder: it shows on no body in particular; give body=, of {bodies}")
+        return learn_remainder(
+            self.posterior_after, body, catalogue=self.catalogue, seed=seed, progress=progress
+        )
 
     def __repr__(self) -> str:
         return f"Loop({verdict_in_words(self.findings)})"

@@ -3,15 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from typing import Any
 
 import numpy as np
 
 from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Candidate, Findings
+from pbrl_ppl.model import ACCELERATION
+from pbrl_ppl.posterior import draws, group
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 #: A size in SI units beyond which nothing is: what the data would show from here on, they never do.
 _NEVER = 1e6
+
+
+def remainder_in_words(before: Any, after: Any) -> str:
+    """What a learned remainder does, from the posteriors without and with it."""
+    sizes = [draws(each)[ACCELERATION].mean(axis=0) for each in (before, after)]
+    names = group(after, "posterior")[ACCELERATION]
+    worst = int(np.argmax(sizes[0] - sizes[1]))
+    name = str(names[names.dims[-1]].values[worst])
+    unit = "rad/s²" if name == "omega" else "m/s²"
+    return (
+        f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
+        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {unit}"
+    )
 
 
 def verdict_in_words(findings: Findings) -> str:

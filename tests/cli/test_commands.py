@@ -96,7 +96,7 @@ def test_options_are_alike() -> None:
             assert {"--json", "--quiet"} <= options, name
         if "--draws" in options:
             assert "--seed" in options, name
-    drawing = {"check", "fit", "close-loop", "plan", "simulate", "calibrate"}
+    drawing = {"check", "fit", "close-loop", "plan", "suggest", "simulate", "calibrate"}
     commands = typer.main.get_command(app).commands
     assert {
         name for name in COMMANDS if any("--draws" in each.opts for each in commands[name].params)

@@ -1,0 +1,104 @@
+"""A force that was learned from what no law explains: a sum of bumps, and no physics."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, final
+
+import numpy as np
+
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Force
+from pbrl_ppl.parameters import Prior
+
+#: The name that every one of them has: it is what it is, and no effect.
+LEARNED_REMAINDER = "learned_remainder"
+
+
+@final
+@dataclass(frozen=True)
+class LearnedRemainder(Effect):
+    """An effect of the force stage whose law is a table; see :func:`learned_remainder`.
+
+    Parameters
+    ----------
+    table : str
+        The table as JSON: what a posterior file holds of it.
+    """
+
+    table: str = ""
+
+    def __reduce__(self) -> tuple[Callable[[str], LearnedRemainder], tuple[str]]:
+        """Pickle the table: a law that is made of one cannot be."""
+        return learned_remainder, (self.table,)
+
+
+@lru_cache(maxsize=64)
+def learned_remainder(table: str) -> LearnedRemainder:
+    """The effect of a table; the same one for the same table.
+
+    The force is a sum of forms, each times a parameter with a standard normal prior, so that
+    together they are a Gaussian process; each form is a sum of Gaussian bumps over the body's
+    velocity in its own frame.
+
+    Parameters
+    ----------
+    table : str
+        JSON of ``centre`` (bump, 3) and ``width`` (bump, 3) in m/s, m/s and rad/s, ``output``
+        (bump,), 0 for the force forward, 1 sideways, 2 for the torque, and ``forms`` (form, bump)
+        in N and N m.
+    """
+    given = json.loads(table)
+    forms = np.array(given["forms"], dtype=float)
+    law = _law_of(
+        np.array(given["centre"], dtype=float),
+        1.0 / np.array(given["width"], dtype=float),
+        np.array(given["output"], dtype=np.int64),
+        forms,
+    )
+    prior = Prior("normal", sigma=1.0)
+    return LearnedRemainder(
+        LEARNED_REMAINDER,
+        tuple(EffectParameter(f"form{k + 1}", "1", prior) for k in range(len(forms))),
+        "a force that was learned from what is left, and that no law is known of",
+        "C. E. Rasmussen and C. K. I. Williams, Gaussian Processes for Machine Learning (2006)",
+        Force(law),
+        table=table,
+    )
+
+
+def _law_of(centre: Any, sharpness: Any, output: Any, forms: Any) -> Callable[..., None]:
+    """The law, with the table's numbers compiled into it."""
+    bumps = len(centre)
+    # a bump has a part in the forms of one process alone, which stand one after the other
+    begin = np.argmax(forms != 0, axis=0)
+    end = len(forms) - np.argmax(forms[::-1] != 0, axis=0)
+
+    def law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+        c, s = math.cos(state[2]), math.sin(state[2])
+        forward = c * state[3] + s * state[4]
+        sideways = c * state[4] - s * state[3]
+        along, across, torque = 0.0, 0.0, 0.0
+        for i in range(bumps):
+            a = (forward - centre[i, 0]) * sharpness[i, 0]
+            b = (sideways - centre[i, 1]) * sharpness[i, 1]
+            d = (state[5] - centre[i, 2]) * sharpness[i, 2]
+            size = 0.0
+            for k in range(begin[i], end[i]):
+                size += parameters[k] * forms[k, i]
+            size *= math.exp(-0.5 * (a * a + b * b + d * d))
+            if output[i] == 0:
+                along += size
+            elif output[i] == 1:
+                across += size
+            else:
+                torque += size
+        wrench[0] += c * along - s * across
+        wrench[1] += s * along + c * across
+        wrench[2] += torque
+
+    return law
