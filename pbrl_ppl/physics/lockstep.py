@@ -147,7 +147,7 @@ def rollout(  # type: ignore[no-untyped-def]
 
     All arrays are of one body, and ``out``, shape (last - first, H, 1, 6), of these items.
     ``trail``, if it has rows, is given x and y after every step of every number of substeps, shape
-    (last - first, step, 2). ``left``, shape (last - first,), says which items come near something
+    (last - first, step, 2). ``left``, shape (last - first,), is set for items that come near something
     or are lost: the engine is for them.
     """
     bodies, joints, discs, command_parameters, force_parameters = given
@@ -220,7 +220,8 @@ def rollout(  # type: ignore[no-untyped-def]
                 for i in range(width):
                     lanes.get_state(z, i, own)
                     lanes.add(out[begin - first + i, h, 0], own, weight, level, len(counts))
-        left[begin - first : begin - first + width] = touched[:width]
+        for i in range(width):  # it has what other bodies came near, too
+            left[begin - first + i] |= touched[i]
 
 
 @numba.njit(nogil=True, cache=True)

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.skipif(
     not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
 )
 
+PATHS = ("compiled", "plain")
 POST = Body("post", Shape.circle(0.05), static=True, pose=(3.0, -2.0, 0.7))
 
 
@@ -133,6 +134,27 @@ def test_what_comes_near_something_is_left_to_the_engine() -> None:
     assert 0.1 < touched.mean() < 0.9
     plain = Simulator(near.scene, near.layout, path="plain")(phi, start, inputs)
     np.testing.assert_allclose(near(phi, start, inputs), plain, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("at_the_wall", [(0,), (1,), (2,), (0, 2), ()])
+def test_one_of_several_bodies_at_a_wall_is_enough(at_the_wall) -> None:
+    """It bounces off, whichever it is, and whatever the others do."""
+    wall = Wall((-1.0, -90.0), (-1.0, 90.0))
+    known = {"mass": 2.0, "r": 0.5, "mu_c": 0.3}
+    bodies = tuple(Body(name, Shape.circle(0.2), known=known) for name in "abc")
+    scene = Scene(time_step=0.2, bodies=bodies, walls=(wall,))
+    start = np.zeros((40, 3, 6))
+    start[:, :, 0], start[:, :, 1] = 5.0, 10.0 * np.arange(3)
+    start[:, :, 3:] = np.random.default_rng(2).normal(0.0, 0.5, (40, 3, 3))
+    for body in at_the_wall:
+        start[:, body, 0], start[:, body, 3] = -0.7, -1.0
+    layout, actions = build_layout(scene), np.zeros((40, 2, 3, 3))
+    phi = np.zeros(layout.size)
+    ours, plain = (Simulator(scene, layout, path=path)(phi, start, actions) for path in PATHS)
+    np.testing.assert_allclose(ours, plain, rtol=1e-9, atol=1e-9)
+    bounced = (ours[:, -1, :, 3] > 0.4).all(axis=0) & (ours[:, -1, :, 0] > -0.85).all(axis=0)
+    assert np.flatnonzero(bounced).tolist() == list(at_the_wall)
+    assert (ours[:, -1, :, 0] > -0.85).all()
 
 
 def test_bodies_that_nothing_ties_are_free() -> None:
