@@ -331,16 +331,16 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array,
     best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
     draws = _flat(idata)
     phi = inside(layout.priors, np.array([draws[label][best] for label in layout.labels]))
-    names = ("sigma",) if "sigma" in draws else tuple(f"sigma[{n}]" for n in observations.names)
-    sigma = np.array([draws[name][best] for name in names])
+    told = dict.fromkeys(observations.names, np.inf) | dict(scene.noise)
+    inferred = {n: draws.get("sigma", draws.get(f"sigma[{n}]")) for n in observations.names}
+    sigma = np.array([told[n] if own is None else own[best] for n, own in inferred.items()])
 
     def residual(points: Array) -> Array:
         states = simulator(points, data["start"].to_numpy(), data["actions"].to_numpy())
         z = whiten(observations.residual(states), sigma, None)
         return np.nan_to_num(z.reshape(len(points), -1))
 
-    begin = 1e-3 * layout.scale(phi)
-    jacobian, _ = posterior_steps(residual, phi, *layout.bounds, begin)
+    jacobian, _ = posterior_steps(residual, phi, *layout.bounds, 1e-3 * layout.scale(phi))
     return layout, phi, jacobian
 
 

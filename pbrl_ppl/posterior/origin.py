@@ -28,7 +28,7 @@ from pbrl_ppl.model import (
 )
 from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.recording import with_recording
-from pbrl_ppl.posterior.store import attributes, draws, group, scene_of
+from pbrl_ppl.posterior.store import attributes, draws, group, has_one_sigma, scene_of
 from pbrl_ppl.state import INPUT, STATE
 
 PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
@@ -113,7 +113,7 @@ def problem_of(
         segments = Segments(start, actions, observed, none, none, actions)
         median, spread = sigma_prior(Observations(values, columns), segments)
     noise = Noise(
-        scalar=group(idata, "posterior")["sigma"].ndim == 2,  # chain and draw
+        scalar=has_one_sigma(idata),
         nu=float(attrs["nu"]) if "nu" in attrs else None,
         prior=(tuple(float(value) for value in median), float(spread)),
     )
@@ -139,7 +139,7 @@ def problem_of(
         return recorded
     # linearised where the posterior is
     named = draws(idata)
-    phi = problem.layout.to_vectors(named, len(named["sigma"]))
+    phi = problem.layout.to_vectors(named, len(next(iter(named.values()))))
     sigma = np.hstack([named[name].reshape(len(phi), -1) for name in recorded.noise_variables])
     likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
     best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())

@@ -151,7 +151,7 @@ def evaluate(
 def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
     """Draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
     named = draws(trace)
-    n = len(named["sigma"])
+    n = len(next(iter(named.values())))
     phi = problem.layout.to_vectors(named, n)
     sigma = np.hstack([named[name].reshape(n, -1) for name in problem.noise_variables])
     return phi, np.broadcast_to(sigma, (len(phi), len(problem.noise_prior[0])))
@@ -181,7 +181,8 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     posterior = posterior.copy()
     for block in problem.layout.blocks:
         posterior[block.name].attrs["units"] = block.unit
-    posterior["sigma"].attrs["units"] = "the unit of each state dimension"
+    if "sigma" in posterior:  # it is not where the errors of measuring are all stated
+        posterior["sigma"].attrs["units"] = "the unit of each state dimension"
     if problem.trajectories is not None:
         for name in {ACCELERATION, JOLT} & set(problem.noise_variables):
             posterior[name].attrs["units"] = "m/s^2, of omega rad/s^2"

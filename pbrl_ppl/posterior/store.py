@@ -49,6 +49,12 @@ def groups(idata: Any) -> dict[str, xr.Dataset]:
     return {name: idata[name] for name in idata.groups()}
 
 
+def has_one_sigma(idata: Any) -> bool:
+    """Whether one sigma is that of all state dimensions."""
+    posterior = group(idata, "posterior")  # without it where all errors of measuring are stated
+    return "sigma" in posterior and posterior["sigma"].ndim == 2  # chain and draw
+
+
 def group(idata: Any, name: str) -> xr.Dataset:
     """One group as a plain dataset.
 

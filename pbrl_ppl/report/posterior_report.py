@@ -13,7 +13,15 @@ from matplotlib.figure import Figure
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError, PosteriorError
-from pbrl_ppl.posterior import compare, group, groups, identify, scalars, scene_of
+from pbrl_ppl.posterior import (
+    compare,
+    group,
+    groups,
+    has_one_sigma,
+    identify,
+    scalars,
+    scene_of,
+)
 from pbrl_ppl.report.comparison_plots import (
     MOST_PRIORS,
     coverage,
@@ -233,7 +241,7 @@ def _refit(posterior: Any) -> str:
         options.append("trajectories=True")
     if int(attrs.get("horizon", 1)) > 1:
         options.append(f"horizon={int(attrs['horizon'])}")
-    if draws["sigma"].ndim == 2:
+    if has_one_sigma(posterior):
         options.append('sigma="scalar"')
     if "nu" in attrs:
         options.append(f"nu={float(attrs['nu']):g}")

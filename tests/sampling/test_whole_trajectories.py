@@ -13,8 +13,10 @@ from pbrl_ppl.model import along_trajectories, physics_model, simulated_trajecto
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, group, parameter_draws, problem_of
 from pbrl_ppl.posterior.store import scalars
+from pbrl_ppl.report import render_posterior
 from pbrl_ppl.scene import Body, Scene, Shape
-from tests.helpers.histories import simulated_history
+from pbrl_ppl.state import STATE
+from tests.helpers.histories import NOISE, simulated_history
 
 SCENE = Scene(
     time_step=0.1,
@@ -177,3 +179,24 @@ def test_a_first_contact_brings_a_noise_of_its_own() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error", RefitWarning)
         assert len(json.loads(quiet(pp.update, both, more, seed=3).attrs["updates"])) == 2
+
+
+@pytest.mark.parametrize("stated", [6, 3])
+def test_stated_errors_of_measuring_leave_a_whole_posterior(stated, tmp_path) -> None:
+    """Of all sensors or some: what is not inferred is no variable, and nothing asks for it."""
+    puck = Body("puck", Shape.circle(0.2), known={"r": 0.0, "mu_c": 0.0})
+    noise = dict(zip(STATE[:stated], NOISE, strict=False))
+    scene = Scene(time_step=0.1, substeps=4, bodies=(puck,), noise=noise)
+    made = {"trajectories": 3, "intervals": 5, "substeps": 8}
+    history = simulated_history(scene, {"mass": [2.0]}, seed=1, **made)
+    model = physics_model(scene, history, trajectories=True)
+    pp.save_posterior(quiet(pp.fit, model, method="laplace", seed=1), tmp_path / "puck.nc")
+    loaded = pp.load_posterior(tmp_path / "puck.nc")
+    assert ("sigma" in group(loaded, "posterior")) == (stated < 6)
+    masses = group(loaded, "posterior")["mass"].values
+    assert abs(masses.mean() - 2.0) < 4.5 * masses.std()  # a false alarm in 1e-5
+    assert pp.identify(loaded).table().loc["mass[puck]", "verdict"] == "informed"
+    few = made | {"trajectories": 1, "intervals": 1}
+    new = simulated_history(scene, {"mass": [2.0]}, seed=2, **few)
+    assert len(json.loads(quiet(pp.update, loaded, new, seed=1).attrs["updates"])) == 1
+    assert "mass" in render_posterior(loaded)
