@@ -147,8 +147,8 @@ def rollout(  # type: ignore[no-untyped-def]
 
     All arrays are of one body, and ``out``, shape (last - first, H, 1, 6), of these items.
     ``trail``, if it has rows, is given x and y after every step of every number of substeps, shape
-    (last - first, step, 2). ``left``, shape (last - first,), is set for items that come near something
-    or are lost: the engine is for them.
+    (last - first, step, 2). ``left``, shape (last - first,), is set for items that come near
+    something or are lost: the engine is for them.
     """
     bodies, joints, discs, command_parameters, force_parameters = given
     n, horizon = len(inputs), inputs.shape[1]

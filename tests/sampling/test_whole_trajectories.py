@@ -16,7 +16,7 @@ from pbrl_ppl.posterior.store import scalars
 from pbrl_ppl.report import render_posterior
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
-from tests.helpers.histories import NOISE, simulated_history
+from tests.helpers.histories import simulated_history
 
 SCENE = Scene(
     time_step=0.1,
