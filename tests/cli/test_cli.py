@@ -50,7 +50,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any, Any, dict[str
     """What the long work was called with; it is over at once."""
     seen: list[tuple[Any, Any, Any, dict[str, Any]]] = []
 
-    def close_loop(scene: Any, train: Any, test: Any, **options: Any) -> Loop:
+    def close_loop(scene: Any, train: Any, test: Any = None, **options: Any) -> Loop:
         options.pop("progress")("fitting [all] of it")
         seen.append((scene, train, test, options))
         return Loop(made_up())
