@@ -58,6 +58,7 @@ def suggestion(posterior) -> pp.Suggestion:
     return pp.suggest_actions(posterior, REST, BOUNDS, steps=12, seed=1)
 
 
+@pytest.mark.one_stack
 @pytest.mark.parametrize(
     "truth", [pytest.param("linear_drag", marks=pytest.mark.slow), "quadratic_drag"]
 )
@@ -79,6 +80,7 @@ def test_the_suggested_experiment_separates_what_a_first_recording_cannot(
     assert step.not_separable_from == ()
 
 
+@pytest.mark.one_stack
 def test_a_random_sequence_separates_less(posterior, suggestion) -> None:
     assert suggestion.decisive
     assert suggestion.expected > 2 * suggestion.at_random
@@ -100,6 +102,7 @@ def test_the_same_seed_suggests_the_same(posterior, suggestion) -> None:
     np.testing.assert_array_equal(again.separation, suggestion.separation)
 
 
+@pytest.mark.one_stack
 def test_nothing_separates_a_model_from_itself(posterior) -> None:
     """Nor do actions at rest, where no drag acts; what parameters absorb is taken off."""
     (one, _) = fit_rivals(posterior, named_effects(DRAGS, BOX, pp.catalogue), pp.catalogue, 8, 1)
@@ -113,6 +116,7 @@ def test_nothing_separates_a_model_from_itself(posterior) -> None:
     assert np.allclose(found[:, :, 0], 0.0, atol=1e-3)
 
 
+@pytest.mark.one_stack
 def test_expected_is_what_bayes_factors_are_in_the_mean(posterior) -> None:
     """Against log densities of simulated recordings, where both models are nearly linear."""
     rivals = fit_rivals(posterior, named_effects(DRAGS, BOX, pp.catalogue), pp.catalogue, 16, 3)
