@@ -47,7 +47,6 @@ Functions = namedtuple(
         "cpConstraintSetMaxForce",
         "cpCircleShapeSetOffset",
         "cpCircleShapeSetRadius",
-        "cpSpaceReindexShape",
         "cpPivotJointSetAnchorA",
         "cpPivotJointSetAnchorB",
         "cpPinJointSetAnchorA",

@@ -100,15 +100,25 @@ def place_bodies(fn, world, bodies, state):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
-    """Place the hidden discs, as in World.set_discs."""
+    """Place the hidden discs, as in World.set_discs.
+
+    They are taken out and put back: the contacts' order depends on where a static shape was before.
+    """
     first = len(world.obstacles) - len(world.discs)
+    for j in range(len(world.discs)):
+        call_pointer(fn.cpSpaceRemoveShape, world.space, world.discs[j])
+    if len(world.discs):
+        for _ in range(-len(world.discs) % (world.padding + len(world.shapes))):
+            # the numbers of the moving shapes go on from a multiple: see World._add_shapes
+            call_pointer(fn.cpSpaceAddShape, world.space, world.discs[0])
+            call_pointer(fn.cpSpaceRemoveShape, world.space, world.discs[0])
     for j in range(len(world.discs)):
         x, y, radius = discs[j, 0], discs[j, 1], discs[j, 2]
         if not radius > 0.0:
             x, y, radius = -FAR, -FAR * (j + 1.0), NO_SIZE
         call2(fn.cpCircleShapeSetOffset, world.discs[j], x, y)
         call1(fn.cpCircleShapeSetRadius, world.discs[j], radius)
-        call_pointer(fn.cpSpaceReindexShape, world.space, world.discs[j])
+        call_pointer(fn.cpSpaceAddShape, world.space, world.discs[j])
         obstacle = world.obstacles[first + j]
         obstacle[0] = obstacle[2] = x
         obstacle[1] = obstacle[3] = y

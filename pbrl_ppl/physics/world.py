@@ -254,13 +254,18 @@ class World:
         self.pivots.append(Pivot(self.bodies.index(hanging), motor, damper))
 
     def set_discs(self, discs: Array) -> None:
-        """Place the hidden discs; x, y and radius, shape (disc, 3). One without radius is away."""
+        """Place the hidden discs; x, y and radius, shape (disc, 3). One without radius is away.
+
+        They are taken out and put back, for the order of contacts depends on the ways of static
+        shapes to where they are.
+        """
         first = len(self.obstacles) - len(self.discs)
+        self.space.remove(*self.discs)
         for j, (shape, (x, y, radius)) in enumerate(zip(self.discs, discs, strict=True)):
             there = (x, y, radius) if radius > 0 else (-FAR, -FAR * (j + 1), NO_SIZE)
             shape.unsafe_set_offset(there[:2])
             shape.unsafe_set_radius(there[2])
-            self.space.reindex_shape(shape)
+            self.space.add(shape)
             self.obstacles[first + j] = (*there[:2], *there)
 
     def set_properties(self, bodies: Array, joints: Array) -> None:

@@ -52,6 +52,8 @@ def scene_and_effects(rng: np.random.Generator):
         walls=tuple(Wall(tuple(a), tuple(b)) for a, b in ends.tolist()),
     )  # fmt: skip
     usable = [e for e in catalogue if any(e.applies(scene, body) for body in bodies)]
+    if joints:  # a start that is measured at a tenth of its size is far off the joint: chaos
+        usable = [e for e in usable if e.name != "sensor_scale"]
     chosen = rng.choice(len(usable), size=int(rng.integers(0, 3)), replace=False)
     return scene, [usable[i] for i in chosen]
 
@@ -76,6 +78,9 @@ def agreement(seed: int) -> None:
         Simulator(scene, layout, attached, path=path)(phi, start, inputs)
         for path in ("compiled", "plain")
     )
+    alone = Simulator(scene, layout, attached)
+    for i in range(0, n, 4):  # whatever came before
+        np.testing.assert_array_equal(alone(phi[1], start[[i]], inputs[[i]])[0], ours[1, i])
     np.testing.assert_array_equal(np.isnan(ours), np.isnan(plain))
     off = np.nanmax(np.abs(ours - plain) / (1.0 + np.abs(plain)), axis=(2, 3, 4))
     assert (off > 1e-6).mean() <= KINKS, (seed, scene, effects)
@@ -88,5 +93,5 @@ def test_paths_agree(seed) -> None:
 
 @pytest.mark.long
 def test_paths_agree_on_many() -> None:
-    for seed in range(10, 300):
+    for seed in range(10, 150):
         agreement(seed)
