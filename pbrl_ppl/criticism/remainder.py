@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.cross_validation import cross_validated, folds, standard_error
@@ -150,12 +151,7 @@ def _learned(mode: Mode, body: str, seed: int) -> LearnedRemainder:
             f"nothing to learn: what the model leaves of the forces on {body} is too little to"
             " matter, or does not depend on its velocity"
         )
-    forms = np.zeros((sum(map(len, blocks)), len(table["output"])))
-    row = column = 0
-    for block in blocks:
-        forms[row : row + len(block), column : column + block.shape[1]] = block
-        row, column = row + len(block), column + block.shape[1]
-    return learned_remainder(json.dumps(table | {"forms": forms.tolist()}))
+    return learned_remainder(json.dumps(table | {"forms": block_diag(*blocks).tolist()}))
 
 
 def _matters(mode: Mode) -> tuple[bool, bool, bool]:

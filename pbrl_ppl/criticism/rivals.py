@@ -17,7 +17,7 @@ from pbrl_ppl.criticism.selection import refitted
 from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
 from pbrl_ppl.modes import Mode, trajectory_mode
-from pbrl_ppl.posterior import group, parameter_draws, problem_of
+from pbrl_ppl.posterior import likeliest_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
@@ -125,8 +125,7 @@ def likeliest_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
             " unexplained motion; take after.nc of close_loop, or fit with trajectories=True"
         )
     phi, sigma = parameter_draws(problem, posterior)
-    likelihood = group(posterior, "log_likelihood")["next_state"].sum("transition")
-    best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
+    best = likeliest_draw(posterior)
     return trajectory_mode(problem, phi[best], sigma[best])
 
 

@@ -16,7 +16,7 @@ from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
 from pbrl_ppl.physics import Simulator
 from pbrl_ppl.posterior.known_effects import known_effects
-from pbrl_ppl.posterior.store import group, scalars, scene_of
+from pbrl_ppl.posterior.store import group, likeliest_draw, scalars, scene_of
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
@@ -327,8 +327,7 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array,
     data, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
     columns = tuple(STATE.index(str(name)) for name in measured["state"].values)
     observations = Observations(measured.to_numpy(), columns)
-    likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
-    best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
+    best = likeliest_draw(idata)
     draws = _flat(idata)
     phi = inside(layout.priors, np.array([draws[label][best] for label in layout.labels]))
     told = dict.fromkeys(observations.names, np.inf) | dict(scene.noise)

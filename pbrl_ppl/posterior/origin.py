@@ -28,7 +28,14 @@ from pbrl_ppl.model import (
 )
 from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.recording import with_recording
-from pbrl_ppl.posterior.store import attributes, draws, group, has_one_sigma, scene_of
+from pbrl_ppl.posterior.store import (
+    attributes,
+    draws,
+    group,
+    has_one_sigma,
+    likeliest_draw,
+    scene_of,
+)
 from pbrl_ppl.state import INPUT, STATE
 
 PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
@@ -141,6 +148,5 @@ def problem_of(
     named = draws(idata)
     phi = problem.layout.to_vectors(named, len(next(iter(named.values()))))
     sigma = np.hstack([named[name].reshape(len(phi), -1) for name in recorded.noise_variables])
-    likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
-    best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
+    best = likeliest_draw(idata)
     return along_trajectories(problem, phi[best], sigma[best], trajectories.cells)

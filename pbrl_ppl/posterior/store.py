@@ -55,6 +55,12 @@ def has_one_sigma(idata: Any) -> bool:
     return "sigma" in posterior and posterior["sigma"].ndim == 2  # chain and draw
 
 
+def likeliest_draw(idata: Any) -> int:
+    """Place of the draw of highest likelihood, chains one after the other as of :func:`draws`."""
+    likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
+    return int(likelihood.transpose("chain", "draw").to_numpy().argmax())
+
+
 def group(idata: Any, name: str) -> xr.Dataset:
     """One group as a plain dataset.
 

@@ -13,7 +13,7 @@ from pbrl_ppl.criticism import Findings
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem
-from pbrl_ppl.posterior import group, parameter_draws, problem_of
+from pbrl_ppl.posterior import likeliest_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import wrapped
 
@@ -47,8 +47,7 @@ class Motion:
 
 def likeliest(problem: Problem, posterior: Any) -> tuple[Array, Array]:
     """The draw of highest likelihood: phi, shape (p,), and the noise parameters."""
-    likelihood = group(posterior, "log_likelihood")["next_state"].sum("transition")
-    best = int(likelihood.transpose("chain", "draw").to_numpy().argmax())
+    best = likeliest_draw(posterior)
     phi, sigma = parameter_draws(problem, posterior)
     return phi[best], sigma[best]
 
