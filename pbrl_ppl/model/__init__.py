@@ -1,5 +1,6 @@
 """Table 1, Eqs. 11 and 12, the engine as a pytensor Op, and the `pm.Model` made of them."""
 
+from pbrl_ppl.model.cells import ACCELERATION, JOLT, Cells
 from pbrl_ppl.model.data import Data
 from pbrl_ppl.model.declaration import build_model, physics_model, prior_predictive_draws
 from pbrl_ppl.model.library import ParameterLibrary
@@ -15,6 +16,7 @@ from pbrl_ppl.model.noise import Noise, estimate_sigma, sigma_prior
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
 from pbrl_ppl.model.problem import Problem
+from pbrl_ppl.model.sensitivity import Sensitivity
 from pbrl_ppl.model.simulation import simulated_trajectories, with_measurements
 from pbrl_ppl.model.smoothing import (
     along_trajectories,
@@ -22,9 +24,10 @@ from pbrl_ppl.model.smoothing import (
     linearised,
     single_transitions,
     smoothed,
+    with_sensitivity,
 )
 from pbrl_ppl.model.table1 import build_layout, index_priors
-from pbrl_ppl.model.trajectory_noise import ACCELERATION, JOLT, Cells, TrajectoryNoise
+from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.model.transition import Transition
 
 __all__ = [
@@ -37,6 +40,7 @@ __all__ = [
     "ParameterLibrary",
     "Physics",
     "Problem",
+    "Sensitivity",
     "SimulatorOp",
     "TrajectoryNoise",
     "Transition",
@@ -62,4 +66,5 @@ __all__ = [
     "smoothed",
     "whiten",
     "with_measurements",
+    "with_sensitivity",
 ]

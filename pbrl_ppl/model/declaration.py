@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, measured_alone
+from pbrl_ppl.model.cells import ACCELERATION, JOLT
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
     Observations,
@@ -27,7 +28,7 @@ from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.smoothing import along_trajectories
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.model.tails import tail_tensor
-from pbrl_ppl.model.trajectory_noise import ACCELERATION, JOLT, TrajectoryNoise
+from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
 from pbrl_ppl.parameters import Block, Layout
 from pbrl_ppl.scene import Scene
@@ -153,8 +154,9 @@ def build_model(problem: Problem) -> pm.Model:
     """Declare the pm.Model of a problem; see :func:`physics_model`."""
     observations, segments, layout = problem.observations, problem.segments, problem.layout
     physics, noise = problem.physics, problem.noise
-    settings = physics.scene, layout, physics.effects, physics.substeps, physics.threads
-    simulate = SimulatorOp(*settings, physics.parts)
+    settings = (physics.scene, layout, physics.effects, physics.substeps, physics.threads,
+                physics.parts, getattr(noise.trajectories, "sensitivity", None))  # fmt: skip
+    simulate = SimulatorOp(*settings)
     with pm.Model(coords=_coords(problem)) as model:
         start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
         actions = pm.Data("actions", problem.inputs, dims=("transition", "step", "body", "wrench"))
@@ -177,10 +179,9 @@ def build_model(problem: Problem) -> pm.Model:
         # the likelihood takes bodies apart that were apart in the data; in draws they may meet
         whole = predicted
         if len(problem.simulator.parts) > 1:
-            whole = OneWorldOp(*settings, physics.parts)(phi, start, actions)[..., columns]
+            whole = OneWorldOp(*settings)(phi, start, actions)[..., columns]
         shape: dict[str, Any] = {"noise": noise.trajectories, "nu": noise.nu}
-        if problem.trajectories is not None:
-            shape["linearised"] = np.nan_to_num(observations.values)
+        shape["linearised"] = np.nan_to_num(observations.values)
         tail = [tail_tensor(physics, table1, noise.nu)] if problem.tails else []
         pm.CustomDist(
             "next_state",

@@ -17,6 +17,7 @@ from pytensor.link.numba.dispatch.basic import numba_funcify
 
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError, SimulationError
+from pbrl_ppl.model.sensitivity import Engine, Sensitivity
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Parts
 from pbrl_ppl.scene import Scene
@@ -28,7 +29,7 @@ Array = NDArray[np.float64]
 class _EngineOp(Op):
     """Base of the prediction and of its derivative: inputs, and the answer to impossible ones."""
 
-    __props__ = ("scene", "layout", "effects", "substeps", "threads", "parts")
+    __props__ = ("scene", "layout", "effects", "substeps", "threads", "parts", "sensitivity")
 
     def __init__(
         self,
@@ -38,8 +39,10 @@ class _EngineOp(Op):
         substeps: int | None = None,
         threads: int = 1,
         parts: Parts | None = None,
+        sensitivity: Sensitivity | None = None,
     ) -> None:
         self.scene, self.layout, self.effects, self.parts = scene, layout, effects, parts
+        self.sensitivity = sensitivity
         self.substeps = scene.substeps if substeps is None else substeps
         self.threads = threads
         self.simulator = PartedSimulator(
@@ -53,6 +56,12 @@ class _EngineOp(Op):
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         raise NotImplementedError
+
+    def _following(self, engine: Engine, phi: Array, start: Array, actions: Array) -> Array:
+        """What an engine predicts, from start states that follow phi."""
+        if self.sensitivity is None:
+            return engine(phi, start, actions)
+        return self.sensitivity.predicted(engine, phi, start, actions)
 
     def make_node(self, phi: Any, start: Any, actions: Any) -> Apply:
         """Check what can be checked before values are there.
@@ -125,6 +134,8 @@ class SimulatorOp(_EngineOp):
     parts : tuple of tuple of str, optional
         Moving bodies in parts that never touch and share no joint, each with an engine of its own;
         see :func:`pbrl_ppl.physics.coupling.independent_parts`.
+    sensitivity : Sensitivity, optional
+        Of the start states, where those are smoothed ones of whole trajectories.
     """
 
     @property
@@ -132,7 +143,7 @@ class SimulatorOp(_EngineOp):
         return len(self.scene.moving), 6
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
-        return self.simulator.recall(phi, start, actions)
+        return self._following(self.simulator.recall, phi, start, actions)
 
     def pullback(
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
@@ -161,7 +172,7 @@ class OneWorldOp(_EngineOp):
         return len(self.scene.moving), 6
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
-        return self.one_world(phi, start, actions)
+        return self._following(self.one_world, phi, start, actions)
 
     @cached_property
     def one_world(self) -> OneWorld:
@@ -173,13 +184,18 @@ class OneWorldOp(_EngineOp):
 
 
 class JacobianOp(_EngineOp):
-    """Derivative of :class:`SimulatorOp` by phi, shape (transition, H, body, 6, p)."""
+    """Derivative of :class:`SimulatorOp` by phi, shape (transition, H, body, 6, p).
+
+    That start states follow phi is no part of it: what they add, the way back takes off.
+    """
 
     @property
     def _last(self) -> tuple[int, ...]:
         return len(self.scene.moving), 6, self.layout.size
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+        if self.sensitivity is not None:
+            start = self.sensitivity.begun(self.sensitivity.moved(phi), start)
         return self.simulator.jacobian(phi, start, actions)
 
 

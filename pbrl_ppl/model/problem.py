@@ -121,7 +121,11 @@ class Problem:
             scene = changes.get("scene", self.scene)
             together = changes.get("together", self.physics.together)
             changes["parts"] = _parts(scene, self.data.history, together)
-        return replace(self, physics=self.physics.changed(**changes))
+        physics, noise = self.physics.changed(**changes), self.noise
+        if noise.trajectories is not None and physics.layout.labels != self.layout.labels:
+            still = replace(noise.trajectories, sensitivity=None)  # it is by other parameters
+            noise = replace(noise, trajectories=still)
+        return replace(self, physics=physics, noise=noise)
 
     def with_noise(self, **changes: Any) -> Problem:
         """The same problem with other noise; arguments are fields of :class:`Noise`."""
@@ -151,7 +155,8 @@ class Problem:
         states, met = self.one_world.told(phi, segments.start, self.inputs)
         if not met.any():
             return self
-        off = abs(self.observations.wrapped((states - self.predict(phi))[..., columns]))
+        apart = self.simulator(phi, segments.start, self.inputs)
+        off = abs(self.observations.wrapped((states - apart)[..., columns]))
         if self.trajectories is not None:  # the noise of measuring; what is not measured has none
             sensors, every = self.trajectories.cells.sensors, sigma
             stated = dict(self.scene.noise)
@@ -269,7 +274,10 @@ class Problem:
 
     def predict(self, phi: Array, engine: Engine | None = None) -> Array:
         """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""
-        return (engine or self.simulator)(phi, self.segments.start, self.inputs)
+        engine, given = engine or self.simulator, (phi, self.segments.start, self.inputs)
+        if self.trajectories is None or self.trajectories.sensitivity is None:
+            return engine(*given)
+        return self.trajectories.sensitivity.predicted(engine, *given)
 
     def residual(self, phi: Array, engine: Engine | None = None) -> Array:
         """Measured minus predicted, shape (..., transition, H, body, state)."""

@@ -12,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import History, hung_bodies, longest_gap, unseen
+from pbrl_ppl.model.cells import Cells
 from pbrl_ppl.model.problem import Problem
-from pbrl_ppl.model.trajectory_noise import Cells, TrajectoryNoise
+from pbrl_ppl.model.sensitivity import Sensitivity
+from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.physics import touching
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA
@@ -96,6 +98,35 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
         if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
             break
     return problem
+
+
+def with_sensitivity(problem: Problem, phi: Array, sigma: Array) -> Problem:
+    """The same problem, its smoothed states following the parameters to first order.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories, its states smoothed at phi and sigma.
+    phi : ndarray
+        Shape (p,).
+    sigma : ndarray
+        Noise parameters, shape (parameter,).
+    """
+    if not len(phi):
+        return problem
+    noise, segments = problem.trajectory_noise, problem.segments
+    cells, nothing = noise.cells, np.zeros_like(noise.measured)
+    slopes = problem.rough.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
+    still = replace(noise, begin=nothing, measured=nothing, sensitivity=None)
+    before = np.empty((*nothing.shape, len(phi)))
+    for j, own in enumerate(cells.of(np.moveaxis(slopes, -1, 0))):
+        first, after = still.smoothed(-np.nan_to_num(own), sigma)
+        before[:, :, j] = np.where(noise.first[:, None], first, np.roll(after, 1, axis=0))
+    if not np.isfinite(before).all():
+        return problem
+    origin = np.tile(phi, (segments.n, 1))
+    follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
+    return problem.with_noise(trajectories=replace(noise, sensitivity=follow))
 
 
 def first_states(history: History) -> Array:

@@ -14,7 +14,11 @@ from pbrl_ppl.modes.laplace import Mode, posterior_steps
 from pbrl_ppl.modes.library_choice import choose_from_library
 from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.modes.search import find_mode
-from pbrl_ppl.modes.trajectories import trajectory_mode
+from pbrl_ppl.modes.trajectories import (
+    find_trajectory_mode,
+    following,
+    trajectory_mode,
+)
 
 __all__ = [
     "ATTRIBUTE",
@@ -24,6 +28,8 @@ __all__ = [
     "choose_from_library",
     "doubts",
     "find_mode",
+    "find_trajectory_mode",
+    "following",
     "index_law",
     "joint_probabilities",
     "posterior_steps",

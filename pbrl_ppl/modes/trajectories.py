@@ -5,9 +5,17 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem, along_trajectories, smoothed
+from pbrl_ppl.model import (
+    Problem,
+    along_trajectories,
+    log_posterior,
+    single_transitions,
+    smoothed,
+    with_sensitivity,
+)
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode
+from pbrl_ppl.parameters import change_from, inside
 
 Array = NDArray[np.float64]
 
@@ -15,6 +23,32 @@ Array = NDArray[np.float64]
 _ROUNDS, _SETTLED = 6, 0.2
 #: Rounds of a climb between two linearisations.
 _CLIMB = 5
+#: Climbs of a search, and how much farther apart than draws from single transitions they begin.
+_STARTS, _WIDER = 5, 2.0
+
+
+def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
+    """The highest mode of whole trajectories that is found from several starts about one of Eq. 11.
+
+    Which side of a kink the states are smoothed on decides where a climb ends.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories.
+    seed : int
+        Of the starts.
+
+    Returns
+    -------
+    Mode
+        As of :func:`following`.
+    """
+    near = find_mode(single_transitions(problem), seed=seed)
+    off = near.draws(np.random.default_rng(seed), _STARTS - 1) - near.phi
+    starts = [near.phi, *inside(problem.layout.priors, near.phi + _WIDER * off)]
+    found = [following(trajectory_mode(problem, phi)) for phi in starts]
+    return max(found, key=lambda mode: mode.log_posterior)
 
 
 def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) -> Mode:
@@ -45,9 +79,44 @@ def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) ->
         if i:
             problem = smoothed(problem, phi, np.asarray(sigma))
         mode = find_mode(problem, initial=phi, rounds=_CLIMB)
-        spread = np.sqrt(np.maximum(np.diag(mode.covariance), 1e-300))
-        change = float((np.abs(mode.phi - phi) / spread).max(initial=0.0))
+        change = _change(mode, phi)
         phi, sigma = mode.phi, mode.sigma
         if i and change < _SETTLED:
             break
     return mode
+
+
+def following(mode: Mode) -> Mode:
+    """A mode of whole trajectories whose smoothed states follow the parameters.
+
+    Parameters
+    ----------
+    mode : Mode
+        As of :func:`trajectory_mode`.
+
+    Returns
+    -------
+    Mode
+        Its problem's noise has a :class:`pbrl_ppl.model.Sensitivity`.
+    """
+    found: list[tuple[float, Mode]] = []
+    problem, phi, sigma = mode.problem, mode.phi, mode.sigma
+    for i in range(_ROUNDS):
+        if i:
+            problem = smoothed(problem, phi, sigma)
+        problem = with_sensitivity(problem, phi, sigma)
+        # far from where it is linearised a climb may end anywhere: judged by where it began
+        value = float(log_posterior(problem, phi, sigma))
+        found.append((value, find_mode(problem, initial=phi, rounds=_CLIMB)))
+        change = _change(found[-1][1], phi)
+        phi, sigma = found[-1][1].phi, found[-1][1].sigma
+        if change < _SETTLED:
+            break
+    return max(found, key=lambda own: own[0])[1]
+
+
+def _change(mode: Mode, phi: Array) -> float:
+    """How far a mode is from where its search began, in standard deviations."""
+    spread = np.sqrt(np.maximum(np.diag(mode.covariance), 1e-300))
+    moved = change_from(mode.problem.layout, mode.phi, phi)
+    return float((np.abs(moved) / spread).max(initial=0.0))

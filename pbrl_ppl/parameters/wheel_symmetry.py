@@ -203,6 +203,39 @@ def beside(layout: Layout, phi: Array, others: Array) -> Array:
     return phi
 
 
+def change_from(layout: Layout, phi: Array, origin: Array) -> Array:
+    """Change from an origin, wheels described and angles counted as is nearest to the origin.
+
+    The engine does the same for all of these, whatever their prior says.
+
+    Parameters
+    ----------
+    layout : Layout
+        Order of phi.
+    phi : ndarray
+        Shape (..., p), SI units.
+    origin : ndarray
+        Shape (p,).
+
+    Returns
+    -------
+    ndarray
+        Shape (..., p).
+    """
+    for wheel in wheels(layout):
+        angle = wheel.places[0]
+        turns = np.rint(wrapped(origin[angle] - phi[..., angle]) / (np.pi / 2)).astype(int)
+        if turns.any():
+            phi = wheel.turned(phi, turns)
+    change = phi - origin
+    for i, (label, prior) in enumerate(zip(layout.labels, layout.priors, strict=True)):
+        if label.startswith("w_theta["):  # a wheel turned half way round is the same
+            change[..., i] = wrapped(2.0 * change[..., i]) / 2.0
+        elif prior.family == "von_mises":
+            change[..., i] = wrapped(change[..., i])
+    return change
+
+
 def _points(values: Array) -> Array:
     """Wheels (..., 3) as points (..., 4) that are near where the wheels are alike."""
     angle = values[..., 0]

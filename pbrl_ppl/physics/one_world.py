@@ -84,8 +84,8 @@ class OneWorld:
 
     def _near(self, states: Array, start: Array, bodies_a: Ints, bodies_b: Ints) -> Bools:
         """Whether a body of one part comes near one of another, shape (..., transition)."""
-        begin = start[:, None, :, :2]
-        first = np.broadcast_to(begin, (*states.shape[:-4], *begin.shape))
+        begin = start[..., :, None, :, :2]
+        first = np.broadcast_to(begin, (*states.shape[:-4], *begin.shape[-4:]))
         places = np.concatenate([first, states[..., :2]], axis=-3)
         found = np.zeros(states.shape[:-3], dtype=bool)
         for i, j in product(bodies_a, bodies_b):

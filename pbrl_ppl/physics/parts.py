@@ -109,8 +109,11 @@ class PartedSimulator:
         proposals = np.atleast_2d(phi)
         out = np.empty((len(proposals), *actions.shape[:-1], 6))
         for part in self.parts:
-            own, which = np.unique(proposals[:, part.places], axis=0, return_inverse=True)
-            states = part.simulator(own, *_of(part, start, actions))
+            own, begin = proposals[:, part.places], start[..., part.bodies, :]
+            keys = own if start.ndim == 3 else np.hstack([own, begin.reshape(len(own), -1)])
+            _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+            begin = begin if start.ndim == 3 else begin[first]
+            states = part.simulator(own[first], begin, actions[:, :, part.bodies])
             out[..., part.bodies, :] = states[which.ravel()]
         return out if phi.ndim == 2 else out[0]
 
@@ -121,15 +124,15 @@ class PartedSimulator:
                 f"phi has shape {phi.shape}, expected ({len(self._labels)},):"
                 f" {', '.join(self._labels)}"
             )
-        data = start.shape, actions.shape, hash(start.tobytes()), hash(actions.tobytes())
+        acted = actions.shape, hash(actions.tobytes())
         out = np.empty((*actions.shape[:-1], 6))
         for part in self.parts:
-            own = phi[part.places]
-            key = (*data, own.tobytes())
+            own, begin = phi[part.places], start[:, part.bodies]
+            key = (*acted, begin.shape, hash(begin.tobytes()), own.tobytes())
             if key in part.memory:
                 part.memory.move_to_end(key)
             else:
-                part.memory[key] = part.simulator(own, *_of(part, start, actions))
+                part.memory[key] = part.simulator(own, begin, actions[:, :, part.bodies])
                 if len(part.memory) > _REMEMBERED:
                     part.memory.popitem(last=False)
             out[..., part.bodies, :] = part.memory[key]

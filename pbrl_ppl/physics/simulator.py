@@ -115,7 +115,7 @@ class Simulator:
         phi : ndarray
             Unknown parameters in the layout's order, SI units, shape (p,) or (proposal, p).
         start : ndarray
-            Start states, shape (transition, body, 6).
+            Start states, shape (transition, body, 6), or (proposal, transition, body, 6).
         actions : ndarray
             Wrenches, shape (transition, H, body, 3), N and N m; of a kinematic body its velocity
             over the interval, m/s and rad/s. Or all inputs, shape (transition, H, body, 9), as in
@@ -189,9 +189,10 @@ class Simulator:
     def _states(self, phi: Array, measured: Array) -> Array:
         """True states by the sensors' inverses, shape (1 or proposal, transition, body, 6)."""
         sensors = self._properties.sensors(phi)
+        measured = measured if measured.ndim == 4 else measured[None]
         if not sensors:
-            return measured[None]
-        states = np.repeat(measured[None], len(phi), axis=0)
+            return measured
+        states = np.array(np.broadcast_to(measured, (len(phi), *measured.shape[1:])))
         for i, sensor, values in reversed(sensors):
             flat = {name: value[..., 0] for name, value in values.items()}
             states[:, :, i] = sensor.invert(states[:, :, i], flat)
@@ -235,16 +236,17 @@ class Simulator:
                 f"phi has shape {phi.shape}, expected ({p},) or (proposal, {p}):"
                 f" {', '.join(self.layout.labels)}"
             )
-        if start.ndim != 3 or start.shape[1:] != (k, 6):
+        own = start.ndim == 4 and phi.ndim == 2 and len(start) == len(phi)
+        if not (own or start.ndim == 3) or start.shape[-2:] != (k, 6):
             raise SimulationError(
-                f"start has shape {start.shape}, expected (transition, {k}, 6)"
-                " in the order x, y, theta, vx, vy, omega"
+                f"start has shape {start.shape}, expected (transition, {k}, 6), or with as many"
+                " proposals first as phi has, in the order x, y, theta, vx, vy, omega"
             )
         widths = (3, len(INPUT))
-        shaped = actions.ndim == 4 and actions.shape[0] == len(start) and actions.shape[2] == k
+        shaped = actions.ndim == 4 and actions.shape[0] == start.shape[-3] and actions.shape[2] == k
         if not shaped or actions.shape[3] not in widths:
             raise SimulationError(
-                f"actions have shape {actions.shape}, expected ({len(start)}, H, {k}, 3)"
+                f"actions have shape {actions.shape}, expected ({start.shape[-3]}, H, {k}, 3)"
                 f" in the order force_x, force_y, torque, or {len(INPUT)} in place of 3:"
                 f" {', '.join(INPUT)}"
             )

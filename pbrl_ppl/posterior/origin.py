@@ -25,6 +25,7 @@ from pbrl_ppl.model import (
     Problem,
     along_trajectories,
     sigma_prior,
+    with_sensitivity,
 )
 from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.recording import with_recording
@@ -149,4 +150,5 @@ def problem_of(
     phi = problem.layout.to_vectors(named, len(next(iter(named.values()))))
     sigma = np.hstack([named[name].reshape(len(phi), -1) for name in recorded.noise_variables])
     best = likeliest_draw(idata)
-    return along_trajectories(problem, phi[best], sigma[best], trajectories.cells)
+    problem = along_trajectories(problem, phi[best], sigma[best], trajectories.cells)
+    return with_sensitivity(problem, phi[best], sigma[best])

@@ -9,11 +9,13 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, TrajectoryNoise, cells_of, linearised
+from pbrl_ppl.model import Problem, Sensitivity, TrajectoryNoise, cells_of, linearised
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
+#: Names of how the smoothed states follow the parameters.
+_ORIGIN, _SENSITIVITY = "smoothed_at", "sensitivity"
 #: Variables of the recording have these before their names, and before their dimensions'.
 _PREFIX = "recorded_"
 
@@ -32,6 +34,10 @@ def recording(problem: Problem) -> xr.Dataset:
     kept["smoothed"] = (dims, problem.data.smoothed_states)
     kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
     kept["linearised_at"] = (("noise_parameter",), noise.sigma)
+    if noise.sensitivity is not None:
+        follow = noise.sensitivity
+        kept[_ORIGIN] = (("transition", "parameter"), follow.phi)
+        kept[_SENSITIVITY] = (("transition", "cell_before", "parameter"), follow.before)
     return kept.assign_attrs({})
 
 
@@ -46,6 +52,10 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
     noise: TrajectoryNoise = linearised(
         problem.on(data), cells, given["slope"].to_numpy(), given["linearised_at"].to_numpy()
     )
+    if _SENSITIVITY in given:
+        origin, before = given[_ORIGIN].to_numpy(), given[_SENSITIVITY].to_numpy()
+        follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
+        noise = replace(noise, sensitivity=follow)
     return problem.on(data).with_noise(trajectories=noise, scalar=False)
 
 
@@ -69,6 +79,12 @@ def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
     if "smoothed" not in new:
         return xr.Dataset()
     by_transition = ["slope"]
+    if _SENSITIVITY in new:
+        by_transition += [_ORIGIN, _SENSITIVITY]
+        if _SENSITIVITY not in held:  # a file of an older version, whose states stay
+            n, (_, cells, p) = held.sizes["transition"], new[_SENSITIVITY].shape
+            none = {_ORIGIN: np.zeros((n, p)), _SENSITIVITY: np.zeros((n, cells, p))}
+            held = held.assign({name: (new[name].dims, none[name]) for name in none})
     whole = [str(name) for name in new.data_vars if f"{_PREFIX}trajectory" in new[name].dims]
     result = xr.Dataset({"linearised_at": new["linearised_at"]})
     for names, dim in ((by_transition, "transition"), (whole, f"{_PREFIX}trajectory")):

@@ -12,8 +12,15 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from pbrl_ppl.model import Problem, build_model, single_transitions
-from pbrl_ppl.modes import Mode, choose_from_library, find_mode, trajectory_mode, weigh
+from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.modes import (
+    Mode,
+    choose_from_library,
+    find_mode,
+    find_trajectory_mode,
+    following,
+    weigh,
+)
 from pbrl_ppl.posterior import complete, group
 from pbrl_ppl.sampling.emulation import emulate
 from pbrl_ppl.sampling.equal_wheels import evened_logp
@@ -303,7 +310,8 @@ def fit(
         trace = sampled(model, *from_posterior(problem, resume))
     else:
         mode = _mode(problem, seed) if start is None else start
-        if start is None and problem.trajectories is not None:  # linearised at the mode by now
+        if mode.problem.trajectories is not None:  # linearised at the mode by now
+            mode = mode if start is None else following(start)
             problem = mode.problem
             model = build_model(problem)
         if joined := joined_model(problem, mode.phi[None], mode.sigma[None]):
@@ -323,9 +331,7 @@ def _mode(problem: Problem, seed: int) -> Mode:
     """The mode to sample about."""
     if problem.trajectories is None:
         return find_mode(problem, seed=seed)
-    single = single_transitions(problem)
-    near = find_mode(single, seed=seed)
-    return trajectory_mode(problem, near.phi)
+    return find_trajectory_mode(problem, seed)
 
 
 def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:

@@ -1,0 +1,123 @@
+"""Cells: unknown coordinates of the bodies' states, and which noise each is subject to."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import fill_hinges
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE, THETA, wrapped
+
+#: The variable of what a step adds: an acceleration that nothing in the model explains.
+ACCELERATION = "unexplained_acceleration"
+#: And the one of what comes on top of it where bodies touch.
+JOLT = "contact_acceleration"
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Cells:
+    """Unknown coordinates of the bodies' states, and which noise parameter each is subject to.
+
+    Parameters
+    ----------
+    places : ndarray of int
+        Where an array of shape (body * 6,) holds them, shape (cell,).
+    columns : tuple of int
+        State dimensions that occur.
+    sensor : ndarray of int
+        Which noise parameter is the error of measuring a cell; -1 where ``fixed`` is.
+    fixed : ndarray
+        Standard deviation of measuring a cell where it is no parameter, shape (cell,).
+    push : ndarray
+        What a unit of an unexplained acceleration adds to the cells in a step, one row a body and
+        velocity, shape (push, cell).
+    pushed : ndarray of int
+        Which noise parameter is the acceleration of each row, shape (push,).
+    sensors, rates, jolts : tuple of int
+        State dimensions that the noise parameters are about: of measurements, of accelerations, of
+        what bodies that touch add to those.
+    """
+
+    places: Ints
+    columns: tuple[int, ...]
+    sensor: Ints
+    fixed: Array
+    push: Array
+    pushed: Ints
+    sensors: tuple[int, ...]
+    rates: tuple[int, ...]
+    jolts: tuple[int, ...] = ()
+
+    @property
+    def variables(self) -> dict[str, tuple[str, ...]]:
+        """Variables of the noise, and the state dimensions of each, in the order of sigma."""
+        own = {"sigma": self.sensors, ACCELERATION: self.rates, JOLT: self.jolts}
+        return {name: tuple(STATE[d] for d in about) for name, about in own.items() if about}
+
+    @property
+    def accelerations(self) -> range:
+        """Places of the noise parameters that are unexplained accelerations."""
+        return range(len(self.sensors), len(self.sensors) + len(self.rates))
+
+    @property
+    def always(self) -> Bools:
+        """Which rows act in every step, and not only where bodies touch, shape (push,)."""
+        return self.pushed < self.accelerations.stop
+
+    def steps(self, sigma: Array) -> Array:
+        """Covariance of what a step adds where no bodies touch, and where some do.
+
+        Shape (2, cell, cell).
+        """
+        size = sigma[self.pushed] ** 2
+        free = np.where(self.always, size, 0.0)
+        return np.stack([(self.push.T * own) @ self.push for own in (free, size)])
+
+    def pushes(self, sigma: Array, touching: Bools, rng: np.random.Generator) -> Array:
+        """Draw what steps add to the cells, shape (..., cell), as ``touching`` has its axes.
+
+        The leading axes of ``sigma``, shape (..., parameter), go with those.
+        """
+        drawn = sigma[..., self.pushed] * rng.standard_normal((*touching.shape, len(self.pushed)))
+        return np.where(self.always | touching[..., None], drawn, 0.0) @ self.push
+
+    def errors(self, sigma: Array) -> Array:
+        """Standard deviation of measuring each cell, shape (cell,)."""
+        return np.where(self.sensor >= 0, sigma[self.sensor], self.fixed)
+
+    def of(self, values: Array) -> Array:
+        """The cells of values of shape (..., body, 6), shape (..., cell)."""
+        return np.asarray(values.reshape(*values.shape[:-2], -1)[..., self.places])
+
+    def completed(self, scene: Scene, states: Array) -> Array:
+        """Put hung bodies of states (..., body, 6) where their hinges hold them, in place."""
+        free = np.zeros((len(scene.moving), 6), dtype=bool)
+        free.reshape(-1)[self.places] = True
+        hung = np.array([not body.kinematic for body in scene.moving])[:, None] & ~free
+        if hung.any():
+            states[..., hung] = np.nan
+            fill_hinges(states.reshape(-1, 1, *states.shape[-2:]), scene)
+        return states
+
+    def wrapped(self, difference: Array) -> Array:
+        """Differences of cells, shape (..., cell), angles wrapped to (-pi, pi]."""
+        angle = self.places % 6 == THETA
+        return np.where(angle, wrapped(difference), difference)
+
+    def of_residual(self, residual: Array) -> Array:
+        """The cells of a residual (..., transition, 1, body, state): (..., transition, cell)."""
+        body, place = self.in_residual
+        return np.ascontiguousarray(residual[..., 0, body, place])
+
+    @property
+    def in_residual(self) -> tuple[Ints, Ints]:
+        """Body and place among the columns of each cell."""
+        body, dimension = np.divmod(self.places, 6)
+        return body, np.searchsorted(self.columns, dimension)
