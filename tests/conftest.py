@@ -1,6 +1,7 @@
 """Fixtures that many tests share."""
 
 import importlib.util
+import os
 from pathlib import Path
 from types import ModuleType
 
@@ -9,6 +10,8 @@ from hypothesis import settings
 
 from tests.helpers.places import RECORDED, ROOT
 
+# where each tensor was made is a fiftieth of the tests' time; pytensor reads this when imported
+os.environ.setdefault("PYTENSOR_FLAGS", "traceback__limit=0")
 # the same examples everywhere, and no test that fails because a machine is slow
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
@@ -19,23 +22,27 @@ WITHOUT_PYMC = (
     "scene", "parameters", "history", "effects", "physics", "modes", "planning", "oomdp",
 )  # fmt: skip
 FITTED = (
-    "modes/test_configurations.py",
     "modes/test_index_priors.py",
     "modes/test_joints.py",
-    "planning/test_experiments.py",
     "planning/test_planning_files.py",
     "planning/test_planning_modes.py",
 )
-#: Of a room that does import them, the files whose tests stand on modes alone.
+#: Of a room that does import them, files whose tests stand on modes or on samplers of our own.
 ON_MODES = (
     "agents/test_box2d_world.py",
+    "agents/test_library_agent.py",
     "agents/test_revision.py",
     "criticism/test_criticism.py",
     "criticism/test_cross_validation.py",
     "criticism/test_misfit.py",
+    "criticism/test_remainder.py",
     "criticism/test_resolution.py",
     "criticism/test_scan.py",
     "criticism/test_structure_search.py",
+    "model/test_contact_noise.py",
+    "model/test_trajectories.py",
+    "modes/test_configurations.py",
+    "sampling/test_emulator.py",
 )
 #: Files that take longest, longest first: workers begin with them, and fill up with the short ones.
 LONGEST = (

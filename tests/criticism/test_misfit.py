@@ -30,7 +30,7 @@ def failed(mode):
     return {test.name for test in misfit(mode).tests if not test.passed}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_each_fails_on_clean_data_no_more_often_than_it_says() -> None:
     rng = np.random.default_rng(5)
     failures = dict.fromkeys(RATES, 0)

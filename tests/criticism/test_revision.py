@@ -190,6 +190,7 @@ def test_a_users_own_effect_is_found_in_a_model_without_unknowns(make_history) -
     assert found.candidates[0].effect == "tether"
 
 
+@pytest.mark.one_stack
 def test_computed_velocities_are_recognised_and_the_effect_is_found(make_history) -> None:
     frames = box2d(make_history, 4, trajectories=12, intervals=30, linear_drag=0.3)
     computed = []

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarn
 FOLDER = MODELS / "pendulum"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_friction_of_a_pivot_of_another_engine_is_chosen() -> None:
     """Without draws: the mode and its covariance say what the posterior will."""
     scene, train, _ = load(FOLDER, FOLDER / "recorded")

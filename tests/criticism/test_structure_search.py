@@ -13,7 +13,8 @@ pytestmark = pytest.mark.one_stack
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [5, 6])  # in which several hits from different sides pin it down
+# in which several hits from different sides pin it down
+@pytest.mark.parametrize("seed", [pytest.param(5, marks=pytest.mark.long), 6])
 def test_a_disc_is_found_from_a_guess_on_the_other_side_of_the_room(make_history, seed) -> None:
     """Box2D's disc, to 5 mm, and what a step adds beyond the model all but gone."""
     disc = (1.2, 0.1, 0.2)

@@ -89,7 +89,7 @@ def test_least_squares_with_the_batched_jacobian(model) -> None:
     np.testing.assert_allclose(result.x, truth(model), rtol=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nuts_agrees_with_the_default_sampler() -> None:
     """Mass, drag and sigma: means and squares within 4 Monte Carlo errors; 0.04 % false alarms."""
     puck = Body("puck", Shape.circle(0.2), known={"r": 0.0, "mu_c": 0.0}, effects=("linear_drag",))

@@ -130,6 +130,7 @@ def furnished(apartment):
     return quick(physics_model(scene, history, library=library))
 
 
+@pytest.mark.one_stack
 def test_the_apartment_s_bodies_are_recognised(apartment, furnished) -> None:
     """Wheels turned are no matter to the three bodies that have none: there the prior decides."""
     scene, _, library, true = apartment
@@ -203,6 +204,7 @@ def test_an_ordinary_model() -> None:
     np.testing.assert_allclose(group(idata, "log_likelihood")["next_state"], theirs.values)
 
 
+@pytest.mark.one_stack
 def test_updates(apartment, furnished) -> None:
     """Weights while they do; a sum anew where they do not."""
     scene, _, library, _ = apartment

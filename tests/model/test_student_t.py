@@ -99,6 +99,7 @@ def test_scalar_sigma_is_allowed(scene, clean) -> None:
     assert problem.with_noise(nu=None).noise.nu is None
 
 
+@pytest.mark.one_stack
 @pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
 def test_fit_covers_the_truth(scene, spoilt) -> None:
     """Central 99.9 % intervals of six parameters: a false alarm 6e-3 of the time."""

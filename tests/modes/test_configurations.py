@@ -573,7 +573,7 @@ def test_no_joint_is_found_where_there_is_none() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["paper", "demetropolisz"])
+@pytest.mark.parametrize("method", [pytest.param("paper", marks=pytest.mark.long), "demetropolisz"])
 @FORK
 @SHORT
 @pytest.mark.usefixtures("known_weights")

@@ -283,7 +283,7 @@ def test_mppi_reaches_a_place() -> None:
     assert (abs(found.wrenches[..., :2]) <= np.hypot(FORCE, FORCE) + 1e-12).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_mppi_swings_a_pendulum_up() -> None:
     """Torque below what would lift it straight: 0.6 of m g l; it must swing."""
     rod = body("rod", Shape.box(0.8, 0.05), mass=1.0)

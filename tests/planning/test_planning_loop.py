@@ -13,7 +13,7 @@ def benchmark(benchmarks):
     return planning_loop
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:the chains have not converged")  # the mode is planned with
 def test_revised_model_ends_nearer_the_goal(benchmark) -> None:
     """Six starts, seed 0: the median final distance is at most half of the declared model's."""

@@ -16,7 +16,7 @@ def benchmark(benchmarks):
     return planning_draws
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:the chains have not converged")  # short, and enough to plan on
 def test_draws_hedge_between_two_places_of_the_wheel(benchmark) -> None:
     """12 starts, each with the wheel in front and at the back in truth; seed 3.

@@ -71,6 +71,7 @@ def no_contact(history):
     return quick_fit(model)
 
 
+@pytest.mark.one_stack
 def test_without_contacts_the_contact_parameters_are_the_prior_s(no_contact) -> None:
     said = pp.identify(no_contact)
     table = said.table()

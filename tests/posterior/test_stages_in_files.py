@@ -76,6 +76,7 @@ def test_a_loaded_file_predicts_as_the_fit(history, idata, tmp_path) -> None:
     assert np.abs(loaded.predict(moved) - loaded.predict(phi)).max() > 1e-3
 
 
+@pytest.mark.one_stack
 def test_an_update_numbers_its_trajectories_on(idata, monkeypatch) -> None:
     """A load taken up in the fifth trajectory is still there in what is recorded since."""
     since = recorded(STAGES, seed=2, trajectories=1)

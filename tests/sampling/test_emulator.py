@@ -121,7 +121,7 @@ def test_none_where_no_polynomial_is_close(model, monkeypatch) -> None:
     assert emulate(mode, unpack, blocks, 3) is None
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:the chains have not converged")  # too short for 400 effective
 def test_looking_ahead_changes_nothing_but_the_speed(model, monkeypatch) -> None:
     """The same posterior with the emulator and without.

@@ -72,6 +72,7 @@ def gaussian() -> pm.Model:
     return model
 
 
+@pytest.mark.one_stack
 @pytest.mark.parametrize("factor", [1 / 7, 1.0, 3.0])
 def test_correlated_gaussian_from_a_wrong_guess(factor: float) -> None:
     """Moments to second order, from a guess off by one sd in place and by a factor in width.
@@ -121,6 +122,7 @@ def test_a_good_look_ahead_gives_nearly_independent_draws() -> None:
 
 
 @pytest.mark.one_stack
+@pytest.mark.one_stack
 def test_blocks_that_depend_on_each_other() -> None:
     """Correlated variables in blocks of their own: slower, and still exact."""
     blocks = [block(MEAN[:1], COVARIANCE[:1, :1]), block(MEAN[1:], COVARIANCE[1:, 1:], first=1)]
@@ -145,6 +147,7 @@ def test_log_normal_and_beta() -> None:
     assert ((draws["share"] > 0) & (draws["share"] < 1)).all()
 
 
+@pytest.mark.one_stack
 @pytest.mark.one_stack
 def test_banana() -> None:
     """x ~ N(0, 1), y | x ~ N(x^2 / 2, 0.7^2): no Gaussian is close to it."""

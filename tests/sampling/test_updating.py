@@ -112,6 +112,7 @@ def one(parts, first):
     return quiet(update, first, parts[2].select([0, 1]), seed=5)
 
 
+@pytest.mark.one_stack
 def test_few_transitions_are_a_matter_of_weights(parts, first, one) -> None:
     assert pp.update is update
     (entry,) = log(one)
