@@ -22,8 +22,8 @@ actuator_delay = Effect(
             "share", "1", Prior("truncated_normal", mu=0.0, sigma=0.5, lower=0.0, upper=1.0)
         ),
     ),
-    "the push arrives late, by this share of the sampling interval, or what is measured is early;"
-    " with one clock in the log the two are the same data",
+    "the push arrives late, by this share of the sampling interval (actuator_delay), or what is"
+    " measured does (sensor_delay); with one clock in the log the two are the same data",
     "pure time delay of a held input, u(t - share dt)",
     Command(_law, memory=True),
 )
