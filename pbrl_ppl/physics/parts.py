@@ -109,11 +109,12 @@ class PartedSimulator:
         proposals = np.atleast_2d(phi)
         out = np.empty((len(proposals), *actions.shape[:-1], 6))
         for part in self.parts:
-            own, begin = proposals[:, part.places], start[..., part.bodies, :]
+            own = proposals[:, part.places]
+            begin, acted = _of(part, start, actions)
             keys = own if start.ndim == 3 else np.hstack([own, begin.reshape(len(own), -1)])
             _, first, which = np.unique(keys, axis=0, return_index=True, return_inverse=True)
             begin = begin if start.ndim == 3 else begin[first]
-            states = part.simulator(own[first], begin, actions[:, :, part.bodies])
+            states = part.simulator(own[first], begin, acted)
             out[..., part.bodies, :] = states[which.ravel()]
         return out if phi.ndim == 2 else out[0]
 
@@ -148,4 +149,4 @@ class PartedSimulator:
 
 
 def _of(part: Part, start: Array, actions: Array) -> tuple[Array, Array]:
-    return start[:, part.bodies], actions[:, :, part.bodies]
+    return start[..., part.bodies, :], actions[:, :, part.bodies]
