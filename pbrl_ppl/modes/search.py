@@ -13,6 +13,7 @@ from pbrl_ppl.errors import FitError
 from pbrl_ppl.model import Problem, estimate_sigma
 from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, gaussian_profile
+from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import box, inside, likeliest, prior_draws
 
 Array = NDArray[np.float64]
@@ -35,6 +36,7 @@ _FAR = 100.0
 _LOWER = 20.0
 
 
+@one_blas_thread
 def find_modes(
     problem: Problem,
     *,

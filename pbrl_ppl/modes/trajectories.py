@@ -15,6 +15,7 @@ from pbrl_ppl.model import (
 )
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode
+from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import change_from, inside
 
 Array = NDArray[np.float64]
@@ -27,6 +28,7 @@ _CLIMB = 5
 _STARTS, _WIDER = 5, 2.0
 
 
+@one_blas_thread
 def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
     """The highest mode of whole trajectories that is found from several starts about one of Eq. 11.
 

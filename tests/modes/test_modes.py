@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Noise, Problem
-from pbrl_ppl.modes import trajectory_mode
+from pbrl_ppl.modes import search, trajectory_mode
+from pbrl_ppl.modes.laplace import climb
 from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import differentiate, fold_wheels
 from pbrl_ppl.scene import Scene
@@ -102,6 +104,25 @@ def test_same_seed_same_modes(problem, modes) -> None:
     for one, other in zip(modes, again, strict=True):
         np.testing.assert_array_equal(one.phi, other.phi)
         np.testing.assert_array_equal(one.sigma, other.sigma)
+
+
+def blas_threads() -> set[int]:
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+
+def test_a_search_takes_one_thread_of_linear_algebra(problem, modes, monkeypatch) -> None:
+    seen = []
+
+    def watched(*arguments, **options):
+        seen.append(blas_threads())
+        return climb(*arguments, **options)
+
+    monkeypatch.setattr(search, "climb", watched)
+    with threadpool_limits(2, "blas"):
+        find_modes(problem, initial=modes[0].phi)
+        assert blas_threads() == {2}  # as it was
+    assert seen
+    assert all(threads == {1} for threads in seen)
 
 
 def test_scalar_sigma(history) -> None:
