@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -218,7 +218,9 @@ class _Loop:
 
     def posterior(self, mode: Mode, draws: int | None) -> Any:
         """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
-        model = build_model(mode.problem.with_physics(threads=1))
+        # a chain a processor: more threads would wait for each other
+        mode = replace(mode, problem=mode.problem.with_physics(threads=1))
+        model = build_model(mode.problem)
         usual = INDEPENDENT if self.method == "laplace" else DRAWS
         for n in usual if draws is None else (draws,):
             tune = max(LEAST_TUNE, 5 * n // 8)

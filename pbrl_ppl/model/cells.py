@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -66,7 +67,7 @@ class Cells:
         """Places of the noise parameters that are unexplained accelerations."""
         return range(len(self.sensors), len(self.sensors) + len(self.rates))
 
-    @property
+    @cached_property
     def always(self) -> Bools:
         """Which rows act in every step, and not only where bodies touch, shape (push,)."""
         return self.pushed < self.accelerations.stop
@@ -98,6 +99,8 @@ class Cells:
 
     def completed(self, scene: Scene, states: Array) -> Array:
         """Put hung bodies of states (..., body, 6) where their hinges hold them, in place."""
+        if len(self.places) == 6 * len(scene.moving):  # none is hung
+            return states
         free = np.zeros((len(scene.moving), 6), dtype=bool)
         free.reshape(-1)[self.places] = True
         hung = np.array([not body.kinematic for body in scene.moving])[:, None] & ~free
@@ -116,7 +119,7 @@ class Cells:
         body, place = self.in_residual
         return np.ascontiguousarray(residual[..., 0, body, place])
 
-    @property
+    @cached_property
     def in_residual(self) -> tuple[Ints, Ints]:
         """Body and place among the columns of each cell."""
         body, dimension = np.divmod(self.places, 6)

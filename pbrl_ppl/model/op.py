@@ -19,7 +19,7 @@ from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.model.sensitivity import Engine, Sensitivity
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import OneWorld, PartedSimulator, Parts
+from pbrl_ppl.physics import Memory, OneWorld, PartedSimulator, Parts
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, WRENCH
 
@@ -143,7 +143,18 @@ class SimulatorOp(_EngineOp):
         return len(self.scene.moving), 6
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
-        return self._following(self.simulator.recall, phi, start, actions)
+        if self.sensitivity is None:
+            return self.simulator.recall(phi, start, actions)
+
+        def follow(*given: Array) -> Array:
+            return self._following(self.simulator.recall, *given)
+
+        # a copy: what is remembered must not be written into
+        return self._memory.recall((phi, start, actions), follow).copy()
+
+    @cached_property
+    def _memory(self) -> Memory:
+        return Memory()
 
     def pullback(
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]

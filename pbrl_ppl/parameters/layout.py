@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,6 +75,10 @@ class Layout:
 
     blocks: tuple[Block, ...]
 
+    def __getstate__(self) -> dict[str, object]:
+        """The blocks; what follows from them is found again."""
+        return {"blocks": self.blocks}
+
     def subset(self, owners: Iterable[str]) -> Layout:
         """The parameters of these bodies and joints alone."""
         kept = set(owners)
@@ -91,17 +96,17 @@ class Layout:
                 )
         return Layout(tuple(blocks))
 
-    @property
+    @cached_property
     def size(self) -> int:
         """Length of the vector."""
         return sum(len(block.owners) for block in self.blocks)
 
-    @property
+    @cached_property
     def labels(self) -> tuple[str, ...]:
         """One readable label an entry, such as ``mass[cart]``."""
         return tuple(f"{block.name}[{owner}]" for block in self.blocks for owner in block.owners)
 
-    @property
+    @cached_property
     def priors(self) -> tuple[Prior, ...]:
         """One prior an entry."""
         return tuple(prior for block in self.blocks for prior in block.priors)

@@ -2,6 +2,7 @@
 
 from pbrl_ppl.physics.coupling import Parts, independent_parts, joined_parts
 from pbrl_ppl.physics.inputs import after_recording
+from pbrl_ppl.physics.memory import Memory
 from pbrl_ppl.physics.one_world import OneWorld
 from pbrl_ppl.physics.parts import Part, PartedSimulator
 from pbrl_ppl.physics.placement import check_history, check_placement, overlap
@@ -11,6 +12,7 @@ from pbrl_ppl.physics.touch import touching
 from pbrl_ppl.physics.trial import try_effect
 
 __all__ = [
+    "Memory",
     "OneWorld",
     "Part",
     "PartedSimulator",

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -12,12 +11,10 @@ from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics.coupling import Parts
+from pbrl_ppl.physics.memory import Memory
 from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.simulator import Simulator
 from pbrl_ppl.scene import Scene
-
-#: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
-_REMEMBERED = 4
 
 
 @dataclass(eq=False)
@@ -27,11 +24,7 @@ class Part:
     simulator: Simulator
     places: NDArray[np.intp]
     bodies: NDArray[np.intp]
-    memory: OrderedDict[tuple[object, ...], Array] = field(default_factory=OrderedDict)
-
-    def __getstate__(self) -> dict[str, object]:
-        """State to pickle, without the memory."""
-        return self.__dict__ | {"memory": OrderedDict()}
+    memory: Memory = field(default_factory=Memory)
 
 
 class PartedSimulator:
@@ -125,18 +118,10 @@ class PartedSimulator:
                 f"phi has shape {phi.shape}, expected ({len(self._labels)},):"
                 f" {', '.join(self._labels)}"
             )
-        acted = actions.shape, hash(actions.tobytes())
         out = np.empty((*actions.shape[:-1], 6))
         for part in self.parts:
-            own, begin = phi[part.places], start[:, part.bodies]
-            key = (*acted, begin.shape, hash(begin.tobytes()), own.tobytes())
-            if key in part.memory:
-                part.memory.move_to_end(key)
-            else:
-                part.memory[key] = part.simulator(own, begin, actions[:, :, part.bodies])
-                if len(part.memory) > _REMEMBERED:
-                    part.memory.popitem(last=False)
-            out[..., part.bodies, :] = part.memory[key]
+            asked = phi[part.places], *_of(part, start, actions)
+            out[..., part.bodies, :] = part.memory.recall(asked, part.simulator)
         return out
 
     def jacobian(self, phi: Array, start: Array, actions: Array) -> Array:

@@ -20,7 +20,7 @@ from pbrl_ppl.sampling.metropolis import Gaussian
 Array = NDArray[np.float64]
 
 #: Steps of the noise a round. Along trajectories there are two noises, one of which may vanish.
-_CHEAP, _CHEAP_ALONG = 5, 15
+_CHEAP, _CHEAP_ALONG = 5, 30
 
 
 def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:

@@ -8,6 +8,7 @@ from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.model import (
     Problem,
+    SimulatorOp,
     along_trajectories,
     build_layout,
     build_model,
@@ -99,6 +100,24 @@ def test_many_parameters_are_as_one_by_one(cart) -> None:
     each = [follows.predict(other) for other in others]
     np.testing.assert_allclose(follows.predict(others), each, rtol=0, atol=1e-12)
     assert np.abs(each[0] - still.predict(others[0])).max() > 1e-4
+
+
+def test_the_op_remembers_what_follows(cart) -> None:
+    """In any order of parameters, and whatever a graph writes into what it was given."""
+    still, phi = cart
+    follows = with_sensitivity(still, phi, BLIND)
+    given = follows.segments.start, follows.segments.inputs
+    physics = follows.physics
+    op = SimulatorOp(
+        follows.scene, follows.layout, physics.effects, physics.substeps, 1, physics.parts,
+        follows.trajectories.sensitivity,
+    )  # fmt: skip
+    others = phi * (1.0 + 0.02 * np.random.default_rng(2).standard_normal((6, len(phi))))
+    expected = [follows.predict(other) for other in others]
+    for i in (0, 1, 0, 0, 5, 4, 3, 2, 1, 0):
+        predicted = op.predict(others[i], *given)
+        np.testing.assert_allclose(predicted, expected[i], rtol=0, atol=1e-12)
+        predicted[:] = 0.0
 
 
 def test_absurd_parameters_have_no_likelihood(cart) -> None:
