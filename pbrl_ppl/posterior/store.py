@@ -272,7 +272,7 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     -------
     r_hat, ess : dict of str to float
         By label, such as ``mass[cart]``. One that is the same in all draws, as the index of a joint
-        that is certain, has converged: 1, and the number of draws.
+        that is certain, has converged: 1, and the number of draws. R-hat of one chain is NaN.
     """
     variables = scalars(idata)
     fixed = [str(name) for name, v in variables.data_vars.items() if v.min() == v.max()]
@@ -286,7 +286,8 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
         hat, bulk, tail = (
             _dataset(measure)
             for measure in (
-                az.rhat(flat),
+                # of one chain there is none, which ArviZ says in a warning for each parameter
+                az.rhat(flat) if flat.sizes["chain"] > 1 else flat.max() * np.nan,
                 az.ess(flat, method="bulk"),
                 az.ess(flat, method="tail", prob=(0.05, 0.95)),
             )

@@ -1,5 +1,7 @@
 """Posterior files: the same after a round trip, whole or not there, and clear when they are bad."""
 
+import logging
+
 import h5py
 import numpy as np
 import pytest
@@ -316,6 +318,17 @@ def test_convergence_sees_chains_apart() -> None:
     assert r_hat["mass[cart]"] > 1.5
     assert ess["mass[cart]"] < 10
     assert r_hat["sigma[x]"] < 1.1
+
+
+def test_one_chain_has_no_r_hat_and_its_own_effective_size(caplog, monkeypatch) -> None:
+    log = getattr(az, "_log", logging.getLogger("arviz"))  # ArviZ 0.x has a logger of its own make
+    monkeypatch.setattr(log, "handlers", [caplog.handler])
+    idata = made()
+    one = {"posterior": group(idata, "posterior").isel(chain=[0])}
+    r_hat, ess = convergence(from_groups(one, {}))
+    assert np.isnan(list(r_hat.values())).all()
+    assert min(ess.values()) > 1
+    assert caplog.records == []  # ArviZ need not complain of what is not asked
 
 
 def test_scalar_parameters_have_plain_labels() -> None:
