@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -29,7 +30,7 @@ from pbrl_ppl.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from pbrl_ppl.report import Loop
+    from pbrl_ppl.report import Loop, Source
 
 #: Share of the time that is over when a stage begins, as measured on a recorded cart.
 SHARES = {
@@ -155,7 +156,7 @@ def close_loop(
         progress("writing the report")
         source = report.Source(str(scene), str(train), str(test or ""), command_line(context))
         loop.save(output, overwrite=overwrite, source=source)
-        remainder = _remainder(loop, output, seed, progress) if learn_remainder else {}
+        remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     if as_json:
         print_json(loop.findings.to_dict() | {"report": output / "report.html"} | remainder)
     else:
@@ -170,19 +171,17 @@ def close_loop(
 
 
 def _remainder(
-    loop: Loop, folder: Path, seed: int, progress: Callable[[str], None]
+    loop: Loop, folder: Path, source: Source, seed: int, progress: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
-    """Learn what is left into a posterior file beside the others, or say why there is nothing."""
+    """Learn what is left, and put it with the loop's results, or say why there is nothing."""
     from pbrl_ppl.errors import FitError
-    from pbrl_ppl.posterior import save_posterior
-    from pbrl_ppl.report import remainder_in_words
 
     path = folder / "remainder.nc"
     path.unlink(missing_ok=True)  # of an earlier run
     try:
-        learned = loop.learn_remainder(seed=seed, progress=progress)
+        loop = replace(loop, remainder=loop.learn_remainder(seed=seed, progress=progress))
     except FitError as error:
         return {"learned_remainder": {"words": str(error), "posterior": None}}
-    save_posterior(learned, path)
-    words = remainder_in_words(loop.posterior_after, learned)
-    return {"learned_remainder": {"words": words, "posterior": path}}
+    progress("writing the report with it")
+    loop.save(folder, overwrite=True, source=source)
+    return {"learned_remainder": {"words": loop.remainder_words, "posterior": path}}

@@ -25,13 +25,14 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.posterior import save_posterior
-from pbrl_ppl.report.page import Source
+from pbrl_ppl.report.page import Source, write_page
 from pbrl_ppl.report.report import render
-from pbrl_ppl.report.words import verdict_in_words
+from pbrl_ppl.report.words import remainder_in_words, verdict_in_words
 from pbrl_ppl.scene import Scene
 
-#: What :meth:`Loop.save` writes.
+#: What :meth:`Loop.save` writes, and what beside it where a remainder was learned.
 FILES = ("report.html", "report.json", "before.nc", "after.nc")
+REMAINDER = "remainder.nc"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -49,11 +50,14 @@ class Loop:
         What errors were measured on; reports play it.
     catalogue : tuple of Effect
         Where the names of effects are looked up.
+    remainder : InferenceData or DataTree, optional
+        What :meth:`learn_remainder` gave: reports name it, and ``save`` writes ``remainder.nc``.
     """
 
     findings: Findings
     held_out: History | None = None
     catalogue: tuple[Effect, ...] = tuple(full_catalogue)
+    remainder: Any = None
 
     @property
     def verdict(self) -> str:
@@ -145,9 +149,18 @@ class Loop:
     def __repr__(self) -> str:
         return f"Loop({verdict_in_words(self.findings)})"
 
+    @property
+    def remainder_words(self) -> str:
+        """What the learned remainder does, in a sentence; empty without one."""
+        if self.remainder is None:
+            return ""
+        return remainder_in_words(self.posterior_after, self.remainder)
+
     def page(self, source: Source | None = None) -> str:
         """The report as one self-contained page of HTML."""
-        return render(self.findings, self.held_out, self.catalogue, source)
+        return render(
+            self.findings, self.held_out, self.catalogue, source, remainder=self.remainder_words
+        )
 
     def report(self, path: str | Path, *, source: Source | None = None) -> Path:
         """Write the report as one self-contained page and return its path.
@@ -169,7 +182,7 @@ class Loop:
     def save(
         self, folder: str | Path, overwrite: bool = False, *, source: Source | None = None
     ) -> Path:
-        """Write report.html, report.json, before.nc and after.nc, all or nothing.
+        """Write report.html, report.json, before.nc, after.nc (and remainder.nc), all or nothing.
 
         Parameters
         ----------
@@ -198,14 +211,18 @@ class Loop:
                 made = Path(temporary) / "result"
                 made.mkdir()
                 (made / "report.html").write_text(self.page(source), encoding="utf-8")
-                text = json.dumps(self.findings.to_dict(), indent=1, allow_nan=False)
-                (made / "report.json").write_text(text + "\n", encoding="utf-8")
+                said = self.findings.to_dict()
                 save_posterior(self.findings.posterior_before, made / "before.nc")
                 save_posterior(self.findings.posterior_after, made / "after.nc")
+                if self.remainder is not None:
+                    said["learned_remainder"] = self.remainder_words
+                    save_posterior(self.remainder, made / REMAINDER)
+                text = json.dumps(said, indent=1, allow_nan=False)
+                (made / "report.json").write_text(text + "\n", encoding="utf-8")
                 if nearest == folder:
                     # it may be a mount or somebody's working directory: fill it, do not swap it
-                    for name in FILES:
-                        (made / name).replace(folder / name)
+                    for one in made.iterdir():
+                        one.replace(folder / one.name)
                 else:
                     folder.parent.mkdir(parents=True, exist_ok=True)
                     made.rename(folder)
@@ -289,26 +306,6 @@ def close_loop(
     return Loop(found, test, catalogue)
 
 
-def write_page(path: str | Path, page: str) -> Path:
-    """Write a page whole or not at all, and return its path.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(page, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
-
-
 def check_folder(folder: Path, overwrite: bool) -> Path:
     """Return the nearest folder that exists, if results can be written to ``folder``.
 
@@ -334,7 +331,7 @@ def check_folder(folder: Path, overwrite: bool) -> Path:
             f"output folder {folder}: it has content already; choose another, or allow"
             " overwriting: overwrite=True"
         )
-    for name in FILES:
+    for name in (*FILES, REMAINDER):
         if (folder / name).is_dir():
             raise OutputError(f"output folder {folder}: {name} in it is a folder; remove it")
     return folder

@@ -51,6 +51,7 @@ def render(
     held_out: History | None = None,
     effects: Iterable[Effect] = full_catalogue,
     source: Source | None = None,
+    remainder: str = "",
 ) -> str:
     """Render the report: one page of HTML that needs nothing else.
 
@@ -65,6 +66,8 @@ def render(
         Where the names of effects are looked up.
     source : Source, optional
         Names of the files, and the command that makes the page again.
+    remainder : str
+        What a learned remainder does, in a sentence, where one was learned.
     """
     effects = tuple(effects)
     table = summary(findings.posterior_after)
@@ -108,6 +111,7 @@ def render(
         motion=animation(findings, held_out_motions(findings, held_out, effects)),
         verdict=verdict_in_words(findings),
         unseen=unseen_in_words(findings),
+        remainder=remainder,
         gains=gains_in_words(findings.before.rollout_rmse, findings.after.rollout_rmse, UNITS),
         evidence=evidence,
         carriers=None if evidence is None else carrier_table(evidence),

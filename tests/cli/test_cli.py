@@ -56,7 +56,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any, Any, dict[str
         return Loop(made_up())
 
     monkeypatch.setattr(report, "close_loop", close_loop)
-    monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
     return seen
 
 
@@ -234,7 +234,7 @@ def test_warnings_are_one_line(
         return Loop(made_up())
 
     monkeypatch.setattr(report, "close_loop", close_loop)
-    monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 0
     assert capsys.readouterr().err.strip() == "warning: w_y did not converge"
 

@@ -139,7 +139,6 @@ def test_an_update_keeps_it(frames, learned) -> None:
 @pytest.mark.slow
 def test_the_command_writes_it_beside_the_report(loop, learned, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(report, "close_loop", lambda *given, **options: loop)
-    monkeypatch.setattr(pp.Loop, "save", lambda self, folder, **options: folder.mkdir())
     monkeypatch.setattr(pp.Loop, "learn_remainder", lambda self, **options: learned)
     (tmp_path / "scene.toml").write_text(BOX.to_toml())
     train = tmp_path / "train.csv"
@@ -155,6 +154,11 @@ def test_the_command_writes_it_beside_the_report(loop, learned, tmp_path, monkey
     assert "a force without a law" in said["learned_remainder"]["words"]
     assert said["learned_remainder"]["posterior"] == str(tmp_path / "out" / "remainder.nc")
     assert pp.load_posterior(tmp_path / "out" / "remainder.nc").attrs[LEARNED_REMAINDER]
+    kept = json.loads((tmp_path / "out" / "report.json").read_text(encoding="utf-8"))
+    assert kept["learned_remainder"] == said["learned_remainder"]["words"]
+    assert (kept["verdict"], kept["added"]) == ("unexplained", [])
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert kept["learned_remainder"] in page
 
 
 def test_clean_data_have_nothing_to_learn(make_history) -> None:

@@ -378,7 +378,7 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> None:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(loop_module, "save_posterior", fail)
-    monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
 
 
 @pytest.mark.usefixtures("broken")
@@ -401,7 +401,7 @@ def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         loop_module, "save_posterior", lambda posterior, path: path.write_bytes(b"nc")
     )
-    monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
     loop = Loop(made_up())
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"has content already.*overwrite=True"):
@@ -426,7 +426,7 @@ def test_folder_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
 
 
 def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop_module, "render", lambda *args: "a page")
+    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
     path = Loop(made_up()).report(tmp_path / "report.html")
     assert path.read_text() == "a page"
     for place in (tmp_path, tmp_path / "none" / "report.html"):
