@@ -10,8 +10,11 @@ from hypothesis import settings
 
 from tests.helpers.places import RECORDED, ROOT
 
-# where each tensor was made is a fiftieth of the tests' time; pytensor reads this when imported
-os.environ.setdefault("PYTENSOR_FLAGS", "traceback__limit=0")
+# Where each tensor was made is a fiftieth of the tests' time, and what the C compiler makes quick
+# is never run for long. pytensor reads this when imported.
+os.environ.setdefault("PYTENSOR_FLAGS", "traceback__limit=0,gcc__cxxflags=-O0")
+# a worker a processor: threads of linear algebra would wait for each other; read with numpy
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # the same examples everywhere, and no test that fails because a machine is slow
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
@@ -44,25 +47,25 @@ ON_MODES = (
     "modes/test_configurations.py",
     "sampling/test_emulator.py",
 )
-#: Files that take longest, longest first: workers begin with them, and fill up with the short ones.
+#: Files that workers begin with: the longest first, and they fill up with the short ones. The
+#: second runs no engine, while the other worker compiles it for both.
 LONGEST = (
     "criticism/test_revision.py",
-    "criticism/test_revision_pivots.py",
-    "domains/test_namo.py",
+    "sampling/test_metropolis.py",
     "test_notebooks.py",
     "sampling/test_updating.py",
-    "sampling/test_fitting.py",
-    "modes/test_joint_search.py",
     "modes/test_configurations.py",
-    "posterior/test_updated_prior.py",
-    "planning/test_planning_loop.py",
-    "planning/test_planning_modes.py",
-    "criticism/test_held_out.py",
-    "criticism/test_misfit.py",
+    "sampling/test_whole_trajectories.py",
+    "sampling/test_fitting.py",
     "criticism/test_criticism.py",
-    "criticism/test_structure_search.py",
+    "agents/test_figures.py",
+    "posterior/test_updated_prior.py",
+    "criticism/test_remainder.py",
+    "planning/test_experiments.py",
+    "modes/test_joint_search.py",
+    "sampling/test_calibration.py",
     "model/test_gradients.py",
-    "sampling/test_emulator.py",
+    "planning/test_planning.py",
 )
 
 

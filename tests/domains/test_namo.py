@@ -14,8 +14,8 @@ from matplotlib.patches import Circle, Polygon
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
 from pbrl_ppl.report.scene_plots import draw_goal, draw_motion, draw_scene
-from pbrl_ppl.sampling import fitting
 from tests.helpers.places import ROOT
+from tests.helpers.samplers import shorten
 
 #: What the model believes before it has touched anything, roughly: the medians of the prior.
 BELIEVED = {
@@ -123,12 +123,10 @@ def test_only_what_moved_has_a_track(namo):
 def story(namo, tmp_path_factory):
     """Posterior, plan, failure, posterior, and what the second plan comes to."""
     folder = tmp_path_factory.mktemp("namo")
-    # few draws, on purpose, also where the update fits anew
-    few = replace(fitting.METHODS["metropolis"], draws=300, tune=200)
     with pytest.MonkeyPatch.context() as patch, warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         warnings.simplefilter("ignore", RefitWarning)
-        patch.setattr(fitting, "METHODS", {"metropolis": few})
+        shorten(patch, draws=300, tune=200)  # on purpose, also where the update fits anew
         world = namo.World(5)
         seen = namo.go_round(world)
         model = pp.physics_model(namo.SCENE, seen.history())

@@ -39,6 +39,7 @@ from pbrl_ppl.sampling.rejuvenation import _Mover, rejuvenate
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
+from tests.helpers.samplers import shorten
 
 KNOWN = {"r": 0.2, "mu_c": 0.3}
 PUCKS = {"mass": [2.0, 3.0], "linear_drag_coefficient": [0.5, 1.0]}
@@ -266,8 +267,9 @@ def test_old_files_have_no_prior_of_the_noise(parts, first, one) -> None:
 
 
 @pytest.mark.slow
-def test_other_data_are_fitted_anew(parts, first) -> None:
+def test_other_data_are_fitted_anew(parts, first, monkeypatch) -> None:
     """The masses are others now: nearly no draw is left, and the answer is the refit's."""
+    shorten(monkeypatch, draws=500, tune=300)
     scene, _, _, _ = parts
     heavy = PUCKS | {"mass": [4.0, 6.0]}
     new = simulated_history(scene, heavy, seed=4, trajectories=40, intervals=1, substeps=8)
