@@ -130,8 +130,9 @@ class TrajectoryNoise:
     def filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
         """White innovations and filtered deviations of cells' residuals (set, transition, cell)."""
         gain, scale, *_ = self.gains(sigma)
+        rows = np.ascontiguousarray(residual)  # another layout would be compiled for, too
         white, state = innovations(
-            self.slope, self.first, self.seen, gain, scale, residual, self.begin, self.measured
+            self.slope, self.first, self.seen, gain, scale, rows, self.begin, self.measured
         )
         return white, state
 

@@ -136,8 +136,9 @@ class Simulator:
             If a parameter is impossible, such as a negative mass.
         """
         phi = np.asarray(phi, dtype=float)
-        start = np.ascontiguousarray(start, dtype=float)
-        actions = np.ascontiguousarray(actions, dtype=float)
+        # of one kind, for numba compiles the rollout anew for another
+        start = np.require(start, float, ("C", "W"))
+        actions = np.require(actions, float, ("C", "W"))
         self._check(phi, start, actions)
         proposals = np.atleast_2d(phi)
         inputs, clock = self._inputs(actions)
@@ -265,7 +266,7 @@ class Simulator:
         counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
         # in closed form: a solver's last digits differ between machines
         weights = [math.prod(n / (n - other) for other in counts if other != n) for n in counts]
-        return np.array(counts, dtype=np.int64), np.array(weights)
+        return np.array(counts, dtype=np.int64), np.array(weights, dtype=float)
 
     @cached_property
     def _commands(self) -> tuple[NDArray[Any], ...]:

@@ -204,7 +204,7 @@ class Separation:
             touching=met,
         )
         rows = np.concatenate([residual[None], -np.moveaxis(by_phi, -1, 0)])
-        white, _ = noise.filtered(np.ascontiguousarray(rows), rival.sigma)
+        white, _ = noise.filtered(rows, rival.sigma)
         white = white.reshape(len(rows), -1, paths.intervals * c)
         r, jacobian = white[0], np.moveaxis(white[1:], 0, -1)
         scaled = jacobian @ mode.factor  # by a posterior standard deviation of each direction

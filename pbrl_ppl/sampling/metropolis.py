@@ -16,7 +16,7 @@ from pymc.step_methods.arraystep import ArrayStepShared
 from pymc.step_methods.compound import StepMethodState
 from pymc.step_methods.state import dataclass_state
 from pymc.util import get_value_vars_from_user_vars
-from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dtrtrs
 
 Array = NDArray[np.float64]
 
@@ -66,8 +66,12 @@ class Gaussian:
 
     def depth(self, x: Array) -> Any:
         """Minus the log-density at points (..., d), up to a constant."""
-        z = solve_triangular(self.factor, (x - self.mean).T, lower=True)
-        return 0.5 * (z**2).sum(axis=0)
+        return 0.5 * (self.standardised(x) ** 2).sum(axis=0)
+
+    def standardised(self, x: Array) -> Array:
+        """Points (..., d) in units of this Gaussian, shape (d, ...)."""
+        # called for each step: scipy's `solve_triangular` takes ten times as long to check
+        return np.asarray(dtrtrs(self.factor, (x - self.mean).T, lower=True)[0])
 
     def propose(self, x: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, Any]:
         """A proposal from each point (..., d), and the logarithm of the Hastings ratio."""
@@ -169,8 +173,7 @@ class Jumps:
         """One jump from the vector q, whose log-density is ``here``; both, where it ends."""
         first, second = (self.hills[i] for i in rng.choice(len(self.hills), 2, replace=False))
         moved = q.copy()
-        z = solve_triangular(first.factor, q[first.places] - first.mean, lower=True)
-        moved[first.places] = second.mean + second.factor @ z
+        moved[first.places] = second.mean + second.factor @ first.standardised(q[first.places])
         there = float(density(moved))
         stretch = np.log(np.diag(second.factor) / np.diag(first.factor)).sum()
         if rng.uniform() < _rate(there - here + float(stretch)):

@@ -5,7 +5,7 @@ import pytest
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator, calls, lockstep
+from pbrl_ppl.physics import Simulator, calls, compiled, lockstep
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import ARM, BOX, proposals
@@ -124,6 +124,19 @@ def test_lanes_do_not_depend_on_each_other(name) -> None:
     np.testing.assert_array_equal(simulator(phi, start[order], inputs[order]), whole[:, order])
     one = np.stack([simulator(phi[1], start[[i]], inputs[[i]])[0] for i in range(10)])
     np.testing.assert_array_equal(one, whole[1, :10])
+
+
+def test_arrays_of_every_kind_take_what_is_compiled_already() -> None:
+    """The rollouts take ten seconds to compile, and would again for another kind of array."""
+    for name in ("wheel", "walls"):
+        simulator, phi, start, inputs = case(name)
+        expected = simulator(phi, start, inputs)
+        start.setflags(write=False)
+        np.testing.assert_array_equal(simulator(phi, start, np.asfortranarray(inputs)), expected)
+        coarse = Simulator(simulator.scene, simulator.layout, simulator.effects, extrapolate=False)
+        assert np.isfinite(coarse(phi, start, inputs)).all()
+    for compiled_once in (lockstep.rollout, compiled.rollout):
+        assert len(compiled_once.signatures) == 1
 
 
 def test_what_comes_near_something_is_left_to_the_engine() -> None:

@@ -280,7 +280,7 @@ def test_other_data_are_fitted_anew(parts, first, monkeypatch) -> None:
     assert "before_updates" not in groups(idata)
     problem = problem_of(first).with_data(history=problem_of(idata).data.history)
     assert problem.segments.n == 100
-    agree(idata, quiet(fit, build_model(problem), seed=10, **QUICK))
+    agree(idata, quiet(fit, build_model(problem), seed=10, **QUICK | {"draws": 500}))
 
 
 @pytest.mark.parametrize(
@@ -308,6 +308,7 @@ def test_a_cart(sigma) -> None:
     agree(idata, whole, sigmas=5.0)
 
 
+@pytest.mark.one_stack
 def test_missing_cells_and_dimensions(parts, first) -> None:
     """What was not measured takes no part; a dimension of which no noise is known cannot."""
     rows = parts[2].select([0]).to_dataframe()
@@ -328,6 +329,7 @@ def test_missing_cells_and_dimensions(parts, first) -> None:
         update(no_omega, parts[2])
 
 
+@pytest.mark.one_stack
 def test_an_effect_of_one_s_own(parts) -> None:
     def force(state, command, parameters, wrench):
         wrench[0] += parameters[0]
@@ -351,6 +353,7 @@ def test_an_effect_of_one_s_own(parts) -> None:
     assert did(quiet(update, idata, new, effects=(*catalogue, own), progress=False)) != []
 
 
+@pytest.mark.one_stack
 @pytest.mark.parametrize("known", ["b", "ab"])
 def test_bodies_of_which_all_is_known(known, monkeypatch) -> None:
     """Nothing to move of them but the noise."""
@@ -381,6 +384,7 @@ def test_refused_histories(parts, first) -> None:
             update(once, data)
 
 
+@pytest.mark.one_stack
 def test_a_shorter_trajectory_than_the_horizon_counts_as_far_as_it_goes(parts) -> None:
     scene = pucks("a")
     truth = {"mass": 2.0, "linear_drag_coefficient": 0.5}

@@ -183,6 +183,7 @@ def test_a_first_contact_brings_a_noise_of_its_own(monkeypatch) -> None:
         assert len(json.loads(quiet(pp.update, both, more, seed=3).attrs["updates"])) == 2
 
 
+@pytest.mark.one_stack
 @pytest.mark.parametrize("stated", [6, 3])
 def test_stated_errors_of_measuring_leave_a_whole_posterior(stated, tmp_path) -> None:
     """Of all sensors or some: what is not inferred is no variable, and nothing asks for it."""
