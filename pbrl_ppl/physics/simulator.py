@@ -193,7 +193,7 @@ class Simulator:
         measured = measured if measured.ndim == 4 else measured[None]
         if not sensors:
             return measured
-        states = np.array(np.broadcast_to(measured, (len(phi), *measured.shape[1:])))
+        states = np.array(np.broadcast_to(measured, (len(phi), *measured.shape[1:])), order="C")
         for i, sensor, values in reversed(sensors):
             flat = {name: value[..., 0] for name, value in values.items()}
             states[:, :, i] = sensor.invert(states[:, :, i], flat)

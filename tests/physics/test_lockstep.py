@@ -53,6 +53,7 @@ SCENES = {
     "patch": cart("sliding_friction", "linear_drag"),
     "payload": cart("mass_change", "actuator_delay"),
     "disc": cart("hidden_obstacle"),
+    "sensor": cart("sensor_scale"),
 }
 PIVOT = tuple(BY_NAME[name] for name in ("pivot_friction", "pivot_damping", "gravity_tilt"))
 
@@ -128,7 +129,7 @@ def test_lanes_do_not_depend_on_each_other(name) -> None:
 
 def test_arrays_of_every_kind_take_what_is_compiled_already() -> None:
     """The rollouts take ten seconds to compile, and would again for another kind of array."""
-    for name in ("wheel", "walls"):
+    for name in ("wheel", "walls", "sensor"):
         simulator, phi, start, inputs = case(name)
         expected = simulator(phi, start, inputs)
         start.setflags(write=False)
