@@ -92,6 +92,7 @@ class Effects:
     pivot_friction: float = 0.0  # N m, Coulomb torque in the hinge
     pivot_damping: float = 0.0  # N m s
     sliding_friction: tuple[float, float] = (0.0, 0.0)  # mu, radius of the ring of contact (m)
+    wheel: tuple[float, ...] = (0.0,) * 5  # as Wheel has it, beside the setup's
     actuator_delay: float = 0.0  # share of the interval by which the command is late
     dead_zone: float = 0.0  # N
     mass_change: tuple[float, float, float] = (1.0, 0.0, 0.0)  # factor, from trajectory, from s
@@ -174,6 +175,8 @@ def rollout(
     if setup.hinge is None and (effects.pivot_friction or effects.pivot_damping):
         raise ValueError("pivot_friction and pivot_damping act in a hinge, and the setup has none")
     factor, loaded_from, loaded_at = effects.mass_change
+    wheels = [wheel for wheel in (setup.wheel, Wheel(*effects.wheel)) if wheel is not None]
+    wheels = [wheel for wheel in wheels if wheel.mu_x or wheel.mu_y]
 
     # Box2D kicks, then drifts. With positions held half a step ahead of the velocities that is the
     # leapfrog, of second order; read without it, positions are half a step's way too far.
@@ -247,8 +250,8 @@ def rollout(
                 v *= 1 - min(1.0, effects.stiction_patch * NORMAL_GRAVITY * step / (abs(v) or 1.0))
             if effects.sliding_friction[0]:
                 v, omega = rub(*effects.sliding_friction, step, mass, inertia, v, omega)
-            if setup.wheel is not None:
-                v, omega = roll(setup.wheel, step, mass, inertia, turn, v, omega)
+            for wheel in wheels:
+                v, omega = roll(wheel, step, mass, inertia, turn, v, omega)
             body.linearVelocity = (v.real * CM, v.imag * CM)
             body.angularVelocity = omega
             world.Step(step, 20, 10)

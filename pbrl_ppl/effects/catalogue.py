@@ -31,6 +31,7 @@ from pbrl_ppl.effects.sliding_friction import sliding_friction
 from pbrl_ppl.effects.spring import spring
 from pbrl_ppl.effects.torque_gain import torque_gain
 from pbrl_ppl.effects.torsion_spring import torsion_spring
+from pbrl_ppl.effects.wheel import wheel
 
 #: Where two effects cannot be told apart, the earlier one is named: a hinge's own friction before
 #: drag on a body, which looks the same on a single pendulum, and the simpler before the richer.
@@ -52,6 +53,7 @@ catalogue: tuple[Effect, ...] = (
     torque_gain,
     anisotropic_gain,
     sliding_friction,
+    wheel,
     actuator_delay,
     dead_zone,
     saturation,

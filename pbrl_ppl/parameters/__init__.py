@@ -18,7 +18,6 @@ from pbrl_ppl.parameters.priors import (
     prior_slopes,
 )
 from pbrl_ppl.parameters.wheel_symmetry import (
-    MIXED,
     Wheel,
     beside,
     change_from,
@@ -35,7 +34,6 @@ __all__ = [
     "BODY_PARAMETERS",
     "JOINT_ANCHORS",
     "JOINT_INDICES",
-    "MIXED",
     "WHEEL_PARAMETERS",
     "Block",
     "Layout",

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,9 @@ Ints = NDArray[np.intp]
 
 #: The parameters that the symmetry mixes: w_theta and w_theta + pi/2 with mu_x, mu_y swapped.
 MIXED = ("w_theta", "mu_x", "mu_y")
+#: What the names begin with, of Table 1's wheel and of the effect's.
+_BEGINNINGS = ("", "wheel_")
+_ANGLES = tuple(f"{begin}w_theta[" for begin in _BEGINNINGS)
 _ROUNDS = 20
 
 
@@ -33,22 +37,17 @@ class Wheel:
 
     Parameters
     ----------
-    owner : str
-        Its body.
+    labels : tuple of str
+        Of the angle and the two frictions.
     places : tuple of int
-        Of the angle and the two frictions in phi.
+        Of the same in phi.
     priors : tuple of Prior
         Of the same.
     """
 
-    owner: str
+    labels: tuple[str, str, str]
     places: tuple[int, int, int]
     priors: tuple[Prior, Prior, Prior]
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Labels of the angle and the two frictions."""
-        return tuple(f"{name}[{self.owner}]" for name in MIXED)
 
     @property
     def period(self) -> int:
@@ -85,11 +84,12 @@ def wheels(layout: Layout) -> tuple[Wheel, ...]:
     places = {label: i for i, label in enumerate(layout.labels)}
     priors, found = layout.priors, []
     owners = {owner: None for b in layout.blocks if b.of == "body" for owner in b.owners}
-    for owner in owners:
-        at = [places.get(f"{name}[{owner}]", -1) for name in MIXED]
+    for begin, owner in product(_BEGINNINGS, owners):
+        one, two, three = (f"{begin}{name}[{owner}]" for name in MIXED)
+        at = places.get(one, -1), places.get(two, -1), places.get(three, -1)
         if min(at) >= 0:
             angle, x, y = at
-            found.append(Wheel(owner, (angle, x, y), (priors[angle], priors[x], priors[y])))
+            found.append(Wheel((one, two, three), at, (priors[angle], priors[x], priors[y])))
     return tuple(found)
 
 
@@ -229,7 +229,7 @@ def change_from(layout: Layout, phi: Array, origin: Array) -> Array:
             phi = wheel.turned(phi, turns)
     change = phi - origin
     for i, (label, prior) in enumerate(zip(layout.labels, layout.priors, strict=True)):
-        if label.startswith("w_theta["):  # a wheel turned half way round is the same
+        if label.startswith(_ANGLES):  # a wheel turned half way round is the same
             change[..., i] = wrapped(2.0 * change[..., i]) / 2.0
         elif prior.family == "von_mises":
             change[..., i] = wrapped(change[..., i])

@@ -47,6 +47,8 @@ JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
 _NO_LENGTH = 1e-9
 _MAX = np.finfo(float).max
 _POSITIVE = ("mass", "moment")
+#: How strong the friction under a body is: of a ring that carries it, and of a wheel.
+_PATCH, _WHEEL = ("patch_mu",), ("mu_x", "mu_y")
 _ANYTHING = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y", "com_x", "com_y")
 #: What an effect sees in place of a column: the moment follows from the mass, gravity is the whole.
 _GIVEN = {
@@ -89,16 +91,16 @@ class EngineInput(NamedTuple):
     indices: NDArray[np.int64]
 
 
-def _is_patch(attached: Attached) -> bool:
-    """Whether an effect puts friction under its body, by a trial evaluation."""
+def _sets(attached: Attached) -> frozenset[str]:
+    """Names of a body's numbers that an effect changes, by a trial evaluation."""
     stage = attached.effect.stage
     if not isinstance(stage, Properties):
-        return False
+        return frozenset()
     row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *_GIVEN)}
     centre = {p.name: np.full((1, 1), p.prior.centre) for p in attached.effect.parameters}
     never = np.full((1, 1), np.inf)
     stage.modify(row, centre, Clock(never, never, never))
-    return bool(row["patch_mu"].any())
+    return frozenset(name for name, value in row.items() if value.any())
 
 
 class EngineProperties:
@@ -121,9 +123,7 @@ class EngineProperties:
         self._known = np.zeros((len(bodies), len(COLUMNS)))
         moved = []  # (place in phi, body, column)
         for i, body in enumerate(scene.moving):
-            known = dict(body.known) | (
-                {"mass": 1.0} if body.kinematic else {}
-            )  # of no consequence
+            known = dict(body.known) | ({"mass": 1.0} if body.kinematic else {})  # not used
             for name in BODY_PARAMETERS:
                 self._known[i, COLUMN[name]] = known.get(name, 0.0)
                 place = places.get(f"{name}[{body.name}]")
@@ -142,11 +142,22 @@ class EngineProperties:
         )
         #: How many discs the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
-        #: Which bodies have friction under them.
-        self.patches = tuple(
-            sorted({bodies.index(attached.body) for attached in effects if _is_patch(attached)})
-        )
+        #: Bodies that effects put friction under: rings, and wheels.
+        self.under = tuple(self._changed(effects, names) for names in (_PATCH, _WHEEL))
         self._bind_joints(scene, places)
+
+    def _changed(self, effects: tuple[Attached, ...], names: tuple[str, ...]) -> tuple[int, ...]:
+        """Bodies of which effects change one of these numbers."""
+        own = {attached.body for attached in effects if _sets(attached).intersection(names)}
+        return tuple(i for i, name in enumerate(self._bodies) if name in own)
+
+    def slides(self, bodies: Array) -> NDArray[np.bool_]:
+        """Whether there is any of it, shape (proposal,), in numbers (proposal, 1, body, column)."""
+        found = np.zeros(len(bodies), dtype=bool)
+        for own, names in zip(self.under, (_PATCH, _WHEEL), strict=True):
+            columns = [COLUMN[name] for name in names]
+            found |= (bodies[:, :, list(own)][..., columns] > 0).any(axis=(1, 2, 3))
+        return found
 
     def values(self, attached: Attached, phi: Array, axes: int = 0) -> dict[str, Array]:
         """An effect's parameters by name, shape (proposal, 1, ...) with so many further axes.

@@ -19,7 +19,7 @@ from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
 from pbrl_ppl.physics.inputs import after_recording
-from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput, EngineProperties
+from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT
@@ -147,7 +147,7 @@ class Simulator:
         n, horizon, k = actions.shape[:3]
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         run = self._run_plain if self.path == "plain" else self._run_compiled
-        if not (self._properties.patches or given.indices.shape[1]):
+        if not (any(self._properties.under) or given.indices.shape[1]):
             run(_ONE_WORLD, given, starts, inputs, out.reshape(-1, horizon, k, 6))
         else:
             for choice, rows in self._choices(given):
@@ -167,10 +167,10 @@ class Simulator:
         whose joints would cost ten times as much as all else where the coefficient is zero, as it
         is when candidates are scored.
         """
-        sliding = given.bodies[..., list(self._properties.patches), COLUMN["patch_mu"]] > 0
+        sliding = self._properties.slides(given.bodies)
         proposals, joints, _ = given.indices.shape
         indices = given.indices.reshape(proposals, 2 * joints)
-        keys = np.column_stack([sliding.any(axis=(1, 2)), indices])
+        keys = np.column_stack([sliding, indices])
         choices, which = np.unique(keys, axis=0, return_inverse=True)
         for i, (slides, *pairs) in enumerate(choices.astype(int).tolist()):
             joined = tuple(zip(pairs[::2], pairs[1::2], strict=True))
@@ -261,7 +261,7 @@ class Simulator:
         The engine's error is a series in the substep (Richardson, 1911): two runs cancel its first
         term, three its second as well. Friction on the floor has kinks that a third run amplifies.
         """
-        kinks = any(body.wheel for body in self.scene.moving) or self._properties.patches
+        kinks = any(body.wheel for body in self.scene.moving) or any(self._properties.under)
         runs = (2 if kinks else 3) if self.extrapolate else 1
         counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
         # in closed form: a solver's last digits differ between machines
@@ -297,7 +297,8 @@ class Simulator:
     def _new_world(self, choice: Choice) -> World:
         joined, slides = choice
         own = self._properties
-        return World(self.scene, own.hinges, joined, own.n_discs, own.patches if slides else ())
+        under = own.under if slides else ()
+        return World(self.scene, own.hinges, joined, own.n_discs, *under)
 
     def _run_plain(
         self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array

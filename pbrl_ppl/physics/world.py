@@ -105,6 +105,8 @@ class World:
         Static discs beside those of the scene; their places and sizes are properties.
     patches : tuple of int
         Bodies with friction under them.
+    wheels : tuple of int
+        Bodies with a wheel beside those of which the scene says so.
     """
 
     def __init__(
@@ -114,6 +116,7 @@ class World:
         joined: tuple[tuple[int, int], ...] = (),
         discs: int = 0,
         patches: tuple[int, ...] = (),
+        wheels: tuple[int, ...] = (),
     ) -> None:
         self.scene = scene
         self.space = pymunk.Space()
@@ -141,7 +144,7 @@ class World:
             self._by_name[body.name] = rigid
             self.space.add(rigid)
             self.shapes += [(i, shape) for shape in _shapes(body, rigid)]
-            if body.wheel:
+            if body.wheel or i in wheels:
                 self._add_wheel(i, rigid)
         self._add_shapes()
         self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)

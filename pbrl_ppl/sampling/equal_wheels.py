@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 
 from pbrl_ppl.model import Problem
-from pbrl_ppl.parameters import MIXED, Wheel, wheels
+from pbrl_ppl.parameters import Wheel, wheels
 
 
 def evened_logp(model: pm.Model, problem: Problem) -> Any:
@@ -38,8 +38,12 @@ def evened_logp(model: pm.Model, problem: Problem) -> Any:
 
 
 def _of_wheel(model: pm.Model, problem: Problem, wheel: Wheel) -> Any:
-    owners = {block.name: block.owners for block in problem.layout.blocks}
-    angle, *mus = (model[name][owners[name].index(wheel.owner)] for name in MIXED)
+    places = {
+        f"{block.name}[{owner}]": (block.name, i)
+        for block in problem.layout.blocks
+        for i, owner in enumerate(block.owners)
+    }
+    angle, *mus = (model[name][i] for name, i in (places[label] for label in wheel.labels))
     direction, *frictions = wheel.priors
     terms = []
     for turns in range(4):

@@ -184,12 +184,14 @@ def test_it_needs_a_floor() -> None:
         attach(scene, (BY_NAME["sliding_friction"].on("block"),))
 
 
-def test_only_it_puts_a_patch_under_a_body() -> None:
+def test_only_it_puts_a_ring_under_a_body() -> None:
     scene = floor()
     others = tuple(each for each in catalogue if each.applies(scene, scene.bodies[0]))
     for effect in others:
         sim = simulator(scene, (effect,))
-        assert bool(sim._properties.patches) == (effect.name == "sliding_friction")
+        rings, wheels = sim._properties.under
+        assert bool(rings) == (effect.name == "sliding_friction")
+        assert bool(wheels) == (effect.name == "wheel")
 
 
 @pytest.mark.slow

@@ -13,8 +13,10 @@ ARM = Shape.box(0.03, 0.4)
 #: Friction in hinges.
 PIVOT = [e for e in catalogue if e.name.startswith("pivot")]
 TILT = [e for e in catalogue if e.name == "gravity_tilt"]
-#: Without hinges there is no friction in them, and without obstacles nothing to touch.
-OTHERS = [e for e in catalogue if not e.name.startswith(("pivot", "gravity", "hidden_obstacle"))]
+#: Without hinges there is no friction in them, without obstacles nothing to touch, and a wheel is
+#: declared.
+_ELSEWHERE = ("pivot", "gravity", "hidden_obstacle", "wheel")
+OTHERS = [e for e in catalogue if not e.name.startswith(_ELSEWHERE)]
 
 
 def ring(half: float) -> tuple[Wall, ...]:

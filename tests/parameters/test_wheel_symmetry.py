@@ -5,6 +5,8 @@ import pymc as pm
 import pytest
 from scipy import stats
 
+from pbrl_ppl.effects import attach
+from pbrl_ppl.effects.wheel import wheel
 from pbrl_ppl.model import build_layout, physics_model
 from pbrl_ppl.parameters import (
     Layout,
@@ -62,6 +64,18 @@ def test_the_period_is_the_prior_s(name) -> None:
 def test_a_wheel_with_something_known_has_no_other_description() -> None:
     for known in ("w_theta", "mu_x", "mu_y"):
         assert not wheels(build_layout(cart_scene(known={known: 0.2})))
+
+
+def test_a_wheel_that_an_effect_adds_is_folded_too() -> None:
+    layout = build_layout(cart_scene(wheel=False), attach(cart_scene(wheel=False), (wheel,)))
+    (own,) = wheels(layout)
+    assert own.labels == ("wheel_w_theta[cart]", "wheel_mu_x[cart]", "wheel_mu_y[cart]")
+    assert own.period == 1
+    phi = draws_of(layout, 50)
+    for turns in range(4):
+        np.testing.assert_allclose(
+            fold_wheels(layout, own.turned(phi, turns)), fold_wheels(layout, phi), atol=1e-12
+        )
 
 
 @OBJECT_MODE

@@ -38,7 +38,7 @@ def tethered(*, body_first: bool) -> Scene:
 
 def cart(*effects: str, walls: bool = False) -> Scene:
     around = (Wall((-1.0, -9.0), (-1.0, 9.0)), Wall((-9, 2), (9, 2)))
-    box = Body("box", BOX, wheel=True, effects=effects)
+    box = Body("box", BOX, wheel="wheel" not in effects, effects=effects)
     return Scene(time_step=0.1, normal_gravity=G, bodies=(box,), walls=around if walls else ())
 
 
@@ -51,6 +51,7 @@ SCENES = {
     "wheel": cart(),
     "walls": cart(walls=True),
     "patch": cart("sliding_friction", "linear_drag"),
+    "undeclared wheel": cart("wheel", "sliding_friction"),
     "payload": cart("mass_change", "actuator_delay"),
     "disc": cart("hidden_obstacle"),
     "sensor": cart("sensor_scale"),
@@ -68,6 +69,8 @@ def case(name: str) -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
     for label, values in {
         "sliding_friction_mu[box]": (0.05, 0.2, 0.4),
         "sliding_friction_radius[box]": (0.2, 0.3, 0.1),
+        "wheel_mu_x[box]": (0.05, 0.2, 0.4),
+        "wheel_mu_y[box]": (0.3, 0.0, 0.1),
         "hidden_obstacle_radius[box]": (0.1, 0.5, 0.3),
         "mass_change_trajectory[box]": (0.5, 1.5, 2.5),
         "mass_change_time[box]": (0.05, 0.13, 0.2),
