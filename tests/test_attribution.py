@@ -1,6 +1,7 @@
 """The scoreboard of attribution: its scores by hand, and its data; no loop is run."""
 
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ pytestmark = pytest.mark.one_stack
 def attribution(monkeypatch):
     """Modules of analysis/attribution can be imported, as the script imports them."""
     monkeypatch.syspath_prepend(str(ROOT / "analysis"))
+    import attribution.baselines
     import attribution.cases
     import attribution.measured
     import attribution.one_case
@@ -92,6 +94,8 @@ def test_scores_by_hand(attribution, row) -> None:
         "missed": 2 / 12,
         "false_alarms": 2 / 4,
         "coverage": 1 / 2,  # the second named another effect of its group
+        "excess": None,  # nobody asked the oracle for forecasts
+        "baseline_naming": None,
         "nonsense_adequate": 1,
         "cases": 20,
         "detected": 12,
@@ -103,6 +107,34 @@ def test_scores_by_hand(attribution, row) -> None:
     assert {attribution.words.plain(each)["outcome"] for each in rows[:8]} == {
         "named", "misnamed", "abstained", "missed", "not-converged", "failed"
     }  # fmt: skip
+
+
+def test_excess_and_baselines_by_hand(attribution, row) -> None:
+    found = row("catalogued", "effects-added", "linear_drag")
+    found.findings["error"] = {"after": {"rollout_rmse": {"x": 0.011, "vx": 0.11}}}
+    oracle = attribution.oracle.Oracle(99.0, 1e-9, {"x": 0.01, "vx": 0.1})
+    rows = [
+        replace(found, oracle=oracle, baselines={"correlation": name})
+        for name in ("linear_drag", "spring", None)
+    ]
+    scores = attribution.scores.score(rows)
+    assert scores["excess"] == pytest.approx(0.1)
+    assert scores["naming_correlation"] == scores["baseline_naming"] == pytest.approx(1 / 3)
+    assert "naming_sparse_regression" not in scores  # it was not there
+    twin = replace(rows[0], effect="force_gain", baselines={"correlation": "torque_gain"})
+    assert attribution.scores.score([twin])["baseline_naming"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("effect", "value"), [("linear_drag", 0.6), ("angular_drag", 0.02), ("magnus_force", 0.15)]
+)
+def test_baselines_name_what_is_linear_in_its_coefficient(attribution, effect, value) -> None:
+    """Of a free puck, strongly: the simple ways do work where they can."""
+    case = attribution.cases.Case("made up", "catalogued", "puck", effect, value)
+    train, _ = case.histories(seed=1)
+    names = attribution.baselines.ask_baselines(case, train, seed=1)
+    assert names["correlation"] == effect
+    assert names["sparse_regression"] in (effect, None)  # without pysindy, none
 
 
 def test_no_cases_no_shares(attribution) -> None:

@@ -15,8 +15,11 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import pbrl_ppl as pp
-from attribution.cases import Case
+from attribution.baselines import ask_baselines
+from attribution.cases import CATALOGUED, Case
 from attribution.oracle import Oracle, ask, true_parameters
 from pbrl_ppl.criticism import revise
 
@@ -25,7 +28,7 @@ _AMBIGUOUS = {("mass_change", "trajectory")}
 #: Seconds after which a case is given up.
 LONGEST = 3600
 #: Changes of what a row means make cached ones useless.
-_FORMAT = 1
+_FORMAT = 2
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ class Row:
         Its parameters.
     oracle : Oracle, optional
         Whether the data show it.
+    baselines : dict of str to str
+        What the usual ways name.
     findings : dict, optional
         As in ``report.json``, and the stages with their seconds; None if the case failed.
     error : str, optional
@@ -58,6 +63,7 @@ class Row:
     effect: str | None = None
     truth: dict[str, float] = field(default_factory=dict)
     oracle: Oracle | None = None
+    baselines: dict[str, str | None] = field(default_factory=dict)
     findings: dict[str, Any] | None = None
     error: str | None = None
     seconds: float = 0.0
@@ -83,6 +89,17 @@ class Row:
         """Whether the oracle sees the effect in the data."""
         return self.oracle is not None and self.oracle.detects
 
+    @property
+    def excess(self) -> float | None:
+        """How much larger the revised model's errors of forecasts are than the oracle's, a share.
+
+        The root mean square over what is measured, of errors in units of the oracle's.
+        """
+        if self.findings is None or self.oracle is None or not self.oracle.rollout_rmse:
+            return None
+        own, best = self.findings["error"]["after"]["rollout_rmse"], self.oracle.rollout_rmse
+        return float(np.sqrt(np.mean([(own[name] / best[name]) ** 2 for name in best]))) - 1.0
+
     def within(self) -> list[bool]:
         """Of each parameter of the right effect, if it was named: is the truth in the interval."""
         return [
@@ -107,7 +124,9 @@ def run_case(case: Case, seed: int, draws: int | None = None, method: str = "met
             warnings.simplefilter("ignore")
             train, test = case.histories(seed)
             if case.effect is not None:
-                known["oracle"] = ask(case, train, seed)
+                known["oracle"] = ask(case, train, test, seed)
+            if case.kind == CATALOGUED:
+                known["baselines"] = ask_baselines(case, train, seed)
             known["findings"] = _loop(case, train, test, seed, draws, method)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]

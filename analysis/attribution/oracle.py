@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from scipy.stats import chi2
 
 import pbrl_ppl as pp
 from attribution.cases import OUTSIDE, Case
 from attribution.outside import OUTSIDE_EFFECTS, parameters_of
+from pbrl_ppl.criticism.forecast import forecast
+from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.effects import Attached, attach
 from pbrl_ppl.model import Problem
@@ -29,10 +31,14 @@ class Oracle:
         Twice the gain in log-likelihood from adding it to the declared model.
     p_value : float
         With as many degrees of freedom as it has parameters.
+    rollout_rmse : dict of str to float
+        Errors of forecasts on the trajectories to judge by, of the model with the effect, as in
+        ``report.json``.
     """
 
     statistic: float
     p_value: float
+    rollout_rmse: dict[str, float] = field(default_factory=dict)
 
     @property
     def detects(self) -> bool:
@@ -55,15 +61,19 @@ def true_parameters(case: Case) -> dict[str, float]:
     return parameters_of(true_effect(case), case.value)
 
 
-def ask(case: Case, train: pp.History, seed: int) -> Oracle:
+def ask(case: Case, train: pp.History, test: pp.History, seed: int) -> Oracle:
     """Fit the declared model with the hidden effect and without, and compare the likelihoods."""
     problem = Problem.of(case.scene, train, attach(case.scene))
     found = find_mode(problem, seed=seed)
     without = with_enough_substeps(trajectory_mode(problem, found.phi), lambda stage: None)
     added = true_effect(case).on(case.scene.moving[0].name)
-    gain = _log_likelihood(_with(without, added, true_parameters(case))) - _log_likelihood(without)
-    statistic = max(0.0, 2 * gain)
-    return Oracle(statistic, float(chi2.sf(statistic, len(added.effect.parameters))))
+    best = _with(without, added, true_parameters(case))
+    statistic = max(0.0, 2 * (_log_likelihood(best) - _log_likelihood(without)))
+    held_out = HeldOut(test, seed)
+    horizon = held_out.rollout_horizon(case.scene.time_step)
+    errors = forecast(held_out.problem(best), best.phi, best.sigma, horizon).rmse()
+    p_value = float(chi2.sf(statistic, len(added.effect.parameters)))
+    return Oracle(statistic, p_value, errors)
 
 
 def _with(mode: Mode, added: Attached, values: dict[str, float]) -> Mode:

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 
+import numpy as np
+
+from attribution.baselines import WAYS
+from attribution.bodies import BODIES
 from attribution.cases import CATALOGUED, CLEAN, LEFT_OUT, NONSENSE, OUTSIDE
 from attribution.one_case import Row
 
@@ -47,7 +51,10 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         loop says that something remains; ``misnamed`` and ``missed``, shares of all of them with a
         wrong name and nothing said to remain, and called adequate. ``false_alarms``: share of
         clean cases that are not adequate. ``coverage``: share of true values of correctly named
-        effects inside the interval. ``nonsense_adequate``: number of nonsense cases called
+        effects inside the interval. ``excess``: median, over catalogued cases, of by how much the
+        revised model's errors of forecasts exceed the oracle's, a share. ``baseline_naming``: the
+        best of the usual ways' shares of names among the same, each beside it; a twin is right.
+        ``nonsense_adequate``: number of nonsense cases called
         adequate. ``detected``, ``cases``, ``failed``, ``not_converged``: numbers. ``seconds``: sum.
     """
     hidden = [row for row in rows if row.kind in (CATALOGUED, LEFT_OUT, OUTSIDE) and row.detected]
@@ -62,6 +69,8 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         "coverage": _share(
             inside for row in catalogued if outcome(row) == NAMED for inside in row.within()
         ),
+        "excess": _median(row.excess for row in catalogued),
+        **_baselines(catalogued),
         "nonsense_adequate": sum(outcome(row) == ACCEPTED for row in rows),
         "cases": len(rows),
         "detected": len(hidden),
@@ -69,6 +78,28 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         "not_converged": sum(row.verdict == "not-converged" for row in rows),
         "seconds": round(sum(row.seconds for row in rows), 1),
     }
+
+
+def _baselines(rows: Sequence[Row]) -> dict[str, float | None]:
+    """Shares of right names of each of the usual ways that was there, and the best."""
+    shares = {}
+    for way in WAYS:
+        names = [(row.baselines.get(way), row) for row in rows]
+        if any(name is not None for name, _ in names):
+            shares[way] = _share(name in _same(row) for name, row in names)
+    best = max((share for share in shares.values() if share is not None), default=None)
+    return {"baseline_naming": best} | {f"naming_{way}": share for way, share in shares.items()}
+
+
+def _same(row: Row) -> tuple[str | None, ...]:
+    """Effects that are the same physics on the body as what is hidden."""
+    groups = BODIES[row.body].twins
+    return next((group for group in groups if row.effect in group), (row.effect,))
+
+
+def _median(found: Iterable[float | None]) -> float | None:
+    known = [value for value in found if value is not None]
+    return float(np.median(known)) if known else None
 
 
 def _share(found: Iterable[bool]) -> float | None:

@@ -1,0 +1,162 @@
+"""What a user would otherwise try: regress the residual force on quantities that were recorded."""
+
+from __future__ import annotations
+
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+import pbrl_ppl as pp
+from attribution.cases import Case
+from pbrl_ppl.effects import attach
+from pbrl_ppl.model import Problem
+from pbrl_ppl.modes import Mode, find_mode
+
+Array = NDArray[np.float64]
+#: Terms of an equation, shape (n,) each, by the effect that each stands for and its own name.
+Terms = dict[tuple[str, str], Array]
+
+#: Coefficients below this share of the residual are dropped, and the ridge, as pysindy has them.
+_THRESHOLD, _RIDGE = 0.1, 0.05
+#: Velocities among the state dimensions, and their names as equations.
+_EQUATIONS = {3: "x", 4: "y", 5: "turn"}
+
+
+def ask_baselines(case: Case, train: pp.History, seed: int) -> dict[str, str | None]:
+    """Name an effect in each of the usual ways; None where a way finds nothing or is not there.
+
+    Parameters
+    ----------
+    case : Case
+        Gives the declared scene.
+    train : History
+        What was recorded.
+    seed : int
+        Of the search for the mode of the declared model.
+
+    Returns
+    -------
+    dict of str to str
+        ``correlation``: the term with the largest correlation with the residual acceleration.
+        ``sparse_regression``: the effect whose terms explain most of it after sequentially
+        thresholded least squares (Brunton, Proctor and Kutz, 2016), by pysindy.
+    """
+    mode = find_mode(Problem.of(case.scene, train, attach(case.scene)), seed=seed)
+    left, named = _equations(mode)
+    return {way: name(left, named) for way, name in WAYS.items()}
+
+
+def _equations(mode: Mode) -> tuple[dict[str, Array], dict[str, Terms]]:
+    """Residual accelerations and terms of each equation, by effect and term, shape (n,) each."""
+    problem = mode.problem
+    residual = problem.residual(mode.phi)[:, 0, 0] / problem.scene.time_step
+    start = problem.segments.start[:, 0]
+    inputs = problem.segments.inputs[:, 0, 0]
+    wrench, before = inputs[:, :3], inputs[:, 3:6] if inputs.shape[1] > 3 else 0 * inputs[:, :3]
+    columns = [int(d) for d in problem.observations.columns]
+    seen = np.isfinite(residual).all(axis=-1)
+    terms = _terms(start[seen], wrench[seen], before[seen])
+    left = {
+        equation: residual[seen][:, columns.index(d)]
+        for d, equation in _EQUATIONS.items()
+        if d in columns
+    }
+    return left, {equation: terms[equation] for equation in left}
+
+
+def _terms(state: Array, wrench: Array, before: Array) -> dict[str, Terms]:
+    """A library as one writes it down, of every law that is linear in a coefficient."""
+    x, y, theta, vx, vy, omega = state.T
+    force_x, force_y, torque = wrench.T
+    speed, one = np.hypot(vx, vy), np.ones(len(state))
+    c, s = np.cos(theta), np.sin(theta)
+    pushed = np.hypot(force_x, force_y)
+    some = np.median(pushed[pushed > 0]) if (pushed > 0).any() else 1.0
+    weak, capped = pushed < some, np.maximum(0.0, 1.0 - some / np.maximum(pushed, 1e-300))
+    spin = np.sign(omega)
+    library = {
+        "x": {
+            ("linear_drag", "vx"): vx,
+            ("quadratic_drag", "|v| vx"): speed * vx,
+            ("sliding_friction", "vx / |v|"): vx / np.maximum(speed, 1e-9),
+            ("constant_force", "1"): one,
+            ("body_force", "cos"): c,
+            ("body_force", "sin"): s,
+            ("spring", "x"): x,
+            ("magnus_force", "omega vy"): omega * vy,
+            ("actuator_rotation", "force_y"): force_y,
+            ("force_gain", "force_x"): force_x,
+            ("actuator_delay", "change of force_x"): before[:, 0] - force_x,
+            ("dead_zone", "weak force_x"): weak * force_x,
+            ("saturation", "strong force_x"): capped * force_x,
+        },
+        "y": {
+            ("linear_drag", "vy"): vy,
+            ("quadratic_drag", "|v| vy"): speed * vy,
+            ("sliding_friction", "vy / |v|"): vy / np.maximum(speed, 1e-9),
+            ("constant_force", "1"): one,
+            ("body_force", "cos"): c,
+            ("body_force", "sin"): s,
+            ("spring", "y"): y,
+            ("magnus_force", "omega vx"): omega * vx,
+            ("actuator_rotation", "force_x"): force_x,
+            ("force_gain", "force_y"): force_y,
+            ("actuator_delay", "change of force_y"): before[:, 1] - force_y,
+            ("dead_zone", "weak force_y"): weak * force_y,
+            ("saturation", "strong force_y"): capped * force_y,
+        },
+        "turn": {
+            ("angular_drag", "omega"): omega,
+            ("pivot_friction", "sign of omega"): spin,
+            ("quadratic_drag", "|omega| omega"): np.abs(omega) * omega,
+            ("constant_torque", "1"): one,
+            ("torsion_spring", "theta"): theta,
+            ("gravity_tilt", "cos"): c,
+            ("push_offset", "force across"): c * force_y - s * force_x,
+            ("push_offset", "force along"): c * force_x + s * force_y,
+            ("torque_gain", "torque"): torque,
+            ("actuator_delay", "change of torque"): before[:, 2] - torque,
+        },
+    }
+    return {
+        equation: {name: own for name, own in terms.items() if own.any()}
+        for equation, terms in library.items()
+    }
+
+
+def _largest(left: dict[str, Array], named: dict[str, Terms]) -> str | None:
+    """The effect of the term that goes with the residual most closely."""
+    found = {
+        effect: abs(float(np.corrcoef(own, left[equation])[0, 1]))
+        for equation, terms in named.items()
+        for (effect, _), own in sorted(terms.items())
+        if own.std() > 0 and left[equation].std() > 0
+    }
+    return max(found, key=lambda effect: found[effect]) if found else None
+
+
+def _sparse(left: dict[str, Array], named: dict[str, Terms]) -> str | None:
+    """The effect whose terms explain most of the residual's square, after pysindy's thresholds."""
+    try:
+        from pysindy.optimizers import STLSQ
+    except ImportError:  # extra `bench`
+        return None
+    share: dict[str, float] = {}
+    for equation, terms in named.items():
+        sizes = {name: float(np.sqrt((own**2).mean())) for name, own in terms.items()}
+        matrix = np.column_stack([own / sizes[name] for name, own in terms.items()])
+        unit = float(np.sqrt((left[equation] ** 2).mean()))
+        if not unit:
+            continue
+        with warnings.catch_warnings():  # that nothing is left is an answer
+            warnings.simplefilter("ignore")
+            kept = STLSQ(threshold=_THRESHOLD, alpha=_RIDGE).fit(matrix, left[equation] / unit)
+        for (effect, _), coefficient in zip(terms, kept.coef_.ravel(), strict=True):
+            share[effect] = share.get(effect, 0.0) + float(coefficient**2)
+    share = {effect: value for effect, value in share.items() if value > 0}
+    return max(share, key=lambda effect: share[effect]) if share else None
+
+
+#: What names an effect from residual accelerations and terms, by equation.
+WAYS = {"correlation": _largest, "sparse_regression": _sparse}
