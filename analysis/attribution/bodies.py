@@ -118,6 +118,7 @@ PUCK = Kind(
         "push_offset": ((-0.0004, 0.0003), (-0.003, 0.002), (-0.02, 0.015)),
         "sliding_friction": ((0.0008, 0.1), (0.006, 0.1), (0.05, 0.1)),
         "wheel": tuple((0.08, 0.02, 0.4, 0.1 * mu, mu) for mu in (0.001, 0.01, 0.1)),
+        "distance_joint": tuple((0.1, 0.05, 1.0, -0.5, length) for length in (1.0, 2.0, 3.0)),
         "dead_zone": (1.0, 2.0, 3.5),
         "hidden_obstacle": ((1.8, 0.0, 0.1), (1.8, 0.0, 0.2), (1.8, 0.0, 0.4)),
         "saturation": (8.0, 5.0, 2.7),

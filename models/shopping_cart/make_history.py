@@ -97,6 +97,8 @@ class Effects:
     dead_zone: float = 0.0  # N
     mass_change: tuple[float, float, float] = (1.0, 0.0, 0.0)  # factor, from trajectory, from s
     hidden_obstacle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # disc: x, y, radius (m)
+    # a rod from a body point to a place, and its length (m); bodies begin where it lets them
+    distance_joint: tuple[float, ...] = (0.0,) * 5
     sensor_bias: tuple[float, ...] = (0.0,) * 6  # m, m, rad, m/s, m/s, rad/s
     heavy_tails: float = 0.0  # reciprocal of the degrees of freedom of the noise
     sensor_scale: tuple[float, float] = (1.0, 1.0)  # of lengths and of angles
@@ -252,6 +254,9 @@ def rollout(
                 v, omega = rub(*effects.sliding_friction, step, mass, inertia, v, omega)
             for wheel in wheels:
                 v, omega = roll(wheel, step, mass, inertia, turn, v, omega)
+            if effects.distance_joint[4]:
+                here = (complex(x, y), theta)
+                v, omega = pull(effects.distance_joint, step, mass, inertia, *here, v, omega)
             body.linearVelocity = (v.real * CM, v.imag * CM)
             body.angularVelocity = omega
             world.Step(step, 20, 10)
@@ -390,6 +395,33 @@ def rub(
     return v, omega
 
 
+def pull(
+    rod: tuple[float, ...],
+    step: float,
+    mass: float,
+    inertia: float,
+    place: complex,
+    theta: float,
+    v: complex,
+    omega: float,
+) -> tuple[complex, float]:
+    """Return the velocities after a rod's pull, with which one step ends at its length (SHAKE)."""
+    a, b, length = complex(*rod[:2]), complex(*rod[2:4]), rod[4]
+
+    def end(place: complex, theta: float) -> tuple[float, complex, float]:
+        arm = a * cmath.exp(1j * theta)
+        way = place + arm - b
+        return abs(way), way / abs(way), cross(arm, way / abs(way))
+
+    _, along, lever = end(place, theta)
+    for _ in range(4):
+        distance, on, on_lever = end(place + step * v, theta + step * omega)
+        impulse = (length - distance) / step / (dot(on, along) / mass + on_lever * lever / inertia)
+        v += impulse / mass * along
+        omega += impulse * lever / inertia
+    return v, omega
+
+
 def simulate(seed: int, setup: Setup = CART, **effects: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return (train, test) in the history format; ``effects`` are the fields of `Effects`.
 
@@ -409,6 +441,8 @@ def _trajectory(
 ) -> pd.DataFrame:
     limit = np.array(setup.start_range)
     start = np.concatenate([rng.uniform(-limit, limit), rng.normal(0.0, setup.start_sd)])
+    if effects.distance_joint[4]:
+        start = tied(effects.distance_joint, start)
     n = setup.n_intervals
     held = rng.normal(0.0, setup.wrench_sd, size=(math.ceil(n / setup.hold), 3))
     wrenches = np.repeat(held, setup.hold, axis=0)[:n].round(6)
@@ -424,6 +458,18 @@ def _trajectory(
     frame[["x", "y", "theta", "vx", "vy", "omega"]] = measured.round(6)
     frame[["force_x", "force_y", "torque"]] = np.vstack([wrenches, np.full(3, np.nan)])
     return frame
+
+
+def tied(rod: tuple[float, ...], start: np.ndarray) -> np.ndarray:
+    """Return the start state that is nearest along a rod, and does not stretch it."""
+    x, y, theta, vx, vy, omega = start
+    arm, place = complex(*rod[:2]) * cmath.exp(1j * theta), complex(*rod[2:4])
+    way = complex(x, y) + arm - place
+    along = way / abs(way)
+    at = place + rod[4] * along - arm
+    v = complex(vx, vy)
+    v -= dot(v + 1j * omega * arm, along) * along
+    return np.array([at.real, at.imag, theta, v.real, v.imag, omega])
 
 
 def sensed(effects: Effects, states: np.ndarray) -> np.ndarray:

@@ -122,7 +122,8 @@ def refitted(mode: Mode, signature: Signature) -> Mode:
     """Mode with the candidate in the model, under the same noise structure."""
     attached = signature.attached
     estimate = np.array(list(signature.candidate.estimate.values()))
-    if isinstance(attached.effect.stage, Structure):
+    stage = attached.effect.stage
+    if isinstance(stage, Structure) and stage.rod is None:  # something to run into
         return structure_mode(mode, attached, estimate)
     effects = (*mode.problem.physics.effects, attached)
     problem = mode.problem.with_physics(effects=effects)

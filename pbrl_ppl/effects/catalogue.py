@@ -9,6 +9,7 @@ from pbrl_ppl.effects.com_offset import com_offset
 from pbrl_ppl.effects.constant_force import constant_force
 from pbrl_ppl.effects.constant_torque import constant_torque
 from pbrl_ppl.effects.dead_zone import dead_zone
+from pbrl_ppl.effects.distance_joint import distance_joint
 from pbrl_ppl.effects.effect import Effect
 from pbrl_ppl.effects.force_gain import force_gain
 from pbrl_ppl.effects.frame_rotation import frame_rotation
@@ -63,6 +64,7 @@ catalogue: tuple[Effect, ...] = (
     point_attractor,
     mass_change,
     hidden_obstacle,
+    distance_joint,
     sensor_bias,
     sensor_scale,
     frame_rotation,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,18 +38,45 @@ class Disc:
     radius: Array
 
 
+class Rod(NamedTuple):
+    """A rod between a body and a place; each an array that broadcasts over proposals.
+
+    Attributes
+    ----------
+    a_x, a_y : ndarray
+        Its end on the body, in the body's frame (m).
+    b_x, b_y : ndarray
+        Its end in the world (m).
+    length : ndarray
+        Its length (m). No length is no rod.
+    """
+
+    a_x: Array
+    a_y: Array
+    b_x: Array
+    b_y: Array
+    length: Array
+
+
+def _no_discs(parameters: Values) -> tuple[Disc, ...]:
+    return ()
+
+
 @final
 @dataclass(frozen=True)
 class Structure:
-    """Adds static discs to the scene.
+    """Adds to the scene: static discs, or a rod that ties the body to a place.
 
     Parameters
     ----------
     discs : callable
         ``discs(parameters) -> tuple of Disc``, always as many; every moving body bounces off them.
+    rod : callable, optional
+        ``rod(parameters) -> Rod``.
     """
 
-    discs: Callable[[Values], tuple[Disc, ...]]
+    discs: Callable[[Values], tuple[Disc, ...]] = _no_discs
+    rod: Callable[[Values], Rod] | None = None
 
 
 @final

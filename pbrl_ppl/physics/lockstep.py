@@ -35,7 +35,8 @@ from pbrl_ppl.physics.lockstep_solver import (
     Y0,
     L,
 )
-from pbrl_ppl.physics.properties import COLUMN, JOINT_COLUMNS
+from pbrl_ppl.physics.properties import COLUMN
+from pbrl_ppl.physics.scene_joints import JOINT_COLUMNS
 from pbrl_ppl.physics.world import RING, World
 
 _TORQUE, _DAMPING, _MU, _RADIUS = (

@@ -33,7 +33,8 @@ from pbrl_ppl.physics.lockstep_solver import (
     Y0,
     L,
 )
-from pbrl_ppl.physics.properties import COLUMN, JOINT_COLUMNS
+from pbrl_ppl.physics.properties import COLUMN
+from pbrl_ppl.physics.scene_joints import JOINT_COLUMNS
 from pbrl_ppl.physics.setters import iterations
 from pbrl_ppl.physics.world import RING, World
 
@@ -74,8 +75,8 @@ def chain_of(world: World) -> Chain | None:
         ends.append([world.bodies.index(body) if body in world.bodies else -1 for body in pair])
         holder = pair[ends[-1].index(-1)] if -1 in ends[-1] else world.space.static_body
         poses.append((*holder.position, math.cos(holder.angle), math.sin(holder.angle)))
-        joint = world.scene.joints[link.joint]
-        has_pivot = joint.kind == "hinge" and joint.bodies is not None
+        declared = world.scene.joints[link.joint : link.joint + 1]  # none of a rod of an effect
+        has_pivot = any(joint.kind == "hinge" and joint.bodies is not None for joint in declared)
         hung.append(next(pivots).body if has_pivot else -1)
     pairs = np.array(ends, dtype=np.int64).reshape(-1, 2)
     turned = pairs[:, 1] < 0

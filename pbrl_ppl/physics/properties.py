@@ -19,8 +19,9 @@ from pbrl_ppl.effects import (
     at_stage,
 )
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS, JOINT_INDICES, Layout
-from pbrl_ppl.scene import WORLD, Scene
+from pbrl_ppl.parameters import BODY_PARAMETERS, Layout
+from pbrl_ppl.physics.scene_joints import JOINT_COLUMNS, SceneJoints
+from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
@@ -41,10 +42,6 @@ COLUMNS = (
     "com_y",
 )
 COLUMN = {name: i for i, name in enumerate(COLUMNS)}
-#: Columns of a joint's properties: its anchors and its length (m).
-JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
-#: A joint shorter than this (m) is a hinge.
-_NO_LENGTH = 1e-9
 _MAX = np.finfo(float).max
 _POSITIVE = ("mass", "moment")
 #: How strong the friction under a body is: of a ring that carries it, and of a wheel.
@@ -140,11 +137,21 @@ class EngineProperties:
             isinstance(attached.effect.stage, Properties) and attached.effect.stage.timed
             for attached in effects
         )
+        self._tying = [
+            (attached, attached.effect.stage.rod)
+            for attached in self._acting[Structure]
+            if isinstance(attached.effect.stage, Structure) and attached.effect.stage.rod
+        ]
         #: How many discs the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
         #: Bodies that effects put friction under: rings, and wheels.
-        self.under = tuple(self._changed(effects, names) for names in (_PATCH, _WHEEL))
-        self._bind_joints(scene, places)
+        self.under = (self._changed(effects, _PATCH), self._changed(effects, _WHEEL))
+        #: Bodies that effects tie to a place, and each rod's place after the scene's joints.
+        self.tied = tuple(
+            (bodies.index(attached.body), len(scene.joints) + j)
+            for j, (attached, _) in enumerate(self._tying)
+        )
+        self.joints = SceneJoints(scene, places)
 
     def _changed(self, effects: tuple[Attached, ...], names: tuple[str, ...]) -> tuple[int, ...]:
         """Bodies of which effects change one of these numbers."""
@@ -183,42 +190,6 @@ class EngineProperties:
             if isinstance(attached.effect.stage, Sensor)
         ]
 
-    def _bind_joints(self, scene: Scene, places: dict[str, int]) -> None:
-        self._anchors = np.zeros((len(scene.joints), 4))
-        self._held = np.zeros((len(scene.joints), 2), dtype=int)
-        fixed = (body.name for body in scene.bodies if body.static or body.kinematic)
-        holders = [*scene.joinable, *fixed]
-        poses = {body.name: body.pose for body in scene.bodies} | {WORLD: None}
-        self._poses = np.array([poses[name] or (0.0, 0.0, 0.0) for name in holders])
-        moved, free = [], []
-        for j, (owner, joint) in enumerate(zip(scene.joint_names, scene.joints, strict=True)):
-            self._anchors[j] = (*(joint.anchor_a or (0, 0)), *(joint.anchor_b or (0, 0)))
-            for column, name in enumerate(JOINT_ANCHORS):
-                place = places.get(f"{name}[{owner}]")
-                if place is not None:
-                    moved.append((place, j, column))
-            if joint.bodies is not None:
-                self._held[j] = [holders.index(name) for name in joint.bodies]
-            else:
-                free.append((j, *(places[f"{name}[{owner}]"] for name in JOINT_INDICES)))
-        self._moved_anchors = np.array(moved, dtype=int).reshape(-1, 3).T
-        self._free = np.array(free, dtype=int).reshape(-1, 3)
-        length = self._lengths(self._anchors, self._held)
-        #: Which joints have no length, one a joint.
-        self.hinges = tuple(
-            joint.kind == "hinge" or bool(joint.known and distance < _NO_LENGTH)
-            for joint, distance in zip(scene.joints, length, strict=True)
-        )
-
-    def _lengths(self, anchors: Array, held: NDArray[np.int64]) -> Array:
-        """Distance of the anchors in the reference poses, shape (...,)."""
-        poses = self._poses[held]
-        c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
-        x, y = anchors[..., 0::2], anchors[..., 1::2]
-        at_x = poses[..., 0] + c * x - s * y
-        at_y = poses[..., 1] + s * x + c * y
-        return np.asarray(np.hypot(at_x[..., 0] - at_x[..., 1], at_y[..., 0] - at_y[..., 1]))
-
     def __call__(self, phi: Array, clock: Clock | None = None) -> EngineInput:
         """Translate.
 
@@ -242,7 +213,8 @@ class EngineProperties:
         bodies[:, body, column] = phi[:, place]
         bodies = self._modified(bodies, phi, clock)
         self._check(bodies)
-        joints, indices = self._joints(phi)
+        joints, indices = self.joints(phi)
+        joints = np.concatenate([joints, self._rods(phi)], axis=1)
         commands, forces = (self._law_parameters(phi, stage) for stage in (Command, Force))
         return EngineInput(bodies, joints, self._discs(phi), commands, forces, indices)
 
@@ -295,7 +267,7 @@ class EngineProperties:
             if isinstance(attached.effect.stage, Structure)
             for disc in attached.effect.stage.discs(self.values(attached, phi))
         ]
-        discs = np.stack(rows, axis=1)
+        discs = np.stack(rows, axis=1) if rows else np.empty((len(phi), 0, 3))
         if not (np.isfinite(discs).all() and (discs[..., 2] >= 0).all()):
             raise ParameterError(
                 "a hidden disc has a place or radius that is not finite, or a radius below 0; give"
@@ -303,27 +275,18 @@ class EngineProperties:
             )
         return discs
 
-    def _joints(self, phi: Array) -> tuple[Array, NDArray[np.int64]]:
-        """Anchors and lengths, and what the joints of unknown bodies hold."""
-        n, count = len(phi), len(self._anchors)
-        if not count:
-            return np.empty((n, 0, len(JOINT_COLUMNS))), np.empty((n, 0, 2), dtype=np.int64)
-        joints = np.empty((n, count, len(JOINT_COLUMNS)))
-        joints[..., :4] = self._anchors
-        place, joint, column = self._moved_anchors
-        joints[:, joint, column] = phi[:, place]
-        indices = phi[:, self._free[:, 1:]]
-        choices = len(self._scene.joinable)
-        wrong = (indices != np.floor(indices)) | (indices < 0) | (indices >= choices)
-        if wrong.any():
+    def _rods(self, phi: Array) -> Array:
+        """The structure stage's rods, shape (proposal, rod, 5)."""
+        rods = np.empty((len(phi), len(self._tying), len(JOINT_COLUMNS)))
+        for j, (attached, rod) in enumerate(self._tying):
+            ends = rod(self.values(attached, phi))
+            rods[:, j] = np.stack(np.broadcast_arrays(*ends), axis=-1)
+        if not (np.isfinite(rods).all() and (rods[..., 4] >= 0).all()):
             raise ParameterError(
-                f"joint index is {indices[wrong][0]:g}, expected a whole number from 0 to"
-                f" {choices - 1}: {', '.join(self._scene.joinable)}"
+                "a rod that an effect adds has an end or a length that is not finite, or a length"
+                " below 0; give finite numbers, and 0 for no rod"
             )
-        held = np.repeat(self._held[None], n, axis=0)
-        held[:, self._free[:, 0]] = indices
-        joints[..., 4] = self._lengths(joints[..., :4], held)
-        return joints, indices.astype(np.int64)
+        return rods
 
     def _refuse_phi(self, phi: Array) -> NoReturn:
         """Name the first value that is not finite."""

@@ -12,7 +12,8 @@ import numba
 import numpy as np
 
 from pbrl_ppl.physics.calls import call1, call2, call_pointer
-from pbrl_ppl.physics.properties import COLUMNS, JOINT_COLUMNS
+from pbrl_ppl.physics.properties import COLUMNS
+from pbrl_ppl.physics.scene_joints import JOINT_COLUMNS
 from pbrl_ppl.physics.world import FAR, ITERATIONS_A_RATIO, MOST_ITERATIONS, NO_SIZE, STICKING
 
 MASS, _R, _MU_C, _W_X, _W_Y, W_THETA, _MU_X, _MU_Y, _MOMENT, _TORQUE, _DAMPING = range(11)

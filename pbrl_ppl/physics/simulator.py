@@ -7,6 +7,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from functools import cached_property, partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -18,11 +19,11 @@ from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
-from pbrl_ppl.physics.inputs import after_recording
+from pbrl_ppl.physics.inputs import after_recording, check_shapes
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
+from pbrl_ppl.physics.rods import on_rod
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import INPUT
 
 PATHS = ("compiled", "plain")
 #: Step of a finite difference as a share of a parameter's scale: about the cube root of the
@@ -34,10 +35,10 @@ _KEPT = 64
 _A_THREAD = 1000
 #: For each joint of unknown bodies, which of ``scene.joinable`` it holds.
 Joined = tuple[tuple[int, int], ...]
-#: And whether there is friction under bodies: what worlds differ in.
-Choice = tuple[Joined, bool]
+#: And whether there is friction under bodies, and which rods there are: what worlds differ in.
+Choice = tuple[Joined, bool, tuple[bool, ...]]
 #: Where there is nothing to choose.
-_ONE_WORLD: Choice = ((), False)
+_ONE_WORLD: Choice = ((), False, ())
 
 
 class Simulator:
@@ -139,15 +140,16 @@ class Simulator:
         # of one kind, for numba compiles the rollout anew for another
         start = np.require(start, float, ("C", "W"))
         actions = np.require(actions, float, ("C", "W"))
-        self._check(phi, start, actions)
+        check_shapes(self.scene, self.layout, phi, start, actions)
         proposals = np.atleast_2d(phi)
         inputs, clock = self._inputs(actions)
         given = self._properties(proposals, clock)
-        starts = self._states(proposals, start)
+        starts = self._on_rods(self._states(proposals, start), given.joints)
         n, horizon, k = actions.shape[:3]
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
         run = self._run_plain if self.path == "plain" else self._run_compiled
-        if not (any(self._properties.under) or given.indices.shape[1]):
+        extra = (*self._properties.under, self._properties.tied)
+        if not (any(extra) or given.indices.shape[1]):
             run(_ONE_WORLD, given, starts, inputs, out.reshape(-1, horizon, k, 6))
         else:
             for choice, rows in self._choices(given):
@@ -168,13 +170,15 @@ class Simulator:
         is when candidates are scored.
         """
         sliding = self._properties.slides(given.bodies)
+        tied = given.joints[:, len(self.scene.joints) :, -1] > 0
         proposals, joints, _ = given.indices.shape
         indices = given.indices.reshape(proposals, 2 * joints)
-        keys = np.column_stack([sliding, indices])
+        keys = np.column_stack([sliding, tied, indices])
         choices, which = np.unique(keys, axis=0, return_inverse=True)
-        for i, (slides, *pairs) in enumerate(choices.astype(int).tolist()):
+        for i, (slides, *others) in enumerate(choices.astype(int).tolist()):
+            rods, pairs = others[: tied.shape[1]], others[tied.shape[1] :]
             joined = tuple(zip(pairs[::2], pairs[1::2], strict=True))
-            yield (joined, bool(slides)), which.ravel() == i
+            yield (joined, bool(slides), tuple(map(bool, rods))), which.ravel() == i
 
     def _inputs(self, actions: Array) -> tuple[Array, Clock | None]:
         """Inputs of the rollout, and times of the intervals."""
@@ -204,6 +208,14 @@ class Simulator:
         fill_hinges(states, self.scene)
         return states
 
+    def _on_rods(self, states: Array, joints: Array) -> Array:
+        """Start states with the bodies that effects tie on their rods."""
+        for i, position in self._properties.tied:
+            states = np.array(np.broadcast_to(states, (len(joints), *states.shape[1:])), order="C")
+            moment = self.scene.moving[i].shape.unit_moment
+            states[:, :, i] = on_rod(states[:, :, i], joints[:, position], moment)
+        return states
+
     def jacobian(self, phi: Array, start: Array, actions: Array) -> Array:
         """Derivative of the predictions by phi, by central differences in one batched call.
 
@@ -229,30 +241,6 @@ class Simulator:
             lambda points: self(points, start, actions), phi, _STEP * self.layout.scale(phi),
             lower, upper,
         )  # fmt: skip
-
-    def _check(self, phi: Array, start: Array, actions: Array) -> None:
-        k, p = len(self.scene.moving), self.layout.size
-        if phi.ndim not in (1, 2) or phi.shape[-1] != p:
-            raise SimulationError(
-                f"phi has shape {phi.shape}, expected ({p},) or (proposal, {p}):"
-                f" {', '.join(self.layout.labels)}"
-            )
-        own = start.ndim == 4 and phi.ndim == 2 and len(start) == len(phi)
-        if not (own or start.ndim == 3) or start.shape[-2:] != (k, 6):
-            raise SimulationError(
-                f"start has shape {start.shape}, expected (transition, {k}, 6), or with as many"
-                " proposals first as phi has, in the order x, y, theta, vx, vy, omega"
-            )
-        widths = (3, len(INPUT))
-        shaped = actions.ndim == 4 and actions.shape[0] == start.shape[-3] and actions.shape[2] == k
-        if not shaped or actions.shape[3] not in widths:
-            raise SimulationError(
-                f"actions have shape {actions.shape}, expected ({start.shape[-3]}, H, {k}, 3)"
-                f" in the order force_x, force_y, torque, or {len(INPUT)} in place of 3:"
-                f" {', '.join(INPUT)}"
-            )
-        if not (np.isfinite(start).all() and np.isfinite(actions[..., :6]).all()):
-            raise SimulationError("start states and actions must be finite; drop the missing rows")
 
     @cached_property
     def levels(self) -> tuple[NDArray[np.int64], Array]:
@@ -295,10 +283,11 @@ class Simulator:
         )
 
     def _new_world(self, choice: Choice) -> World:
-        joined, slides = choice
+        joined, slides, there = choice
         own = self._properties
-        under = own.under if slides else ()
-        return World(self.scene, own.hinges, joined, own.n_discs, *under)
+        patches, wheels = own.under if slides else ((), ())
+        rods = tuple(compress(own.tied, there))
+        return World(self.scene, own.joints.hinges, joined, own.n_discs, patches, wheels, rods)
 
     def _run_plain(
         self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array

@@ -139,7 +139,9 @@ def _applied(effect: Effect, state: Array, parameters: Array) -> Array:
         return np.concatenate([np.ravel(measured), np.ravel(stage.invert(measured, flat))])
     if isinstance(stage, Structure):
         discs: tuple[Disc, ...] = stage.discs(named)
-        return np.concatenate([np.ravel([disc.x, disc.y, disc.radius]) for disc in discs])
+        rods = () if stage.rod is None else (stage.rod(named),)
+        added = [(disc.x, disc.y, disc.radius) for disc in discs] + [tuple(rod) for rod in rods]
+        return np.concatenate([np.ravel(numbers) for numbers in added])
     if isinstance(stage, Noise):
         return np.ravel(np.asarray(stage.tail(named), dtype=float))
     raise EffectError(f"effect {effect.name}: {stage!r} is no stage")

@@ -107,6 +107,9 @@ class World:
         Bodies with friction under them.
     wheels : tuple of int
         Bodies with a wheel beside those of which the scene says so.
+    rods : tuple of (int, int)
+        Bodies that a rod ties to a place beside the scene's joints, and each rod's place among all
+        joints.
     """
 
     def __init__(
@@ -117,6 +120,7 @@ class World:
         discs: int = 0,
         patches: tuple[int, ...] = (),
         wheels: tuple[int, ...] = (),
+        rods: tuple[tuple[int, int], ...] = (),
     ) -> None:
         self.scene = scene
         self.space = pymunk.Space()
@@ -149,6 +153,8 @@ class World:
         self._add_shapes()
         self.can_touch = np.ones((len(self.bodies), len(self.bodies)), dtype=bool)
         self._add_joints(hinges, joined)
+        for i, position in rods:
+            self._add_link(position, self.bodies[i], self.space.static_body, False)
         self.patches = [self._new_patch(i) for i in patches]
         #: Which bodies that forces move are joined to other moving ones.
         self.chained = np.logical_not(self.can_touch.all(axis=1)) & ~self.kinematic
@@ -233,20 +239,20 @@ class World:
                     continue
                 bodies = names[first], names[second]
             a, b = (self._by_name[name] for name in bodies)
-            link: pymunk.PinJoint | pymunk.PivotJoint
-            if hinge:
-                link = pymunk.PivotJoint(a, b, (0, 0), (0, 0))
-            else:
-                link = pymunk.PinJoint(a, b, (0, 0), (0, 0))
-            link.error_bias = 0.0  # correct the whole drift every substep
-            link.collide_bodies = False
-            self.space.add(link)
-            self.links.append(Link(position, link))
+            self._add_link(position, a, b, hinge)
             if joint.kind == "hinge" and joint.bodies is not None:
                 self._add_pivot(joint, a, b)
             if a in self.bodies and b in self.bodies:
                 i, j = self.bodies.index(a), self.bodies.index(b)
                 self.can_touch[i, j] = self.can_touch[j, i] = False
+
+    def _add_link(self, position: int, a: pymunk.Body, b: pymunk.Body, hinge: bool) -> None:
+        kind = pymunk.PivotJoint if hinge else pymunk.PinJoint
+        link = kind(a, b, (0, 0), (0, 0))
+        link.error_bias = 0.0  # correct the whole drift every substep
+        link.collide_bodies = False
+        self.space.add(link)
+        self.links.append(Link(position, link))
 
     def _add_pivot(self, joint: Joint, a: pymunk.Body, b: pymunk.Body) -> None:
         motor = pymunk.SimpleMotor(a, b, 0.0)

@@ -212,6 +212,26 @@ def test_magnus_force_turns_the_velocity():
     np.testing.assert_allclose(got[3:5], [math.cos(angle), math.sin(angle)], atol=2e-3)
 
 
+def test_a_rod_keeps_its_length_and_the_energy():
+    """Of a body that is pushed by nothing else: to a millionth, and to one in ten thousand."""
+    rod = (0.1, 0.05, 1.0, -0.5, 1.5)
+    start = mh.tied(rod, np.array([0.0, 1.0, 0.3, 1.0, 0.5, 3.0]))
+    end = end_of(PUCK, start, 2.0, distance_joint=rod)
+    for state in (start, end):
+        point = complex(*state[:2]) + complex(*rod[:2]) * cmath.exp(1j * state[2])
+        assert abs(point - complex(*rod[2:4])) == pytest.approx(rod[4], abs=2e-6)
+    energy = [0.5 * (2.0 * (s[3] ** 2 + s[4] ** 2) + INERTIA * s[5] ** 2) for s in (start, end)]
+    assert energy[1] == pytest.approx(energy[0], rel=1e-4)
+    assert np.abs(end[:2] - start[:2]).max() > 0.5
+
+
+def test_a_hidden_wheel_is_the_declared_one():
+    wheel = (0.1, 0.0, 0.5, 0.002, 0.02)
+    start = np.array([0.0, 0.0, 0.3, 1.0, 0.5, 3.0])
+    declared = end_of(replace(PUCK, wheel=mh.Wheel(*wheel)), start, 0.5)
+    np.testing.assert_array_equal(end_of(PUCK, start, 0.5, wheel=wheel), declared)
+
+
 def test_sliding_friction_stops_sliding_and_turning_and_holds():
     ring = {"sliding_friction": (0.1, 0.15)}
     slides = end_of(PUCK, [0, 0, 0, 1.0, 0, 0], 0.4, **ring)

@@ -261,6 +261,7 @@ def test_both_paths_agree_with_effects_of_every_stage() -> None:
     phi = np.stack([prior.sample(rng, 3) for prior in layout.priors], axis=1)
     phi[:, layout.index("hidden_obstacle_x", "cart")] = [0.6, 0.0, 3.0]
     phi[:, layout.index("hidden_obstacle_y", "cart")] = [0.0, 0.7, 3.0]
+    phi[:2, layout.index("distance_joint_length", "cart")] = 0.0  # a rod pulls hard at once
     start = rng.normal(0, 1, (8, 1, 6)) * [0.2, 0.2, 1, 2, 2, 2]
     clock = np.cumsum(np.full((8, 3, 1), 0.1), axis=1) + rng.uniform(0, 60, (8, 1, 1))
     given = np.concatenate(

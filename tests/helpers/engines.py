@@ -13,9 +13,9 @@ ARM = Shape.box(0.03, 0.4)
 #: Friction in hinges.
 PIVOT = [e for e in catalogue if e.name.startswith("pivot")]
 TILT = [e for e in catalogue if e.name == "gravity_tilt"]
-#: Without hinges there is no friction in them, without obstacles nothing to touch, and a wheel is
-#: declared.
-_ELSEWHERE = ("pivot", "gravity", "hidden_obstacle", "wheel")
+#: Without hinges there is no friction in them, without obstacles nothing to touch, a wheel is
+#: declared, and bodies that are anywhere are on no rod.
+_ELSEWHERE = ("pivot", "gravity", "hidden_obstacle", "wheel", "distance_joint")
 OTHERS = [e for e in catalogue if not e.name.startswith(_ELSEWHERE)]
 
 
