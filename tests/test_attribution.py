@@ -132,7 +132,8 @@ def test_baselines_name_what_is_linear_in_its_coefficient(attribution, effect, v
     """Of a free puck, strongly: the simple ways do work where they can."""
     case = attribution.cases.Case("made up", "catalogued", "puck", effect, value)
     train, _ = case.histories(seed=1)
-    names = attribution.baselines.ask_baselines(case, train, seed=1)
+    declared = attribution.oracle.declared_mode(case, train, seed=1)
+    names = attribution.baselines.ask_baselines(declared)
     assert names["correlation"] == effect
     assert names["sparse_regression"] in (effect, None)  # without pysindy, none
 

@@ -7,11 +7,7 @@ import warnings
 import numpy as np
 from numpy.typing import NDArray
 
-import pbrl_ppl as pp
-from attribution.cases import Case
-from pbrl_ppl.effects import attach
-from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import Mode, find_mode
+from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
 #: Terms of an equation, shape (n,) each, by the effect that each stands for and its own name.
@@ -23,17 +19,13 @@ _THRESHOLD, _RIDGE = 0.1, 0.05
 _EQUATIONS = {3: "x", 4: "y", 5: "turn"}
 
 
-def ask_baselines(case: Case, train: pp.History, seed: int) -> dict[str, str | None]:
+def ask_baselines(declared: Mode) -> dict[str, str | None]:
     """Name an effect in each of the usual ways; None where a way finds nothing or is not there.
 
     Parameters
     ----------
-    case : Case
-        Gives the declared scene.
-    train : History
-        What was recorded.
-    seed : int
-        Of the search for the mode of the declared model.
+    declared : Mode
+        Of the declared model, of single transitions.
 
     Returns
     -------
@@ -42,8 +34,7 @@ def ask_baselines(case: Case, train: pp.History, seed: int) -> dict[str, str | N
         ``sparse_regression``: the effect whose terms explain most of it after sequentially
         thresholded least squares (Brunton, Proctor and Kutz, 2016), by pysindy.
     """
-    mode = find_mode(Problem.of(case.scene, train, attach(case.scene)), seed=seed)
-    left, named = _equations(mode)
+    left, named = _equations(declared)
     return {way: name(left, named) for way, name in WAYS.items()}
 
 
@@ -53,7 +44,7 @@ def _equations(mode: Mode) -> tuple[dict[str, Array], dict[str, Terms]]:
     residual = problem.residual(mode.phi)[:, 0, 0] / problem.scene.time_step
     start = problem.segments.start[:, 0]
     inputs = problem.segments.inputs[:, 0, 0]
-    wrench, before = inputs[:, :3], inputs[:, 3:6] if inputs.shape[1] > 3 else 0 * inputs[:, :3]
+    wrench, before = inputs[:, :3], inputs[:, 3:6]
     columns = [int(d) for d in problem.observations.columns]
     seen = np.isfinite(residual).all(axis=-1)
     terms = _terms(start[seen], wrench[seen], before[seen])
@@ -74,41 +65,32 @@ def _terms(state: Array, wrench: Array, before: Array) -> dict[str, Terms]:
     pushed = np.hypot(force_x, force_y)
     some = np.median(pushed[pushed > 0]) if (pushed > 0).any() else 1.0
     weak, capped = pushed < some, np.maximum(0.0, 1.0 - some / np.maximum(pushed, 1e-300))
-    spin = np.sign(omega)
+
+    def along(
+        axis: str, place: Array, v: Array, across: Array, push: Array, aside: Array, held: Array
+    ) -> Terms:
+        return {
+            ("linear_drag", f"v{axis}"): v,
+            ("quadratic_drag", f"|v| v{axis}"): speed * v,
+            ("sliding_friction", f"v{axis} / |v|"): v / np.maximum(speed, 1e-9),
+            ("constant_force", "1"): one,
+            ("body_force", "cos"): c,
+            ("body_force", "sin"): s,
+            ("spring", axis): place,
+            ("magnus_force", "omega times v across"): omega * across,
+            ("actuator_rotation", "force across"): aside,
+            ("force_gain", f"force_{axis}"): push,
+            ("actuator_delay", f"change of force_{axis}"): held - push,
+            ("dead_zone", f"weak force_{axis}"): weak * push,
+            ("saturation", f"strong force_{axis}"): capped * push,
+        }
+
     library = {
-        "x": {
-            ("linear_drag", "vx"): vx,
-            ("quadratic_drag", "|v| vx"): speed * vx,
-            ("sliding_friction", "vx / |v|"): vx / np.maximum(speed, 1e-9),
-            ("constant_force", "1"): one,
-            ("body_force", "cos"): c,
-            ("body_force", "sin"): s,
-            ("spring", "x"): x,
-            ("magnus_force", "omega vy"): omega * vy,
-            ("actuator_rotation", "force_y"): force_y,
-            ("force_gain", "force_x"): force_x,
-            ("actuator_delay", "change of force_x"): before[:, 0] - force_x,
-            ("dead_zone", "weak force_x"): weak * force_x,
-            ("saturation", "strong force_x"): capped * force_x,
-        },
-        "y": {
-            ("linear_drag", "vy"): vy,
-            ("quadratic_drag", "|v| vy"): speed * vy,
-            ("sliding_friction", "vy / |v|"): vy / np.maximum(speed, 1e-9),
-            ("constant_force", "1"): one,
-            ("body_force", "cos"): c,
-            ("body_force", "sin"): s,
-            ("spring", "y"): y,
-            ("magnus_force", "omega vx"): omega * vx,
-            ("actuator_rotation", "force_x"): force_x,
-            ("force_gain", "force_y"): force_y,
-            ("actuator_delay", "change of force_y"): before[:, 1] - force_y,
-            ("dead_zone", "weak force_y"): weak * force_y,
-            ("saturation", "strong force_y"): capped * force_y,
-        },
+        "x": along("x", x, vx, vy, force_x, force_y, before[:, 0]),
+        "y": along("y", y, vy, vx, force_y, force_x, before[:, 1]),
         "turn": {
             ("angular_drag", "omega"): omega,
-            ("pivot_friction", "sign of omega"): spin,
+            ("pivot_friction", "sign of omega"): np.sign(omega),
             ("quadratic_drag", "|omega| omega"): np.abs(omega) * omega,
             ("constant_torque", "1"): one,
             ("torsion_spring", "theta"): theta,

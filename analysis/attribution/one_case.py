@@ -20,7 +20,7 @@ import numpy as np
 import pbrl_ppl as pp
 from attribution.baselines import ask_baselines
 from attribution.cases import CATALOGUED, Case
-from attribution.oracle import Oracle, ask, true_parameters
+from attribution.oracle import Oracle, ask, declared_mode, true_parameters
 from pbrl_ppl.criticism import revise
 
 #: Parameters of which more than one value is the truth: any number between two trajectories.
@@ -124,9 +124,10 @@ def run_case(case: Case, seed: int, draws: int | None = None, method: str = "met
             warnings.simplefilter("ignore")
             train, test = case.histories(seed)
             if case.effect is not None:
-                known["oracle"] = ask(case, train, test, seed)
-            if case.kind == CATALOGUED:
-                known["baselines"] = ask_baselines(case, train, seed)
+                declared = declared_mode(case, train, seed)
+                known["oracle"] = ask(case, declared, test, seed)
+                if case.kind == CATALOGUED:
+                    known["baselines"] = ask_baselines(declared)
             known["findings"] = _loop(case, train, test, seed, draws, method)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]

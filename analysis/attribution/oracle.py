@@ -61,11 +61,15 @@ def true_parameters(case: Case) -> dict[str, float]:
     return parameters_of(true_effect(case), case.value)
 
 
-def ask(case: Case, train: pp.History, test: pp.History, seed: int) -> Oracle:
+def declared_mode(case: Case, train: pp.History, seed: int) -> Mode:
+    """Fit the declared model to single transitions."""
+    return find_mode(Problem.of(case.scene, train, attach(case.scene)), seed=seed)
+
+
+def ask(case: Case, declared: Mode, test: pp.History, seed: int) -> Oracle:
     """Fit the declared model with the hidden effect and without, and compare the likelihoods."""
-    problem = Problem.of(case.scene, train, attach(case.scene))
-    found = find_mode(problem, seed=seed)
-    without = with_enough_substeps(trajectory_mode(problem, found.phi), lambda stage: None)
+    without = trajectory_mode(declared.problem, declared.phi)
+    without = with_enough_substeps(without, lambda stage: None)
     added = true_effect(case).on(case.scene.moving[0].name)
     best = _with(without, added, true_parameters(case))
     statistic = max(0.0, 2 * (_log_likelihood(best) - _log_likelihood(without)))

@@ -177,8 +177,11 @@ def rollout(
     if setup.hinge is None and (effects.pivot_friction or effects.pivot_damping):
         raise ValueError("pivot_friction and pivot_damping act in a hinge, and the setup has none")
     factor, loaded_from, loaded_at = effects.mass_change
-    wheels = [wheel for wheel in (setup.wheel, Wheel(*effects.wheel)) if wheel is not None]
-    wheels = [wheel for wheel in wheels if wheel.mu_x or wheel.mu_y]
+    wheels = [
+        wheel
+        for wheel in (setup.wheel, Wheel(*effects.wheel))
+        if wheel is not None and (wheel.mu_x or wheel.mu_y)
+    ]
 
     # Box2D kicks, then drifts. With positions held half a step ahead of the velocities that is the
     # leapfrog, of second order; read without it, positions are half a step's way too far.

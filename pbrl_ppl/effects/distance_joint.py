@@ -8,6 +8,7 @@ from scipy.optimize import least_squares
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.hinge import hangs_in_none
+from pbrl_ppl.effects.scans import body_points
 from pbrl_ppl.effects.stages import Rod, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -15,8 +16,6 @@ from pbrl_ppl.scene import Body, Scene
 
 Array = NDArray[np.float64]
 
-#: Where on the body the search begins, as shares of its half extent.
-_BEGIN = ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))
 #: Distances that vary by less than this share of how far the body went are of a rod, and one that
 #: is longer than so many times that cannot be told from a straight line.
 _HELD, _LONGEST = 0.03, 20.0
@@ -37,21 +36,17 @@ def _scan(scene: Scene, history: History, body: Body) -> Any:
     if len(poses) < 6:
         return np.empty((0, 5))
     way = float(np.sqrt(poses[:, :2].var(axis=0).sum()))
-    x_min, x_max, y_min, y_max = body.shape.bounds
-    half = 0.5 * np.array([x_max - x_min, y_max - y_min])
 
     def off(ends: Array) -> Array:
         distance = _distance(ends, poses)
         return np.asarray(distance - distance.mean())
 
     found: list[Array] = []
-    for share in _BEGIN:
-        begin = half * share
+    for begin in body_points(body):
         ends = np.array([*begin, *_middle(begin, poses)])
         fitted = least_squares(off, ends, x_scale="jac").x
         length = float(_distance(fitted, poses).mean())
-        short = way * _LONGEST
-        if off(fitted).std() > _HELD * way or not _SHORTEST < length < short:
+        if off(fitted).std() > _HELD * way or not _SHORTEST < length < _LONGEST * way:
             continue
         if all(np.abs(fitted - other[:4]).max() > _SAME for other in found):
             found.append(np.array([*fitted, length]))

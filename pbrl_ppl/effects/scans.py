@@ -1,4 +1,4 @@
-"""What a scan looks at in a history: sizes of commanded forces, places that a body has been at."""
+"""What a scan looks at: sizes of commanded forces, places of a body, points on it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,9 @@ from pbrl_ppl.history import History
 from pbrl_ppl.scene import Body
 
 Array = NDArray[np.float64]
+
+#: Points tried on a body, as shares of its half extent.
+_ON_BODY = np.array([(0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7)])
 
 
 def force_levels(history: History, body: Body, most: int) -> Array:
@@ -35,3 +38,9 @@ def places(history: History, body: Body) -> Array:
     """Where a body was measured to be, shape (n, 2), m."""
     place = history.dataset["start"].sel(body=body.name).to_numpy()[..., :2].reshape(-1, 2)
     return np.asarray(place[np.isfinite(place).all(axis=1)])
+
+
+def body_points(body: Body) -> Array:
+    """The middle of a body and points to all four sides of it, in its frame, shape (5, 2), m."""
+    x_min, x_max, y_min, y_max = body.shape.bounds
+    return np.asarray(0.5 * np.array([x_max - x_min, y_max - y_min]) * _ON_BODY)

@@ -6,13 +6,14 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.scans import body_points
 from pbrl_ppl.effects.stages import Properties
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
-#: Directions tried, over a right angle, and places, as shares of the body's half extent.
-_TURNS, _PLACES = 3, ((0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7))
+#: Directions tried, over a right angle.
+_TURNS = 3
 _NAMES = ("w_x", "w_y", "w_theta", "mu_x", "mu_y")
 
 
@@ -24,10 +25,8 @@ def _modify(properties: Any, parameters: Any, clock: Any) -> None:
 def _scan(scene: Scene, history: History, body: Body) -> Any:
     """Places and directions; both frictions are differentiated."""
     turns = np.arange(_TURNS) * (0.5 * np.pi / _TURNS)
-    x_min, x_max, y_min, y_max = body.shape.bounds
-    half = 0.5 * np.array([x_max - x_min, y_max - y_min])
-    looks = product(_PLACES, turns)
-    return np.array([(*(half * place), turn, np.nan, np.nan) for place, turn in looks])
+    looks = product(body_points(body), turns)
+    return np.array([(*place, turn, np.nan, np.nan) for place, turn in looks])
 
 
 def _has_none(scene: Scene, body: Body) -> bool:

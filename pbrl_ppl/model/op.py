@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numba
@@ -145,10 +145,7 @@ class SimulatorOp(_EngineOp):
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         if self.sensitivity is None:
             return self.simulator.recall(phi, start, actions)
-
-        def follow(*given: Array) -> Array:
-            return self._following(self.simulator.recall, *given)
-
+        follow = partial(self._following, self.simulator.recall)
         # a copy: what is remembered must not be written into
         return self._memory.recall((phi, start, actions), follow).copy()
 

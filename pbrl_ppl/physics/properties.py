@@ -214,7 +214,8 @@ class EngineProperties:
         bodies = self._modified(bodies, phi, clock)
         self._check(bodies)
         joints, indices = self.joints(phi)
-        joints = np.concatenate([joints, self._rods(phi)], axis=1)
+        if self._tying:
+            joints = np.concatenate([joints, self._rods(phi)], axis=1)
         commands, forces = (self._law_parameters(phi, stage) for stage in (Command, Force))
         return EngineInput(bodies, joints, self._discs(phi), commands, forces, indices)
 
@@ -259,15 +260,15 @@ class EngineProperties:
 
     def _discs(self, phi: Array) -> Array:
         """The structure stage's discs, shape (proposal, disc, 3)."""
-        if not self._acting[Structure]:
-            return np.empty((len(phi), 0, 3))
         rows = [
             np.stack(np.broadcast_arrays(disc.x, disc.y, disc.radius), axis=-1)
             for attached in self._acting[Structure]
             if isinstance(attached.effect.stage, Structure)
             for disc in attached.effect.stage.discs(self.values(attached, phi))
         ]
-        discs = np.stack(rows, axis=1) if rows else np.empty((len(phi), 0, 3))
+        if not rows:
+            return np.empty((len(phi), 0, 3))
+        discs = np.stack(rows, axis=1)
         if not (np.isfinite(discs).all() and (discs[..., 2] >= 0).all()):
             raise ParameterError(
                 "a hidden disc has a place or radius that is not finite, or a radius below 0; give"

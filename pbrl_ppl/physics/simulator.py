@@ -197,7 +197,7 @@ class Simulator:
         measured = measured if measured.ndim == 4 else measured[None]
         if not sensors:
             return measured
-        states = np.array(np.broadcast_to(measured, (len(phi), *measured.shape[1:])), order="C")
+        states = _each(measured, len(phi))
         for i, sensor, values in reversed(sensors):
             flat = {name: value[..., 0] for name, value in values.items()}
             states[:, :, i] = sensor.invert(states[:, :, i], flat)
@@ -210,8 +210,9 @@ class Simulator:
 
     def _on_rods(self, states: Array, joints: Array) -> Array:
         """Start states with the bodies that effects tie on their rods."""
+        if self._properties.tied:
+            states = _each(states, len(joints))
         for i, position in self._properties.tied:
-            states = np.array(np.broadcast_to(states, (len(joints), *states.shape[1:])), order="C")
             moment = self.scene.moving[i].shape.unit_moment
             states[:, :, i] = on_rod(states[:, :, i], joints[:, position], moment)
         return states
@@ -337,3 +338,8 @@ class Simulator:
                 engine.rollout(batch, alone, first, last, out)
 
             share_out(run, engines[:workers], len(out))
+
+
+def _each(states: Array, proposals: int) -> Array:
+    """A copy of start states for each proposal, in the layout that the rollouts take."""
+    return np.array(np.broadcast_to(states, (proposals, *states.shape[1:])), order="C")
