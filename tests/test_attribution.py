@@ -138,6 +138,17 @@ def test_baselines_name_what_is_linear_in_its_coefficient(attribution, effect, v
     assert names["sparse_regression"] in (effect, None)  # without pysindy, none
 
 
+def test_the_closest_of_an_effect_s_terms_counts(attribution) -> None:
+    """Not the last: an effect may have a term in each equation, and two in one."""
+    x = np.linspace(-1.0, 1.0, 50)
+    left = {"x": x, "y": np.cos(9 * x)}
+    named = {
+        "x": {("body_force", "cos"): x, ("body_force", "sin"): x**2, ("spring", "x"): x + x**3},
+        "y": {("spring", "y"): x**2},
+    }
+    assert attribution.baselines.WAYS["correlation"](left, named) == "body_force"
+
+
 def test_no_cases_no_shares(attribution) -> None:
     scores = attribution.scores.score([])
     assert scores["naming"] is None

@@ -109,13 +109,13 @@ def _terms(state: Array, wrench: Array, before: Array) -> dict[str, Terms]:
 
 def _largest(left: dict[str, Array], named: dict[str, Terms]) -> str | None:
     """The effect of the term that goes with the residual most closely."""
-    found = {
-        effect: abs(float(np.corrcoef(own, left[equation])[0, 1]))
+    found = [
+        (abs(float(np.corrcoef(own, left[equation])[0, 1])), effect)
         for equation, terms in named.items()
-        for (effect, _), own in sorted(terms.items())
+        for (effect, _), own in terms.items()
         if own.std() > 0 and left[equation].std() > 0
-    }
-    return max(found, key=lambda effect: found[effect]) if found else None
+    ]
+    return max(found)[1] if found else None
 
 
 def _sparse(left: dict[str, Array], named: dict[str, Terms]) -> str | None:
