@@ -28,17 +28,25 @@ import pytensor.tensor as pt
 
 from pbrl_ppl import Body, Scene, Shape, Simulator, SimulatorOp
 from pbrl_ppl.effects import attach
-from pbrl_ppl.history import fill_hinges
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import calls, pointers
+from pbrl_ppl.history import History, fill_hinges
+from pbrl_ppl.model import Problem, build_layout
+from pbrl_ppl.parameters import Layout, box, differentiate
+from pbrl_ppl.physics import PartedSimulator, calls, pointers
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Joint, Wall
 
-APARTMENT = Path(__file__).parents[2] / "models" / "apartment" / "scene.toml"
+MODELS = Path(__file__).parents[2] / "models"
+APARTMENT = MODELS / "apartment" / "scene.toml"
+RECORDED = MODELS / "shopping_cart"
 G, TIME_STEP, SUBSTEPS, TRANSITIONS = 9.81, 0.1, 10, 100
+#: Transitions of which what a call costs by itself is a small share.
+MANY = 10_000
 CART = {"mass": 8.0, "r": 0.2, "mu_c": 0.3, "w_x": -0.3, "w_y": 0.0, "w_theta": 0.1}
 CART |= {"mu_x": 0.05, "mu_y": 0.4}
+#: Effects of the commands' stage and of the forces', and their parameters.
+EFFECTS = ("linear_drag", "constant_force", "actuator_delay")
+SIZES = {"linear_drag_coefficient": 1.5, "actuator_delay_share": 0.3}
+SIZES |= {"constant_force_force_x": 1.0, "constant_force_force_y": -1.0}
 BOX = Shape.box(0.9, 0.55)
 ROUNDS = 5
 
@@ -77,9 +85,9 @@ def timed(function: Callable[[], object]) -> Callable[[], float]:
 # -- the worlds ------------------------------------------------------------------------------------
 
 
-def cart_scene() -> Scene:
-    """A wheeled cart on a floor without walls."""
-    cart = Body("cart", BOX, wheel=True)
+def cart_scene(wheel: bool = True, effects: tuple[str, ...] = ()) -> Scene:
+    """A cart on a floor without walls, wheeled unless said otherwise."""
+    cart = Body("cart", BOX, wheel=wheel, effects=effects)
     return Scene(time_step=TIME_STEP, substeps=SUBSTEPS, normal_gravity=G, bodies=(cart,))
 
 
@@ -216,13 +224,71 @@ def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[
 # -- the ratios ------------------------------------------------------------------------------------
 
 
+def free_sides(
+    n: int, wheel: bool = True, effects: tuple[str, ...] = ()
+) -> tuple[Callable[[], float], Callable[[], float]]:
+    """A prediction of ``n`` transitions that touch nothing, and bare C stepping without effects."""
+    start, actions = cart_data(n)
+    simulators = []
+    for acting in (effects, ()):
+        scene = cart_scene(wheel, acting)
+        attached = attach(scene)
+        layout = build_layout(scene, attached)
+        given = {block.name: (CART | SIZES)[block.name] for block in layout.blocks}
+        simulators.append(
+            (Simulator(scene, layout, attached, extrapolate=False), layout.to_vector(given))
+        )
+    (ours, phi), (theirs, known) = simulators
+    return timed(lambda: ours(phi, start, actions)), timed(bare(theirs, known, start))
+
+
+def free_rows(n: int = MANY) -> list[Row]:
+    """Predictions of a body that touches nothing, one thread, without extrapolation."""
+    what = f"{n} transitions that touch nothing / bare C stepping: "
+    return [
+        Row("free_over_c", what + "with a wheel", "<= 0.15", *free_sides(n)),
+        Row("free_plain_over_c", what + "without", "<= 0.10", *free_sides(n, wheel=False)),
+        Row("free_effects_over_c", what + "with a wheel and three effects, stepped without these",
+            "<= 0.2", *free_sides(n, effects=EFFECTS)),
+    ]  # fmt: skip
+
+
+def jacobian_rows() -> list[Row]:
+    """The Jacobian of the demo's residual, as a mode's covariance and as a climb to it take it."""
+    scene = Scene.load(RECORDED / "scene.toml").with_effects("cart", *EFFECTS)
+    history = History.load(RECORDED / "recorded" / "train.csv", scene)
+    problem = Problem.of(scene, history, attach(scene))
+    layout, sigma = problem.layout, problem.noise_prior[0]
+    phi = layout.to_vector(CART | SIZES)
+    lower, upper = box(layout.priors)
+    steps, rough = 1e-3 * layout.scale(phi), problem.coarse.simulator
+
+    def both(engine: PartedSimulator) -> Callable[[], float]:
+        """The time of values and derivatives, the latter through an engine."""
+
+        def run() -> None:
+            problem.robust(phi, sigma)
+            differentiate(lambda at: problem.robust(at, sigma, engine), phi, steps, lower, upper)
+
+        return timed(run)
+
+    value = timed(lambda: problem.robust(phi, sigma))
+    what = f"residual of the demo's {history.n_transitions} transitions with its derivatives by"
+    return [
+        Row("jacobian_over_value", f"{what} {layout.size} parameters / the residual alone",
+            "<= 10", both(problem.simulator), value),
+        Row("coarse_jacobian_over_value", "the same, derivatives with few engine steps, as climbs"
+            " take them", "", both(rough), value),
+    ]  # fmt: skip
+
+
 def rows() -> list[Row]:
     """All ratios."""
     scene = cart_scene()
     layout = build_layout(scene)
     phi = layout.to_vector(CART)
     start, actions = cart_data(TRANSITIONS)
-    many = cart_data(10_000)
+    many = cart_data(MANY)
     plain = Simulator(scene, layout, extrapolate=False)
     usual = Simulator(scene, layout)
     two = Simulator(scene, layout, threads=2)
@@ -247,6 +313,8 @@ def rows() -> list[Row]:
             "", timed(lambda: naive(start, actions)), timed(lambda: usual(phi, start, actions))),
         Row("ours_over_c", "ours / bare C stepping of the same world from the same states",
             "<= 1.7", timed(lambda: plain(phi, start, actions)), timed(bare(plain, phi, start))),
+        *free_rows(),
+        *jacobian_rows(),
         Row("two_threads", "two threads / one thread, throughput, 10,000 transitions",
             ">= 1.7", timed(lambda: usual(phi, *many)), timed(lambda: two(phi, *many))),
         Row("two_threads_c", "the same of the bare C stepping: what the machine gives", "",
