@@ -16,7 +16,7 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 
@@ -39,9 +39,8 @@ from pbrl_ppl.posterior.store import az, convergence, group
 from pbrl_ppl.sampling.fitting import METHODS
 
 sys.path.insert(0, str(Path(__file__).parent))
-from engine import ROUNDS, hung, machine, naive
+from engine import MODELS, ROUNDS, hung, machine, naive
 
-MODELS = Path(__file__).parents[2] / "models"
 NOISE = np.array([0.002, 0.002, 0.004, 0.01, 0.01, 0.02])  # of motion capture
 CART = {"mass": 8.0, "r": 0.3, "mu_c": 0.3, "w_x": -0.25, "w_y": 0.05, "w_theta": 0.3}
 CART |= {"mu_x": 0.04, "mu_y": 0.45}
@@ -379,11 +378,15 @@ PARTS: dict[str, Callable[[], Iterator[Row]]] = {
 }
 
 
-def measure(parts: Mapping[str, Callable[[], Iterator[Row]]], description: str | None) -> None:
-    """Measure the parts that the command line asks for, and print."""
+def measure(
+    parts: Mapping[str, Callable[[], Iterator[Row]]],
+    description: str | None,
+    usual: Sequence[str] = (),
+) -> None:
+    """Measure the parts that the command line asks for, or the usual ones or all, and print."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--only", nargs="+", choices=parts, default=list(parts))
+    parser.add_argument("--only", nargs="+", choices=parts, default=list(usual or parts))
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
     rows = (row for name in arguments.only for row in parts[name]())

@@ -1,15 +1,20 @@
-"""How long the loop takes on a recorded cart, in all and to rank the candidates.
+"""How long the loop takes on a recording, from its files to the report.
 
-    python analysis/benchmarks/loop.py          # a table
-    python analysis/benchmarks/loop.py --json   # one JSON object
+    python analysis/benchmarks/loop.py                     # a table of the demo's cart
+    python analysis/benchmarks/loop.py --json              # one JSON object
+    python analysis/benchmarks/loop.py --only pair real    # minutes each; long: far more
 
-The history is that of `make demo`: Box2D's cart with an undeclared drag. Seconds are this
-machine's; beside them stands how often the likelihood could have been evaluated meanwhile.
+`loop`, the default, is `make demo`'s history: Box2D's cart with an undeclared drag; `pair` two
+bodies that touch; `long` a hundred thousand transitions; `real` the measured recordings. Pair and
+measurements lie beside the project and are left out where they do not. Seconds are this machine's.
 """
 
 from __future__ import annotations
 
+import json
+import subprocess
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Iterator
@@ -22,9 +27,42 @@ from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
 
 sys.path.insert(0, str(Path(__file__).parent))
+from engine import MODELS
 from inference import Row, measure
 
-CART = Path(__file__).parents[2] / "models" / "shopping_cart"
+CART = MODELS / "shopping_cart"
+#: Recordings beside the project, which holds no copy.
+SHARED = Path(__file__).parents[3] / "shared"
+PAIR = SHARED / "data" / "pair-linear-drag"
+REAL, PUSHED = SHARED / "data" / "real", SHARED / "contact" / "planar-push"
+LONG = 100_000
+
+
+def closed(scene_file: Path, folder: Path) -> tuple[float, pp.Loop]:
+    """Seconds from a scene and its recordings to the report, and what was found."""
+    begin = time.perf_counter()
+    with warnings.catch_warnings(), tempfile.TemporaryDirectory() as out:
+        warnings.simplefilter("ignore")
+        scene = pp.Scene.load(scene_file)
+        train, test = (pp.History.load(folder / f"{name}.csv", scene) for name in ("train", "test"))
+        found = pp.close_loop(scene, train, test, seed=1)
+        found.save(Path(out) / "loop")
+    return time.perf_counter() - begin, found
+
+
+def told(found: pp.Loop) -> str:
+    """What a loop was about, and what it found."""
+    names = ", ".join(f"{one.effect} on {one.body}" for one in found.added) or "nothing"
+    count = found.findings.provenance["transitions"]
+    return f"{count} transitions; {found.verdict}, added: {names}"
+
+
+def there(key: str, *folders: Path) -> bool:
+    """Whether the recordings of a key are there; says so where they are not."""
+    missing = [str(folder) for folder in folders if not folder.is_dir()]
+    if missing:
+        print(f"{key} is left out: nothing at {' or '.join(missing)}", file=sys.stderr)
+    return not missing
 
 
 def measure_loop() -> Iterator[Row]:
@@ -57,5 +95,42 @@ def measure_loop() -> Iterator[Row]:
     yield "loop_ess", "the same: least ESS", ">= 100", found.posterior_after.attrs["min_ess"]
 
 
+def measure_pair() -> Iterator[Row]:
+    """The loop on two bodies that touch, of which one has an undeclared drag."""
+    if there("pair_seconds", PAIR):
+        took, found = closed(PAIR / "scene.toml", PAIR)
+        yield "pair_seconds", f"two bodies that touch, {told(found)} (s)", "<= 180", took
+
+
+def measure_long(transitions: int = LONG) -> Iterator[Row]:
+    """The loop on a long recording, in a process of its own: its memory counts."""
+    script = Path(__file__).with_name("long_loop.py")
+    ran = subprocess.run(
+        [sys.executable, str(script), str(transitions)], stdout=subprocess.PIPE, check=True
+    )
+    got = json.loads(ran.stdout)
+    yield "long_loop_seconds", f"cart, {got['told']} (s)", "<= 1200", got["seconds"]
+    yield "long_loop_gigabytes", "the same: most memory (GB)", "<= 4", got["gigabytes"]
+
+
+def measure_real() -> Iterator[Row]:
+    """The loops on the measured recordings, and the longest of them."""
+    if not there("real_seconds_max", REAL, PUSHED):
+        return
+    longest = 0.0
+    for folder in (*sorted(path.parent for path in REAL.glob("*/scene.toml")), PUSHED):
+        took, found = closed(folder / "scene.toml", folder)
+        longest = max(longest, took)
+        yield (
+            f"{folder.name.replace('-', '_')}_seconds",
+            f"{folder.name}, {told(found)} (s)",
+            "",
+            took,
+        )
+    yield "real_seconds_max", "the longest of the measured recordings (s)", "< 300", longest
+
+
+PARTS = {"loop": measure_loop, "pair": measure_pair, "long": measure_long, "real": measure_real}
+
 if __name__ == "__main__":
-    measure({"loop": measure_loop}, __doc__)
+    measure(PARTS, __doc__, usual=["loop"])

@@ -24,7 +24,8 @@ from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.scene import Wall
 
 sys.path.insert(0, str(Path(__file__).parent))
-from inference import CART, MODELS, NOISE, Row, simulate
+from engine import MODELS
+from inference import CART, NOISE, Row, simulate
 
 DRAWS, STARTS, SEED = 16, 20, 0
 #: Where the wheel is, forwards (m), and the share of draws that counts where there are two modes.

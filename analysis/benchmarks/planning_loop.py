@@ -22,7 +22,8 @@ import numpy as np
 import pbrl_ppl as pp
 
 sys.path.insert(0, str(Path(__file__).parent))
-from inference import MODELS, Row
+from engine import MODELS
+from inference import Row
 from planning_draws import PUSHES
 
 DRAG, STARTS, SEED = 3.0, 20, 0  # kg/s
