@@ -4,12 +4,14 @@
     python analysis/attribution_benchmark.py --quick                     # a tenth of the cases
     python analysis/attribution_benchmark.py --only cart-linear_drag --verbose
     python analysis/attribution_benchmark.py --list
+    python analysis/attribution_benchmark.py --measured double_pendulum push    # no cases: minutes
 
 Box2D makes the data (models/shopping_cart/make_history.py): a cart on a wheel, a free puck and a
 pendulum, each effect at three sizes; each with itself left out of the catalogue; effects that are
 not in it; clean data; and logs that are nonsense. An oracle that knows what is hidden says which
 cases can be told at all: scores are over those. Where the measured pendulum lies beside the
-project, the loop's forecasts of it are told too (``--only`` leaves them out).
+project, the loop's forecasts of it are told too (``--only`` leaves them out); those of the other
+measured recordings take minutes each, and are told where ``--measured`` names them.
 """
 
 from __future__ import annotations
@@ -22,14 +24,14 @@ import signal
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from attribution.cases import Case, a_tenth, all_cases
-from attribution.measured import SWING, pendulum_errors
+from attribution.measured import MEASURED, SHARED, SWING, pendulum_errors
 from attribution.one_case import Row, cache_path, load, run_case, save, sources
 from attribution.scores import score
 from attribution.words import plain, score_table, table, told
@@ -163,6 +165,9 @@ def parsed() -> argparse.Namespace:
     )
     parser.add_argument("--quick", action="store_true", help="a tenth of the cases")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="cases with this in their name")
+    parser.add_argument(
+        "--measured", nargs="+", choices=MEASURED, help="measured recordings, and no cases"
+    )
     parser.add_argument("--list", action="store_true", help="print the cases' names and stop")
     parser.add_argument("--repeats", type=int, default=1, help="each case so often, new data each")
     parser.add_argument("--seed", type=int, default=0)
@@ -182,9 +187,29 @@ def parsed() -> argparse.Namespace:
     return options
 
 
+def write(name: str | None, found: Mapping[str, object]) -> None:
+    """Write what was found where it is asked for."""
+    text = json.dumps(found, indent=1)
+    if name == "-":
+        print(text)
+    elif name:
+        Path(name).write_text(text + "\n")
+
+
 def main() -> None:
     """Run the cases and print their table and scores."""
     options = parsed()
+    console = Console(stderr=options.json == "-", width=None if sys.stdout.isatty() else _WIDTH)
+    if options.measured:
+        scores: dict[str, float | int | None] = {}
+        for name in options.measured:
+            say(f"the measured {name.replace('_', ' ')}")
+            scores |= MEASURED[name](seed=options.seed)
+        if None in scores.values():
+            say(f"not all recordings are there, in {SHARED}")
+        console.print(score_table(scores))
+        write(options.json, scores)
+        return
     cases = chosen(options)
     if not cases:
         sys.exit(f"no case has {' or '.join(options.only)} in its name; --list prints the names")
@@ -205,18 +230,12 @@ def main() -> None:
     )
     rows = watched(in_batches(cases, options), len(cases), kept, options.verbose)
     scores = score(rows)
-    console = Console(stderr=options.json == "-", width=None if sys.stdout.isatty() else _WIDTH)
     if not options.only:
         say("the measured pendulum" + ("" if SWING.is_dir() else f": none at {SWING}"))
         scores |= pendulum_errors(seed=options.seed)
     console.print(table(rows), score_table(scores))
-    if options.json:
-        ordered = sorted(rows, key=lambda row: row.name)
-        text = json.dumps(scores | {"rows": [plain(row) for row in ordered]}, indent=1)
-        if options.json == "-":
-            print(text)
-        else:
-            Path(options.json).write_text(text + "\n")
+    ordered = sorted(rows, key=lambda row: row.name)
+    write(options.json, scores | {"rows": [plain(row) for row in ordered]})
 
 
 if __name__ == "__main__":

@@ -2,8 +2,10 @@
 
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import pbrl_ppl as pp
@@ -267,3 +269,40 @@ def test_the_measured_pendulum_is_left_out_where_it_is_not(attribution, tmp_path
     none = attribution.measured.pendulum_errors(tmp_path / "nowhere")
     assert {"pendulum_1s", "pendulum_2s", "pendulum_angle_only_1s"} < set(none)
     assert set(none.values()) == {None}
+
+
+def test_other_measured_recordings_are_left_out_where_they_are_not(attribution, tmp_path) -> None:
+    measured = attribution.measured
+    none = measured.double_pendulum_errors(tmp_path / "nowhere")
+    none |= measured.push_errors(tmp_path / "nowhere")
+    assert none == {"double_pendulum_01s": None, "push_mm": None, "push_deg": None}
+
+
+def test_the_pushed_blocks_error_is_in_the_plane(attribution, shared_data, monkeypatch) -> None:
+    folder = shared_data.parent / "contact" / "planar-push"
+    if not folder.is_dir():
+        pytest.skip(f"no recorded pushes at {folder}")
+    error = {"x": 3e-3, "y": 4e-3, "theta": np.radians(2.0)}
+    found = SimpleNamespace(after=SimpleNamespace(rollout_rmse=error))
+    monkeypatch.setattr(attribution.measured, "revise", lambda *args, **settings: found)
+    told = attribution.measured.push_errors(folder)
+    assert told == pytest.approx({"push_mm": 5.0, "push_deg": 2.0})
+
+
+@pytest.mark.slow
+def test_the_double_pendulums_error_is_of_a_tenth_of_a_second(
+    attribution, shared_data, monkeypatch, tmp_path
+) -> None:
+    """Three trajectories, and nothing added: as far off as without friction."""
+    folder = shared_data / "real" / "double-pendulum-driven"
+    if not folder.is_dir():
+        pytest.skip(f"no recorded double pendulum at {folder}")
+    (tmp_path / "scene.toml").write_text((folder / "scene.toml").read_text())
+    for name in ("train", "test"):
+        rows = pd.read_csv(folder / f"{name}.csv")
+        first = rows["trajectory"].isin(rows["trajectory"].unique()[:3])
+        rows[first].to_csv(tmp_path / f"{name}.csv", index=False)
+    found = SimpleNamespace(added=(), numerical=SimpleNamespace(substeps_used=20))
+    monkeypatch.setattr(attribution.measured, "revise", lambda *args, **settings: found)
+    told = attribution.measured.double_pendulum_errors(tmp_path)
+    assert 0.01 < told["double_pendulum_01s"] < 0.2
