@@ -236,7 +236,8 @@ def test_the_wheel_has_all_rooms_and_the_models() -> None:
     for scene in MODELS.glob("*/scene.toml"):
         own = {path for pattern in tools["package-data"]["pbrl_ppl.models"]
                for path in MODELS.glob(pattern)}  # fmt: skip
-        assert {scene, *scene.parent.glob("recorded/*.csv")} <= own
+        given = ("recorded/*.csv", "*.json")
+        assert {scene, *(path for pattern in given for path in scene.parent.glob(pattern))} <= own
     assert (ROOT / "pbrl_ppl" / "py.typed").exists() and (ROOT / "CITATION.cff").exists()
 
 
