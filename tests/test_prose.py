@@ -101,6 +101,12 @@ def test_links_lead_to_files() -> None:
             assert (path.parent / link).exists(), f"{path}: {link}"
 
 
+def test_scripts_that_are_named_exist() -> None:
+    for path in [*PROSE, ROOT / "CHANGELOG.md"]:
+        for name in re.findall(r"\banalysis/[\w/]+\.py\b", path.read_text()):
+            assert (ROOT / name).is_file(), f"{path}: {name}"
+
+
 def test_commands_and_their_options_exist() -> None:
     commands = typer.main.get_command(app).commands
     lines = "".join(block for path in PROSE for block in blocks(path, "sh")).replace("\\\n", " ")

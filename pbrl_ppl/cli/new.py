@@ -130,8 +130,10 @@ def new(
     elif not quiet:
         for path in written:
             typer.echo(f"wrote {path}")
-        log = history or (written[-1] if len(written) > 1 else "history.csv")
-        typer.echo(f"next: {shlex.join(['pbrl-ppl', 'check', str(scene), str(log), *reading])}")
+        log = history or (written[-1] if len(written) > 1 else None)
+        command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv"), *reading]
+        begin = "next" if log else "next, with a recording of your own"
+        typer.echo(f"{begin}: {shlex.join(command)}")
 
 
 def _reading(

@@ -72,6 +72,8 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*argv, "-q"]) == 130
     message = "interrupted; finished logs are in out; the same command goes on\n"
     assert capsys.readouterr().err == message
+    assert main(argv) == 130
+    assert capsys.readouterr().err.count("interrupted") == 1
     assert Path("out/red/report.html").is_file() and not Path("out/blue/report.json").exists()
 
 
