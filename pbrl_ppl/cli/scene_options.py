@@ -8,7 +8,7 @@ from pbrl_ppl.cli.scene_text import BodyText, HingeText, numbers
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import WORLD, nearest
 
-SHAPES = "box:0.9x0.55, circle:0.1 or polygon:-0.05,-0.05/0.1,-0.05/-0.05,0.1, in m"
+SHAPES = "box:0.9x0.55, circle:0.1 or polygon:0,2/-1,-1/1,-1, in m"
 HINGE = "arm@0,0.15 (to the world) or upper@0,-0.1=lower@0,0.15"
 
 
