@@ -101,6 +101,12 @@ def test_links_lead_to_files() -> None:
             assert (path.parent / link).exists(), f"{path}: {link}"
 
 
+def test_scripts_that_are_named_exist() -> None:
+    for path in [*PROSE, ROOT / "CHANGELOG.md"]:
+        for name in re.findall(r"\banalysis/[\w/]+\.py\b", path.read_text()):
+            assert (ROOT / name).is_file(), f"{path}: {name}"
+
+
 def test_commands_and_their_options_exist() -> None:
     commands = typer.main.get_command(app).commands
     lines = "".join(block for path in PROSE for block in blocks(path, "sh")).replace("\\\n", " ")
@@ -112,7 +118,7 @@ def test_commands_and_their_options_exist() -> None:
         options = {
             flag for each in commands[name].params for flag in (*each.opts, *each.secondary_opts)
         }
-        assert {word for word in words if word.startswith("-")} <= options, line
+        assert {word for word in words if re.match("--?[a-z]", word)} <= options, line
 
 
 def test_the_tutorial_has_the_files_that_it_names(tmp_path, monkeypatch) -> None:

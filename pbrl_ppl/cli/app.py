@@ -44,9 +44,9 @@ app = typer.Typer(
     name="pbrl-ppl",
     help="A physics engine as model prior, and a loop that closes on measured data.",
     epilog="Example: pbrl-ppl new --from shopping_cart. Exit codes: 0; 1 for a calibration that"
-    " failed, a goal that was not reached or effects that stay inseparable; 2 for bad usage or"
-    " input, with one message on stderr; 3 where chains have not converged; 130 after an"
-    " interrupt.",
+    " failed, a goal that was not reached, effects that stay inseparable or some of many logs that"
+    " failed; 2 for bad usage or input, with one message on stderr; 3 where chains have not"
+    " converged; 130 after an interrupt.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )

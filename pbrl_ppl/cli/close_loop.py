@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import replace
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -32,7 +33,7 @@ from pbrl_ppl.cli.terminal import (
 if TYPE_CHECKING:
     from pbrl_ppl.report import Loop, Source
 
-#: Share of the time that is over when a stage begins, as measured on a recorded cart.
+#: Share of the time that is over when a stage begins, as measured on a recorded cart with chains.
 SHARES = {
     "loading the sampler": 0.01,
     "looking whether the prior could have made the data": 0.03,
@@ -44,6 +45,13 @@ SHARES = {
     "comparing errors on held-out data": 0.98,
     "writing the report": 0.99,
 }
+
+
+class Method(StrEnum):
+    """How posteriors are drawn."""
+
+    METROPOLIS = "metropolis"
+    LAPLACE = "laplace"
 
 
 def close_loop(
@@ -77,6 +85,13 @@ def close_loop(
     draws: Annotated[
         int | None, typer.Option(min=100, help="Posterior draws of each chain.")
     ] = None,
+    method: Annotated[
+        Method,
+        typer.Option(
+            help="metropolis draws the posteriors; laplace takes Gaussians at the modes, on which"
+            " the verdict then stands."
+        ),
+    ] = Method.METROPOLIS,
     noise: Errors = None,
     estimate_velocities: Velocities = False,
     columns: Columns = None,
@@ -119,8 +134,8 @@ def close_loop(
         close_loop_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
-            noise=named_numbers(noise, "--noise", "x=0.002"), columns=columns_of(columns or []),
-            units=units_of(units or []), time_step=time_step,
+            method=method.value, noise=named_numbers(noise, "--noise", "x=0.002"),
+            columns=columns_of(columns or []), units=units_of(units or []), time_step=time_step,
             estimate_velocities=estimate_velocities,
         )  # fmt: skip
         return
@@ -128,7 +143,8 @@ def close_loop(
         raise typer.BadParameter("expected SCENE and TRAIN, or --many MANIFEST")
     if jobs > 1 or scheduler is not None:
         raise typer.BadParameter("--jobs and --scheduler are for --many")
-    with interruptible(), stages(quiet, SHARES) as progress:
+    shares = SHARES if method is Method.METROPOLIS else None
+    with interruptible(), stages(quiet, shares) as progress:
         check_can_make(output)  # before the long work, which would be lost
         progress("reading the scene and the histories")
         declared, histories = load_own(
@@ -151,6 +167,7 @@ def close_loop(
             *histories,
             seed=seed,
             draws=draws,
+            method=method.value,
             progress=progress,
         )
         progress("writing the report")

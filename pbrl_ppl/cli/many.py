@@ -14,6 +14,7 @@ from typing import Any
 import typer
 
 from pbrl_ppl.cli.answers import print_json
+from pbrl_ppl.cli.outputs import check_can_make
 from pbrl_ppl.cli.terminal import FAILED, interruptible, stages
 from pbrl_ppl.errors import OutputError
 
@@ -31,6 +32,7 @@ def close_loop_many(
     """Close the loop on each log of a manifest, and say which effects are where."""
     kept = f"finished logs are in {output}; the same command goes on"
     with interruptible(kept), stages(quiet) as progress:
+        check_can_make(output)
         progress("reading the manifest")
         os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import shlex
 import shutil
 import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,13 +14,16 @@ import typer
 
 from pbrl_ppl.cli.answers import print_json
 from pbrl_ppl.cli.outputs import check_file
-from pbrl_ppl.cli.scene_text import BodyText, scene_text
+from pbrl_ppl.cli.own_tables import Columns, Units, columns_of, units_of
+from pbrl_ppl.cli.recorded import Recorded, recorded
+from pbrl_ppl.cli.scene_options import HINGE, SHAPES, hinge, outline, outlines, wall
+from pbrl_ppl.cli.scene_options import bodies as parts
+from pbrl_ppl.cli.scene_text import scene_text
 from pbrl_ppl.cli.terminal import AsJson, Overwrite, Quiet, interruptible
 from pbrl_ppl.errors import OutputError, SceneError
 
 #: Where models/ is in an installed package, and in a clone.
 _MODELS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
-_SHAPES = "box:0.9x0.55 or circle:0.1, in m"
 
 
 def new(
@@ -26,11 +32,35 @@ def new(
     ),
     bodies: Annotated[
         list[str] | None,
-        typer.Option("--body", metavar="NAME=SHAPE", help=f"A body and its outline: {_SHAPES}."),
+        typer.Option("--body", metavar="NAME=SHAPE", help=f"A body and its outline: {SHAPES}."),
     ] = None,
     wheels: Annotated[
         list[str] | None,
         typer.Option("--wheel", metavar="NAME", help="A body that has a wheel or sticky feet."),
+    ] = None,
+    kinematic: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME", help="A body that follows its recorded path: a finger."),
+    ] = None,
+    known: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME.PARAMETER=VALUE", help="What is given: arm.mass=0.148 (SI)."),
+    ] = None,
+    declare: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=EFFECT,...", help="Effects that it has: arm=inertia_scale."),
+    ] = None,
+    hinges: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--hinge",
+            metavar="NAME@X,Y[=NAME@X,Y]",
+            help=f"What hangs on what, at which points of their own frames (m): {HINGE}.",
+        ),
+    ] = None,
+    walls: Annotated[
+        list[str] | None,
+        typer.Option("--wall", metavar="X,Y/X,Y", help="An edge between two points (m)."),
     ] = None,
     side: Annotated[
         bool | None,
@@ -45,6 +75,8 @@ def new(
             metavar="HISTORY", help="A recording: has the bodies' names and the time step."
         ),
     ] = None,
+    columns: Columns = None,
+    units: Units = None,
     model: Annotated[
         str | None,
         typer.Option("--from", metavar="MODEL", help="Copy a model that comes with the package."),
@@ -55,17 +87,42 @@ def new(
 ) -> None:
     """Write a commented scene, from options or from a few questions; or copy a model.
 
-    What is not given is asked for, if there is a terminal to ask at. Models to copy: apartment,
-    namo, pendulum and shopping_cart; recordings that a model has go beside the scene.
+    What is not given and is needed is asked for, if there is a terminal to ask at. All options of
+    bodies, hinges and walls can be repeated. Models to copy: apartment, namo, pendulum and
+    shopping_cart; recordings that a model has go beside the scene.
     """
+    described = (
+        bodies, wheels, kinematic, known, declare, hinges, walls, time_step, history, columns, units
+    )  # fmt: skip
     with interruptible():
         check_file(scene, (".toml",), overwrite)
+        names, measures = columns_of(columns or []), units_of(units or [])
+        if model is not None and (side is not None or any(described)):
+            raise SceneError("--from copies a model as it is: leave the other options, or --from")
+        if history is None and (names or measures):
+            raise SceneError("--columns and --units say how a recording is read: add --history")
+        reading: list[str] = []
         try:
             if model is not None:
                 written = _copied(model, scene, overwrite)
             else:
+                shapes = outlines(bodies or [])
+                found = None if history is None else recorded(history, names, measures, [*shapes])
+                reading = _reading(found, columns, units)
+                answers = _asked(shapes, wheels, kinematic, side, time_step, history, found)
+                texts = parts(
+                    answers.shapes, answers.names, wheels=answers.wheels,
+                    kinematic=kinematic or [], known=known or [], effects=declare or [],
+                )  # fmt: skip
+                text = scene_text(
+                    texts,
+                    side=answers.side,
+                    time_step=answers.time_step,
+                    hinges=[hinge(each, answers.names) for each in hinges or []],
+                    walls=[wall(each) for each in walls or []],
+                )
                 written = [scene]
-                _write(scene, _asked(bodies or [], wheels, side, time_step, history))
+                _write(scene, text)
         except typer.Abort:  # Ctrl-C at a question
             raise KeyboardInterrupt from None
     if as_json:
@@ -73,8 +130,23 @@ def new(
     elif not quiet:
         for path in written:
             typer.echo(f"wrote {path}")
-        log = history or (written[-1] if len(written) > 1 else "history.csv")
-        typer.echo(f"next: pbrl-ppl check {scene} {log}")
+        log = history or (written[-1] if len(written) > 1 else None)
+        command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv"), *reading]
+        begin = "next" if log else "next, with a recording of your own"
+        typer.echo(f"{begin}: {shlex.join(command)}")
+
+
+def _reading(
+    found: Recorded | None, columns: list[str] | None, units: list[str] | None
+) -> list[str]:
+    """Options with which later commands read the recording."""
+    if found is None:
+        return []
+    options = [word for each in columns or [] for word in ("--columns", each)]
+    options += [word for each in units or [] for word in ("--units", each)]
+    if not found.even:
+        options += ["--time-step", f"{found.time_step:g}"]
+    return options if found.velocities else [*options, "--estimate-velocities"]
 
 
 def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
@@ -101,26 +173,40 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
 
 def _write(path: Path, text: str) -> None:
     """Write a scene that can be read, whole or not at all."""
+    from pbrl_ppl.effects import attach
     from pbrl_ppl.history import write_atomically
     from pbrl_ppl.scene import Scene
 
-    Scene.from_toml(text)
+    attach(Scene.from_toml(text))  # whether declared effects exist too
     write_atomically(path, lambda to: to.write_text(text, encoding="utf-8"))
 
 
+@dataclass(frozen=True)
+class _Answers:
+    """What a scene needs, whoever said it."""
+
+    names: Sequence[str]
+    shapes: Mapping[str, str]
+    wheels: Sequence[str]
+    side: bool
+    time_step: float
+
+
 def _asked(
-    given: list[str],
+    given: Mapping[str, str],
     wheels: list[str] | None,
+    kinematic: list[str] | None,
     side: bool | None,
     time_step: float | None,
     history: Path | None,
-) -> str:
-    """The scene's text, from options, a recording and answers."""
-    shapes = dict(map(_body, given))
+    found: Recorded | None,
+) -> _Answers:
+    """What options, a recording and answers say."""
+    shapes = dict(given)
     names = list(shapes)
-    if history is not None:
-        names, measured = _recorded(history)
-        time_step = measured if time_step is None else time_step
+    if found is not None:
+        names = list(found.names)
+        time_step = found.time_step if time_step is None else time_step
         for name in shapes:
             if name not in names:
                 raise SceneError(
@@ -128,7 +214,7 @@ def _asked(
                 )
     asking = not names or any(name not in shapes for name in names) or time_step is None
     if asking and not sys.stdin.isatty():
-        lacking = [f"--body {name}={_SHAPES}" for name in names or ["NAME"] if name not in shapes]
+        lacking = [f"--body {name}={SHAPES}" for name in names or ["NAME"] if name not in shapes]
         lacking += ["--time-step"] if time_step is None else []
         raise SceneError(f"new: there is no terminal to ask at; give {', '.join(lacking)}")
     if asking and side is None:
@@ -138,61 +224,14 @@ def _asked(
     rolling = list(wheels or [])
     for name in names:
         while name not in shapes:
-            answer = typer.prompt(f"Outline of {name} ({_SHAPES})")
+            answer = typer.prompt(f"Outline of {name} ({SHAPES})")
             try:
-                shapes |= dict([_body(f"{name}={answer}")])
+                shapes |= dict([outline(f"{name}={answer}")])
             except SceneError as error:
                 typer.echo(str(error), err=True)
-        if asking and wheels is None and not side and typer.confirm(f"Has {name} a wheel?"):
+        free = not side and name not in (kinematic or [])
+        if asking and wheels is None and free and typer.confirm(f"Has {name} a wheel?"):
             rolling.append(name)
     if time_step is None:
         time_step = typer.prompt("Time between two rows of the recording (s)", type=float)
-    for name in rolling:
-        if name not in names:
-            raise SceneError(f"--wheel: there is no body {name!r}, only {', '.join(names)}")
-    return scene_text(
-        [BodyText(name, shapes[name], name in rolling) for name in names],
-        side=bool(side),
-        time_step=time_step,
-    )
-
-
-def _body(text: str) -> tuple[str, str]:
-    """Name and shape, as TOML, of ``NAME=box:LENGTHxWIDTH`` or ``NAME=circle:RADIUS``."""
-    name, _, shape = text.rpartition("=")
-    kind, _, numbers = shape.partition(":")
-    try:
-        sizes = [float(number) for number in numbers.split("x")]
-    except ValueError:
-        sizes = []
-    if name and kind == "box" and len(sizes) == 2:
-        return name, f'{{ kind = "box", size = [{sizes[0]:g}, {sizes[1]:g}] }}'
-    if name and kind == "circle" and len(sizes) == 1:
-        return name, f'{{ kind = "circle", radius = {sizes[0]:g} }}'
-    raise SceneError(f"--body: {text!r} is not NAME=SHAPE with a shape such as {_SHAPES}")
-
-
-def _recorded(path: Path) -> tuple[list[str], float]:
-    """Names of the bodies in a recording, and the median time between its rows (s)."""
-    import numpy as np
-    import pandas as pd
-
-    from pbrl_ppl.errors import HistoryError
-    from pbrl_ppl.history import read_table
-
-    table = read_table(path)
-    for name in ("trajectory", "body", "time"):
-        if name not in table:
-            raise HistoryError(
-                f"history {path}: it has no column {name}; give --body and --time-step instead"
-            )
-    names = [str(name).strip() for name in table["body"].dropna().unique() if str(name).strip()]
-    table["time"] = pd.to_numeric(table["time"], errors="coerce")
-    steps = table.groupby(["trajectory", "body"])["time"].diff()
-    step = float(np.nanmedian(steps)) if steps.notna().any() else float("nan")
-    if not names or not step > 0:
-        raise HistoryError(
-            f"history {path}: its rows name no body, or their times do not go on; correct them, or"
-            " give --body and --time-step instead"
-        )
-    return names, float(f"{step:.6g}")
+    return _Answers(names, shapes, rolling, bool(side), time_step)

@@ -35,7 +35,12 @@ TimeStep = Annotated[
 ]
 
 Resample = Annotated[
-    bool, typer.Option("--resample", help="Interpolate uneven samples to the scene's time step.")
+    bool,
+    typer.Option(
+        "--resample",
+        help="Interpolate uneven samples to the scene's time step. There is no --time-step as of"
+        " other commands, which sets another: a posterior is of its own.",
+    ),
 ]
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 _HEAD = """\
 # What is known before a measurement. SI units: m, kg, s, N, rad.
@@ -33,22 +33,52 @@ substeps = 10              # engine steps in that time; close-loop takes more wh
 # x = 0.002                # one standard deviation, m
 # theta = 0.01             # rad
 """
-_BODY = """
+_SHAPE = """
 [[body]]
 name = {name:<20} # as in the history's column "body"
-shape = {shape}   # m; or {{ kind = "polygon", vertices = [[0, 0], [1, 0], [0, 1]] }}
+shape = {shape}   # m; boxes, circles and polygons, about the centroid
+"""
+_WHEEL = """\
 wheel = {wheel:<20}# whether it resists motion along one axis more than along the other
-# known = {{ mass = 6.0 }}                          # kg: given, not inferred
-# prior = {{ mass = {{ mu = 1.8, sigma = 0.5 }} }}    # exp(1.8) = 6 kg, within a factor of 1.6
+"""
+_KINEMATIC = """\
+kinematic = true           # follows its recorded path whatever it meets, as a robot's finger does
+"""
+_KNOWN = """\
+known = {known}   # SI units: given, not inferred
+"""
+_NOT_KNOWN = """\
+# known = { mass = 6.0 }                          # kg: given, not inferred
+"""
+_PRIOR = """\
+# prior = { mass = { mu = 1.8, sigma = 0.5 } }    # exp(1.8) = 6 kg, within a factor of 1.6
+"""
+_EFFECTS = """\
+effects = {effects}   # declared from the start; close-loop finds others
+"""
+_NO_EFFECTS = """\
 # effects = ["linear_drag"]                       # declared; close-loop finds others
 """
-_REST = """
+_WALL = """
+[[wall]]                   # an edge that bodies hit
+from = {start}
+to = {end}   # m
+"""
+_NO_WALL = """
 # [[wall]]                 # an edge that bodies hit
 # from = [-2.0, -1.0]      # m
 # to = [2.0, -1.0]
-
+"""
+_HINGE = """
+[[joint]]
+kind = "hinge"             # or "distance", a rod
+bodies = [{a}, {b}]
+anchor_a = {anchor_a:<15} # {in_a}, m
+anchor_b = {anchor_b:<15} # {in_b}, m
+"""
+_NO_JOINT = """
 # [[joint]]
-# kind = "hinge"           # or "distance"
+# kind = "hinge"           # or "distance", a rod
 # bodies = [{name}, "world"]
 # anchor_a = [0.0, 0.1]    # in the body's frame, m
 # anchor_b = [0.0, 0.0]    # in the world, m
@@ -57,14 +87,44 @@ _REST = """
 
 @dataclass(frozen=True)
 class BodyText:
-    """A body of a new scene: its name, its shape as TOML, and whether it has a wheel."""
+    """A body of a new scene.
+
+    Parameters
+    ----------
+    name, shape : str
+        The shape as TOML.
+    wheel, kinematic : bool
+        Whether it has a wheel; whether it follows its recorded path.
+    known : mapping of str to float
+        Parameters that are given (SI units).
+    effects : tuple of str
+        Declared from the start.
+    """
 
     name: str
     shape: str
-    wheel: bool
+    wheel: bool = False
+    kinematic: bool = False
+    known: Mapping[str, float] = field(default_factory=dict)
+    effects: tuple[str, ...] = ()
 
 
-def scene_text(bodies: Iterable[BodyText], *, side: bool, time_step: float) -> str:
+@dataclass(frozen=True)
+class HingeText:
+    """A hinge of two bodies, or of one and ``"world"``, and where it holds each (m)."""
+
+    bodies: tuple[str, str]
+    anchors: tuple[tuple[float, float], tuple[float, float]]
+
+
+def scene_text(
+    bodies: Iterable[BodyText],
+    *,
+    side: bool,
+    time_step: float,
+    hinges: Iterable[HingeText] = (),
+    walls: Iterable[tuple[Sequence[float], Sequence[float]]] = (),
+) -> str:
     """A commented scene as TOML.
 
     Parameters
@@ -75,6 +135,10 @@ def scene_text(bodies: Iterable[BodyText], *, side: bool, time_step: float) -> s
         Whether it is seen from the side.
     time_step : float
         Between rows of the history (s).
+    hinges : iterable of HingeText
+        All joints; without one, a comment says how to declare one.
+    walls : iterable of tuple
+        Both ends of each (m); as with hinges.
 
     Examples
     --------
@@ -86,7 +150,48 @@ def scene_text(bodies: Iterable[BodyText], *, side: bool, time_step: float) -> s
     names = []
     parts = [_HEAD, _SIDE if side else _TOP, _CLOCK.format(time_step=time_step)]
     for body in bodies:
-        names.append(json.dumps(body.name, ensure_ascii=False))
-        wheel = str(body.wheel).lower()
-        parts.append(_BODY.format(name=names[-1], shape=body.shape, wheel=wheel))
-    return "".join([*parts, _REST.format(name=names[0])])
+        names.append(_quoted(body.name))
+        parts.append(_body(body))
+    edges = [_WALL.format(start=numbers(start), end=numbers(end)) for start, end in walls]
+    joints = [_hinge(each) for each in hinges]
+    parts += [*(edges or [_NO_WALL]), *(joints or [_NO_JOINT.format(name=names[0])])]
+    return "".join(parts)
+
+
+def numbers(values: Sequence[float]) -> str:
+    """Numbers as TOML."""
+    return f"[{', '.join(map(repr, values))}]"
+
+
+def _body(body: BodyText) -> str:
+    parts = [_SHAPE.format(name=_quoted(body.name), shape=body.shape)]
+    parts.append(_KINEMATIC if body.kinematic else _WHEEL.format(wheel=str(body.wheel).lower()))
+    if body.known:
+        known = ", ".join(f"{_key(name)} = {value!r}" for name, value in body.known.items())
+        parts.append(_KNOWN.format(known=f"{{ {known} }}"))
+    elif not body.kinematic:
+        parts.append(_NOT_KNOWN)
+    if not body.kinematic:
+        parts.append(_PRIOR)
+    if body.effects:
+        listed = ", ".join(map(_quoted, body.effects))
+        parts.append(_EFFECTS.format(effects=f"[{listed}]"))
+    elif not body.kinematic:
+        parts.append(_NO_EFFECTS)
+    return "".join(parts)
+
+
+def _hinge(hinge: HingeText) -> str:
+    frames = ["in the world" if name == "world" else f"in {name}'s frame" for name in hinge.bodies]
+    (a, b), (anchor_a, anchor_b) = map(_quoted, hinge.bodies), map(numbers, hinge.anchors)
+    return _HINGE.format(
+        a=a, b=b, anchor_a=anchor_a, anchor_b=anchor_b, in_a=frames[0], in_b=frames[1]
+    )
+
+
+def _quoted(name: str) -> str:
+    return json.dumps(name, ensure_ascii=False)
+
+
+def _key(name: str) -> str:
+    return name if name.isidentifier() and name.isascii() else _quoted(name)

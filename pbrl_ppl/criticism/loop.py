@@ -32,6 +32,7 @@ from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.errors import ConvergenceWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode
@@ -221,8 +222,8 @@ class _Loop:
         # a chain a processor: more threads would wait for each other
         mode = replace(mode, problem=mode.problem.with_physics(threads=1))
         model = build_model(mode.problem)
-        usual = INDEPENDENT if self.method == "laplace" else DRAWS
-        for n in usual if draws is None else (draws,):
+        chains = self.method != "laplace"
+        for n in (DRAWS if chains else INDEPENDENT) if draws is None else (draws,):
             tune = max(LEAST_TUNE, 5 * n // 8)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always")
@@ -235,8 +236,9 @@ class _Loop:
             if _converged(fitted):
                 break
             self.say(f"the chains have not converged after {n} draws each")
-        for warning in caught:  # of the last
-            warnings.warn(warning.message, stacklevel=2)
+        for warning in caught:  # of the last; independent draws are no chains that converge
+            if chains or not issubclass(warning.category, ConvergenceWarning):
+                warnings.warn(warning.message, stacklevel=2)
         return fitted
 
     def findings(
@@ -326,11 +328,7 @@ def _added(step: Step, revised: Mode, posterior: Any) -> Added:
     """Summarise an added effect with its posterior."""
     candidate, effect = step.signature.candidate, step.signature.attached.effect
     named = posterior_draws(posterior)
-    bodies = [
-        attached.body
-        for attached in revised.problem.physics.effects
-        if attached.effect.name == effect.name
-    ]
+    bodies = [a.body for a in revised.problem.physics.effects if a.effect.name == effect.name]
     estimates = {}
     for parameter in effect.parameters:
         values = named[effect.variable(parameter)][:, bodies.index(candidate.body)]

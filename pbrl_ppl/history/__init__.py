@@ -5,7 +5,7 @@ from pbrl_ppl.history.files import read_table, write_atomically
 from pbrl_ppl.history.gaps import longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.mujoco import from_mujoco
-from pbrl_ppl.history.reading import Reading
+from pbrl_ppl.history.reading import Reading, as_history
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
 from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
 
@@ -13,6 +13,7 @@ __all__ = [
     "History",
     "Reading",
     "Segments",
+    "as_history",
     "derived_velocities",
     "fill_hinges",
     "from_mujoco",

@@ -172,19 +172,15 @@ def close_loop_many(
     left = [log for log in logs if log.name not in rows]
     tasks = {log: partial(settle, log, folder, settings, inputs[log.name], run) for log in left}
     _write_summary(folder, _ordered(logs, rows), {}, {})
-    try:
-        with closing(_results(tasks, executor)) as results:
-            for log, result in results:
-                try:
-                    row = result()
-                except Exception as error:  # its worker died, or it could not be sent there
-                    row = failed(log, folder, error)
-                rows[log.name] = row
-                tell(f"{len(rows)}/{len(logs)} {_row_in_words(row)}")
-                _write_summary(folder, _ordered(logs, rows), {}, {})
-    except KeyboardInterrupt:
-        tell(f"interrupted: {len(rows)} of {len(logs)} logs are in {folder}; run it again")
-        raise
+    with closing(_results(tasks, executor)) as results:
+        for log, result in results:
+            try:
+                row = result()
+            except Exception as error:  # its worker died, or it could not be sent there
+                row = failed(log, folder, error)
+            rows[log.name] = row
+            tell(f"{len(rows)}/{len(logs)} {_row_in_words(row)}")
+            _write_summary(folder, _ordered(logs, rows), {}, {})
     pooled, not_pooled = _pooled(logs, rows, folder)
     ordered = _ordered(logs, rows)
     _write_summary(folder, ordered, pooled, not_pooled)
@@ -243,7 +239,10 @@ def _opened(folder: Path) -> Path:
     except OutputError:
         raise
     except OSError as error:
-        raise OutputError(f"output folder {folder}: cannot be written: {error}") from error
+        raise OutputError(
+            f"output folder {folder}: it cannot be made or written ({error.strerror}); choose"
+            " another path"
+        ) from error
     return folder.absolute()
 
 

@@ -90,23 +90,25 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     scene, train, test, options = calls[0]
     assert scene.substeps == 4
     assert train.n_transitions == test.n_transitions == 4
-    assert options == {"seed": 1, "draws": None}
+    assert options == {"seed": 1, "draws": None, "method": "metropolis"}
 
 
 @pytest.mark.usefixtures("files")
 def test_close_loop_options(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    options = "--seed 7 --substeps 20 --draws 300 --quiet --estimate-velocities"
+    options = "--seed 7 --substeps 20 --draws 300 --method laplace --quiet --estimate-velocities"
     argv = ["close-loop", "scene.toml", "train.csv", "-o", "out", *options.split()]
     assert main(argv) == 0
     assert capsys.readouterr().err == ""
     scene, _, test, given = calls[0]
     assert scene.substeps == 20
     assert test is None
-    assert given == {"seed": 7, "draws": 300}
+    assert given == {"seed": 7, "draws": 300, "method": "laplace"}
     assert main(argv) == 2
     assert "has content already" in capsys.readouterr().err
     assert len(calls) == 1
     assert main([*argv, "--overwrite"]) == 0
+    assert main([*argv, "--overwrite", "--method", "nuts"]) == 2
+    assert "'metropolis', 'laplace'" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("files")

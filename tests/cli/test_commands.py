@@ -105,6 +105,9 @@ def test_options_are_alike() -> None:
 
 def test_exit_codes_are_documented() -> None:
     readme = (ROOT / "README.md").read_text()
+    page = (ROOT / "analysis" / "docs" / "pages" / "explanation" / "reliability.md").read_text()
+    for text in (readme, page, app.info.epilog):
+        assert "some of many logs" in text
     for code in ("0", "1", "2", "3", "130"):
         assert f"| {code} |" in readme
         assert f"{code} " in app.info.epilog or f"{code};" in app.info.epilog
@@ -184,6 +187,10 @@ def test_new_copies_a_model_with_its_recordings(capsys: pytest.CaptureFixture[st
     assert sorted(written) == ["scene.toml", "test.csv", "train.csv"]
     History.load("train.csv", Scene.load("scene.toml"))
     assert 'did you mean "shopping_cart"' in message(capsys, "new", "b.toml", "--from", "cart")
+    assert main(["new", "--from", "pendulum", "--overwrite"]) == 0
+    assert "next: pbrl-ppl check scene.toml train.csv" in capsys.readouterr().out
+    assert main(["new", "b.toml", "--from", "apartment"]) == 0  # no recording comes with it
+    assert "next, with a recording of your own: pbrl-ppl check" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("puck")
@@ -236,7 +243,8 @@ def test_the_wheel_has_all_rooms_and_the_models() -> None:
     for scene in MODELS.glob("*/scene.toml"):
         own = {path for pattern in tools["package-data"]["pbrl_ppl.models"]
                for path in MODELS.glob(pattern)}  # fmt: skip
-        assert {scene, *scene.parent.glob("recorded/*.csv")} <= own
+        given = ("recorded/*.csv", "*.json")
+        assert {scene, *(path for pattern in given for path in scene.parent.glob(pattern))} <= own
     assert (ROOT / "pbrl_ppl" / "py.typed").exists() and (ROOT / "CITATION.cff").exists()
 
 
@@ -383,8 +391,10 @@ def test_a_folder_that_cannot_be_made_is_refused_at_once(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(report, "close_loop", lambda *args, **options: pytest.fail("too late"))
+    Path("logs.csv").write_text("name,scene,train\na,scene.toml,train.csv\n")
     for argv in (
         ["close-loop", "scene.toml", "train.csv"],
+        ["close-loop", "--many", "logs.csv"],
         ["calibrate", "scene.toml", "train.csv"],
     ):
         assert "cannot be made" in message(capsys, *argv, "-o", name)

@@ -47,7 +47,7 @@ def logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[Settings]:
 def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
     options = (
         "--seed 7 --draws 300 --substeps 5 --noise x=0.1 --columns x=px,force_y=0 --columns time=t"
-        " --units x=mm,theta=deg --time-step 0.2 --estimate-velocities"
+        " --units x=mm,theta=deg --time-step 0.2 --estimate-velocities --method laplace"
     )
     argv = ["close-loop", "--many", "logs.csv", "-o", "out"]
     assert main([*argv, *options.split()]) == 0
@@ -60,7 +60,7 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
     assert "2/2 blue: adequate" in captured.err
     assert logs == [
         Settings(
-            7, 5, 300, "metropolis", None, {"x": 0.1}, True,
+            7, 5, 300, "laplace", None, {"x": 0.1}, True,
             {"x": "px", "force_y": 0.0, "time": "t"}, {"x": "mm", "theta": "deg"}, 0.2,
         )
     ] * 2  # fmt: skip
@@ -72,6 +72,8 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
     assert main([*argv, "-q"]) == 130
     message = "interrupted; finished logs are in out; the same command goes on\n"
     assert capsys.readouterr().err == message
+    assert main(argv) == 130
+    assert capsys.readouterr().err.count("interrupted") == 1
     assert Path("out/red/report.html").is_file() and not Path("out/blue/report.json").exists()
 
 

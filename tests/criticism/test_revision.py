@@ -4,18 +4,23 @@ Most are of a free puck, for a loop on it takes seconds; each loop is run once.
 """
 
 import json
+import warnings
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 import pbrl_ppl as pp
+from pbrl_ppl.criticism import loop as loop_module
 from pbrl_ppl.criticism import revise
 from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
-from pbrl_ppl.errors import EffectError
-from tests.helpers.free_puck import BOX, MASS, box2d, fitted
+from pbrl_ppl.errors import ConvergenceWarning, EffectError
+from tests.helpers.free_puck import BOX, DISC, MASS, box2d, fitted
 from tests.helpers.places import load
 
 # a posterior of few draws is enough to test a verdict, and says that it is one
@@ -280,3 +285,28 @@ def test_a_clean_cart_is_adequate(shared_data) -> None:
     for name, value in expected.items():
         low, high = np.quantile(draws[name].values, [0.0005, 0.9995])
         assert low <= value <= high, (name, low, value, high)
+
+
+@dataclass(frozen=True)
+class _Mode:
+    """What the loop asks of a mode before it draws."""
+
+    problem: Any
+
+
+@pytest.mark.parametrize(("method", "said"), [("laplace", 0), ("metropolis", 1)])
+def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None:
+    """Independent draws have an R-hat too, and nothing to converge."""
+
+    def rough(*args: Any, **options: Any) -> Any:
+        warnings.warn("the chains have not converged", ConvergenceWarning, stacklevel=1)
+        return SimpleNamespace(attrs={"max_rhat": 1.02, "min_ess": 350.0})
+
+    monkeypatch.setattr(loop_module, "fit", rough)
+    monkeypatch.setattr(loop_module, "build_model", lambda problem: problem)
+    mode = _Mode(SimpleNamespace(with_physics=lambda threads: None))
+    shared = loop_module._Loop(DISC, None, None, seed=1, method=method, say=print)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        shared.posterior(mode, None)
+    assert len(caught) == said

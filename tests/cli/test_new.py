@@ -1,0 +1,180 @@
+"""``new``: pendulums, double pendulums and pushed blocks, from raw tables and options alone."""
+
+import shlex
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from pbrl_ppl import report
+from pbrl_ppl.cli import main
+from pbrl_ppl.report import loop as loop_module
+from pbrl_ppl.report.loop import Loop
+from pbrl_ppl.scene import Scene
+from tests.helpers.made_up import made_up
+from tests.helpers.places import MODELS, ROOT
+
+pytestmark = pytest.mark.one_stack
+
+COLUMNS = "--columns trajectory=swing,time=ms,theta=angle,force_x=0,force_y=0,torque=0"
+UNITS = "--units time=ms,theta=deg"
+PENDULUM = "--side --body arm=box:0.03x0.4 --hinge arm@0,0.18"
+
+
+@pytest.fixture
+def swing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder to run in, with the recorded pendulum's angles as a stranger would log them."""
+    rows = pd.read_csv(MODELS / "pendulum" / "recorded" / "train.csv")
+    table = {
+        "swing": rows["trajectory"],
+        "ms": 1e3 * rows["time"],
+        "angle": np.degrees(rows["theta"]),
+        "volts": 0.0,
+    }
+    monkeypatch.chdir(tmp_path)
+    pd.DataFrame(table).to_csv("swing.csv", index=False)
+    return tmp_path
+
+
+def run(text: str) -> int:
+    return main(shlex.split(text))
+
+
+def refused(capsys: pytest.CaptureFixture[str], options: str) -> str:
+    """Run ``new`` with these options; expect code 2, one message, and no file."""
+    assert run(f"new bad.toml {options}") == 2
+    said = capsys.readouterr()
+    assert said.out == "" and "Traceback" not in said.err and not Path("bad.toml").exists()
+    # typer puts usage errors into a box
+    return " ".join(said.err.replace("│", " ").split())
+
+
+@pytest.mark.usefixtures("swing")
+def test_three_commands_from_a_raw_table_to_a_verdict(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its own names, milliseconds and degrees; each command says the next one's options."""
+    seen: list[Any] = []
+
+    def close_loop(scene: Any, train: Any, *rest: Any, **options: Any) -> Loop:
+        seen.append((scene, train))
+        return Loop(made_up())
+
+    monkeypatch.setattr(report, "close_loop", close_loop)
+    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
+    known = "--known arm.mass=0.5 --declare arm=inertia_scale"
+    assert run(f"new --history swing.csv {COLUMNS} {UNITS} {PENDULUM} {known}") == 0
+    said = capsys.readouterr().out
+    advised = said.partition("next: pbrl-ppl ")[2].strip()
+    assert advised == f"check scene.toml swing.csv {COLUMNS} {UNITS} --estimate-velocities"
+    declared = Scene.load(MODELS / "pendulum" / "scene.toml")
+    assert Scene.load("scene.toml") == declared.replace(substeps=10)
+    assert run(f"{advised} --no-prior --json -q") == 0
+    assert '"transitions"' in capsys.readouterr().out
+    assert run(f"close-loop {advised.removeprefix('check ')} -o out -q") == 0
+    ((scene, train),) = seen
+    rows = pd.read_csv(MODELS / "pendulum" / "recorded" / "train.csv")
+    assert [body.name for body in scene.dynamic] == ["arm"] and scene.time_step == 0.02
+    measured = train.dataset["observed"].to_numpy()[0, :, 0, 2]
+    np.testing.assert_allclose(measured, rows[rows["trajectory"] == 0]["theta"], atol=1e-12)
+
+
+@pytest.mark.usefixtures("swing")
+def test_a_double_pendulum_side_by_side_in_a_row(capsys: pytest.CaptureFixture[str]) -> None:
+    rows = ["t,q1,q2,tau", "0,0.1,0.2,0", "0.0101,0.1,0.2,0", "0.03,0.1,0.2,0", "0.04,0.1,0.2,0"]
+    Path("arm.csv").write_text("\n".join(rows))
+    columns = "time=t,upper.theta=q1,lower.theta=q2,upper.torque=tau,lower.torque=0"
+    columns += ",force_x=0,force_y=0"
+    bodies = "--body upper=box:0.05x0.2 --body lower=box:0.05x0.3 --known lower.mass=0.2"
+    hinges = "--hinge upper@0,0.1=world@0,1.5 --hinge upper@0,-0.1=lower@0,0.15"
+    declared = "--declare upper=inertia_scale,com_offset"
+    options = f"--side {bodies} {hinges} {declared}"
+    assert run(f"new --history arm.csv --columns {columns} {options}") == 0
+    scene = Scene.load("scene.toml")
+    assert [joint.bodies for joint in scene.joints] == [("upper", "world"), ("upper", "lower")]
+    assert scene.joints[0].anchor_b == (0.0, 1.5) and scene.joints[1].anchor_a == (0.0, -0.1)
+    assert scene.body("upper").effects == ("inertia_scale", "com_offset")
+    assert scene.body("lower").known == (("mass", 0.2),) and scene.gravity == (0.0, -9.81)
+    # its samples are uneven: later commands interpolate them
+    said = capsys.readouterr().out
+    assert "--time-step 0.0101 --estimate-velocities" in said
+
+
+@pytest.mark.usefixtures("swing")
+def test_a_pushed_block_beside_a_wall() -> None:
+    rows = ["object,trajectory,time,x,vx", *(f"{b},0,{t},0,0" for t in (0, 1) for b in "ab")]
+    Path("push.csv").write_text("\n".join(rows).replace("a,", "block,").replace("b,", "finger,"))
+    block = "--body block=polygon:-0.05,-0.05/0.1,-0.05/-0.05,0.1 --known block.mass=1.518"
+    finger = "--body finger=circle:1e-3 --kinematic finger --known finger.mu_c=0.5"
+    options = f"--columns body=object --time-step 0.1 {block} {finger} --wall -2,-1/2,-1"
+    assert run(f"new --history push.csv {options}") == 0
+    scene = Scene.load("scene.toml")
+    assert scene.time_step == 0.1 and scene.normal_gravity == 9.81
+    assert scene.body("block").shape.vertices == ((-0.05, -0.05), (0.1, -0.05), (-0.05, 0.1))
+    assert scene.body("finger").kinematic and scene.body("finger").known == (("mu_c", 0.5),)
+    assert [(wall.start, wall.end) for wall in scene.walls] == [((-2.0, -1.0), (2.0, -1.0))]
+
+
+@pytest.mark.usefixtures("swing")
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ("--hinge arm", "--hinge: 'arm' is not BODY@X,Y"),
+        ("--hinge arm@0", "is not BODY@X,Y"),
+        ("--hinge arm@0,0=b@1,1=c@2,2", "is not BODY@X,Y"),
+        ("--hinge arn@0,0", "--hinge: there is no body 'arn', only arm, world; did you mean"),
+        ("--hinge world@0,0", 'joins "world" with itself'),
+        ("--wall 0,0,1,1", "--wall: '0,0,1,1' is not X,Y/X,Y"),
+        ("--wall 0,0/0,0", "its length is zero"),
+        ("--known arm=1", "--known: 'arm=1' is not BODY.PARAMETER=VALUE"),
+        ("--known arm.mass=heavy", "is not BODY.PARAMETER=VALUE"),
+        ("--known arm.mas=1", 'unknown parameter "mas"'),
+        ("--known a.mass=1", "--known: there is no body 'a'"),
+        ("--declare arm", "--declare: 'arm' is not BODY=EFFECT"),
+        ("--declare arm=inertia", "did you mean 'inertia_scale'"),
+        ("--kinematic finger", "--kinematic: there is no body 'finger'"),
+        ("--kinematic arm", "no body that moves freely"),
+        ("--body arm=box:1x1", "--body: 'arm' is given twice"),
+        ("--body b=polygon:0,0/1,0", "expected at least 3"),
+        ("--body b=polygon:0,0/1,0/0,1", "subtract (0.333333333, 0.333333333) from every vertex"),
+        ("--body b=polygon:0,0/1", "is not NAME=SHAPE"),
+        ("--from pendulum", "--from copies a model as it is"),
+        ("--columns x=px", "add --history"),
+        ("--history swing.csv", "it has no column trajectory; say which it is"),
+        ("--history swing.csv --columns time=sec", 'no column "sec" for time'),
+        (f"--history swing.csv {COLUMNS} --units time=h", '"h" is none of time'),
+        ("--history swing.csv --columns time=volts", "its times do not rise"),
+    ],
+)
+def test_bad_options(options: str, message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    recording = "" if "--history" in options else "--time-step 0.02"
+    assert message in refused(capsys, f"--body arm=box:0.03x0.4 {recording} {options}")
+
+
+@pytest.mark.usefixtures("swing")
+def test_a_table_that_names_no_body(capsys: pytest.CaptureFixture[str]) -> None:
+    said = refused(capsys, f"--history swing.csv {COLUMNS}")
+    assert "give --body NAME=SHAPE for one body, --columns body=COLUMN" in said
+
+
+def test_the_page_on_own_logs_writes_scenes_that_load(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its examples of ``new``, on short tables of the columns that they name."""
+    monkeypatch.chdir(tmp_path)
+    Path("swing.csv").write_text("swing,ms,angle\n0,0,1\n0,20,2\n")
+    angles = "run,t,q1,dq1,tau1,q2,dq2,tau2"
+    Path("arm.csv").write_text(f"{angles}\n0,0,0,0,0,0,0,0\n0,0.01,0,0,0,0,0,0\n")
+    rows = [f"0,{time},{body},0" for time in (0, 0.1) for body in ("block", "finger")]
+    Path("push.csv").write_text("\n".join(["trajectory,time,object,x", *rows]))
+    page = (ROOT / "analysis" / "docs" / "pages" / "guides" / "own_log.md").read_text()
+    lines = page.replace("\\\n", " ").splitlines()
+    commands = [line for line in lines if line.startswith("pbrl-ppl new")]
+    kinds = []
+    for command in commands:
+        assert run(f"{command.removeprefix('pbrl-ppl ')} --overwrite -q") == 0
+        scene = Scene.load("scene.toml")
+        kinds.append((len(scene.dynamic), len(scene.moving), len(scene.joints), len(scene.walls)))
+    assert kinds == [(1, 1, 1, 0), (2, 2, 2, 0), (1, 2, 0, 1)]

@@ -1,0 +1,93 @@
+"""The package as others get it: a source archive, what pip makes of it, run outside the clone."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import pytest
+
+from tests.helpers.places import ROOT
+
+PARTS = ("pbrl_ppl", "models", "pyproject.toml", "README.md", "LICENSE")
+
+
+def run(*argv: str, cwd: Path, **environment: str) -> str:
+    done = subprocess.run(
+        argv, cwd=cwd, env=os.environ | environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+def makes_wheels() -> bool:
+    """Whether setuptools does so by itself, as it does from 70.1 on."""
+    try:
+        major, minor = version("setuptools").split(".")[:2]
+    except PackageNotFoundError:
+        return False
+    return (int(major), int(minor)) >= (70, 1)
+
+
+@pytest.fixture(scope="module")
+def files() -> list[str]:
+    """What the clone keeps, but for what is ignored."""
+    listing = ["git", "ls-files", "--cached", "--others", "--exclude-standard", *PARTS]
+    try:
+        return run(*listing, cwd=ROOT).split()
+    except (OSError, AssertionError):
+        pytest.skip("no git repository says which files belong to the package")
+
+
+@pytest.mark.slow
+def test_it_runs_where_it_is_installed_from_its_source_archive(
+    files: list[str], tmp_path: Path
+) -> None:
+    """Nothing is fetched: the environment's own setuptools builds, and dependencies are there."""
+    if not makes_wheels():
+        pytest.skip("setuptools is missing or old: pip install -e '.[test]'")
+    source, library, elsewhere = (tmp_path / name for name in ("source", "library", "elsewhere"))
+    elsewhere.mkdir()
+    for name in files:
+        if (ROOT / name).is_file():
+            (source / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(ROOT / name, source / name)
+    build = "from setuptools import build_meta; build_meta.build_sdist('dist')"
+    run(sys.executable, "-c", build, cwd=source)
+    (archive,) = (source / "dist").glob("*.tar.gz")
+    with tarfile.open(archive) as packed:
+        inside = {name.partition("/")[2] for name in packed.getnames()}
+    assert {name for name in files if (ROOT / name).is_file()} <= inside
+    pip = [sys.executable, "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
+    options = ["--no-deps", "--no-index", "--no-build-isolation", "--no-compile"]
+    run(*pip, *options, "--target", str(library), str(archive), cwd=elsewhere)
+    borrow_compiled(library / "pbrl_ppl" / "physics")
+
+    path = {"PYTHONPATH": str(library), "PYTHONDONTWRITEBYTECODE": "1"}
+    rooms = [each.parent.name for each in (ROOT / "pbrl_ppl").glob("*/__init__.py")]
+    code = f"import sys, {', '.join(f'pbrl_ppl.{room}' for room in sorted(rooms))}"
+    code += "; sys.exit(pbrl_ppl.cli.main(['doctor', '--json']))"
+    found = json.loads(run(sys.executable, "-c", code, cwd=elsewhere, **path))
+    assert found["ok"] and found["package"] == str(library / "pbrl_ppl")
+    command = str(library / "bin" / "pbrl-ppl")
+    for model in sorted(each.parent.name for each in (ROOT / "models").glob("*/scene.toml")):
+        run(command, "new", f"{model}.toml", "--from", model, "--overwrite", cwd=elsewhere, **path)
+    assert (elsewhere / "train.csv").is_file()
+    kept = {path.relative_to(library / "pbrl_ppl") for path in library.rglob("models/**/*")}
+    assert {Path(name) for name in files if name.startswith("models/")} <= kept
+
+
+def borrow_compiled(physics: Path) -> None:
+    """Give an installed engine the machine code of this one's, which it would take long to make.
+
+    Numba takes it for a source of the same size and time.
+    """
+    for source in (ROOT / "pbrl_ppl" / "physics").glob("*.py"):
+        shutil.copystat(source, physics / source.name)
+    for made in (ROOT / "pbrl_ppl" / "physics" / "__pycache__").glob("*.nb?"):
+        (physics / "__pycache__").mkdir(exist_ok=True)
+        shutil.copy(made, physics / "__pycache__")
