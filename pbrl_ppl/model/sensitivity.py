@@ -11,7 +11,7 @@ Kalman filtering and moving-horizon estimation (2005), on the point of linearisa
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -66,6 +66,10 @@ class Sensitivity:
         rows = [which.ravel() == i for i in range(len(sets))]
         own = [self.before[row].reshape(-1, self.phi.shape[1]) for row in rows]
         return list(zip(sets, rows, own, strict=True))
+
+    def at(self, rows: NDArray[np.intp]) -> Sensitivity:
+        """That of these transitions alone."""
+        return replace(self, slope=self.slope[rows], phi=self.phi[rows], before=self.before[rows])
 
     def moved(self, phi: Array) -> Array:
         """How far the states are from where they were smoothed, shape (..., transition, cell)."""

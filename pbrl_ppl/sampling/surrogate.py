@@ -78,7 +78,7 @@ class Surrogate:
         self.problem, self.unpack, self.emulator = problem, unpack, emulator
         # white residuals are then linear in the polynomials' terms, given the noise
         gaussian = problem.noise.nu is None and not problem.tails
-        self._linear = gaussian and len(emulator.parts) == 1
+        self._linear = gaussian and emulator.linear
         self._noise, self._form, self._first = b"", np.zeros((0, 0)), (np.zeros(0), 0.0)
 
     def __call__(self, q: Array) -> float:

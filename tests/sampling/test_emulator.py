@@ -1,31 +1,34 @@
 """Polynomials in place of the engine: exact on polynomials, close to the engine, safe to use."""
 
-from types import SimpleNamespace
+from functools import partial
 
 import numpy as np
 import pymc as pm
 import pytest
 
-from pbrl_ppl.model import physics_model, single_transitions
+from pbrl_ppl.effects import attach
+from pbrl_ppl.model import Problem, along_trajectories, physics_model, single_transitions
 from pbrl_ppl.modes import find_mode, trajectory_mode
 from pbrl_ppl.posterior.store import az, group
 from pbrl_ppl.sampling import emulation, fit, fitting
 from pbrl_ppl.sampling.emulation import emulate
-from pbrl_ppl.sampling.emulator import Emulator
+from pbrl_ppl.sampling.emulator import Emulator, Piece, Pieces
 from pbrl_ppl.sampling.starts import gaussian_blocks
 from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 
 
-def two_parts(sizes: tuple[int, int]) -> SimpleNamespace:
-    """As much of a problem as an emulator looks at: one body a part, with its own parameters."""
+def two_parts(sizes: tuple[int, int]) -> Pieces:
+    """One body a piece, with its own parameters, in the one transition."""
     first, second = sizes
-    parts = [
-        SimpleNamespace(places=np.arange(first), bodies=np.array([0])),
-        SimpleNamespace(places=first + np.arange(second), bodies=np.array([1])),
+    row = np.array([0])
+    pieces = [
+        Piece(np.arange(first), np.array([0]), row),
+        Piece(first + np.arange(second), np.array([1]), row),
     ]
-    return SimpleNamespace(simulator=SimpleNamespace(parts=parts))
+    return Pieces(pieces, np.zeros(0, dtype=int), lambda phi: phi)
 
 
 def polynomial(phi: np.ndarray) -> np.ndarray:
@@ -59,6 +62,32 @@ def test_a_part_is_asked_again_when_its_parameters_change() -> None:
         here = here.copy()
         here[place] = rng.choice([-0.5, 0.3, 1.0])  # also back to where it was
         np.testing.assert_allclose(told(here), polynomial(here[None])[0], atol=1e-9)
+
+
+def test_bodies_that_meet_are_emulated_apart_and_the_engine_predicts_their_contacts() -> None:
+    """Polynomials of all parameters would need more runs, and follow no kink."""
+    body = partial(Body, shape=Shape.circle(0.3), known={"mu_c": 0.2})
+    pair = Scene(time_step=0.1, substeps=4, bodies=(body("one"), body("two")))
+    history = simulated_history(
+        pair, {"mass": 1.0, "r": 0.5}, seed=2, trajectories=6, intervals=12,
+        wrench_sd=(1.5, 1.5, 0.1), poses=[(0.0, 0.0, 0.0), (0.61, 0.0, 0.0)],
+    )  # fmt: skip
+    problem = Problem.of(pair, history, attach(pair))
+    truth = problem.layout.to_vector({"mass": 1.0, "r": 0.5})
+    problem = along_trajectories(problem, truth)
+    met = problem.trajectories.touching
+    assert 0.1 < met.mean() < 0.9
+    found = Pieces.of(problem)
+    np.testing.assert_array_equal(found.rows, np.flatnonzero(met))
+    rng = np.random.default_rng(1)
+    phi = truth * (1 + 0.02 * rng.standard_normal((40, len(truth))))
+    runs = problem.residual(phi)
+    told, spread = Emulator(found, phi, runs, 2), runs.std(axis=0)[~met].max()
+    fresh = truth * (1 + 0.02 * rng.standard_normal((5, len(truth))))
+    for point in fresh:
+        exact, emulated = problem.residual(point), told(point)
+        np.testing.assert_allclose(emulated[met], exact[met], atol=1e-14)
+        assert 0 < np.abs(emulated - exact)[~met].max() < 0.02 * spread
 
 
 @pytest.fixture(scope="module")
@@ -159,7 +188,7 @@ def test_a_quadratic_form_stands_for_the_density_at_the_same_noise(trajectories)
     problem = problem if not trajectories else trajectory_mode(problem, mode.phi).problem
     mode = trajectory_mode(problem, mode.phi) if trajectories else mode
     phi = mode.draws(np.random.default_rng(1), 60)
-    told = Emulator(problem, phi, problem.residual(phi), 1)
+    told = Emulator(Pieces.of(problem), phi, problem.residual(phi), 1)
     q = np.zeros(3)
 
     def unpack(q: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
