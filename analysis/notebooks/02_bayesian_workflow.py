@@ -131,6 +131,12 @@ figure
 # panels both models look right, and the declared one is only somewhat wide in `omega`: `sigma` is
 # free, and grows until the overall spread fits. Such a check has little power, and the ones below
 # ask more.
+#
+# ArviZ's own check is of the states themselves, which spread so much more than the noise that
+# nothing can be seen. It pools all dimensions unless told otherwise:
+#
+#     az.plot_ppc(idata, flatten=["transition", "step", "body"])  # ArviZ 0.x
+#     az.plot_ppc_dist(idata, cols=["state"])  # ArviZ 1.x
 
 # %%
 start = posteriors["declared"]["constant_data"]["start"].rename(full_state="state")

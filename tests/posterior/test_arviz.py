@@ -85,6 +85,27 @@ def test_arviz_takes_it(function, idata, of_vx) -> None:
     plt.close("all")
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.filterwarnings("ignore::UserWarning")  # ArviZ's own
+def test_predictive_check_has_a_panel_a_state_dimension(idata) -> None:
+    """As the guide has it: metres beside radians per second, and not in one density with them."""
+    names = list(group(idata, "observed_data")["state"].values)
+    if DATATREE:
+        panels = az.plot_ppc_dist(idata, cols=["state"]).viz["plot"].to_dataset()
+        panels = [panels["plot"].sel(state=name).item() for name in names]
+    else:
+        flatten = ["transition", "step", "body"]
+        panels = az.plot_ppc(idata, flatten=flatten, num_pp_samples=20, random_seed=1).ravel()
+    measured = group(idata, "observed_data")["next_state"]
+    for name, axes in zip(names, panels, strict=True):
+        own = measured.sel(state=name)
+        width = float(own.max() - own.min())
+        # what it shows is about as wide as this dimension's values, not all dimensions'
+        shown = np.ptp(np.concatenate([line.get_xdata() for line in axes.get_lines()]))
+        assert 0.8 * width < shown < 3 * width, name
+    plt.close("all")
+
+
 def test_prior_is_pymc_s(idata) -> None:
     """Its density against PyMC's; its draws against their law, false alarm 1e-4 each."""
     model = physics_model(SCENE, history(1))
