@@ -116,7 +116,8 @@ figure
 # %% [markdown]
 # Rank plot: of each chain, how its draws rank among all, less what an even spread gives. Chains
 # that have converged stay in the grey band. Draws of a Markov chain depend on each other, so it is
-# as wide as their effective sample size makes it; `az.plot_rank` compares with independent draws.
+# as wide as their effective sample size makes it. `az.plot_rank` has no band in ArviZ 0.x, and in
+# 1.3 marks what a test of the ranks finds suspicious.
 
 # %%
 figure = plot_rank(posteriors["with drag"], shown)
