@@ -181,6 +181,8 @@ def test_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     names: dict[str, Any] = {"__name__": "__main__"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # too few draws, of course
+        for kind in (DeprecationWarning, FutureWarning, RuntimeWarning):  # ArviZ's own
+            warnings.simplefilter("ignore", kind)
         for block in BLOCKS:
             exec(compile(block, block, "exec"), names)
     assert Path("report.html").exists() and Path("episode.nc").exists()

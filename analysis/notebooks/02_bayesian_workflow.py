@@ -116,7 +116,8 @@ figure
 # %% [markdown]
 # Rank plot: of each chain, how its draws rank among all, less what an even spread gives. Chains
 # that have converged stay in the grey band. Draws of a Markov chain depend on each other, so it is
-# as wide as their effective sample size makes it; `az.plot_rank` compares with independent draws.
+# as wide as their effective sample size makes it. `az.plot_rank` has no band in ArviZ 0.x, and in
+# 1.3 marks what a test of the ranks finds suspicious.
 
 # %%
 figure = plot_rank(posteriors["with drag"], shown)
@@ -131,6 +132,12 @@ figure
 # panels both models look right, and the declared one is only somewhat wide in `omega`: `sigma` is
 # free, and grows until the overall spread fits. Such a check has little power, and the ones below
 # ask more.
+#
+# ArviZ's own check is of the states themselves, which spread so much more than the noise that
+# nothing can be seen. It pools all dimensions unless told otherwise:
+#
+#     az.plot_ppc(idata, flatten=["transition", "step", "body"])  # ArviZ 0.x
+#     az.plot_ppc_dist(idata, cols=["state"])  # ArviZ 1.x
 
 # %%
 start = posteriors["declared"]["constant_data"]["start"].rename(full_state="state")

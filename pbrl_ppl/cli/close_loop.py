@@ -136,7 +136,7 @@ def close_loop(
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
             method=method.value, noise=named_numbers(noise, "--noise", "x=0.002"),
             columns=columns_of(columns or []), units=units_of(units or []), time_step=time_step,
-            estimate_velocities=estimate_velocities,
+            estimate_velocities=estimate_velocities, command=command_line(context),
         )  # fmt: skip
         return
     if scene is None or train is None:

@@ -23,6 +23,7 @@ def close_loop_many(
     manifest: Path,
     output: Path,
     *,
+    command: str,
     jobs: int,
     scheduler: str | None,
     as_json: bool,
@@ -40,7 +41,12 @@ def close_loop_many(
         logs = report.read_manifest(manifest)  # its errors come before a cluster is looked for
         with _executor(jobs, scheduler) as executor:
             loops = report.close_loop_many(
-                logs, output, executor=executor, progress=progress, **options
+                logs,
+                output,
+                executor=executor,
+                progress=progress,
+                source=report.Source(command=command),
+                **options,
             )
     if as_json:
         print_json({"page": output / "index.html", "logs": loops.rows})

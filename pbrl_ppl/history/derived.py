@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
+from pbrl_ppl.history.angles import unwrapped
 from pbrl_ppl.history.history import History
 from pbrl_ppl.state import STATE, THETA
 
@@ -67,17 +68,11 @@ def derived_velocities(history: History) -> Bools:
             for trajectory, n in enumerate(rows):
                 position, rate = observed[trajectory, :n, body, [d - 3, d]]
                 if np.isfinite(position).all() and np.isfinite(rate).all():
-                    angle = d - 3 == THETA
-                    series.append((_unwrapped(position, rate, dt) if angle else position, rate))
+                    if d - 3 == THETA:
+                        position = unwrapped(dt * np.arange(n), position, rate)
+                    series.append((position, rate))
             result[body, d] = _is_derived(series, dt)
     return result
-
-
-def _unwrapped(angle: Floats, rate: Floats, dt: float) -> Floats:
-    """Angles without jumps; the rates say how often a body has turned round between samples."""
-    step, expected = np.diff(angle), 0.5 * dt * (rate[1:] + rate[:-1])
-    step += 2 * np.pi * np.round((expected - step) / (2 * np.pi))
-    return np.concatenate([angle[:1], angle[0] + np.cumsum(step)])
 
 
 def _is_derived(series: list[tuple[Floats, Floats]], dt: float) -> bool:

@@ -11,6 +11,7 @@ import pandas as pd
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from pbrl_ppl.errors import HistoryError, ResamplingWarning
+from pbrl_ppl.history.angles import unwrapped
 from pbrl_ppl.history.cells import Rows, read_rows
 from pbrl_ppl.history.rows import TIME_TOLERANCE
 from pbrl_ppl.scene import Scene
@@ -183,7 +184,7 @@ def _quotients(tracks: dict[tuple[int, int], _Track], scene: Scene) -> npt.NDArr
                 place, rate = track.state[:, d - 3], track.state[:, d]
                 if len(place) < 3 or not np.isfinite([place, rate]).all():
                     continue
-                place = _unwrapped(track.time, place, rate) if d - 3 == THETA else place
+                place = unwrapped(track.time, place, rate) if d - 3 == THETA else place
                 one = np.diff(place) / np.diff(track.time)
                 two = (place[2:] - place[:-2]) / (track.time[2:] - track.time[:-2])
                 for kind, quotient in enumerate((one[:-1], two, one[1:])):
@@ -209,18 +210,9 @@ def _states(track: _Track, grid: Floats, dt: float) -> Floats:
             inside = (grid >= time[0] - _SAME * dt) & (grid <= time[-1] + _SAME * dt)
             rate = track.state[run, d + 3] if d < 3 else None
             if d == THETA:
-                values = _unwrapped(time, values, track.state[run, 5])
+                values = unwrapped(time, values, track.state[run, 5])
             result[inside, d] = _interpolated(time, values, rate, grid[inside])
     return result
-
-
-def _unwrapped(time: Floats, angle: Floats, rate: Floats) -> Floats:
-    """Angles without jumps; measured rates say how often a body has turned round meanwhile."""
-    if not np.isfinite(rate).all():
-        return np.asarray(np.unwrap(angle))
-    step, expected = np.diff(angle), 0.5 * np.diff(time) * (rate[1:] + rate[:-1])
-    step += 2 * np.pi * np.round((expected - step) / (2 * np.pi))
-    return np.concatenate([angle[:1], angle[0] + np.cumsum(step)])
 
 
 def _interpolated(time: Floats, values: Floats, rate: Floats | None, grid: Floats) -> Floats:

@@ -6,6 +6,7 @@ from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
 from pbrl_ppl.posterior.loo_pit import loo_pit
 from pbrl_ppl.posterior.origin import problem_of, versions
+from pbrl_ppl.posterior.places import both_places, placed
 from pbrl_ppl.posterior.predictions import predicted_rows
 from pbrl_ppl.posterior.prior_groups import prior_groups
 from pbrl_ppl.posterior.record import (
@@ -41,6 +42,7 @@ __all__ = [
     "MIN_ESS",
     "Comparison",
     "Identifiability",
+    "both_places",
     "both_recordings",
     "checked",
     "compare",
@@ -62,6 +64,7 @@ __all__ = [
     "loo_pit",
     "moment_matched",
     "parameter_draws",
+    "placed",
     "predicted_rows",
     "prior_groups",
     "problem_of",

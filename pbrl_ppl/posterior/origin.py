@@ -129,7 +129,8 @@ def problem_of(
     if history is None:
         history = from_segments(scene, start, actions, observed)
     elif actions.shape[-1] == len(INPUT):  # recorded since
-        history = history.numbered(float(actions[..., INPUT.index("trajectory")].max()) + 1.0)
+        # after a trajectory's end there is none: of the first interval alone
+        history = history.numbered(float(actions[:, 0, :, INPUT.index("trajectory")].max()) + 1.0)
     problem = Problem.of(
         scene,
         history,

@@ -17,6 +17,7 @@ from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.origin import origin
+from pbrl_ppl.posterior.places import placed, places
 from pbrl_ppl.posterior.predictions import predictive_rows
 from pbrl_ppl.posterior.prior_groups import prior_groups
 from pbrl_ppl.posterior.recording import recording
@@ -103,6 +104,7 @@ def complete(
         "constant_data": data["constant_data"].merge(recording(problem)),
     }
     idata = from_groups(result, origin(problem, seed) | {"method": method})
+    idata = placed(idata, places(problem.segments))
     if ATTRIBUTE in trace.attrs:
         idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
     return checked(problem, idata, asked)

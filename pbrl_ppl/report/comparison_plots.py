@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import arviz as az
 import numpy as np
+import pandas as pd
 import xarray as xr
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -207,6 +208,5 @@ def _grid(width: float, height: float, rows: int, columns: int) -> tuple[Figure,
 
 def _correlations(draws: xr.Dataset, names: Sequence[str]) -> Array:
     """Rank correlations, shape (parameter, parameter)."""
-    ranks = [np.argsort(np.argsort(draws[name].to_numpy().ravel())) for name in names]
-    with np.errstate(all="ignore"):
-        return np.atleast_2d(np.corrcoef(np.array(ranks, dtype=float)))
+    table = pd.DataFrame({name: draws[name].to_numpy().ravel() for name in names})
+    return np.asarray(table.corr("spearman"))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, as_completed
 from contextlib import closing
@@ -21,7 +20,7 @@ from pbrl_ppl.history import write_atomically
 from pbrl_ppl.posterior import load_posterior
 from pbrl_ppl.report.loop import check_folder
 from pbrl_ppl.report.manifest import Log, read_manifest
-from pbrl_ppl.report.many_page import effect_table, page, summary_table
+from pbrl_ppl.report.many_page import effect_table, in_words, page, summary_table
 from pbrl_ppl.report.one_log import (
     FAILED,
     Run,
@@ -32,6 +31,7 @@ from pbrl_ppl.report.one_log import (
     row_of,
     settle,
 )
+from pbrl_ppl.report.page import Source
 from pbrl_ppl.sampling import Pooled, pool
 
 #: The files of all logs together; the first says what the folder is.
@@ -97,6 +97,7 @@ def close_loop_many(
     again: bool = False,
     run: Run = close_log,
     progress: Callable[[str], None] | None = None,
+    source: Source | None = None,
 ) -> ManyLoops:
     """Close the loop on each log of a manifest, and write a page of which effects are where.
 
@@ -129,6 +130,8 @@ def close_loop_many(
         What closes the loop on a log, if not the package.
     progress : callable, optional
         Told of each log that is finished.
+    source : Source, optional
+        The command that makes the page again.
 
     Returns
     -------
@@ -152,6 +155,9 @@ def close_loop_many(
         loops.effects()
         loops.pooled["cart"].scene  # the next cart's, with what is known of carts
     """
+    if source is None:
+        given = repr(str(manifest)) if isinstance(manifest, str | Path) else "logs"
+        source = Source(command=f"pp.close_loop_many({given}, {str(folder)!r}, seed={seed}, ...)")
     logs = read_manifest(manifest) if isinstance(manifest, str | Path) else tuple(manifest)
     folder = _opened(Path(folder))
     settings = Settings(
@@ -171,7 +177,8 @@ def close_loop_many(
         tell(f"{len(rows)} of {len(logs)} logs are in {folder}")
     left = [log for log in logs if log.name not in rows]
     tasks = {log: partial(settle, log, folder, settings, inputs[log.name], run) for log in left}
-    _write_summary(folder, _ordered(logs, rows), {}, {})
+    write = partial(_write_summary, folder, source)
+    write(_ordered(logs, rows), {}, {})
     with closing(_results(tasks, executor)) as results:
         for log, result in results:
             try:
@@ -180,17 +187,11 @@ def close_loop_many(
                 row = failed(log, folder, error)
             rows[log.name] = row
             tell(f"{len(rows)}/{len(logs)} {_row_in_words(row)}")
-            _write_summary(folder, _ordered(logs, rows), {}, {})
+            write(_ordered(logs, rows), {}, {})
     pooled, not_pooled = _pooled(logs, rows, folder)
     ordered = _ordered(logs, rows)
-    _write_summary(folder, ordered, pooled, not_pooled)
+    write(ordered, pooled, not_pooled)
     return ManyLoops(folder, ordered, pooled, not_pooled)
-
-
-def in_words(rows: Iterable[Mapping[str, Any]]) -> str:
-    """One line: how many logs had which end."""
-    ends = Counter(str(row.get("verdict", row["status"])) for row in rows)
-    return ", ".join(f"{count} {end}" for end, count in sorted(ends.items()))
 
 
 def _row_in_words(row: Mapping[str, Any]) -> str:
@@ -271,6 +272,7 @@ def _pooled(
 
 def _write_summary(
     folder: Path,
+    source: Source,
     rows: tuple[Mapping[str, Any], ...],
     pooled: Mapping[str, Pooled],
     not_pooled: Mapping[str, str],
@@ -286,7 +288,7 @@ def _write_summary(
         _SUMMARY: json.dumps(contents, indent=1, default=dict) + "\n",
         _TABLE: summary_table(rows).to_csv(index=False, lineterminator="\n"),
         _EFFECTS: effect_table(rows).to_csv(index=False, lineterminator="\n"),
-        _PAGE: page(rows, pooled, not_pooled, in_words(rows)),
+        _PAGE: page(rows, pooled, not_pooled, source),
     }
     for kind, each in pooled.items():
         texts[f"kind-{kind}.toml"] = each.scene.to_toml()

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
-from importlib import resources
 from typing import Any
 
-import jinja2
 import pandas as pd
+from markupsafe import Markup
 
-from pbrl_ppl.report.words import number, plain, quantity
+from pbrl_ppl.criticism import NOT_CONVERGED
+from pbrl_ppl.report.page import Cell, Source, Table, render_page
+from pbrl_ppl.report.words import chance, joined, number, plain, quantity
 from pbrl_ppl.sampling import Pooled
 
 Row = Mapping[str, Any]
@@ -18,6 +20,8 @@ _COLUMNS = ("name", "kind", "status", "verdict", "effects", "error_before", "err
             "seconds", "warnings", "message", "report")  # fmt: skip
 _ESTIMATE = ("name", "kind", "effect", "body", "parameter", "mean", "sd", "low", "high", "unit",
              "p_value")  # fmt: skip
+#: Effects side by side in one table: with more, it would not fit beside the names of the logs.
+_SIDE_BY_SIDE = 4
 
 
 def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
@@ -49,41 +53,118 @@ def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
     return pd.DataFrame(table, columns=list(_ESTIMATE))
 
 
+def in_words(rows: Iterable[Row]) -> str:
+    """One line: how many logs had which end."""
+    ends = Counter(str(row.get("verdict", row["status"])) for row in rows)
+    return ", ".join(f"{count} {end}" for end, count in sorted(ends.items()))
+
+
 def page(
     rows: tuple[Row, ...],
     pooled: Mapping[str, Pooled],
     not_pooled: Mapping[str, str],
-    sentence: str,
+    source: Source,
 ) -> str:
     """One page of HTML with links to each log's report."""
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters.update(number=number, plain=plain)
-    template = resources.files("pbrl_ppl.report").joinpath("many.html.jinja").read_text("utf-8")
-    found = dict.fromkeys(
-        (each["effect"], each["body"]) for row in rows for each in row.get("effects", ())
-    )
-    return environment.from_string(template).render(
-        rows=rows,
-        sentence=sentence,
-        found=list(found),
-        cell=_cell,
-        pooled={kind: each.table().to_dict("records") for kind, each in pooled.items()},
-        robots={kind: each.names for kind, each in pooled.items()},
+    found: dict[tuple[str, str], list[str]] = {}
+    for row in rows:
+        for each in row.get("effects", ()):
+            found.setdefault((each["effect"], each["body"]), []).append(row["name"])
+    pairs = list(found)
+    tables = -(-len(pairs) // _SIDE_BY_SIDE)
+    return render_page(
+        "many.html.jinja",
+        {},
+        count=len(rows),
+        headline=_verdict(in_words(rows)),
+        found={_title(*pair): names for pair, names in found.items()},
+        failed=[row["name"] for row in rows if row["status"] == "failed"],
+        logs=_logs(rows),
+        effects=[
+            _effects(rows, pairs[i * len(pairs) // tables : (i + 1) * len(pairs) // tables])
+            for i in range(tables)
+        ],
+        kinds={kind: (each.names, _pooled(each, kind)) for kind, each in pooled.items()},
         not_pooled=not_pooled,
+        warnings={row["name"]: row["warnings"] for row in rows if row.get("warnings")},
+        source=source,
     )
 
 
-def _cell(row: Row, effect: str, body: str) -> tuple[str, str]:
-    """What a log says of an effect, and in which way: found, unseen, or nothing."""
+def _logs(rows: Iterable[Row]) -> Table:
+    """One row a log."""
+    cells: list[list[Cell]] = []
+    marks = []
+    for row in rows:
+        status = row["status"]
+        said = ""
+        if status == "done":
+            said = joined(f"{plain(e['effect'])} on the {plain(e['body'])}" for e in row["effects"])
+        numbers = ["", "", "", ""]
+        if status == "done":
+            numbers = [number(row["error_before"]), number(row["error_after"]),
+                       str(len(row["warnings"]) or ""), number(row["seconds"])]  # fmt: skip
+        verdict = _verdict(row.get("verdict", status))
+        cells.append([(_link(row), row["kind"]), verdict, said or row.get("message", ""), *numbers])
+        bad = status == "failed" or row.get("verdict") == NOT_CONVERGED
+        marks.append("bad" if bad else "")
+    heads = ("Log", "Verdict", "Effects, or what went wrong", "Error before", "Error after",
+             "Warnings", "Time (s)")  # fmt: skip
+    return Table("All logs", heads, cells, (1, 2), marks)
+
+
+def _effects(rows: Iterable[Row], pairs: list[tuple[str, str]]) -> Table:
+    """One row a finished log, one column an effect."""
+    cells: list[list[Cell]] = [
+        [_link(row), *(_cell(row, *pair) for pair in pairs)]
+        for row in rows
+        if row["status"] == "done"
+    ]
+    heads = ["Log", *(_title(*pair) for pair in pairs)]
+    return Table("Effects found, by log", heads, cells, tuple(range(1, len(heads))))
+
+
+def _pooled(pooled: Pooled, kind: str) -> Table:
+    """One row a parameter that a kind's robots share."""
+
+    def told(row: Mapping[Any, Any], middle: str, of: str) -> Cell:
+        return number(row[middle]), f"{number(row[f'{of}_low'])} to {number(row[f'{of}_high'])}"
+
+    cells: list[list[Cell]] = [
+        [(row["parameter"], row["scale"]), told(row, "mean", "mean"), told(row, "spread", "spread"),
+         told(row, "next_median", "next"), str(row["informed"]), chance(row["p_same"])]
+        for row in pooled.table().to_dict("records")
+    ]  # fmt: skip
+    heads = ("Parameter", "Mean of the kind", "Spread of robots", "Next robot",
+             "Robots that inform", "Same in all, p")  # fmt: skip
+    return Table(f"Robots of the kind {kind}", heads, cells)
+
+
+def _verdict(name: str) -> str:
+    return name.replace("-", " ")
+
+
+def _title(effect: str, body: str) -> str:
+    return f"{plain(effect).capitalize()} on the {plain(body)}"
+
+
+def _link(row: Row) -> str:
+    """A log's name, which leads to its report or to what went wrong."""
+    files = {"done": "report.html", "failed": "error.json"}
+    if row["status"] not in files:
+        return str(row["name"])
+    return Markup('<a href="{0}/{1}">{0}</a>').format(row["name"], files[row["status"]])
+
+
+def _cell(row: Row, effect: str, body: str) -> str:
+    """What a log says of an effect: its size, how small it would have to be, or nothing."""
     for added in row.get("effects", ()):
         if (added["effect"], added["body"]) == (effect, body):
             said = [
                 f"{number(each['mean'])} ± {quantity(each['sd'], each['unit'])}"
                 for each in added["parameters"].values()
             ]
-            return "; ".join(said), "found"
+            return Markup("<strong>{}</strong>").format("; ".join(said))
     sizes = row.get("detectable", {}).get(f"{effect}[{body}]") or {}
     said = [f"below {number(size)}" for size in sizes.values() if size is not None]
-    return "; ".join(said), "unseen" if said else "none"
+    return "; ".join(said) or "–"

@@ -23,6 +23,7 @@ from pbrl_ppl.model import (
 )
 from pbrl_ppl.posterior import (
     MIN_ESS,
+    both_places,
     both_recordings,
     checked,
     complete,
@@ -32,6 +33,7 @@ from pbrl_ppl.posterior import (
     group,
     groups,
     parameter_draws,
+    placed,
     predicted_rows,
     prior_groups,
     problem_of,
@@ -198,7 +200,7 @@ def _updated(
         )
         chains = base.sizes["chain"]
         result = fit(build_model(whole), seed=seed, chains=chains, progress=progress)
-        return result, how | {"did": "refitted"}
+        return placed(result, base.coords), how | {"did": "refitted"}
     draws = min(base.sizes["draw"], -(-_WALKERS // base.sizes["chain"]))
     chosen = _systematic(weights, base.sizes["chain"] * draws, rng)
     phi, sigma, accepted = rejuvenate(whole, phi[chosen], sigma[chosen], rng)
@@ -208,7 +210,7 @@ def _updated(
     trace = from_groups(data | {"posterior": posterior, "sample_stats": stats}, {})
     method = str(idata.attrs.get("method", "update"))
     result = complete(whole, trace, seed=seed, method=method)
-    return result, how | {"did": "moved", "draws": draws}
+    return placed(result, base.coords), how | {"did": "moved", "draws": draws}
 
 
 def _worn(base: xr.Dataset, result: Any) -> bool:
@@ -320,7 +322,7 @@ def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
             )
             for key, variable in own.data_vars.items()
         }
-        coords = {key: coordinate for key, coordinate in own.coords.items() if key != "transition"}
+        coords = dict(own.drop_dims("transition").coords) | both_places(own, segments)
         result[name] = xr.Dataset(both, coords | {"transition": np.arange(total)}, held.attrs)
     more = both_recordings(group(idata, "constant_data"), recording(problem))
     result["constant_data"] = result["constant_data"].merge(more)

@@ -58,6 +58,9 @@ def test_many(logs: list[Settings], capsys: pytest.CaptureFixture[str]) -> None:
         "page: out/index.html",
     ]
     assert "2/2 blue: adequate" in captured.err
+    # the page says what makes it again
+    page = Path("out/index.html").read_text()
+    assert "pbrl-ppl close-loop" in page and "--many logs.csv" in page and "--units x=mm" in page
     assert logs == [
         Settings(
             7, 5, 300, "laplace", None, {"x": 0.1}, True,

@@ -8,13 +8,17 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import pandas as pd
 import pytest
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.report import Source, close_loop_many
 from pbrl_ppl.report.loop import FILES
 from pbrl_ppl.report.manifest import Log
+from pbrl_ppl.report.many_page import page
 
 #: One line a log that was begun and one a log that was kept: what was done how often.
 BEGUN, KEPT = "begun.txt", "kept.txt"
@@ -95,3 +99,29 @@ def pretend(log: Log, settings: Any) -> Pretended:
     if text == "warn":
         warnings.warn("rows were\nresampled", UserWarning, stacklevel=2)
     return Pretended(log, text if text.endswith("_drag") else "")
+
+
+#: Effects of the page's logs: more than one table has beside each other.
+MANY = ("angular_drag", "linear_drag", "quadratic_drag", "some_longer_name_of_a_drag", "air_drag")
+
+
+def many_page(folder: Path) -> tuple[str, tuple[str, ...]]:
+    """A page of logs of all kinds with a pooled one, and the files that it leads to."""
+    what = {f"cart_of_floor_{i}": effect for i, effect in enumerate(MANY)}
+    logs = made_logs(folder, **what, plain="", lost="fail", told="warn")
+    rows = close_loop_many(logs, folder / "out", run=pretend).rows
+    row = {
+        "parameter": "some_longer_name_of_a_drag_coefficient[cart]", "scale": "logarithm",
+        "mean": 0.2, "mean_low": 0.123456, "mean_high": 0.23456,
+        "spread": 0.03, "spread_low": 0.012345, "spread_high": 0.23456,
+        "next_median": 0.2, "next_low": 0.123456, "next_high": 0.23456,
+        "informed": 5, "p_same": 1e-9,
+    }  # fmt: skip
+    pooled: Any = SimpleNamespace(names=tuple(what), table=lambda: pd.DataFrame([row] * 3))
+    waiting = {"name": "late", "kind": "", "status": "waiting"}
+    source = Source(command=f"pbrl-ppl close-loop --many {'logs' * 40}.csv -o out")
+    reason = "1 adequate model(s), expected at least 2"
+    html = page((*rows, waiting), {"cart": pooled}, {"arm": reason}, source)
+    files = [f"{name}/report.html" for name in (*what, "plain", "told")]
+    files += ["lost/error.json", "kind-cart.toml", "kind-cart.csv"]
+    return html, (*files, "summary.csv", "effects.csv", "summary.json")

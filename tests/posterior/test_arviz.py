@@ -1,5 +1,7 @@
 """What ArviZ wants of a posterior: prior, its density, predictions that belong to draws."""
 
+import json
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from pbrl_ppl.posterior import from_groups, group, groups, loo_pit, predicted_ro
 from pbrl_ppl.posterior.predictions import predictive_rows
 from pbrl_ppl.posterior.prior_groups import prior_groups
 from pbrl_ppl.posterior.store import DATATREE, az, load_posterior, save_posterior
+from pbrl_ppl.sampling import fit, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.stacks import GENERATIONS, SCENE, file, fitted, history
@@ -82,6 +85,27 @@ def test_arviz_takes_it(function, idata, of_vx) -> None:
     plt.close("all")
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.filterwarnings("ignore::UserWarning")  # ArviZ's own
+def test_predictive_check_has_a_panel_a_state_dimension(idata) -> None:
+    """As the guide has it: metres beside radians per second, and not in one density with them."""
+    names = list(group(idata, "observed_data")["state"].values)
+    if DATATREE:
+        panels = az.plot_ppc_dist(idata, cols=["state"]).viz["plot"].to_dataset()
+        panels = [panels["plot"].sel(state=name).item() for name in names]
+    else:
+        flatten = ["transition", "step", "body"]
+        panels = az.plot_ppc(idata, flatten=flatten, num_pp_samples=20, random_seed=1).ravel()
+    measured = group(idata, "observed_data")["next_state"]
+    for name, axes in zip(names, panels, strict=True):
+        own = measured.sel(state=name)
+        width = float(own.max() - own.min())
+        # what it shows is about as wide as this dimension's values, not all dimensions'
+        shown = np.ptp(np.concatenate([line.get_xdata() for line in axes.get_lines()]))
+        assert 0.8 * width < shown < 3 * width, name
+    plt.close("all")
+
+
 def test_prior_is_pymc_s(idata) -> None:
     """Its density against PyMC's; its draws against their law, false alarm 1e-4 each."""
     model = physics_model(SCENE, history(1))
@@ -117,6 +141,79 @@ def test_prior_of_a_wheel_is_described_like_the_posterior() -> None:
     np.testing.assert_allclose(
         made["log_prior"]["mu_x"].values.ravel(), problem.layout.log_prior(phi)[:, 4]
     )
+
+
+#: Of the puck's 3 trajectories of 4 intervals.
+TRAJECTORY, TIME = np.repeat([0, 1, 2], 4), np.tile([0.0, 0.1, 0.2, 0.3], 3)
+
+
+def test_transitions_say_of_which_trajectory_and_when(idata) -> None:
+    """In every group that has them, for whom a sum over trajectories is one line."""
+    of = [name for name, data in groups(idata).items() if "transition" in data.dims]
+    assert len(of) == 4
+    for name in of:
+        coords = group(idata, name).coords
+        assert coords["trajectory"].dims == coords["time"].dims == ("transition",)
+        np.testing.assert_array_equal(coords["trajectory"], TRAJECTORY)
+        np.testing.assert_allclose(coords["time"], TIME)
+        assert coords["time"].attrs["units"] == "s"
+    likelihood = group(idata, "log_likelihood")["next_state"]
+    by_trajectory = likelihood.groupby("trajectory").sum()
+    np.testing.assert_allclose(
+        by_trajectory.sel(trajectory=1), likelihood.sel(transition=slice(4, 7)).sum("transition")
+    )
+
+
+@pytest.mark.filterwarnings(
+    "ignore::UserWarning", "ignore::FutureWarning", "ignore::DeprecationWarning"
+)
+def test_arviz_keeps_trajectory_and_time(idata) -> None:
+    k = az.loo(idata, pointwise=True).pareto_k
+    np.testing.assert_array_equal(k["trajectory"], TRAJECTORY)
+    pairs = az.compare({"one": idata, "other": idata})
+    assert list(pairs["rank"]) == [0, 1]
+
+
+def test_a_selection_of_trajectories_keeps_their_numbers() -> None:
+    model = physics_model(SCENE, history(1).select([2, 0]))
+    few = fit(model, method="map", seed=1, progress=False)
+    np.testing.assert_array_equal(few["observed_data"]["trajectory"], [2] * 4 + [0] * 4)
+
+
+@pytest.mark.parametrize("way", ["reweighted", "moved", "refitted"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_an_update_numbers_trajectories_on(idata, way, monkeypatch) -> None:
+    """In the group that the next update starts from too."""
+    of = "pbrl_ppl.sampling.updating."
+    monkeypatch.setattr(f"{of}MIN_ESS", 0)
+    monkeypatch.setattr(f"{of}_HEAVY", np.inf)
+    monkeypatch.setattr(f"{of}_MOVE", 0.0 if way == "reweighted" else 1.0)
+    monkeypatch.setattr(f"{of}_REFIT", 1.0 if way == "refitted" else 0.0)
+    monkeypatch.setattr(f"{of}fit", lambda model, **_: fit(model, method="laplace", progress=False))
+    new = update(idata, history(2, trajectories=1), seed=1)
+    new = update(new, history(3, trajectories=1), seed=1)
+    assert [each["did"] for each in json.loads(new.attrs["updates"])] == [way, way]
+    for name, data in groups(new).items():
+        if "transition" in data.dims:
+            assert data.sizes["transition"] == 20, name
+            np.testing.assert_array_equal(data["trajectory"], [*TRAJECTORY, *[3] * 4, *[4] * 4])
+            np.testing.assert_allclose(data["time"], [*TIME, *TIME[:4], *TIME[:4]])
+
+
+@pytest.mark.parametrize("way", ["reweighted", "moved"])
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_older_files_do_not_say_and_nothing_is_made_up(idata, way, monkeypatch) -> None:
+    monkeypatch.setattr("pbrl_ppl.sampling.updating.MIN_ESS", 0)
+    monkeypatch.setattr("pbrl_ppl.sampling.updating._HEAVY", np.inf)
+    monkeypatch.setattr("pbrl_ppl.sampling.updating._MOVE", 0.0 if way == "reweighted" else 1.0)
+    monkeypatch.setattr("pbrl_ppl.sampling.updating._REFIT", 0.0)
+    old = from_groups(
+        {n: d.drop_vars(("trajectory", "time"), errors="ignore") for n, d in groups(idata).items()},
+        idata.attrs,
+    )
+    new = update(old, history(2, trajectories=1), seed=1)
+    for data in groups(new).values():
+        assert not {"trajectory", "time"} & set(data.coords)
 
 
 def test_predictions_belong_to_draws(idata) -> None:

@@ -90,6 +90,20 @@ def test_an_update_numbers_its_trajectories_on(idata, monkeypatch) -> None:
     assert json.loads(result.attrs["updates"])[-1]["transitions"] == since.n_transitions
 
 
+@pytest.mark.one_stack
+def test_a_trajectory_that_its_end_cuts_short_has_a_number_too() -> None:
+    """After its end it has none, which is not the largest there is."""
+    rows = recorded(("mass_change",), trajectories=3, intervals=4).to_dataframe()
+    last = (rows["trajectory"] == 1) & (rows["step"] == 2)
+    rows.loc[last, ["force_x", "force_y", "torque"]] = np.nan
+    rows = rows[(rows["trajectory"] != 1) | (rows["step"] <= 2)]
+    declared = scene("mass_change")
+    model = physics_model(declared, History.from_dataframe(rows, declared), horizon=4)
+    fitted = fit(model, method="map", seed=1, progress=False)
+    since = recorded(("mass_change",), seed=2, trajectories=1, intervals=4)
+    assert problem_of(fitted, history=since).inputs[0, 0, 0, 6] == 3.0
+
+
 def test_a_plan_from_the_file_knows_the_load_and_the_delay(idata, tmp_path) -> None:
     save_posterior(idata, tmp_path / "puck.nc")
     loaded = load_posterior(tmp_path / "puck.nc")

@@ -12,6 +12,7 @@ from PIL import Image
 
 from pbrl_ppl.report import render_posterior
 from pbrl_ppl.report.report import render
+from tests.helpers.fleet import many_page
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.revised import recordings, revised
 
@@ -44,6 +45,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     pages = {
         "loop": render(revised(), recordings()[1]),
         "posterior": render_posterior(revised().posterior_after),
+        "many": many_page(folder / "logs")[0],
     }
     for name, html in pages.items():
         (folder / f"{name}.html").write_text(html, encoding="utf-8")
@@ -58,6 +60,22 @@ def test_page_as_a_file(files: dict[str, Path], name: str, pictures: int) -> Non
         picture = Image.open(BytesIO(base64.b64decode(address.partition(",")[2])))
         low, high = picture.convert("L").getextrema()
         assert low < 100 and high == 255
+
+
+def test_page_of_many_logs_as_a_file(tmp_path: Path) -> None:
+    html, links = many_page(tmp_path)
+    stands_alone(html, 0, links)
+    for words in (
+        "5 effects added, 1 failed, 1 waiting",
+        "Angular drag on the cart. In cart_of_floor_0.",
+        "Failed. lost:",
+        "1.20 ± 0.100 kg/s",
+        "below 0.0300",
+        "Robots of the kind arm were not pooled: 1 adequate",
+        "told rows were resampled",
+        "logslogs.csv -o out",
+    ):
+        assert words in Page(html).text, words
 
 
 def opened(browser: Any, path: Path, width: int, **options: Any) -> tuple[Any, list[str]]:
@@ -113,7 +131,7 @@ CONTRAST = """() => {
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [390, 1100])
-@pytest.mark.parametrize("name", ["loop", "posterior"])
+@pytest.mark.parametrize("name", ["loop", "posterior", "many"])
 def test_page_is_readable(
     browser: Any, files: dict[str, Path], name: str, width: int, scheme: str
 ) -> None:

@@ -3,6 +3,7 @@
 import shlex
 import warnings
 
+import numpy as np
 import pytest
 
 from pbrl_ppl.cli import main
@@ -86,6 +87,18 @@ def test_pairs_are_those_that_depend_on_each_other() -> None:
     figure = plot_pairs(from_groups(parts, {}), names)
     assert [axes.get_title() for axes in figure.axes].count("+1.00") == 1
     assert plot_prior(posterior, ["mass[cart]"]).axes[0].get_title() == "mass[cart]"
+
+
+def test_draws_that_are_equal_make_no_dependence() -> None:
+    """Two indices that are nearly always the same, and differ in other draws."""
+    parts = groups(made_up_posterior())
+    mass = parts["posterior"]["mass"]
+    for name, place in (("one", 3), ("other", 40)):
+        index = mass.copy(data=np.zeros(mass.shape))
+        index.values[0, place] = 1.0
+        parts["posterior"][name] = index
+    figure = plot_pairs(from_groups(parts, {}), ["one[cart]", "other[cart]"])
+    assert abs(float(figure.axes[0].get_title().replace("−", "-"))) < 0.1
 
 
 @pytest.mark.usefixtures("undrawn")
