@@ -92,6 +92,12 @@ def test_clean_data_of_another_engine_yields_no_name(make_history) -> None:
     smallest = {one.candidate.effect: one.candidate.detectable for one in found}
     assert smallest["linear_drag"]["coefficient"] < 0.06
     assert smallest["constant_force"]["force_x"] < 0.1
+    # of what is scanned too, where it shows best
+    assert smallest["dead_zone"]["threshold"] < 2.0
+    assert smallest["mass_change"]["factor"] < 0.08
+    assert smallest["wheel"]["mu_y"] < 0.02
+    assert smallest["heavy_tails"]["inverse_nu"] < 0.4
+    assert smallest["hidden_obstacle"] == smallest["distance_joint"] == {}
 
 
 @pytest.mark.slow
