@@ -5,13 +5,15 @@ That they are found is tested in test_criticism, with all other effects.
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, norm
+from scipy.stats import binom, chi2, norm
 
 from pbrl_ppl.criticism.detectable import caps, smallest_of_looks
 from pbrl_ppl.criticism.scan import Look, looks
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
-from tests.helpers.free_puck import BOX, box2d, fitted
+from pbrl_ppl.state import STATE
+from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
+from tests.helpers.histories import NOISE
 
 EFFECTS = {effect.name: effect for effect in catalogue}
 
@@ -86,6 +88,22 @@ def test_sizes_of_what_is_scanned_are_seen(make_history) -> None:
     pulled = fitted(BOX, box2d(make_history, 3, spring=(2 * size, 1.0, -0.5))[0])
     (found,) = rank_candidates(pulled, [EFFECTS["spring"].on("puck")])
     assert found.candidate.p_value < 0.01
+
+
+@pytest.mark.long
+def test_p_values_of_scans_are_no_smaller_than_chance_makes_them() -> None:
+    """Looks are paid for by a union bound, and an obstacle's are where the data bounced most."""
+    disc = Disc(scene=DISC.replace(substeps=40, noise=dict(zip(STATE, NOISE, strict=True))))
+    names = ("mass_change", "dead_zone", "saturation", "spring", "hidden_obstacle")
+    tried = [EFFECTS[name].on("puck") for name in names]
+    rng = np.random.default_rng(12)
+    found = {name: [] for name in names}
+    for _ in range(100):
+        for one in rank_candidates(disc.mode(rng), tried):
+            found[one.candidate.effect].append(np.exp(one.log_p))
+    for name, p in found.items():
+        # more come by chance in one of a thousand
+        assert (np.array(p) < 0.05).sum() <= binom.isf(0.001, 100, 0.05), name
 
 
 def test_an_effect_without_a_scan_has_no_looks(mode) -> None:
