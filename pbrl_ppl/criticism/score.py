@@ -289,8 +289,10 @@ def _tail_score(mode: Mode, attached: Attached, left: Array, n_candidates: int) 
     """
     noise = mode.problem.trajectories
     seen = mode.problem.observations.measured if noise is None else noise.seen
-    cells = np.flatnonzero(seen.ravel()) if mode.problem.nu(mode.phi) is None else np.zeros(0, int)
-    z = left[cells]
+    whitened = left[: seen.size].reshape(seen.shape)
+    # what never moves has no noise, and would make that of all others look heavy
+    loud = seen & (np.abs(whitened).max(axis=0) > _SHOWS)
+    z = whitened[loud] if mode.problem.nu(mode.phi) is None else np.zeros(0)
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0
