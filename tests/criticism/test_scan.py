@@ -78,7 +78,6 @@ def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
     assert not caps(EFFECTS["mass_change"], free)
 
 
-@pytest.mark.one_stack
 def test_sizes_of_what_is_scanned_are_seen(make_history) -> None:
     """Twice the smallest stiffness that shows anywhere is found where the spring really is."""
     clean = fitted(BOX, box2d(make_history, 3)[0])
