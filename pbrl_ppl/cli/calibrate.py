@@ -16,11 +16,13 @@ from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
 from pbrl_ppl.cli.terminal import (
     FAILED,
     AsJson,
+    Errors,
     Quiet,
     SceneFile,
     Seed,
     Velocities,
     interruptible,
+    stated_noise,
 )
 
 if TYPE_CHECKING:
@@ -38,6 +40,15 @@ def calibrate(
         Path,
         typer.Option("-o", "--output", metavar="DIR", help="Folder for results; goes on there."),
     ],
+    trajectories: Annotated[
+        bool,
+        typer.Option(
+            "--trajectories/--transitions",
+            help="Likelihood of whole trajectories, as of fit and close-loop (it takes several"
+            " times as long), or of single transitions from exact states (the paper's Eq. 11).",
+        ),
+    ] = False,
+    noise: Errors = None,
     replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
     seed: Seed = 1,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
@@ -56,6 +67,7 @@ def calibrate(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
             units=units, time_step=time_step,
         )  # fmt: skip
+        declared = stated_noise(declared, noise)
         os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report
         from pbrl_ppl.history import write_atomically
@@ -63,8 +75,8 @@ def calibrate(
 
         with _pool(jobs) as executor:
             result = calibration.calibrate(
-                declared, design, replications=replications, seed=seed, draws=draws, folder=output,
-                executor=executor, progress=not quiet,
+                declared, design, trajectories=trajectories, replications=replications, seed=seed,
+                draws=draws, folder=output, executor=executor, progress=not quiet,
             )  # fmt: skip
         result.save(output / "ranks.nc")
         write_atomically(output / "table.csv", result.table().to_csv)

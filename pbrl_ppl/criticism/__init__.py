@@ -1,6 +1,7 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
 from pbrl_ppl.criticism.cross_validation import cross_validated, folds, standard_error
+from pbrl_ppl.criticism.dependence import PRODUCTS
 from pbrl_ppl.criticism.findings import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
 from pbrl_ppl.criticism.loop import revise
 from pbrl_ppl.criticism.prior_check import (
@@ -28,6 +29,7 @@ __all__ = [
     "MIN_ELPD",
     "MIN_ELPD_SE",
     "NOT_CONVERGED",
+    "PRODUCTS",
     "TRIED",
     "UNEXPLAINED",
     "Acceleration",

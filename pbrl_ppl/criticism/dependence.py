@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -46,13 +48,31 @@ FEATURES = (
     "torque commanded before",
     "time",
 )
+#: What depends on two quantities together has no smooth term in either: a spinning body's lift,
+#: a force that fades with speed, an actuator that remembers, a floor that is rough in places.
+PRODUCTS = {
+    " × ".join(pair): pair
+    for pair in (
+        ("angular speed", "forward speed"),
+        ("angular speed", "sideways speed"),
+        ("commanded forward force", "forward speed"),
+        ("commanded sideways force", "sideways speed"),
+        ("commanded torque", "angular speed"),
+        ("commanded forward force", "forward force commanded before"),
+        ("commanded sideways force", "sideways force commanded before"),
+        ("commanded torque", "torque commanded before"),
+        ("position x", "velocity x"),
+        ("position y", "velocity y"),
+    )
+}
 
 
 def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
     """Test whether the innovations of a fitted model still depend on state, action or time.
 
-    A kernel ridge regression with one smooth term a quantity predicts the residual of trajectories
-    that it was not trained on; the null distribution comes from shuffling the transitions.
+    A kernel ridge regression with one smooth term a quantity, or product of two, predicts the
+    residual of trajectories that it was not trained on; the null distribution comes from shuffling
+    the transitions.
 
     Parameters
     ----------
@@ -83,8 +103,7 @@ def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
         own = np.flatnonzero(places // len(STATE) == i)
         y, names, of = _in_both_frames(innovations[:, own], places[own] % len(STATE), features)
         y = y - y.mean(axis=0)
-        kernels = _kernels(features)
-        smoother = _cross_validated(kernels.sum(axis=0), groups, rng)
+        smoother = _cross_validated(_summed(features), groups, rng)
         shares = _explained(smoother, y)
         null = np.array(
             [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
@@ -95,7 +114,7 @@ def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
         if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE or size < MATTERS_IN_A_STEP:
             continue
         if best is None or shares[at] > best.share:
-            best = _describe(body.name, names[at], kernels, y[:, at], shares[at], p_value)
+            best = _describe(body.name, names[at], features, y[:, at], shares[at], p_value)
     return best
 
 
@@ -114,14 +133,14 @@ def _in_both_frames(
 
 
 def _features(mode: Mode, body: int) -> Array:
-    """State and action at each start, in the body's frame, shape (transition, feature)."""
+    """State, action and products at each start, in the body's frame, shape (transition, name)."""
     segments = mode.problem.segments
     x, y, theta, vx, vy, omega = segments.start[:, body].T
     fx, fy, torque = segments.actions[:, :, body].mean(axis=1).T
     gx, gy, torque_before = segments.inputs[:, 0, body, 3:6].T
     c, s = np.cos(theta), np.sin(theta)
     time = segments.step.astype(float)
-    return np.stack(
+    single = np.stack(
         [
             x, y, vx, vy, fx, fy, c, s, c * vx + s * vy, c * vy - s * vx, omega, np.hypot(vx, vy),
             c * fx + s * fy, c * fy - s * fx, torque,
@@ -129,17 +148,25 @@ def _features(mode: Mode, body: int) -> Array:
         ],
         axis=1,
     )  # fmt: skip
+    pairs = np.array([[FEATURES.index(name) for name in pair] for pair in PRODUCTS.values()])
+    return np.hstack([single, single[:, pairs].prod(axis=2)])
 
 
-def _kernels(features: Array) -> Array:
-    """One Gaussian kernel a quantity, on ranks scaled to unit range, shape (feature, n, n)."""
-    order = np.argsort(np.argsort(features, axis=0), axis=0) / max(len(features) - 1, 1)
+def _kernels(features: Array) -> Iterator[Array]:
+    """One Gaussian kernel a quantity, on ranks scaled to unit range, shape (n, n) each."""
+    ranks = np.argsort(np.argsort(features, axis=0), axis=0) / max(len(features) - 1, 1)
     varies = np.ptp(features, axis=0) > 1e-9
-    order = np.where(varies, order, 0.0)
-    difference = order.T[:, :, None] - order.T[:, None, :]
-    kernels = np.exp(-0.5 * (difference / 0.2) ** 2)
-    kernels[~varies] = 0.0
-    return kernels / max(int(varies.sum()), 1)
+    for rank, moves in zip(ranks.T, varies, strict=True):
+        difference = rank[:, None] - rank
+        yield np.exp(-0.5 * (difference / 0.2) ** 2) * moves / max(int(varies.sum()), 1)
+
+
+def _summed(features: Array) -> Array:
+    """Kernel of all quantities together, shape (n, n)."""
+    kernel = np.zeros((len(features), len(features)))
+    for term in _kernels(features):
+        kernel += term
+    return kernel
 
 
 def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
@@ -160,11 +187,11 @@ def _explained(smoother: Array, y: Array) -> Array:
 
 
 def _describe(
-    body: str, dimension: str, kernels: Array, y: Array, share: float, p_value: float
+    body: str, dimension: str, features: Array, y: Array, share: float, p_value: float
 ) -> Unexplained:
-    weights = np.linalg.solve(kernels.sum(axis=0) + _RIDGE * np.eye(len(y)), y)
-    parts = np.array([np.var(kernel @ weights) for kernel in kernels])
-    name = FEATURES[int(np.argmax(parts))]
+    weights = np.linalg.solve(_summed(features) + _RIDGE * np.eye(len(y)), y)
+    parts = [np.var(kernel @ weights) for kernel in _kernels(features)]
+    name = (*FEATURES, *PRODUCTS)[int(np.argmax(parts))]
     return Unexplained(
         body=body,
         dimension=dimension,

@@ -39,7 +39,10 @@ class Candidate:
         At how many places, thresholds or times it was tried; the p-value pays for them.
     detectable : dict of str to float
         Smallest size of each parameter that these data would show (nine times of ten, at a p-value
-        of 0.01), the others being nothing; infinite where they would not show any.
+        of 0.01), the others being nothing; infinite where they would not show any. Of a scan, where
+        it shows best; empty where there is no size without a place.
+    caps : bool
+        Whether smaller is stronger, as of a limit: larger ones than ``detectable`` are not seen.
     """
 
     effect: str
@@ -53,6 +56,7 @@ class Candidate:
     identifiable: float
     looks: int = 1
     detectable: Mapping[str, float] = field(default_factory=dict)
+    caps: bool = False
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
+from pbrl_ppl.criticism.detectable import caps, smallest, smallest_of_looks
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import Look, looks
 from pbrl_ppl.effects import Attached, Noise
@@ -244,38 +245,35 @@ def _signature(
         units={parameter.name: parameter.unit for parameter in effect.parameters},
         identifiable=evidence.share,
         looks=n_looks,
-        # of what is scanned there is no size without a place
-        detectable=_detectable(names, evidence.unit, n_candidates) if effect.scan is None else {},
+        detectable=smallest(effect, evidence.unit, n_candidates) if effect.scan is None else {},
     )
     return Signature(attached, candidate, log_p, evidence.basis, evidence.direction)
-
-
-def _detectable(names: Sequence[str], unit: Array, tried: int) -> dict[str, float]:
-    """Size of each parameter that a score test at 0.01, corrected, shows nine times of ten."""
-    if len(unit) != len(names):  # of the noise
-        return {}
-    needed = norm.isf(0.005 / tried) + norm.isf(0.1)
-    with np.errstate(divide="ignore"):
-        return dict(zip(names, (needed / unit).tolist(), strict=True))
 
 
 def _best_look(
     attached: Attached, tried: Sequence[Look], q: Array, residual: Array, n_candidates: int
 ) -> Signature:
     """The look of a scan that explains most; of a whole change, only its own sign counts."""
-    best = _none(len(residual))
-    values = np.array(attached.effect.null)
+    effect, best, units = attached.effect, _none(len(residual)), []
+    values = np.array(effect.null)
     for look in tried:
         rows = np.pad(look.signature, ((0, len(residual) - len(look.signature)), (0, 0)))
         columns = list(look.columns)
         sides = np.zeros(len(columns), dtype=np.intp) if columns else np.ones(1, dtype=np.intp)
         scales = _scales(attached)[columns] if columns else np.ones(1)
         found = _evidence(rows, q, residual, sides, scales)
+        units.append(found.unit)
         if found.log_p < best.log_p:
             best, values = found, look.values.copy()
             for column, size in zip(look.columns, found.size, strict=False):
                 values[column] += size
-    return _signature(attached, best, values, len(tried), n_candidates)
+    signature = _signature(attached, best, values, len(tried), n_candidates)
+    candidate = replace(
+        signature.candidate,
+        detectable=smallest_of_looks(effect, tried, units, n_candidates),
+        caps=caps(effect, tried),
+    )
+    return replace(signature, candidate=candidate)
 
 
 def _of_noise(attached: Attached) -> bool:
@@ -291,8 +289,10 @@ def _tail_score(mode: Mode, attached: Attached, left: Array, n_candidates: int) 
     """
     noise = mode.problem.trajectories
     seen = mode.problem.observations.measured if noise is None else noise.seen
-    cells = np.flatnonzero(seen.ravel()) if mode.problem.nu(mode.phi) is None else np.zeros(0, int)
-    z = left[cells]
+    whitened = left[: seen.size].reshape(seen.shape)
+    # what never moves has no noise, and would make that of all others look heavy
+    loud = seen & (np.abs(whitened).max(axis=0) > _SHOWS)
+    z = whitened[loud] if mode.problem.nu(mode.phi) is None else np.zeros(0)
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0
@@ -301,6 +301,7 @@ def _tail_score(mode: Mode, attached: Attached, left: Array, n_candidates: int) 
         statistic=score**2 / variance if heavier else 0.0,
         log_p=float(norm.logsf(score / np.sqrt(variance))) if heavier else 0.0,
         share=1.0,
+        unit=np.array([np.sqrt(variance) if len(z) else 0.0]),
     )
     values = np.array(attached.effect.null)
     if heavier and len(values) == 1:

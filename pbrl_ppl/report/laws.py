@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import PRODUCTS, Findings
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import problem_of
@@ -138,7 +138,7 @@ def _quantities(problem: Problem, body: int) -> dict[str, tuple[Array, str]]:
     place = INPUT.index("previous_force_x")
     gx, gy, torque_before = segments.inputs[:, 0, body, place : place + 3].T
     c, s = np.cos(theta), np.sin(theta)
-    return {
+    single = {
         "position x": (x, "m"),
         "position y": (y, "m"),
         "velocity x": (vx, "m/s"),
@@ -159,6 +159,11 @@ def _quantities(problem: Problem, body: int) -> dict[str, tuple[Array, str]]:
         "torque commanded before": (torque_before, "N m"),
         "time": (segments.step * problem.scene.time_step, "s"),
     }
+    products = {
+        name: (single[a][0] * single[b][0], f"{single[a][1]} {single[b][1]}")
+        for name, (a, b) in PRODUCTS.items()
+    }
+    return single | products
 
 
 def _law(

@@ -227,6 +227,7 @@ def row_of(log: Log, folder: Path, inputs: str) -> dict[str, Any] | None:
             "detectable": {
                 f"{each['effect']}[{each['body']}]": each["detectable"]
                 for each in report["candidates"]
+                if not each.get("caps", False)
             },
             "error_before": error["before"]["normalised_rmse"],
             "error_after": error["after"]["normalised_rmse"],

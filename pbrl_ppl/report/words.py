@@ -69,25 +69,32 @@ def verdict_in_words(findings: Findings) -> str:
 
 
 def unseen_in_words(findings: Findings) -> str:
-    """Say how small an effect must be for these data not to show it; nothing of those added."""
+    """Say how small an effect must be for these data not to show it; nothing of those added.
+
+    An obstacle has no size without a place: what has none is named, for nothing was said of it.
+    """
     there = {(added.effect, added.body) for added in findings.added}
-    sizes = []
+    sizes, silent = [], []
     for candidate in findings.candidates:
         if (candidate.effect, candidate.body) in there:
             continue
+        of = f" of the {plain(candidate.body)}" if len(findings.scene.dynamic) > 1 else ""
         for name, size in candidate.detectable.items():
-            amount = "of any size" if size > _NEVER else _below(candidate, name, size)
             which = plain(candidate.effect)
             if len(candidate.detectable) > 1:
                 which = f"{which} ({plain(name)})"
-            if len(findings.scene.dynamic) > 1:
-                which = f"{which} of the {plain(candidate.body)}"
-            sizes.append(f"{which} {amount}")
-    return f"These data would not show: {'; '.join(sizes)}." if sizes else ""
+            sizes.append(f"{which}{of} {_unseen(candidate, name, size)}")
+        if not candidate.detectable:
+            silent.append(f"{plain(candidate.effect)}{of}")
+    text = f"These data would not show: {'; '.join(sizes)}." if sizes else ""
+    rest = f"Nothing can be said of how large these would have to be: {'; '.join(silent)}."
+    return f"{text} {rest if silent else ''}".strip()
 
 
-def _below(candidate: Candidate, name: str, size: float) -> str:
-    return f"below {quantity(size, candidate.units[name])}"
+def _unseen(candidate: Candidate, name: str, size: float) -> str:
+    if size > _NEVER:
+        return "of any size"
+    return f"{'above' if candidate.caps else 'below'} {quantity(size, candidate.units[name])}"
 
 
 def plain(name: str) -> str:

@@ -19,7 +19,7 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import COMMANDS, _options_of, app
 from pbrl_ppl.cli.scene_text import _HEAD
 from pbrl_ppl.cli.terminal import warnings_in_a_line
-from pbrl_ppl.errors import BoundWarning, ConvergenceWarning
+from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.model.table1 import table1
@@ -383,6 +383,25 @@ def test_convergence_is_judged_as_it_is_written(monkeypatch: pytest.MonkeyPatch)
         said = [str(each.message) for each in caught if each.category is ConvergenceWarning]
         assert len(said) == len(words)
         assert all(f"not converged: {word}" in each for word, each in zip(words, said, strict=True))
+
+
+@pytest.mark.usefixtures("puck")
+@pytest.mark.one_stack
+def test_calibrate_takes_the_likelihood_of_fit(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seen = []
+
+    def take(scene: Scene, design: History, **options: Any) -> None:
+        seen.append((dict(scene.noise), options["trajectories"]))
+        raise FitError("that is all")
+
+    monkeypatch.setattr(sampling.calibration, "calibrate", take)
+    argv = ["calibrate", "scene.toml", "train.csv", "-o", "ranks"]
+    for options in ([], ["--trajectories", "--noise", "x=0.002"]):
+        assert "that is all" in message(capsys, *argv, *options)
+    assert seen == [({}, False), ({"x": 0.002}, True)]
+    assert 'unknown key "z"' in message(capsys, *argv, "--noise", "z=0.1")
 
 
 @pytest.mark.usefixtures("puck")

@@ -9,6 +9,8 @@ from scipy.stats import chi2, kstest
 from pbrl_ppl.criticism.score import inseparable, rank_candidates, twins
 from pbrl_ppl.effects import attach, candidates, catalogue
 from pbrl_ppl.history import History
+from pbrl_ppl.model import Problem, single_transitions
+from pbrl_ppl.modes import find_mode
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
@@ -92,6 +94,12 @@ def test_clean_data_of_another_engine_yields_no_name(make_history) -> None:
     smallest = {one.candidate.effect: one.candidate.detectable for one in found}
     assert smallest["linear_drag"]["coefficient"] < 0.06
     assert smallest["constant_force"]["force_x"] < 0.1
+    # of what is scanned too, where it shows best
+    assert smallest["dead_zone"]["threshold"] < 2.0
+    assert smallest["mass_change"]["factor"] < 0.08
+    assert smallest["wheel"]["mu_y"] < 0.02
+    assert smallest["heavy_tails"]["inverse_nu"] < 0.4
+    assert smallest["hidden_obstacle"] == smallest["distance_joint"] == {}
 
 
 @pytest.mark.slow
@@ -136,6 +144,25 @@ def test_one_sided_statistics_are_half_as_likely() -> None:
     assert 13 <= (p == 1).sum() <= 47  # binomial, a false alarm in 1e-5
     # those that are not are uniform below a half: Kolmogorov-Smirnov at 0.1 %
     assert kstest(2 * p[p < 1], "uniform").pvalue > 0.001
+
+
+@pytest.mark.slow
+def test_a_fifth_of_what_single_transitions_show_is_seen_along_trajectories() -> None:
+    """At least half of twenty pucks' drags, each a fifth of the least that Eq. 11 shows."""
+    scene = DISC.replace(substeps=40)
+    smooth = [one for one in candidates(scene, ()) if one.effect.scan is None]
+    rng = np.random.default_rng(15)
+
+    def score(mode):
+        found = {one.candidate.effect: one.candidate for one in rank_candidates(mode, smooth)}
+        return found["linear_drag"]
+
+    history = History.from_dataframe(Disc(8, 15, scene).frame(rng), scene)
+    problem = single_transitions(Problem.of(scene, history, attach(scene)))
+    limit = score(find_mode(problem, seed=1)).detectable["coefficient"]
+    pucks = (Disc(8, 15, scene, drag=limit / 5, seed=seed) for seed in range(20))
+    found = [score(puck.mode(rng)).p_value < 0.01 for puck in pucks]
+    assert np.mean(found) >= 0.5
 
 
 def test_drag_cannot_have_the_wrong_sign() -> None:

@@ -121,6 +121,15 @@ def test_a_spring_that_is_not_in_the_scene_fails_all_that_look_at_states(make_hi
     assert found.unexplained.depends_on.startswith("position")
 
 
+def test_a_force_that_takes_two_quantities_depends_on_their_product(make_history) -> None:
+    """Magnus: neither the spin nor the speed says anything of it alone."""
+    train, _ = box2d(make_history, 3, trajectories=20, intervals=10, magnus_force=0.15)
+    found = misfit(fitted(BOX, train))
+    assert DEPENDENCE in {test.name for test in found.tests if not test.passed}
+    assert found.unexplained.depends_on.startswith("angular speed × ")
+    assert found.unexplained.dimension in ("forward speed", "sideways speed")
+
+
 def test_same_seed_same_tests(make_history) -> None:
     mode = fitted(BOX, box2d(make_history, 3)[0])
     assert misfit(mode, seed=2).tests == misfit(mode, seed=2).tests

@@ -19,7 +19,7 @@ from pbrl_ppl.criticism import revise
 from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
-from pbrl_ppl.errors import ConvergenceWarning, EffectError
+from pbrl_ppl.errors import ConvergenceWarning, EffectError, PosteriorError
 from tests.helpers.free_puck import BOX, DISC, MASS, box2d, fitted
 from tests.helpers.places import load
 
@@ -67,16 +67,39 @@ def test_clean_data_are_adequate(adequate) -> None:
 
 @pytest.mark.slow
 def test_adequate_says_what_would_have_been_seen(adequate) -> None:
-    """Sizes that are found in test_criticism are above those; nothing is claimed of scans."""
+    """Sizes that are found in test_criticism are above those; an obstacle has none."""
     sizes = {one.effect: one.detectable for one in adequate.candidates}
     for effect, parameter, hidden in (
         ("linear_drag", "coefficient", 0.06),
         ("constant_force", "force_x", 0.1),
         ("actuator_delay", "share", 0.12),
         ("constant_torque", "torque", 0.004),
+        ("dead_zone", "threshold", 2.0),
     ):
         assert 0 < sizes[effect][parameter] < hidden
-    assert sizes["dead_zone"] == {}
+    assert sizes["hidden_obstacle"] == {}
+
+
+@pytest.mark.slow
+def test_its_posterior_goes_on_with_what_is_recorded_after(adequate, clean) -> None:
+    """What a loop gives is what an update takes: whole trajectories, both noises."""
+    more = histories(clean)[1].select([0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # of so few draws
+        updated = pp.update(adequate.posterior_after, more, seed=1)
+    (entry,) = json.loads(updated.attrs["updates"])
+    assert entry["did"] in ("reweighted", "moved")
+    assert entry["transitions"] == 15
+    before, after = (
+        each["posterior"]["mass"].values for each in (adequate.posterior_after, updated)
+    )
+    assert np.unique(after).size > 50
+    # a thousandth of false alarms for the truth, and no wider than Monte Carlo makes it
+    low, high = np.quantile(after, [0.0005, 0.9995])
+    assert low <= MASS <= high
+    assert after.std() < 1.2 * before.std()
+    with pytest.raises(PosteriorError, match="already"):
+        pp.update(updated, more, seed=1)
 
 
 @pytest.mark.slow

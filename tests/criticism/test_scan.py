@@ -5,12 +5,15 @@ That they are found is tested in test_criticism, with all other effects.
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import binom, chi2, norm
 
-from pbrl_ppl.criticism.scan import looks
+from pbrl_ppl.criticism.detectable import caps, smallest_of_looks
+from pbrl_ppl.criticism.scan import Look, looks
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
-from tests.helpers.free_puck import BOX, box2d, fitted
+from pbrl_ppl.state import STATE
+from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
+from tests.helpers.histories import NOISE
 
 EFFECTS = {effect.name: effect for effect in catalogue}
 
@@ -53,6 +56,53 @@ def test_a_signature_is_what_the_effect_does(mode) -> None:
     best = min(thresholds, key=left)
     assert left(best) < 0.9 * (residual**2).sum()
     assert best.values[0] == pytest.approx(2.0, rel=0.3)  # the nearest of those looked at
+
+
+def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
+    needed = norm.isf(0.005 / (2 * 2)) + norm.isf(0.1)  # two candidates, two looks
+    signature = np.zeros((3, 1))
+    free = [Look(np.array([1.0, begin, 0.0]), signature, (0,)) for begin in (0.5, 1.5)]
+    units = [np.array([2.0]), np.array([5.0])]
+    sizes = smallest_of_looks(EFFECTS["mass_change"], free, units, 2)
+    assert sizes == {"factor": pytest.approx(needed / 5.0)}
+    whole = [Look(np.array([value]), signature, ()) for value in (1.0, 2.0, 3.0)]
+    units = [np.array([change]) for change in (1.0, 9.0, 12.0)]
+    assert smallest_of_looks(EFFECTS["dead_zone"], whole, units, 2) == {"threshold": 2.0}
+    assert smallest_of_looks(EFFECTS["saturation"], whole, units, 2) == {"limit": 3.0}
+    none = smallest_of_looks(EFFECTS["dead_zone"], whole[:1], units[:1], 2)
+    assert none == {"threshold": np.inf}
+    there = [Look(np.zeros(3), signature, ())]
+    assert smallest_of_looks(EFFECTS["hidden_obstacle"], there, units[1:2], 2) == {}
+    assert caps(EFFECTS["saturation"], whole)
+    assert not caps(EFFECTS["dead_zone"], whole)
+    assert not caps(EFFECTS["mass_change"], free)
+
+
+def test_sizes_of_what_is_scanned_are_seen(make_history) -> None:
+    """Twice the smallest stiffness that shows anywhere is found where the spring really is."""
+    clean = fitted(BOX, box2d(make_history, 3)[0])
+    (found,) = rank_candidates(clean, [EFFECTS["spring"].on("puck")])
+    size = found.candidate.detectable["stiffness"]
+    assert 0 < size < 0.1
+    pulled = fitted(BOX, box2d(make_history, 3, spring=(2 * size, 1.0, -0.5))[0])
+    (found,) = rank_candidates(pulled, [EFFECTS["spring"].on("puck")])
+    assert found.candidate.p_value < 0.01
+
+
+@pytest.mark.long
+def test_p_values_of_scans_are_no_smaller_than_chance_makes_them() -> None:
+    """Looks are paid for by a union bound, and an obstacle's are where the data bounced most."""
+    disc = Disc(scene=DISC.replace(substeps=40, noise=dict(zip(STATE, NOISE, strict=True))))
+    names = ("mass_change", "dead_zone", "saturation", "spring", "hidden_obstacle")
+    tried = [EFFECTS[name].on("puck") for name in names]
+    rng = np.random.default_rng(12)
+    found = {name: [] for name in names}
+    for _ in range(100):
+        for one in rank_candidates(disc.mode(rng), tried):
+            found[one.candidate.effect].append(np.exp(one.log_p))
+    for name, p in found.items():
+        # more come by chance in one of a thousand
+        assert (np.array(p) < 0.05).sum() <= binom.isf(0.001, 100, 0.05), name
 
 
 def test_an_effect_without_a_scan_has_no_looks(mode) -> None:

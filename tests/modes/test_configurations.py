@@ -24,6 +24,7 @@ from pbrl_ppl.modes.configurations import (
     configurations,
     doubts,
     joint_probabilities,
+    number,
     stored,
 )
 from pbrl_ppl.modes.evidence import Evidence, _Law, importance, laplace
@@ -40,7 +41,7 @@ from pbrl_ppl.posterior import (
     updated_scene,
 )
 from pbrl_ppl.sampling import fit, mixture, updating
-from pbrl_ppl.scene import WORLD, Joint, Scene, Shape
+from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.histories import simulated_history
 from tests.helpers.joints import HINGED, reference_anchors, scene
@@ -124,6 +125,20 @@ def test_joints_of_one_kind_are_exchangeable() -> None:
     assert weight[("joint1", ab), ("joint2", cd)] == pytest.approx(2 * 0.08**2)
     assert weight[("joint1", ab), ("joint2", ab)] == pytest.approx(0.08**2)
     assert (("joint1", cd), ("joint2", ab)) not in weight
+
+
+def test_they_are_counted_without_being_made() -> None:
+    """Eleven bodies and the world: 66 pairs and none, two of them at a time, 68 over 2."""
+    room = tuple(Body(f"b{i}", Shape.circle(0.1), pose=(i, 0.0, 0.0)) for i in range(11))
+    for kinds, count in (
+        (("hinge",), 67),
+        (("hinge", "hinge"), 2278),
+        (("hinge", "distance"), 67**2),
+    ):
+        joints = tuple(Joint(kind, known=False) for kind in kinds)
+        assert number(Scene(time_step=0.1, bodies=room, joints=joints)) == count
+    two = scene(*(Joint("hinge", known=False),) * 2)
+    assert number(two) == len(configurations(two))
 
 
 def test_named_joints_keep_their_names_without_the_free_ones() -> None:

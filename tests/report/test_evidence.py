@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import compare
@@ -60,6 +61,15 @@ def test_the_law_that_is_wanted_is_the_drag() -> None:
     assert (others[0].quantity, others[0].dimension) == ("velocity y", "vy")
     nowhere = replace(left, body="")
     assert find_laws(replace(unexplained(), unexplained=nowhere), catalogue) == []
+
+
+def test_a_law_may_follow_whatever_an_error_may_depend_on() -> None:
+    left = replace(unexplained().unexplained, depends_on="position x × velocity x")
+    laws = find_laws(replace(unexplained(), unexplained=left), catalogue, most=100)
+    named = {law.quantity: law for law in laws}
+    assert set(named) <= {*FEATURES, *PRODUCTS}
+    x, v = (named[name].x for name in ("position x", "velocity x"))
+    np.testing.assert_allclose(named[left.depends_on].x, x * v)
 
 
 def test_bins_hold_about_as_many_and_equal_values_share_one() -> None:

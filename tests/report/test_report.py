@@ -23,7 +23,7 @@ from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.report import render
-from pbrl_ppl.report.words import number, verdict_in_words
+from pbrl_ppl.report.words import number, unseen_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 
@@ -102,6 +102,18 @@ def test_page_where_nothing_is_missing() -> None:
     assert "chance alone brings one that close in 37 % of all cases" in text
     assert "fell by" not in text and "After:" not in text
     assert "Where it remains" not in text
+
+
+def test_what_would_not_be_seen_has_a_side_or_is_named() -> None:
+    findings = made_up("adequate")
+    first, second, *_ = findings.candidates
+    limit = replace(first, effect="saturation", detectable={"coefficient": 8.0}, caps=True)
+    place = replace(second, effect="hidden_obstacle", detectable={})
+    said = unseen_in_words(replace(findings, candidates=(limit, place)))
+    assert said == (
+        "These data would not show: saturation above 8.00 kg/s. Nothing can be said of how large"
+        " these would have to be: hidden obstacle."
+    )
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -362,6 +374,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "identifiable",
         "looks",
         "detectable",
+        "caps",
     ]
     assert list(got["error"]) == ["before", "after", "noise_floor"]
     assert got["error"]["before"]["normalised_rmse"] == 2.4
