@@ -3,8 +3,9 @@
     python analysis/05_apartment.py                 # ten seeds of each agent, in out/apartment
     python analysis/05_apartment.py --resume        # go on where a run was interrupted
     python analysis/05_apartment.py --quick         # one seed and few observations, for CI
-    python analysis/05_apartment.py --only oolwr --seeds 2
+    python analysis/05_apartment.py --only oolwr --seeds 2 --workers 1
 
+Each trial of an agent is a process and a file of its own.
 Observations are of random actions of the task, any of whose bodies is as likely, in episodes of 25
 from the start. After so many of them an agent learns, and plans once from the start, with two
 thirds of the goal's tolerances; its plan is played in the true world without looking. It is valid
@@ -17,6 +18,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -28,6 +30,7 @@ import xarray as xr
 from scipy import stats
 
 import pbrl_ppl as pp
+from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.history import write_atomically
 
@@ -108,8 +111,8 @@ def explored(count: int, seed: int, sigma: float) -> list[tuple[np.ndarray, ...]
     return found[:count]
 
 
-def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float) -> xr.Dataset:
-    """Plans of one agent after so many observations, and where they lead."""
+def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float, path: Path) -> xr.Dataset:
+    """Plans of one agent after so many observations, and where they lead; kept in a file."""
     learner, seen = agent(name, seed), 0
     every = explored(max(counts), seed, sigma)
     rows = {key: [] for key in ("foreseen", "valid", "reward", "models", "update", "search")}
@@ -138,7 +141,9 @@ def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float) -> xr.Dat
         )
     variables = {key: ("observations", np.array(values)) for key, values in rows.items()}
     attrs = {"agent": name, "seed": seed, "sigma": sigma, "scene": TASK.scene.to_toml()}
-    return xr.Dataset(variables, {"observations": list(counts)}, attrs)
+    found = xr.Dataset(variables, {"observations": list(counts)}, attrs)
+    write_atomically(path, lambda to: found.to_netcdf(to, engine="h5netcdf"))
+    return found
 
 
 def played(wrenches: np.ndarray) -> tuple[bool, float]:
@@ -183,16 +188,21 @@ def run(options: argparse.Namespace, counts: dict[str, tuple[int, ...]]) -> xr.D
         raise EpisodeError(
             f"{folder}: there are trials; go on with --resume, or give another --out"
         )
-    every = []
+    every, left = [], []
     for seed in range(1, options.seeds + 1):
         for name in options.only:
             path = folder / f"{name}-{seed}.nc"
             if path.is_file():
                 every.append(stored(path, counts[name], options.sigma))
-                continue
-            found = trial(name, seed, counts[name], options.sigma)
-            write_atomically(path, lambda to, found=found: found.to_netcdf(to, engine="h5netcdf"))
-            every.append(found)
+            else:
+                left.append((name, seed, counts[name], options.sigma, path))
+    workers = min(options.workers, len(left))
+    if workers < 2:
+        every += [trial(*each) for each in left]
+    else:
+        with processes(workers) as executor:
+            running = [executor.submit(trial, *each) for each in left]
+            every += [future.result() for future in as_completed(running)]
     return joined(every, options)
 
 
@@ -247,6 +257,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--sigma", type=float, default=0.0, help="noise of the observations")
     parser.add_argument("--only", nargs="+", choices=list(NAMES), default=list(NAMES))
+    parser.add_argument("--workers", type=int, default=processors(), help="trials at a time")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--resume", action="store_true", help="go on with what is in the folder")
     parser.add_argument("--quick", action="store_true", help="one seed, few observations, for CI")
@@ -257,14 +268,14 @@ def main() -> None:
         counts = {"true": (0,), "pbrl": (3,), "oolwr": (3, 10)}
         options.only = [name for name in options.only if name in counts]
         options.seeds, options.out = 1, options.out.with_name(options.out.name + "_quick")
-    if options.seeds < 1:
-        parser.error("--seeds: expected at least 1")
+    if options.seeds < 1 or options.workers < 1:
+        parser.error("--seeds and --workers: expected 1 or more")
     try:
         data = run(options, counts)
     except EpisodeError as error:
         parser.error(str(error))
     except KeyboardInterrupt:
-        print("\ninterrupted: finished trials are kept; go on with --resume", file=sys.stderr)
+        print("interrupted: finished trials are kept; go on with --resume", file=sys.stderr)
         sys.exit(130)
     write_atomically(options.out / "figure_4c.nc", lambda to: data.to_netcdf(to, engine="h5netcdf"))
     draw(data, options.out / "figure_4c.png")

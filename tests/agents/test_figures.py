@@ -1,11 +1,15 @@
 """The paper's figure 4 at a small size: resumed, refused, and read by the benchmark."""
 
+import importlib.util
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
+import matplotlib.pyplot as plt
 import pytest
 import xarray as xr
 
@@ -20,6 +24,33 @@ def ran(folder: Path, script: str, *options: str) -> subprocess.CompletedProcess
     return subprocess.run(
         command, cwd=folder, env=given, capture_output=True, text=True, check=False
     )
+
+
+@pytest.fixture
+def script(monkeypatch, tmp_path) -> Callable[[str], ModuleType]:
+    """A script as a module; what it makes goes into a folder of its own."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [*sys.path])  # scripts add to it
+
+    def load(name: str) -> ModuleType:
+        spec = importlib.util.spec_from_file_location(Path(name).stem, ANALYSIS / name)
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module
+
+    yield load
+    plt.close("all")
+
+
+def main(module: ModuleType, *options: str) -> int:
+    """Run a script here, one thing after the other; its exit code."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(sys, "argv", ["script", *options, "--workers", "1"])
+        try:
+            module.main()
+        except SystemExit as left:
+            return left.code
+    return 0
 
 
 @pytest.mark.slow
@@ -57,35 +88,83 @@ def test_wrong_model(tmp_path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.one_stack
-def test_scaling(tmp_path) -> None:
-    done = ran(tmp_path, "07_scaling.py", "--quick")
-    assert done.returncode == 0, done.stderr
-    with xr.open_dataset(tmp_path / "out" / "scaling" / "scaling.nc", engine="h5netcdf") as kept:
+def test_scaling(script) -> None:
+    assert main(script("07_scaling.py"), "--quick") == 0
+    out = Path("out") / "scaling_quick"
+    with xr.open_dataset(out / "scaling.nc", engine="h5netcdf") as kept:
         # a body of one object and four sectors, then two of two objects each
         assert kept["conditions"].values.tolist() == [16.0, 2 * 256.0]
         met, needed = (kept[name].values[0] for name in ("conditions_met", "observations_needed"))
         assert (met > 1).all() and (met <= kept["conditions"].values).all()
         assert needed[0] <= needed[1] < 50  # each box has to be pushed
-    assert (tmp_path / "out" / "scaling" / "scaling.png").stat().st_size > 10_000
+    assert (out / "scaling.png").stat().st_size > 10_000
+
+
+def pressed(*_: object) -> None:
+    """Ctrl-C."""
+    raise KeyboardInterrupt
+
+
+@pytest.mark.one_stack
+def test_an_interrupted_scaling_goes_on(script, monkeypatch, capsys) -> None:
+    module = script("07_scaling.py")
+    monkeypatch.setattr(module, "observations_needed", lambda scene, *_: 3.0 * len(scene.bodies))
+    with monkeypatch.context() as patch:
+        explore = module.explore
+        patch.setattr(module, "explore", lambda n, *rest: explore(n, *rest) if n < 2 else pressed())
+        assert main(module, "--quick") == 130
+    assert capsys.readouterr().err == (
+        "interrupted: finished rooms are kept; go on with --resume\n"
+    )
+    rooms = Path("out") / "scaling_quick" / "rooms"
+    assert [path.name for path in rooms.iterdir()] == ["1-1.nc"]
+    assert main(module, "--quick") == 2
+    assert "there are rooms; go on with --resume" in capsys.readouterr().err
+    assert main(module, "--quick", "--resume") == 0
+    assert capsys.readouterr().out.startswith("2 objects, seed 1")
+    with xr.open_dataset("out/scaling_quick/scaling.nc", engine="h5netcdf") as kept:
+        assert kept["observations_needed"].values.tolist() == [[3.0, 6.0]]
+    monkeypatch.setattr(module, "TOLERANCE", 0.1)
+    assert main(module, "--quick", "--resume") == 2
+    assert "other settings; give another folder" in capsys.readouterr().err
+
+
+@pytest.mark.one_stack
+def test_an_interrupted_apartment_goes_on(script, monkeypatch, capsys) -> None:
+    """Its quick size, with no search for a plan."""
+    module = script("05_apartment.py")
+    monkeypatch.setattr(module, "SEARCH", {"nodes": 1})
+    run = ("--quick", "--only", "true", "oolwr")
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "explored", lambda count, *_: pressed() if count else [])
+        assert main(module, *run) == 130
+    assert capsys.readouterr().err == (
+        "interrupted: finished trials are kept; go on with --resume\n"
+    )
+    trials = Path("out") / "apartment_quick" / "sigma_0"
+    assert [path.name for path in trials.iterdir()] == ["true-1.nc"]
+    assert main(module, *run) == 2
+    assert "go on with --resume" in capsys.readouterr().err
+    assert main(module, *run, "--resume") == 0
+    said = capsys.readouterr().out
+    assert "true model, seed" not in said and "OO-LWR, seed 1, 10 observations" in said
+    with xr.open_dataset("out/apartment_quick/figure_4c.nc", engine="h5netcdf") as kept:
+        assert kept["models"].sel(agent="oolwr", observations=10).item() >= 11
+    options = ("--only", "oolwr", "--resume", "--out", "out/apartment_quick", "--seeds", "1")
+    assert main(module, *options) == 2
+    assert "other settings; give another folder" in capsys.readouterr().err
 
 
 @pytest.mark.long
 def test_apartment(tmp_path) -> None:
-    first = ran(tmp_path, "05_apartment.py", "--quick", "--only", "true", "oolwr")
+    """In processes of their own."""
+    first = ran(tmp_path, "05_apartment.py", "--quick")
     assert first.returncode == 0, first.stderr
     assert "true model, seed 1, 0 observations: valid plan" in first.stdout
+    assert "categorical, seed 1, 3" in first.stdout
     assert "OO-LWR, seed 1, 10 observations: no plan" in first.stdout
     out = tmp_path / "out" / "apartment_quick"
     assert (out / "figure_4c.png").stat().st_size > 10_000
-    refused = ran(tmp_path, "05_apartment.py", "--quick", "--only", "true")
-    assert refused.returncode == 2 and "go on with --resume" in refused.stderr
-    again = ran(tmp_path, "05_apartment.py", "--quick", "--only", "true", "pbrl", "--resume")
-    assert again.returncode == 0, again.stderr
-    assert "true model, seed" not in again.stdout and "categorical, seed 1, 3" in again.stdout
-    other = ran(
-        tmp_path, "05_apartment.py", "--only", "oolwr", "--resume", "--out", "out/apartment_quick"
-    )
-    assert other.returncode == 2 and "other settings; give another folder" in other.stderr
 
 
 @pytest.mark.one_stack
