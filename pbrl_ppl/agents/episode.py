@@ -58,7 +58,7 @@ class Episode:
           the interval; NaN before it did.
 
         In ``attrs``: the scene as TOML, the agent's name, the seed, ``sigma`` of the world, the
-        limit of steps, and whether the goal was reached.
+        limit of steps, and whether the goal was reached; ``world``, its description, if it has one.
 
     Raises
     ------
@@ -101,7 +101,7 @@ class Episode:
         recorded : mapping
             The other variables by name.
         **attrs
-            ``agent``, ``seed``, ``sigma``, ``limit``, ``reached``.
+            ``agent``, ``seed``, ``sigma``, ``limit``, ``reached``, ``world``.
         """
         labels = list(dict.fromkeys(label for each in estimates for label in each))
         believed = [[each.get(label, np.nan) for label in labels] for each in estimates]

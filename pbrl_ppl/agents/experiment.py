@@ -10,7 +10,7 @@ import numpy as np
 
 from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.episode import Episode
-from pbrl_ppl.agents.online import AnyWorld, run_episode
+from pbrl_ppl.agents.online import AnyWorld, described, run_episode
 from pbrl_ppl.errors import EpisodeError
 
 #: Makes an agent of a seed.
@@ -56,12 +56,13 @@ def run_episodes(
     Raises
     ------
     EpisodeError
-        If a file there is of another scene, start, noise or limit of steps, or as
+        If a file there is of another scene, world, start, noise or limit of steps, or as
         :func:`run_episode`.
     OutputError
         If a file cannot be written.
     KeyboardInterrupt
-        If it is interrupted: the files of finished episodes stay, and the same call goes on.
+        If it is interrupted: the files of finished episodes stay, and the same call goes on. It
+        says so.
 
     Examples
     --------
@@ -103,8 +104,8 @@ def run_episodes(
                 for future in futures:
                     future.cancel()
     except KeyboardInterrupt:
-        tell(f"interrupted: {len(found)} of {len(paths)} episodes are in {folder}; run it again")
-        raise
+        said = f"{len(found)} of {len(paths)} episodes are in {folder}; run it again"
+        raise KeyboardInterrupt(said) from None
     return {name: [found[name, seed] for seed in seeds] for name in agents}
 
 
@@ -134,6 +135,11 @@ def _same(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
                 f"{path}: this is an episode with {name} {got}, expected {value}; give another"
                 " folder"
             )
+    if episode.dataset.attrs.get("world", "") != described(world):
+        raise EpisodeError(
+            f"{path}: this is an episode in another world: its engine, true parameters or effects"
+            " are not these; give another folder"
+        )
     if not np.array_equal(episode.dataset["states"][0], world.reset(seed)):
         raise EpisodeError(f"{path}: this episode starts elsewhere; give another folder")
     return episode

@@ -20,7 +20,10 @@ Array = NDArray[np.float64]
 
 
 class AnyWorld(Protocol):
-    """What the loop needs of a world; :class:`World` is one."""
+    """What the loop needs of a world; :class:`World` is one.
+
+    A string ``description`` is optional: files of worlds with another are not taken for this one's.
+    """
 
     sigma: float
 
@@ -119,8 +122,13 @@ def run_episode(
     }
     return Episode.of(
         task.scene, np.array(states), estimates, recorded, agent=agent.name, seed=seed,
-        sigma=world.sigma, limit=steps, reached=int(reached),
+        sigma=world.sigma, limit=steps, reached=int(reached), world=described(world),
     )  # fmt: skip
+
+
+def described(world: AnyWorld) -> str:
+    """What the episode's file says of the world; nothing of one that does not describe itself."""
+    return str(getattr(world, "description", ""))
 
 
 def checked(task: Task, given: Any, what: str) -> Array:
