@@ -12,6 +12,7 @@ from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.episode import Episode
 from pbrl_ppl.agents.online import AnyWorld, described, run_episode
 from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.posterior import save_posterior
 
 #: Makes an agent of a seed.
 MakeAgent = Callable[[int], Agent]
@@ -40,7 +41,8 @@ def run_episodes(
     seeds : iterable of int
         One episode each.
     folder : str or Path
-        Of the files, ``<name>-<seed>.nc``; made if it is not there.
+        Of the files, ``<name>-<seed>.nc``, and ``<name>-<seed>.posterior.nc`` of agents that have a
+        posterior: the last, for :func:`pbrl_ppl.load_posterior`. Made if it is not there.
     steps : int
         The most actions of an episode.
     executor : Executor, optional
@@ -119,8 +121,11 @@ def in_words(episode: Episode) -> str:
 
 
 def _played(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path: Path) -> Episode:
-    """Run one episode and save it, where it ran."""
-    episode = run_episode(make(seed), world, steps=steps, seed=seed)
+    """Run one episode and save it, where it ran; its own file last, for that says it is done."""
+    agent = make(seed)
+    episode = run_episode(agent, world, steps=steps, seed=seed)
+    if agent.posterior is not None:
+        save_posterior(agent.posterior, path.with_suffix(".posterior.nc"))
     episode.save(path)
     return episode
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -120,9 +121,14 @@ def run_episode(
         "planned": np.array(rows["planned"], dtype=bool),
         "seconds": np.array(rows["seconds"], dtype=float),
     }
+    added = [
+        {"effect": each.effect, "body": each.body, "transitions": each.transitions}
+        for each in agent.added
+    ]
     return Episode.of(
         task.scene, np.array(states), estimates, recorded, agent=agent.name, seed=seed,
         sigma=world.sigma, limit=steps, reached=int(reached), world=described(world),
+        added=json.dumps(added),
     )  # fmt: skip
 
 

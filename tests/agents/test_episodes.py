@@ -1,14 +1,27 @@
 """Episodes and their files: saved, loaded, resumed, refused."""
 
+import warnings
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 
 import numpy as np
 import pytest
 
-from pbrl_ppl.agents import Agent, Episode, TrueModelAgent, World, run_episode, run_episodes
+from pbrl_ppl.agents import (
+    Agent,
+    Episode,
+    Revision,
+    TrueModelAgent,
+    World,
+    run_episode,
+    run_episodes,
+)
 from pbrl_ppl.effects import catalogue
-from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.errors import EpisodeError, UninformedWarning
+from pbrl_ppl.history import from_segments
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.posterior import group, load_posterior
+from pbrl_ppl.sampling import fit
 from tests.helpers.tasks import PUCK, PUCK_TRUTH, puck_world
 
 
@@ -123,3 +136,30 @@ def test_an_interrupted_search_ends_the_episode(monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.planning.astar._Search.expand", pressed)
     with pytest.raises(KeyboardInterrupt):
         run_episode(known(1), puck_world())
+
+
+class Believing(TrueModelAgent):
+    """Fits once, after its first action, and finds an effect missing."""
+
+    def update(self) -> None:
+        if self.posterior is None:
+            drag = {effect.name: effect for effect in catalogue}["linear_drag"]
+            state = PUCK.start[None]
+            history = from_segments(PUCK.scene, state, 0 * state[:, None, :, :3], state[:, None])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UninformedWarning)
+                model = physics_model(PUCK.scene, history, sigma="scalar")
+                self.posterior = fit(model, seed=1, method="map", progress=False)
+            self.added = (Revision(drag.on("puck"), 1, 0.001, 10.0, 3.0, ()),)
+
+
+def test_what_an_agent_believed_is_kept(tmp_path) -> None:
+    agents = {"pbrl": lambda seed: Believing(PUCK, PUCK_TRUTH, seed=seed), "true": known}
+    done = run_episodes(agents, puck_world(), [1], tmp_path, steps=1)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"pbrl-1.nc", "pbrl-1.posterior.nc", "true-1.nc"}
+    found = group(load_posterior(tmp_path / "pbrl-1.posterior.nc"), "posterior")
+    assert found["mass"].sizes == {"chain": 1, "draw": 1, "body": 1}
+    loaded = Episode.load(tmp_path / "pbrl-1.nc")
+    assert loaded.added == [{"effect": "linear_drag", "body": "puck", "transitions": 1}]
+    assert done["true"][0].added == []
