@@ -13,9 +13,13 @@ import matplotlib.pyplot as plt
 import pytest
 import xarray as xr
 
+import pbrl_ppl as pp
+from pbrl_ppl.agents import Revision
 from tests.helpers.places import ROOT
 
 ANALYSIS = ROOT / "analysis"
+#: What the scripts of episodes say on Ctrl-C, and nothing else.
+INTERRUPTED = "interrupted: finished episodes are kept; go on with --resume\n"
 
 
 def ran(folder: Path, script: str, *options: str) -> subprocess.CompletedProcess[str]:
@@ -53,6 +57,11 @@ def main(module: ModuleType, *options: str) -> int:
     return 0
 
 
+def pressed(*_: object) -> None:
+    """Ctrl-C."""
+    raise KeyboardInterrupt
+
+
 @pytest.mark.slow
 def test_shopping_cart(tmp_path) -> None:
     first = ran(tmp_path, "04_shopping_cart.py", "--quick")
@@ -77,13 +86,64 @@ def test_shopping_cart(tmp_path) -> None:
 
 @pytest.mark.long
 def test_wrong_model(tmp_path) -> None:
-    done = ran(tmp_path, "06_wrong_model.py", "--quick", "--json", "result.json")
+    """In processes of their own."""
+    done = ran(tmp_path, "06_wrong_model.py", "--quick")
     assert done.returncode == 0, done.stderr
-    assert "6/6 PBRL" in done.stdout and "online_loop_return_ratio" in done.stdout
-    result = json.loads((tmp_path / "result.json").read_text())
-    assert 0.5 < result["online_loop_return_ratio"] < 2.0 and result["step_seconds"] > 0
-    (picture,) = (tmp_path / "out" / "wrong_model_quick").rglob("wrong_model.png")
-    assert picture.stat().st_size > 10_000
+    assert "6/6 PBRL" in done.stdout and "not closing it" in done.stdout
+    read = ran(tmp_path, "benchmarks/agents.py", "--json", "--results", "out/wrong_model_quick")
+    result = json.loads(read.stdout)
+    assert 0.5 < result["online_loop_return_ratio"] < 2.0
+    assert result["online_loop_step_seconds"] > 0
+
+
+@pytest.fixture
+def wrong_model(script, monkeypatch) -> ModuleType:
+    """The script, with agents that learn next to nothing, fast."""
+    module = script("06_wrong_model.py")
+
+    def agent(kind: str, effect: str, seed: int) -> pp.Agent:
+        made = pp.LWRAgent(module.TASK, seed=seed, nodes=20)
+        if kind == "revising":
+            made.added = (Revision(module.EFFECTS[effect].on("cart"), 4, 0.01, 9.0, 2.0, ()),)
+        return made
+
+    monkeypatch.setattr(module, "agent", agent)
+    return module
+
+
+@pytest.mark.one_stack
+def test_an_interrupted_wrong_model_goes_on(wrong_model, script, monkeypatch, capsys) -> None:
+    with monkeypatch.context() as patch:
+        agent = wrong_model.agent
+        patch.setattr(wrong_model, "agent", lambda *of: agent(*of) if of[2] == 1 else pressed())
+        assert main(wrong_model, "--quick") == 130
+    assert capsys.readouterr().err == INTERRUPTED
+    assert main(wrong_model, "--quick") == 2
+    assert "there are episodes; go on with --resume" in capsys.readouterr().err
+    assert main(wrong_model, "--quick", "--resume") == 0
+    said, out = capsys.readouterr().out, Path("out") / "wrong_model_quick"
+    assert "1 of 6 episodes are in" in said
+    assert "added: constant_force after 4; constant_force after 4" in said
+    assert (out / "wrong_model.png").stat().st_size > 10_000
+    with xr.open_dataset(out / "wrong_model.nc", engine="h5netcdf") as kept:
+        assert kept["reward"].sizes == {"world": 2, "agent": 3, "seed": 2, "time": 5}
+    keys = script("benchmarks/agents.py").numbers([out])
+    # the same agent three times
+    assert keys["online_loop_return_ratio"] == keys["online_loop_return_ratio_without"] == 1.0
+    assert keys["online_loop_return_ratio_low"] == keys["online_loop_return_ratio_high"] == 1.0
+    assert keys["online_loop_return_ratio_constant_force"] == 1.0
+    monkeypatch.setitem(wrong_model.WORLDS["constant_force"], "constant_force_force_y", 5.0)
+    assert main(wrong_model, "--quick", "--resume") == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert "this is an episode in another world" in said
+
+
+@pytest.mark.one_stack
+def test_an_interrupted_shopping_cart_says_so_once(script, monkeypatch, capsys) -> None:
+    module = script("04_shopping_cart.py")
+    monkeypatch.setattr(module, "AGENTS", {"true": pressed})
+    assert main(module, "--quick") == 130
+    assert capsys.readouterr() == ("", INTERRUPTED)
 
 
 @pytest.mark.slow
@@ -98,11 +158,6 @@ def test_scaling(script) -> None:
         assert (met > 1).all() and (met <= kept["conditions"].values).all()
         assert needed[0] <= needed[1] < 50  # each box has to be pushed
     assert (out / "scaling.png").stat().st_size > 10_000
-
-
-def pressed(*_: object) -> None:
-    """Ctrl-C."""
-    raise KeyboardInterrupt
 
 
 @pytest.mark.one_stack
