@@ -30,7 +30,6 @@ import xarray as xr
 from scipy import stats
 
 import pbrl_ppl as pp
-from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.history import write_atomically
 
@@ -125,7 +124,7 @@ def run() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, default=60)
-    parser.add_argument("--workers", type=int, default=processors(), help="episodes at a time")
+    parser.add_argument("--workers", type=int, help="processes; all processors by default")
     parser.add_argument("--sigma", type=float, default=0.0, help="noise (m, rad, m/s, rad/s)")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--resume", action="store_true", help="go on with what is in the folder")
@@ -134,8 +133,8 @@ def run() -> None:
     episodes, steps = (2, 4) if options.quick else (options.episodes, options.steps)
     if episodes < 2:
         parser.error("--episodes: an interval needs at least 2")
-    if steps < 1 or options.workers < 1:
-        parser.error("--steps and --workers: expected 1 or more")
+    if steps < 1:
+        parser.error("--steps: expected 1 or more")
     if not 0 <= options.sigma < np.inf:
         parser.error("--sigma: expected a finite number from 0 up")
     kind = (f"_sigma_{options.sigma:g}" if options.sigma else "") + "_quick" * options.quick
@@ -148,15 +147,10 @@ def run() -> None:
     found = []
     for name, axis in zip(WORLDS, axes, strict=True):
         agents = {kind: partial(agent, kind, name) for kind in AGENTS}
-        play = partial(
-            pp.run_episodes, agents, world(name, options.sigma), range(1, episodes + 1), out / name,
-            steps=steps, progress=partial(print, flush=True),
+        done = pp.run_episodes(
+            agents, world(name, options.sigma), range(1, episodes + 1), out / name,
+            steps=steps, workers=options.workers, progress=partial(print, flush=True),
         )  # fmt: skip
-        if options.workers > 1:
-            with processes(options.workers) as executor:
-                done = play(executor=executor)
-        else:
-            done = play()
         found.append(kept(done, steps))
         print(f"\n{name} undeclared, {episodes} episodes of at most {steps} steps")
         rows = [summary(kind, each, steps) for kind, each in done.items()]

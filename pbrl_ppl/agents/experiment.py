@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, as_completed
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +13,7 @@ import numpy as np
 from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.episode import Episode
 from pbrl_ppl.agents.online import AnyWorld, described, run_episode
+from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.posterior import save_posterior
 
@@ -25,6 +28,7 @@ def run_episodes(
     folder: str | Path,
     *,
     steps: int = 100,
+    workers: int | None = None,
     executor: Executor | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, list[Episode]]:
@@ -33,9 +37,9 @@ def run_episodes(
     Parameters
     ----------
     agents : mapping
-        What makes an agent of a seed, by the name of its files: ``{"pbrl": make_pbrl}``. An
-        executor of processes needs functions that can be pickled, such as ``functools.partial`` of
-        one in a module.
+        What makes an agent of a seed, by the name of its files: ``{"pbrl": make_pbrl}``. Other
+        processes need functions that can be pickled, such as ``functools.partial`` of one in a
+        module.
     world : World
         Each episode resets it, or a copy of it.
     seeds : iterable of int
@@ -45,8 +49,12 @@ def run_episodes(
         posterior: the last, for :func:`pbrl_ppl.load_posterior`. Made if it is not there.
     steps : int
         The most actions of an episode.
+    workers : int, optional
+        Processes that are started for the episodes, as many as there are processors by default. A
+        script must then call this under ``if __name__ == "__main__":``, for each process imports
+        it. With 1, or one episode to run, they run here, one after the other.
     executor : Executor, optional
-        Where the episodes run: processes, threads, Dask. Without it, here, one after the other.
+        Where the episodes run instead: threads, Dask.
     progress : callable, optional
         Told of each episode that is finished.
 
@@ -58,8 +66,8 @@ def run_episodes(
     Raises
     ------
     EpisodeError
-        If a file there is of another scene, world, start, noise or limit of steps, or as
-        :func:`run_episode`.
+        If a file there is of another scene, world, start, noise or limit of steps, what makes an
+        agent cannot be sent to another process, one ended too early, or as :func:`run_episode`.
     OutputError
         If a file cannot be written.
     KeyboardInterrupt
@@ -70,10 +78,18 @@ def run_episodes(
     --------
     ::
 
-        agents = {"pbrl": lambda seed: pp.PBRLAgent(task, seed=seed)}
-        with ThreadPoolExecutor(2) as executor:
-            done = pp.run_episodes(agents, world, range(10), "out/cart", executor=executor)
+        def learner(seed):
+            return pp.PBRLAgent(task, seed=seed)
+
+        if __name__ == "__main__":
+            done = pp.run_episodes({"pbrl": learner}, world, range(10), "out/cart")
+            # with dask.distributed, whose workers write into the same folder
+            with Client("tcp://host:8786") as client:
+                executor = client.get_executor(pure=False)
+                pp.run_episodes({"pbrl": learner}, world, range(20), "out/cart", executor=executor)
     """
+    if workers is not None and workers < 1:
+        raise EpisodeError(f"episodes: workers is {workers}, expected at least 1")
     folder, seeds = Path(folder), list(seeds)
     folder.mkdir(parents=True, exist_ok=True)
     tell = progress or (lambda _: None)
@@ -90,21 +106,25 @@ def run_episodes(
         tell(f"{len(found)}/{len(paths)} {in_words(episode)}")
 
     left = [key for key in paths if key not in found]
+    at_once = min(processors() if workers is None else workers, len(left))
     try:
-        if executor is None:
+        if executor is None and at_once < 2:
             for key in left:
                 finished(key, _played(agents[key[0]], world, key[1], steps, paths[key]))
         else:
-            futures = {
-                executor.submit(_played, agents[key[0]], world, key[1], steps, paths[key]): key
-                for key in left
-            }
-            try:
-                for future in as_completed(futures):
-                    finished(futures[future], future.result())
-            finally:
-                for future in futures:
-                    future.cancel()
+            if executor is None:
+                _check_pickled(agents, world)
+            with processes(at_once) if executor is None else nullcontext(executor) as pool:
+                futures = {
+                    pool.submit(_played, agents[key[0]], world, key[1], steps, paths[key]): key
+                    for key in left
+                }
+                try:
+                    for future in as_completed(futures):
+                        finished(futures[future], future.result())
+                finally:
+                    for future in futures:
+                        future.cancel()
     except KeyboardInterrupt:
         said = f"{len(found)} of {len(paths)} episodes are in {folder}; run it again"
         raise KeyboardInterrupt(said) from None
@@ -118,6 +138,19 @@ def in_words(episode: Episode) -> str:
         f"{episode.agent}, seed {episode.seed}: {how} in {episode.steps} steps,"
         f" {episode.bumps} with bumps"
     )
+
+
+def _check_pickled(agents: Mapping[str, MakeAgent], world: AnyWorld) -> None:
+    """Refuse what cannot be sent to another process."""
+    given = {f"what makes agent {name!r}": make for name, make in agents.items()}
+    for what, each in {**given, "the world": world}.items():
+        try:
+            pickle.dumps(each)
+        except Exception as error:  # classes raise what they like
+            raise EpisodeError(
+                f"episodes: {what} cannot be sent to another process ({error}); use functions and"
+                " classes of a module, or give workers=1"
+            ) from None
 
 
 def _played(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path: Path) -> Episode:

@@ -64,7 +64,8 @@ def pressed(*_: object) -> None:
 
 @pytest.mark.slow
 def test_shopping_cart(tmp_path) -> None:
-    first = ran(tmp_path, "04_shopping_cart.py", "--quick")
+    quick = ("04_shopping_cart.py", "--quick", "--workers", "1")
+    first = ran(tmp_path, *quick)
     assert first.returncode == 0, first.stderr
     assert "8/8 LWR, seed 2" in first.stdout
     assert "true model" in first.stdout and "return (m)" in first.stdout
@@ -73,13 +74,13 @@ def test_shopping_cart(tmp_path) -> None:
     with xr.open_dataset(out / "figure_4b.nc", engine="h5netcdf") as kept:
         assert kept.attrs["sigma"] == 0.25 and kept.sizes["seed"] == 2
         assert kept["reward"].notnull().all()
-    refused = ran(tmp_path, "04_shopping_cart.py", "--quick")
+    refused = ran(tmp_path, *quick)
     assert refused.returncode == 2 and "go on with --resume" in refused.stderr
     (out / "sigma_0" / "lwr-2.nc").unlink()
-    again = ran(tmp_path, "04_shopping_cart.py", "--quick", "--resume")
+    again = ran(tmp_path, *quick, "--resume")
     assert again.returncode == 0 and "7 of 8 episodes are in" in again.stdout
     (out / "sigma_0" / "lwr-2.nc").write_text("nothing")
-    broken = ran(tmp_path, "04_shopping_cart.py", "--quick", "--resume")
+    broken = ran(tmp_path, *quick, "--resume")
     assert broken.returncode == 2 and "Traceback" not in broken.stderr
     assert "lwr-2.nc: this is not a NetCDF file" in broken.stderr
 
