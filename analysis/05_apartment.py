@@ -4,6 +4,7 @@
     python analysis/05_apartment.py --resume        # go on where a run was interrupted
     python analysis/05_apartment.py --quick         # one seed and few observations, for CI
     python analysis/05_apartment.py --only oolwr --seeds 2 --workers 1
+    python analysis/05_apartment.py --box2d         # the world in another engine than the agents'
 
 Each trial of an agent is a process and a file of its own.
 Observations are of random actions of the task, any of whose bodies is as likely, in episodes of 25
@@ -93,7 +94,7 @@ def agent(name: str, seed: int) -> pp.Agent:
     return kinds[name](TASK, seed=seed)
 
 
-def explored(count: int, seed: int, sigma: float) -> list[tuple[np.ndarray, ...]]:
+def explored(count: int, seed: int, sigma: float, box2d: bool) -> list[tuple[np.ndarray, ...]]:
     """Observed transitions."""
     found: list[tuple[np.ndarray, ...]] = []
     part = 0
@@ -101,7 +102,7 @@ def explored(count: int, seed: int, sigma: float) -> list[tuple[np.ndarray, ...]
         # seeds that no other run has
         own = 1000 * seed + part
         data = pp.run_episode(
-            Explorer(TASK, seed=own), world(sigma), steps=LENGTH, seed=own
+            Explorer(TASK, seed=own), world(sigma, box2d=box2d), steps=LENGTH, seed=own
         ).dataset
         found += zip(
             data["states"].to_numpy()[:-1], data["action"].to_numpy(),
@@ -111,10 +112,12 @@ def explored(count: int, seed: int, sigma: float) -> list[tuple[np.ndarray, ...]
     return found[:count]
 
 
-def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float, path: Path) -> xr.Dataset:
+def trial(
+    name: str, seed: int, counts: tuple[int, ...], sigma: float, box2d: bool, path: Path
+) -> xr.Dataset:
     """Plans of one agent after so many observations, and where they lead; kept in a file."""
     learner, seen = agent(name, seed), 0
-    every = explored(max(counts), seed, sigma)
+    every = explored(max(counts), seed, sigma, box2d)
     rows = {key: [] for key in ("foreseen", "valid", "reward", "models", "update", "search")}
     for count in counts:
         for transition in every[seen:count]:
@@ -124,7 +127,9 @@ def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float, path: Pat
         learned = time.monotonic()
         plan = pp.plan(learner.model, TASK.start, AIM, TASK.actions, **SEARCH)
         searched = time.monotonic()
-        valid, reward = played(plan.wrenches) if plan.reached else (False, TASK.reward(TASK.start))
+        valid, reward = False, TASK.reward(TASK.start)
+        if plan.reached:
+            valid, reward = played(plan.wrenches, box2d)
         # of OO-LWR: effect models so far, one a body and condition
         bodies = [body.name for body in TASK.scene.dynamic]
         models = (
@@ -140,15 +145,16 @@ def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float, path: Pat
             flush=True,
         )
     variables = {key: ("observations", np.array(values)) for key, values in rows.items()}
-    attrs = {"agent": name, "seed": seed, "sigma": sigma, "scene": TASK.scene.to_toml()}
+    attrs = {"agent": name, "seed": seed, "sigma": sigma, "box2d": int(box2d)}
+    attrs["scene"] = TASK.scene.to_toml()
     found = xr.Dataset(variables, {"observations": list(counts)}, attrs)
     write_atomically(path, lambda to: found.to_netcdf(to, engine="h5netcdf"))
     return found
 
 
-def played(wrenches: np.ndarray) -> tuple[bool, float]:
+def played(wrenches: np.ndarray, box2d: bool) -> tuple[bool, float]:
     """Whether a plan reaches the goal in the true world, and the last reward."""
-    true = world()
+    true = world(box2d=box2d)
     state = true.reset(0)
     for wanted in wrenches:
         # a body's heading is not quite what the plan foretold, and with it the wrench
@@ -160,7 +166,7 @@ def played(wrenches: np.ndarray) -> tuple[bool, float]:
     return False, TASK.reward(state)
 
 
-def stored(path: Path, counts: tuple[int, ...], sigma: float) -> xr.Dataset:
+def stored(path: Path, counts: tuple[int, ...], options: argparse.Namespace) -> xr.Dataset:
     """A trial of an earlier run.
 
     Raises
@@ -175,7 +181,9 @@ def stored(path: Path, counts: tuple[int, ...], sigma: float) -> xr.Dataset:
         raise EpisodeError(f"{path}: this is not a NetCDF file: {error}") from None
     if found.attrs.get("scene") != TASK.scene.to_toml():
         raise EpisodeError(f"{path}: this is a trial in another scene; give another folder")
-    if tuple(found["observations"].to_numpy()) != counts or found.attrs["sigma"] != sigma:
+    wanted = (counts, options.sigma, options.box2d)
+    own = (found["observations"].to_numpy(), found.attrs["sigma"], found.attrs.get("box2d", 0))
+    if (tuple(own[0]), *own[1:]) != wanted:
         raise EpisodeError(f"{path}: this is a trial with other settings; give another folder")
     return found
 
@@ -193,9 +201,9 @@ def run(options: argparse.Namespace, counts: dict[str, tuple[int, ...]]) -> xr.D
         for name in options.only:
             path = folder / f"{name}-{seed}.nc"
             if path.is_file():
-                every.append(stored(path, counts[name], options.sigma))
+                every.append(stored(path, counts[name], options))
             else:
-                left.append((name, seed, counts[name], options.sigma, path))
+                left.append((name, seed, counts[name], options.sigma, options.box2d, path))
     workers = min(options.workers, len(left))
     if workers < 2:
         every += [trial(*each) for each in left]
@@ -219,6 +227,7 @@ def joined(every: list[xr.Dataset], options: argparse.Namespace) -> xr.Dataset:
     # a dataset may come back without a name
     whole = whole if isinstance(whole, xr.Dataset) else whole.to_dataset()
     command = f"python analysis/05_apartment.py --sigma {options.sigma:g}"
+    command += " --box2d" * options.box2d
     return whole.assign_attrs(
         command=f"{command} --seeds {options.seeds} --only {' '.join(options.only)}",
         sigma=options.sigma, nodes=SEARCH["nodes"], start=TASK.reward(TASK.start),
@@ -260,9 +269,12 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=processors(), help="trials at a time")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--resume", action="store_true", help="go on with what is in the folder")
+    parser.add_argument("--box2d", action="store_true", help="the world in Box2D")
     parser.add_argument("--quick", action="store_true", help="one seed, few observations, for CI")
     options = parser.parse_args()
     counts = COUNTS
+    if options.box2d:
+        options.out = options.out.with_name(options.out.name + "_box2d")
     if options.quick:
         # the continuous prior of eleven bodies takes a minute
         counts = {"true": (0,), "pbrl": (3,), "oolwr": (3, 10)}

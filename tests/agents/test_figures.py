@@ -185,11 +185,30 @@ def test_an_interrupted_scaling_goes_on(script, monkeypatch, capsys) -> None:
     assert "other settings; give another folder" in capsys.readouterr().err
 
 
+def fast(apartment: ModuleType, monkeypatch) -> ModuleType:
+    """The script with short episodes and no search for a plan."""
+    monkeypatch.setattr(apartment, "SEARCH", {"nodes": 1})
+    monkeypatch.setattr(apartment, "LENGTH", 2)
+    return apartment
+
+
+@pytest.mark.one_stack
+def test_the_apartment_in_another_engine(script, monkeypatch) -> None:
+    module = fast(script("05_apartment.py"), monkeypatch)
+    assert main(module, "--quick", "--only", "oolwr", "--box2d") == 0
+    out = Path("out") / "apartment_box2d_quick"
+    with xr.open_dataset(out / "figure_4c.nc", engine="h5netcdf") as kept:
+        assert "--box2d" in kept.attrs["command"]
+    (ours,), (its,) = (module.explored(1, 1, 0.0, box2d) for box2d in (False, True))
+    assert (ours[1] == its[1]).all() and not (ours[2] == its[2]).all()
+    out.rename(out.with_name("apartment_quick"))
+    assert main(module, "--quick", "--only", "oolwr", "--resume") == 2
+
+
 @pytest.mark.one_stack
 def test_an_interrupted_apartment_goes_on(script, monkeypatch, capsys) -> None:
     """Its quick size, with no search for a plan."""
-    module = script("05_apartment.py")
-    monkeypatch.setattr(module, "SEARCH", {"nodes": 1})
+    module = fast(script("05_apartment.py"), monkeypatch)
     run = ("--quick", "--only", "true", "oolwr")
     with monkeypatch.context() as patch:
         patch.setattr(module, "explored", lambda count, *_: pressed() if count else [])
