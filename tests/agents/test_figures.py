@@ -63,26 +63,25 @@ def pressed(*_: object) -> None:
 
 
 @pytest.mark.slow
-def test_shopping_cart(tmp_path) -> None:
-    quick = ("04_shopping_cart.py", "--quick", "--workers", "1")
-    first = ran(tmp_path, *quick)
-    assert first.returncode == 0, first.stderr
-    assert "8/8 LWR, seed 2" in first.stdout
-    assert "true model" in first.stdout and "return (m)" in first.stdout
-    out = tmp_path / "out" / "shopping_cart_quick"
+def test_shopping_cart(script, capsys) -> None:
+    module = script("04_shopping_cart.py")
+    assert main(module, "--quick") == 0
+    said = capsys.readouterr().out
+    assert "8/8 LWR, seed 2" in said and "true model" in said and "return (m)" in said
+    out = Path("out") / "shopping_cart_quick"
     assert (out / "figure_4ab.png").stat().st_size > 10_000
     with xr.open_dataset(out / "figure_4b.nc", engine="h5netcdf") as kept:
         assert kept.attrs["sigma"] == 0.25 and kept.sizes["seed"] == 2
         assert kept["reward"].notnull().all()
-    refused = ran(tmp_path, *quick)
-    assert refused.returncode == 2 and "go on with --resume" in refused.stderr
+    assert main(module, "--quick") == 2
+    assert "go on with --resume" in capsys.readouterr().err
     (out / "sigma_0" / "lwr-2.nc").unlink()
-    again = ran(tmp_path, *quick, "--resume")
-    assert again.returncode == 0 and "7 of 8 episodes are in" in again.stdout
+    assert main(module, "--quick", "--resume") == 0
+    assert "7 of 8 episodes are in" in capsys.readouterr().out
     (out / "sigma_0" / "lwr-2.nc").write_text("nothing")
-    broken = ran(tmp_path, *quick, "--resume")
-    assert broken.returncode == 2 and "Traceback" not in broken.stderr
-    assert "lwr-2.nc: this is not a NetCDF file" in broken.stderr
+    assert main(module, "--quick", "--resume") == 2
+    (broken,) = capsys.readouterr().err.splitlines()
+    assert "lwr-2.nc: this is not a NetCDF file" in broken
 
 
 @pytest.mark.long
@@ -99,8 +98,11 @@ def test_wrong_model(tmp_path) -> None:
 
 @pytest.fixture
 def wrong_model(script, monkeypatch) -> ModuleType:
-    """The script, with agents that learn next to nothing, fast."""
+    """The script, with agents that learn next to nothing, fast; its own are made and left."""
     module = script("06_wrong_model.py")
+    for effect in module.WORLDS:
+        made = {kind: module.agent(kind, effect, 1) for kind in module.AGENTS}
+        assert [kind for kind, each in made.items() if each.revise] == ["revising"]
 
     def agent(kind: str, effect: str, seed: int) -> pp.Agent:
         made = pp.LWRAgent(module.TASK, seed=seed, nodes=20)
@@ -186,8 +188,8 @@ def test_an_interrupted_scaling_goes_on(script, monkeypatch, capsys) -> None:
 
 
 def fast(apartment: ModuleType, monkeypatch) -> ModuleType:
-    """The script with short episodes and no search for a plan."""
-    monkeypatch.setattr(apartment, "SEARCH", {"nodes": 1})
+    """The script with short episodes and searches."""
+    monkeypatch.setattr(apartment, "SEARCH", {**apartment.SEARCH, "nodes": 500})
     monkeypatch.setattr(apartment, "LENGTH", 2)
     return apartment
 
@@ -207,7 +209,6 @@ def test_the_apartment_in_another_engine(script, monkeypatch) -> None:
 
 @pytest.mark.one_stack
 def test_an_interrupted_apartment_goes_on(script, monkeypatch, capsys) -> None:
-    """Its quick size, with no search for a plan."""
     module = fast(script("05_apartment.py"), monkeypatch)
     run = ("--quick", "--only", "true", "oolwr")
     with monkeypatch.context() as patch:
