@@ -146,9 +146,6 @@ def measured(objects: int, seed: int, observed: int, path: Path) -> xr.Dataset:
     """What a room shows, kept in a file."""
     scene, masses, seen = explore(objects, observed, seed)
     met, needed = conditions_met(scene, seen), observations_needed(scene, masses, seen)
-    print(
-        f"{objects} objects, seed {seed}: {met} conditions, {needed:.0f} observations", flush=True
-    )
     found = xr.Dataset(
         {
             "conditions_met": (("seed", "objects"), [[float(met)]]),
@@ -158,6 +155,9 @@ def measured(objects: int, seed: int, observed: int, path: Path) -> xr.Dataset:
         {"observations": observed, "tolerance": TOLERANCE},
     )
     write_atomically(path, lambda to: found.to_netcdf(to, engine="h5netcdf"))
+    print(
+        f"{objects} objects, seed {seed}: {met} conditions, {needed:.0f} observations", flush=True
+    )
     return found
 
 
