@@ -2,7 +2,7 @@
 
     python analysis/04_shopping_cart.py            # ten episodes of each, in out/shopping_cart
     python analysis/04_shopping_cart.py --quick    # two short ones, for CI
-    python analysis/04_shopping_cart.py --workers 2
+    python analysis/04_shopping_cart.py --workers 1   # not in processes of their own
     python analysis/04_shopping_cart.py --resume   # go on where a run was interrupted
     python analysis/04_shopping_cart.py --box2d    # the world in another engine than the agents'
 
@@ -17,7 +17,6 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -112,7 +111,7 @@ def run() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, default=80)
-    parser.add_argument("--workers", type=int, default=1, help="processes")
+    parser.add_argument("--workers", type=int, help="processes; all processors by default")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--resume", action="store_true", help="go on with what is in the folder")
     parser.add_argument("--box2d", action="store_true", help="the world in Box2D")
@@ -127,15 +126,11 @@ def run() -> None:
         parser.error(f"{out}: there are episodes; go on with --resume, or give another --out")
     figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), sharey=True, layout="constrained")
     for (panel, sigma), axis in zip(SIGMAS.items(), axes, strict=True):
-        run = partial(
-            pp.run_episodes, AGENTS, world(sigma, box2d=options.box2d), range(1, episodes + 1),
-            out / f"sigma_{sigma:g}", steps=steps, progress=partial(print, flush=True),
+        done = pp.run_episodes(
+            AGENTS, world(sigma, box2d=options.box2d), range(1, episodes + 1),
+            out / f"sigma_{sigma:g}", steps=steps, workers=options.workers,
+            progress=partial(print, flush=True),
         )  # fmt: skip
-        if options.workers > 1:
-            with ProcessPoolExecutor(options.workers) as executor:
-                done = run(executor=executor)
-        else:
-            done = run()
         engine = " --box2d" if options.box2d else ""
         command = f"python analysis/04_shopping_cart.py --episodes {episodes} --steps {steps}"
         small = kept(done, steps, sigma=sigma, command=command + engine)

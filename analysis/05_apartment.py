@@ -3,8 +3,10 @@
     python analysis/05_apartment.py                 # ten seeds of each agent, in out/apartment
     python analysis/05_apartment.py --resume        # go on where a run was interrupted
     python analysis/05_apartment.py --quick         # one seed and few observations, for CI
-    python analysis/05_apartment.py --only oolwr --seeds 2
+    python analysis/05_apartment.py --only oolwr --seeds 2 --workers 1
+    python analysis/05_apartment.py --box2d         # the world in another engine than the agents'
 
+Each trial of an agent is a process and a file of its own.
 Observations are of random actions of the task, any of whose bodies is as likely, in episodes of 25
 from the start. After so many of them an agent learns, and plans once from the start, with two
 thirds of the goal's tolerances; its plan is played in the true world without looking. It is valid
@@ -17,6 +19,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
@@ -28,6 +31,7 @@ import xarray as xr
 from scipy import stats
 
 import pbrl_ppl as pp
+from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.history import write_atomically
 
@@ -90,7 +94,7 @@ def agent(name: str, seed: int) -> pp.Agent:
     return kinds[name](TASK, seed=seed)
 
 
-def explored(count: int, seed: int, sigma: float) -> list[tuple[np.ndarray, ...]]:
+def explored(count: int, seed: int, sigma: float, box2d: bool) -> list[tuple[np.ndarray, ...]]:
     """Observed transitions."""
     found: list[tuple[np.ndarray, ...]] = []
     part = 0
@@ -98,7 +102,7 @@ def explored(count: int, seed: int, sigma: float) -> list[tuple[np.ndarray, ...]
         # seeds that no other run has
         own = 1000 * seed + part
         data = pp.run_episode(
-            Explorer(TASK, seed=own), world(sigma), steps=LENGTH, seed=own
+            Explorer(TASK, seed=own), world(sigma, box2d=box2d), steps=LENGTH, seed=own
         ).dataset
         found += zip(
             data["states"].to_numpy()[:-1], data["action"].to_numpy(),
@@ -108,10 +112,12 @@ def explored(count: int, seed: int, sigma: float) -> list[tuple[np.ndarray, ...]
     return found[:count]
 
 
-def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float) -> xr.Dataset:
-    """Plans of one agent after so many observations, and where they lead."""
+def trial(
+    name: str, seed: int, counts: tuple[int, ...], sigma: float, box2d: bool, path: Path
+) -> xr.Dataset:
+    """Plans of one agent after so many observations, and where they lead; kept in a file."""
     learner, seen = agent(name, seed), 0
-    every = explored(max(counts), seed, sigma)
+    every = explored(max(counts), seed, sigma, box2d)
     rows = {key: [] for key in ("foreseen", "valid", "reward", "models", "update", "search")}
     for count in counts:
         for transition in every[seen:count]:
@@ -121,7 +127,9 @@ def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float) -> xr.Dat
         learned = time.monotonic()
         plan = pp.plan(learner.model, TASK.start, AIM, TASK.actions, **SEARCH)
         searched = time.monotonic()
-        valid, reward = played(plan.wrenches) if plan.reached else (False, TASK.reward(TASK.start))
+        valid, reward = False, TASK.reward(TASK.start)
+        if plan.reached:
+            valid, reward = played(plan.wrenches, box2d)
         # of OO-LWR: effect models so far, one a body and condition
         bodies = [body.name for body in TASK.scene.dynamic]
         models = (
@@ -137,13 +145,16 @@ def trial(name: str, seed: int, counts: tuple[int, ...], sigma: float) -> xr.Dat
             flush=True,
         )
     variables = {key: ("observations", np.array(values)) for key, values in rows.items()}
-    attrs = {"agent": name, "seed": seed, "sigma": sigma, "scene": TASK.scene.to_toml()}
-    return xr.Dataset(variables, {"observations": list(counts)}, attrs)
+    attrs = {"agent": name, "seed": seed, "sigma": sigma, "box2d": int(box2d)}
+    attrs["scene"] = TASK.scene.to_toml()
+    found = xr.Dataset(variables, {"observations": list(counts)}, attrs)
+    write_atomically(path, lambda to: found.to_netcdf(to, engine="h5netcdf"))
+    return found
 
 
-def played(wrenches: np.ndarray) -> tuple[bool, float]:
+def played(wrenches: np.ndarray, box2d: bool) -> tuple[bool, float]:
     """Whether a plan reaches the goal in the true world, and the last reward."""
-    true = world()
+    true = world(box2d=box2d)
     state = true.reset(0)
     for wanted in wrenches:
         # a body's heading is not quite what the plan foretold, and with it the wrench
@@ -155,7 +166,7 @@ def played(wrenches: np.ndarray) -> tuple[bool, float]:
     return False, TASK.reward(state)
 
 
-def stored(path: Path, counts: tuple[int, ...], sigma: float) -> xr.Dataset:
+def stored(path: Path, counts: tuple[int, ...], options: argparse.Namespace) -> xr.Dataset:
     """A trial of an earlier run.
 
     Raises
@@ -170,7 +181,9 @@ def stored(path: Path, counts: tuple[int, ...], sigma: float) -> xr.Dataset:
         raise EpisodeError(f"{path}: this is not a NetCDF file: {error}") from None
     if found.attrs.get("scene") != TASK.scene.to_toml():
         raise EpisodeError(f"{path}: this is a trial in another scene; give another folder")
-    if tuple(found["observations"].to_numpy()) != counts or found.attrs["sigma"] != sigma:
+    wanted = (counts, options.sigma, options.box2d)
+    own = (found["observations"].to_numpy(), found.attrs["sigma"], found.attrs.get("box2d", 0))
+    if (tuple(own[0]), *own[1:]) != wanted:
         raise EpisodeError(f"{path}: this is a trial with other settings; give another folder")
     return found
 
@@ -183,16 +196,21 @@ def run(options: argparse.Namespace, counts: dict[str, tuple[int, ...]]) -> xr.D
         raise EpisodeError(
             f"{folder}: there are trials; go on with --resume, or give another --out"
         )
-    every = []
+    every, left = [], []
     for seed in range(1, options.seeds + 1):
         for name in options.only:
             path = folder / f"{name}-{seed}.nc"
             if path.is_file():
-                every.append(stored(path, counts[name], options.sigma))
-                continue
-            found = trial(name, seed, counts[name], options.sigma)
-            write_atomically(path, lambda to, found=found: found.to_netcdf(to, engine="h5netcdf"))
-            every.append(found)
+                every.append(stored(path, counts[name], options))
+            else:
+                left.append((name, seed, counts[name], options.sigma, options.box2d, path))
+    workers = min(options.workers, len(left))
+    if workers < 2:
+        every += [trial(*each) for each in left]
+    else:
+        with processes(workers) as executor:
+            running = [executor.submit(trial, *each) for each in left]
+            every += [future.result() for future in as_completed(running)]
     return joined(every, options)
 
 
@@ -209,6 +227,7 @@ def joined(every: list[xr.Dataset], options: argparse.Namespace) -> xr.Dataset:
     # a dataset may come back without a name
     whole = whole if isinstance(whole, xr.Dataset) else whole.to_dataset()
     command = f"python analysis/05_apartment.py --sigma {options.sigma:g}"
+    command += " --box2d" * options.box2d
     return whole.assign_attrs(
         command=f"{command} --seeds {options.seeds} --only {' '.join(options.only)}",
         sigma=options.sigma, nodes=SEARCH["nodes"], start=TASK.reward(TASK.start),
@@ -247,24 +266,28 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--sigma", type=float, default=0.0, help="noise of the observations")
     parser.add_argument("--only", nargs="+", choices=list(NAMES), default=list(NAMES))
+    parser.add_argument("--workers", type=int, default=processors(), help="trials at a time")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--resume", action="store_true", help="go on with what is in the folder")
+    parser.add_argument("--box2d", action="store_true", help="the world in Box2D")
     parser.add_argument("--quick", action="store_true", help="one seed, few observations, for CI")
     options = parser.parse_args()
     counts = COUNTS
+    if options.box2d:
+        options.out = options.out.with_name(options.out.name + "_box2d")
     if options.quick:
         # the continuous prior of eleven bodies takes a minute
         counts = {"true": (0,), "pbrl": (3,), "oolwr": (3, 10)}
         options.only = [name for name in options.only if name in counts]
         options.seeds, options.out = 1, options.out.with_name(options.out.name + "_quick")
-    if options.seeds < 1:
-        parser.error("--seeds: expected at least 1")
+    if options.seeds < 1 or options.workers < 1:
+        parser.error("--seeds and --workers: expected 1 or more")
     try:
         data = run(options, counts)
     except EpisodeError as error:
         parser.error(str(error))
     except KeyboardInterrupt:
-        print("\ninterrupted: finished trials are kept; go on with --resume", file=sys.stderr)
+        print("interrupted: finished trials are kept; go on with --resume", file=sys.stderr)
         sys.exit(130)
     write_atomically(options.out / "figure_4c.nc", lambda to: data.to_netcdf(to, engine="h5netcdf"))
     draw(data, options.out / "figure_4c.png")

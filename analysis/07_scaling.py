@@ -1,19 +1,23 @@
 """What the baselines and the physics prior have to learn, against the number of objects.
 
     python analysis/07_scaling.py            # one to eight objects, five seeds, in out/scaling
+    python analysis/07_scaling.py --resume   # go on where a run was interrupted
     python analysis/07_scaling.py --quick    # one and two objects, a seed, for CI
 
 Boxes on casters stand in a square room, close together: one of them is pushed at a time, at random.
 Left: OO-LWR has a model for each condition of each body, of which there are 2^(|O| n_s) (section
 3.1.3 of the paper); shown are the bound and how many of them 1000 observations have met. Right: how
 many observations PBRL needs until the mass of every box is known to 5 % (the mode of the posterior
-against the truth, noise as of a motion capture). What is kept is in scaling.nc.
+against the truth, noise as of a motion capture). Each room is a process and a file of its own, all
+of them are in scaling.nc.
 """
 
 from __future__ import annotations
 
 import argparse
+import sys
 import warnings
+from concurrent.futures import as_completed
 from importlib.metadata import version
 from pathlib import Path
 
@@ -23,6 +27,8 @@ import pandas as pd
 import xarray as xr
 
 import pbrl_ppl as pp
+from pbrl_ppl.agents.processes import processes, processors
+from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.history import write_atomically
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import find_mode
@@ -136,35 +142,70 @@ def observations_needed(scene: Scene, masses: dict[str, float], seen: pd.DataFra
     return float(high)
 
 
-def measured(counts: list[int], seeds: list[int], observed: int) -> xr.Dataset:
-    """Everything the figure shows."""
-    met = np.empty((len(seeds), len(counts)))
-    needed = np.full(met.shape, np.nan)
-    for j, objects in enumerate(counts):
-        for i, seed in enumerate(seeds):
-            scene, masses, seen = explore(objects, observed, seed)
-            met[i, j] = conditions_met(scene, seen)
-            needed[i, j] = observations_needed(scene, masses, seen)
-            print(
-                f"{objects} objects, seed {seed}: {met[i, j]:.0f} conditions, "
-                f"{needed[i, j]:.0f} observations",
-                flush=True,
-            )
+def measured(objects: int, seed: int, observed: int, path: Path) -> xr.Dataset:
+    """What a room shows, kept in a file."""
+    scene, masses, seen = explore(objects, observed, seed)
+    met, needed = conditions_met(scene, seen), observations_needed(scene, masses, seen)
+    found = xr.Dataset(
+        {
+            "conditions_met": (("seed", "objects"), [[float(met)]]),
+            "observations_needed": (("seed", "objects"), [[needed]]),
+        },
+        {"seed": [seed], "objects": [objects]},
+        {"observations": observed, "tolerance": TOLERANCE},
+    )
+    write_atomically(path, lambda to: found.to_netcdf(to, engine="h5netcdf"))
+    print(
+        f"{objects} objects, seed {seed}: {met} conditions, {needed:.0f} observations", flush=True
+    )
+    return found
+
+
+def stored(path: Path, observed: int) -> xr.Dataset:
+    """A room of an earlier run.
+
+    Raises
+    ------
+    EpisodeError
+        If the file is damaged, or of other settings.
+    """
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as opened:
+            found = opened.load()
+    except Exception as error:  # HDF5 raises many kinds on a damaged file
+        raise EpisodeError(f"{path}: this is not a NetCDF file: {error}") from None
+    if found.attrs != {"observations": observed, "tolerance": TOLERANCE}:
+        raise EpisodeError(f"{path}: this is a room with other settings; give another folder")
+    return found
+
+
+def run(options: argparse.Namespace, counts: list[int], observed: int) -> xr.Dataset:
+    """Run what is missing; everything the figure shows."""
+    folder = options.out / "rooms"
+    folder.mkdir(parents=True, exist_ok=True)
+    if any(folder.glob("*.nc")) and not options.resume:
+        raise EpisodeError(f"{folder}: there are rooms; go on with --resume, or give another --out")
+    every, left = [], []
+    for objects in counts:
+        for seed in range(1, options.seeds + 1):
+            path = folder / f"{objects}-{seed}.nc"
+            if path.is_file():
+                every.append(stored(path, observed))
+            else:
+                left.append((objects, seed, observed, path))
+    workers = min(options.workers, len(left))
+    if workers < 2:
+        every += [measured(*each) for each in left]
+    else:
+        with processes(workers) as executor:
+            running = [executor.submit(measured, *each) for each in left]
+            every += [future.result() for future in as_completed(running)]
+    whole = xr.combine_by_coords(every, combine_attrs="override")
     touchable = np.array(counts)  # the other boxes, and the walls
-    bound = np.array(counts) * 2.0 ** (touchable * CONTACTS.sectors)
-    return xr.Dataset(
-        {
-            "conditions_met": (("seed", "objects"), met),
-            "observations_needed": (("seed", "objects"), needed),
-            "conditions": ("objects", bound),
-        },
-        {"seed": seeds, "objects": counts},
-        {
-            "command": "python analysis/07_scaling.py",
-            "observations": observed,
-            "tolerance": TOLERANCE,
-            "pbrl_ppl": version("pbrl_ppl"),
-        },
+    bound = touchable * 2.0 ** (touchable * CONTACTS.sectors)
+    return whole.assign(conditions=("objects", bound)).assign_attrs(
+        command=f"python analysis/07_scaling.py --seeds {options.seeds}",
+        pbrl_ppl=version("pbrl_ppl"),
     )
 
 
@@ -201,14 +242,26 @@ def drawn(found: xr.Dataset, path: Path) -> None:
 def main() -> None:
     """Measure, keep and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--quick", action="store_true", help="one and two objects, a seed")
+    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--workers", type=int, default=processors(), help="rooms at a time")
     parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--resume", action="store_true", help="go on with what is in the folder")
+    parser.add_argument("--quick", action="store_true", help="one and two objects, a seed")
     options = parser.parse_args()
-    counts, seeds, observed = (
-        ([1, 2], [1], 50) if options.quick else ([1, 2, 3, 4, 6, 8], list(range(1, 6)), OBSERVED)
-    )
-    options.out.mkdir(parents=True, exist_ok=True)
-    found = measured(counts, seeds, observed)
+    counts, observed = [1, 2, 3, 4, 6, 8], OBSERVED
+    if options.quick:
+        counts, observed, options.seeds = [1, 2], 50, 1
+        options.out = options.out.with_name(options.out.name + "_quick")
+    if options.seeds < 1 or options.workers < 1:
+        parser.error("--seeds and --workers: expected 1 or more")
+    try:
+        found = run(options, counts, observed)
+    except EpisodeError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except KeyboardInterrupt:
+        print("interrupted: finished rooms are kept; go on with --resume", file=sys.stderr)
+        sys.exit(130)
     write_atomically(
         options.out / "scaling.nc", lambda path: found.to_netcdf(path, engine="h5netcdf")
     )

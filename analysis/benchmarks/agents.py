@@ -1,11 +1,11 @@
-"""Benchmark of the agents: numbers of figure 4, from the results that are kept.
+"""Benchmark of the agents: numbers of figure 4 and of the wrong model, from what is kept.
 
     python analysis/benchmarks/agents.py              # the table of README.md
     python analysis/benchmarks/agents.py --json       # one JSON object
     python analysis/benchmarks/agents.py --results out/shopping_cart out/apartment   # of own runs
 
-The runs themselves are `analysis/04_shopping_cart.py` and `analysis/05_apartment.py`. What
-there is no result of is null.
+The runs themselves are `analysis/04_shopping_cart.py`, `05_apartment.py` and `06_wrong_model.py`.
+What there is no result of is null.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ TRUTH = {"mass[cart]": 8.0, "w_x[cart]": -0.25, "mu_x[cart]": 0.04}
 LEARNED, RIGHT = 2, 0.03
 
 
-def found(folders: list[Path], panel: str) -> xr.Dataset | None:
-    """A panel's results, from the first folder that has them."""
+def found(folders: list[Path], name: str) -> xr.Dataset | None:
+    """Results of a name, from the first folder that has them."""
     for folder in folders:
-        path = folder / f"figure_4{panel}.nc"
+        path = folder / f"{name}.nc"
         if path.is_file():
             try:
                 with xr.open_dataset(path, engine="h5netcdf") as opened:
@@ -94,10 +94,42 @@ def apartment(data: xr.Dataset, agent: str) -> float | None:
     return float(valid.isel(observations=-1).mean())
 
 
+#: Of the agent that closes the loop online, over the one that knows the undeclared effect.
+ONLINE = tuple(f"online_loop_{each}" for each in (
+    "return_ratio", "return_ratio_low", "return_ratio_high", "return_ratio_without", "step_seconds",
+))  # fmt: skip
+
+
+def online(data: xr.Dataset) -> dict[str, float]:
+    """Ratios of mean returns over all worlds, their 95 % interval, and the same by world."""
+    returns = data["reward"].sum("time").transpose("agent", "world", "seed")
+    closing, without, informed = (
+        returns.sel(agent=name).to_numpy() for name in ("revising", "declared", "informed")
+    )
+
+    def of(one: np.ndarray, other: np.ndarray, axis: int = -1) -> np.ndarray:
+        return one.mean(axis=axis) / other.mean(axis=axis)
+
+    # episodes of a seed are a pair: they begin at the same place
+    low, high = stats.bootstrap(
+        (closing.ravel(), informed.ravel()), of, paired=True, method="percentile",
+        rng=np.random.default_rng(1),
+    ).confidence_interval  # fmt: skip
+    seconds = float(np.nanmedian(data["seconds"].sel(agent="revising")))
+    whole = [of(each.ravel(), informed.ravel()) for each in (closing, without)]
+    values = (whole[0], low, high, whole[1], seconds)
+    keys = {key: float(value) for key, value in zip(ONLINE, values, strict=True)}
+    for i, world in enumerate(data["world"].to_numpy()):
+        keys[f"{ONLINE[0]}_{world}"] = float(of(closing[i], informed[i]))
+        keys[f"{ONLINE[3]}_{world}"] = float(of(without[i], informed[i]))
+    return keys
+
+
 def numbers(folders: list[Path]) -> dict[str, float | None]:
     """All keys."""
     keys: dict[str, float | None] = {}
-    free, noisy, rooms = (found(folders, panel) for panel in "abc")
+    free, noisy, rooms = (found(folders, f"figure_4{panel}") for panel in "abc")
+    wrong = found(folders, "wrong_model")
     if free is not None:
         keys |= cart(free) | {"pbrl_right_after_two": right_after_two(free)}
         seconds = free["seconds"].sel(agent="pbrl").to_numpy()
@@ -116,7 +148,7 @@ def numbers(folders: list[Path]) -> dict[str, float | None]:
             if agent in rooms["agent"].to_numpy():
                 tried = rooms["valid"].sel(agent=agent).dropna("observations", how="all")
                 keys[f"apartment_{agent}_seeds"] = int(tried.notnull().any("observations").sum())
-    return keys
+    return keys | (dict.fromkeys(ONLINE) if wrong is None else online(wrong))
 
 
 def main() -> None:
@@ -130,7 +162,7 @@ def main() -> None:
         print(json.dumps(keys, indent=1))
         return
     for key, value in keys.items():
-        print(f"{key:28} {'-' if value is None else f'{value:.3g}'}")
+        print(f"{key:52} {'-' if value is None else f'{value:.3g}'}")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.agents.revision import Revision
 from pbrl_ppl.agents.task import Task
 from pbrl_ppl.planning import TransitionModel, plan, rollout
 
@@ -38,10 +39,16 @@ class Agent(ABC):
     ----------
     planned : bool
         Whether the last action was planned rather than random.
+    posterior : InferenceData or DataTree or None
+        What it believes in, as :func:`pbrl_ppl.fit` made it; None where there is none.
+    added : tuple of Revision
+        Effects that it found missing from its model.
     """
 
     #: What episodes and figures call it.
     name: ClassVar[str]
+    posterior: Any = None
+    added: tuple[Revision, ...] = ()
 
     def __init__(self, task: Task, *, seed: int = 0, nodes: int = 20_000, **options: Any) -> None:
         self.task, self.seed = task, seed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -58,7 +59,8 @@ class Episode:
           the interval; NaN before it did.
 
         In ``attrs``: the scene as TOML, the agent's name, the seed, ``sigma`` of the world, the
-        limit of steps, and whether the goal was reached.
+        limit of steps, and whether the goal was reached; ``world``, its description, if it has one,
+        and ``added``, as JSON, the effects that the agent added to its model.
 
     Raises
     ------
@@ -101,7 +103,7 @@ class Episode:
         recorded : mapping
             The other variables by name.
         **attrs
-            ``agent``, ``seed``, ``sigma``, ``limit``, ``reached``.
+            ``agent``, ``seed``, ``sigma``, ``limit``, ``reached``, ``world``, ``added``.
         """
         labels = list(dict.fromkeys(label for each in estimates for label in each))
         believed = [[each.get(label, np.nan) for label in labels] for each in estimates]
@@ -202,6 +204,11 @@ class Episode:
     def bumps(self) -> int:
         """Intervals in which a body touched a wall or another."""
         return int(self.dataset["bumped"].sum())
+
+    @property
+    def added(self) -> list[dict[str, Any]]:
+        """Effects added to the model and kept: ``effect``, ``body``, after how many transitions."""
+        return list(json.loads(self.dataset.attrs.get("added", "[]")))
 
     def rewards(self, steps: int) -> Array:
         """Reward at each of so many steps and the start, shape (steps + 1,), m.

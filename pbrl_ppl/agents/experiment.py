@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, as_completed
+from contextlib import nullcontext
 from pathlib import Path
 
 import numpy as np
 
 from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.episode import Episode
-from pbrl_ppl.agents.online import AnyWorld, run_episode
+from pbrl_ppl.agents.online import AnyWorld, described, run_episode
+from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.posterior import save_posterior
 
 #: Makes an agent of a seed.
 MakeAgent = Callable[[int], Agent]
@@ -24,6 +28,7 @@ def run_episodes(
     folder: str | Path,
     *,
     steps: int = 100,
+    workers: int | None = None,
     executor: Executor | None = None,
     progress: Callable[[str], None] | None = None,
 ) -> dict[str, list[Episode]]:
@@ -32,19 +37,24 @@ def run_episodes(
     Parameters
     ----------
     agents : mapping
-        What makes an agent of a seed, by the name of its files: ``{"pbrl": make_pbrl}``. An
-        executor of processes needs functions that can be pickled, such as ``functools.partial`` of
-        one in a module.
+        What makes an agent of a seed, by the name of its files: ``{"pbrl": make_pbrl}``. Other
+        processes need functions that can be pickled, such as ``functools.partial`` of one in a
+        module.
     world : World
         Each episode resets it, or a copy of it.
     seeds : iterable of int
         One episode each.
     folder : str or Path
-        Of the files, ``<name>-<seed>.nc``; made if it is not there.
+        Of the files, ``<name>-<seed>.nc``, and ``<name>-<seed>.posterior.nc`` of agents that have a
+        posterior: the last, for :func:`pbrl_ppl.load_posterior`. Made if it is not there.
     steps : int
         The most actions of an episode.
+    workers : int, optional
+        Processes that are started for the episodes, as many as there are processors by default. A
+        script must then call this under ``if __name__ == "__main__":``, for each process imports
+        it. With 1, or one episode to run, they run here, one after the other.
     executor : Executor, optional
-        Where the episodes run: processes, threads, Dask. Without it, here, one after the other.
+        Where the episodes run instead: threads, Dask.
     progress : callable, optional
         Told of each episode that is finished.
 
@@ -56,21 +66,30 @@ def run_episodes(
     Raises
     ------
     EpisodeError
-        If a file there is of another scene, start, noise or limit of steps, or as
-        :func:`run_episode`.
+        If a file there is of another scene, world, start, noise or limit of steps, what makes an
+        agent cannot be sent to another process, one ended too early, or as :func:`run_episode`.
     OutputError
         If a file cannot be written.
     KeyboardInterrupt
-        If it is interrupted: the files of finished episodes stay, and the same call goes on.
+        If it is interrupted: the files of finished episodes stay, and the same call goes on. It
+        says so.
 
     Examples
     --------
     ::
 
-        agents = {"pbrl": lambda seed: pp.PBRLAgent(task, seed=seed)}
-        with ThreadPoolExecutor(2) as executor:
-            done = pp.run_episodes(agents, world, range(10), "out/cart", executor=executor)
+        def learner(seed):
+            return pp.PBRLAgent(task, seed=seed)
+
+        if __name__ == "__main__":
+            done = pp.run_episodes({"pbrl": learner}, world, range(10), "out/cart")
+            # with dask.distributed, whose workers write into the same folder
+            with Client("tcp://host:8786") as client:
+                executor = client.get_executor(pure=False)
+                pp.run_episodes({"pbrl": learner}, world, range(20), "out/cart", executor=executor)
     """
+    if workers is not None and workers < 1:
+        raise EpisodeError(f"episodes: workers is {workers}, expected at least 1")
     folder, seeds = Path(folder), list(seeds)
     folder.mkdir(parents=True, exist_ok=True)
     tell = progress or (lambda _: None)
@@ -87,24 +106,28 @@ def run_episodes(
         tell(f"{len(found)}/{len(paths)} {in_words(episode)}")
 
     left = [key for key in paths if key not in found]
+    at_once = min(processors() if workers is None else workers, len(left))
     try:
-        if executor is None:
+        if executor is None and at_once < 2:
             for key in left:
                 finished(key, _played(agents[key[0]], world, key[1], steps, paths[key]))
         else:
-            futures = {
-                executor.submit(_played, agents[key[0]], world, key[1], steps, paths[key]): key
-                for key in left
-            }
-            try:
-                for future in as_completed(futures):
-                    finished(futures[future], future.result())
-            finally:
-                for future in futures:
-                    future.cancel()
+            if executor is None:
+                _check_pickled(agents, world)
+            with processes(at_once) if executor is None else nullcontext(executor) as pool:
+                futures = {
+                    pool.submit(_played, agents[key[0]], world, key[1], steps, paths[key]): key
+                    for key in left
+                }
+                try:
+                    for future in as_completed(futures):
+                        finished(futures[future], future.result())
+                finally:
+                    for future in futures:
+                        future.cancel()
     except KeyboardInterrupt:
-        tell(f"interrupted: {len(found)} of {len(paths)} episodes are in {folder}; run it again")
-        raise
+        said = f"{len(found)} of {len(paths)} episodes are in {folder}; run it again"
+        raise KeyboardInterrupt(said) from None
     return {name: [found[name, seed] for seed in seeds] for name in agents}
 
 
@@ -117,9 +140,25 @@ def in_words(episode: Episode) -> str:
     )
 
 
+def _check_pickled(agents: Mapping[str, MakeAgent], world: AnyWorld) -> None:
+    """Refuse what cannot be sent to another process."""
+    given = {f"what makes agent {name!r}": make for name, make in agents.items()}
+    for what, each in {**given, "the world": world}.items():
+        try:
+            pickle.dumps(each)
+        except Exception as error:  # classes raise what they like
+            raise EpisodeError(
+                f"episodes: {what} cannot be sent to another process ({error}); use functions and"
+                " classes of a module, or give workers=1"
+            ) from None
+
+
 def _played(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path: Path) -> Episode:
-    """Run one episode and save it, where it ran."""
-    episode = run_episode(make(seed), world, steps=steps, seed=seed)
+    """Run one episode and save it, where it ran; its own file last, for that says it is done."""
+    agent = make(seed)
+    episode = run_episode(agent, world, steps=steps, seed=seed)
+    if agent.posterior is not None:
+        save_posterior(agent.posterior, path.with_suffix(".posterior.nc"))
     episode.save(path)
     return episode
 
@@ -134,6 +173,11 @@ def _same(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
                 f"{path}: this is an episode with {name} {got}, expected {value}; give another"
                 " folder"
             )
+    if episode.dataset.attrs.get("world", "") != described(world):
+        raise EpisodeError(
+            f"{path}: this is an episode in another world: its engine, true parameters or effects"
+            " are not these; give another folder"
+        )
     if not np.array_equal(episode.dataset["states"][0], world.reset(seed)):
         raise EpisodeError(f"{path}: this episode starts elsewhere; give another folder")
     return episode

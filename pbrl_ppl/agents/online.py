@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Callable
 from typing import Any, Protocol
@@ -20,7 +21,10 @@ Array = NDArray[np.float64]
 
 
 class AnyWorld(Protocol):
-    """What the loop needs of a world; :class:`World` is one."""
+    """What the loop needs of a world; :class:`World` is one.
+
+    A string ``description`` is optional: files of worlds with another are not taken for this one's.
+    """
 
     sigma: float
 
@@ -117,10 +121,20 @@ def run_episode(
         "planned": np.array(rows["planned"], dtype=bool),
         "seconds": np.array(rows["seconds"], dtype=float),
     }
+    added = [
+        {"effect": each.effect, "body": each.body, "transitions": each.transitions}
+        for each in agent.added
+    ]
     return Episode.of(
         task.scene, np.array(states), estimates, recorded, agent=agent.name, seed=seed,
-        sigma=world.sigma, limit=steps, reached=int(reached),
+        sigma=world.sigma, limit=steps, reached=int(reached), world=described(world),
+        added=json.dumps(added),
     )  # fmt: skip
+
+
+def described(world: AnyWorld) -> str:
+    """What the episode's file says of the world; nothing of one that does not describe itself."""
+    return str(getattr(world, "description", ""))
 
 
 def checked(task: Task, given: Any, what: str) -> Array:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import Agent
-from pbrl_ppl.agents.revision import Revision, select_effects
+from pbrl_ppl.agents.revision import select_effects
 from pbrl_ppl.agents.task import Task
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -115,8 +115,6 @@ class PBRLAgent(Agent):
         self._transitions: list[tuple[Array, Array, Array]] = []
         self._dynamics: Dynamics | None = None
         self._sigma = np.empty(0)
-        self.posterior: Any = None
-        self.added: tuple[Revision, ...] = ()
         self.fits = self._fitted = self.looks = self._looked = 0
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -104,6 +105,13 @@ class World:
         self.task, self.sigma, self.spread = task, float(sigma), float(spread)
         self._truth = Dynamics.known(task.scene, parameters, effects, threads=1, substeps=substeps)
         self.reset(0)
+
+    @property
+    def description(self) -> str:
+        """Engine and true parameters, those of effects too, as JSON; an episode's file keeps it."""
+        truth = self._truth
+        values = dict(zip(truth.layout.labels, truth.phi[0].tolist(), strict=True))
+        return json.dumps({"engine": type(self).__name__, **values})
 
     def reset(self, seed: int) -> Array:
         """Back to the start; the seed is that of the noise and the start.

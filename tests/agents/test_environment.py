@@ -1,5 +1,6 @@
 """Worlds as Gymnasium environments."""
 
+import runpy
 import subprocess
 import sys
 
@@ -19,6 +20,15 @@ from tests.helpers.tasks import PUCK, PUCK_TRUTH, puck_world
 @pytest.mark.parametrize("sigma", [0.0, 0.25])
 def test_gymnasium_accepts_it(sigma) -> None:
     check_env(Environment(puck_world(sigma), steps=20), skip_render_check=True)
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is -?infinity")
+@pytest.mark.parametrize("model", ["shopping_cart", "apartment"])
+def test_gymnasium_accepts_the_papers_worlds(model) -> None:
+    task = runpy.run_path(str(ROOT / "models" / model / "task.py"))
+    environment = Environment(task["world"](0.25), steps=20)
+    check_env(environment, skip_render_check=True)
+    assert environment.observation_space.shape == (len(task["SCENE"].moving), 6)
 
 
 def test_an_agent_gets_what_the_world_gives() -> None:

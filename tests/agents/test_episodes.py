@@ -1,13 +1,29 @@
 """Episodes and their files: saved, loaded, resumed, refused."""
 
-from concurrent.futures import ProcessPoolExecutor
+import pickle
+import warnings
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 
 import numpy as np
 import pytest
 
-from pbrl_ppl.agents import Agent, Episode, TrueModelAgent, World, run_episode, run_episodes
-from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.agents import (
+    Agent,
+    Episode,
+    Revision,
+    TrueModelAgent,
+    World,
+    run_episode,
+    run_episodes,
+)
+from pbrl_ppl.effects import catalogue
+from pbrl_ppl.errors import EpisodeError, UninformedWarning
+from pbrl_ppl.history import from_segments
+from pbrl_ppl.model import physics_model
+from pbrl_ppl.posterior import group, load_posterior
+from pbrl_ppl.sampling import fit
 from tests.helpers.tasks import PUCK, PUCK_TRUTH, puck_world
 
 
@@ -72,7 +88,7 @@ def test_finished_episodes_are_not_run_again(tmp_path) -> None:
     assert said == [f"1/1 true model, seed 1: reached the goal in {first.steps} steps, "
                     f"{first.bumps} with bumps"]  # fmt: skip
     said.clear()
-    with ProcessPoolExecutor(1) as executor:
+    with ThreadPoolExecutor(1) as executor:
         both = run(seeds=[1, 2], executor=executor, progress=said.append)["true"]
     assert said[0] == f"1 of 2 episodes are in {tmp_path}" and len(said) == 2
     assert [each.seed for each in both] == [1, 2]
@@ -81,8 +97,62 @@ def test_finished_episodes_are_not_run_again(tmp_path) -> None:
         run_episodes({"true": known}, puck_world(0.25), [1], tmp_path, steps=30)
     with pytest.raises(EpisodeError, match=r"limit 30, expected 31"):
         run_episodes({"true": known}, puck_world(), [1], tmp_path, steps=31)
+    with pytest.raises(EpisodeError, match="episode in another world"):
+        run_episodes({"true": known}, World(PUCK, {"mass": 2.1}), [1], tmp_path, steps=30)
+    drag = {effect.name: effect for effect in catalogue}["linear_drag"]
+    dragged = World(PUCK, PUCK_TRUTH | {"linear_drag_coefficient": 0.0}, (drag,))
+    with pytest.raises(EpisodeError, match="episode in another world"):
+        run_episodes({"true": known}, dragged, [1], tmp_path, steps=30)
     with pytest.raises(EpisodeError, match="starts elsewhere"):
         run_episodes({"true": known}, World(PUCK, PUCK_TRUTH, spread=0.1), [1], tmp_path, steps=30)
+
+
+class Here(Executor):
+    """Runs what could be sent to another process at once."""
+
+    def submit(self, fn, /, *args) -> Future:
+        future = Future()
+        future.set_result(pickle.loads(pickle.dumps(fn))(*pickle.loads(pickle.dumps(args))))
+        return future
+
+
+def test_processes_by_default(tmp_path, monkeypatch) -> None:
+    """As many as there are processors, but no more than episodes, and none for a single one."""
+    asked: list[int] = []
+
+    @contextmanager
+    def started(workers):
+        asked.append(workers)
+        yield Here()
+
+    monkeypatch.setattr("pbrl_ppl.agents.experiment.processes", started)
+    monkeypatch.setattr("pbrl_ppl.agents.experiment.processors", lambda: 4)
+    run = partial(run_episodes, {"true": known}, puck_world(), folder=tmp_path, steps=1)
+    for seeds in (range(1), range(3), range(9)):
+        assert [each.seed for each in run(seeds=seeds)["true"]] == list(seeds)
+    assert asked == [2, 4]
+    run(seeds=range(12), workers=2)
+    assert asked == [2, 4, 2]
+    with pytest.raises(EpisodeError, match="workers is 0, expected at least 1"):
+        run(seeds=[1], workers=0)
+    with pytest.raises(EpisodeError, match=r"what makes agent 'own' cannot be sent .* workers=1"):
+        run_episodes({"own": lambda seed: known(seed)}, puck_world(), range(2), tmp_path)
+
+
+@pytest.mark.one_stack
+def test_dask(tmp_path) -> None:
+    """Its workers as threads: what processes need is above."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.Client(
+        processes=False, n_workers=2, threads_per_worker=1, dashboard_address=":0",
+        local_directory=tmp_path / "dask",
+    ) as client:  # fmt: skip
+        done = run_episodes(
+            {"true": known}, puck_world(), range(3), tmp_path / "episodes", steps=1,
+            executor=client.get_executor(pure=False),
+        )["true"]  # fmt: skip
+    assert [each.seed for each in done] == [0, 1, 2]
+    assert len(list((tmp_path / "episodes").iterdir())) == 3
 
 
 class Interrupted(Agent):
@@ -101,12 +171,10 @@ class Interrupted(Agent):
 
 
 def test_an_interrupt_keeps_finished_episodes(tmp_path) -> None:
-    said: list[str] = []
     agents = {"true": known, "other": lambda seed: Interrupted(PUCK, seed=seed)}
-    with pytest.raises(KeyboardInterrupt):
-        run_episodes(agents, puck_world(), [1], tmp_path, steps=30, progress=said.append)
+    with pytest.raises(KeyboardInterrupt, match=f"^1 of 2 episodes are in {tmp_path}; run it"):
+        run_episodes(agents, puck_world(), [1], tmp_path, steps=30, workers=1)
     assert [path.name for path in tmp_path.iterdir()] == ["true-1.nc"]
-    assert said[-1] == f"interrupted: 1 of 2 episodes are in {tmp_path}; run it again"
 
 
 def test_an_interrupted_search_ends_the_episode(monkeypatch) -> None:
@@ -118,3 +186,30 @@ def test_an_interrupted_search_ends_the_episode(monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.planning.astar._Search.expand", pressed)
     with pytest.raises(KeyboardInterrupt):
         run_episode(known(1), puck_world())
+
+
+class Believing(TrueModelAgent):
+    """Fits once, after its first action, and finds an effect missing."""
+
+    def update(self) -> None:
+        if self.posterior is None:
+            drag = {effect.name: effect for effect in catalogue}["linear_drag"]
+            state = PUCK.start[None]
+            history = from_segments(PUCK.scene, state, 0 * state[:, None, :, :3], state[:, None])
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UninformedWarning)
+                model = physics_model(PUCK.scene, history, sigma="scalar")
+                self.posterior = fit(model, seed=1, method="map", progress=False)
+            self.added = (Revision(drag.on("puck"), 1, 0.001, 10.0, 3.0, ()),)
+
+
+def test_what_an_agent_believed_is_kept(tmp_path) -> None:
+    agents = {"pbrl": lambda seed: Believing(PUCK, PUCK_TRUTH, seed=seed), "true": known}
+    done = run_episodes(agents, puck_world(), [1], tmp_path, steps=1, workers=1)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"pbrl-1.nc", "pbrl-1.posterior.nc", "true-1.nc"}
+    found = group(load_posterior(tmp_path / "pbrl-1.posterior.nc"), "posterior")
+    assert found["mass"].sizes == {"chain": 1, "draw": 1, "body": 1}
+    loaded = Episode.load(tmp_path / "pbrl-1.nc")
+    assert loaded.added == [{"effect": "linear_drag", "body": "puck", "transitions": 1}]
+    assert done["true"][0].added == []

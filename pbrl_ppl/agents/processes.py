@@ -1,0 +1,68 @@
+"""Fresh processes to run episodes in, which an interrupt or an error ends at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from concurrent.futures import Executor, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import active_children, get_context
+
+from pbrl_ppl.errors import EpisodeError
+
+
+@contextmanager
+def processes(workers: int | None = None) -> Iterator[Executor]:
+    """Run calls in spawned processes: PyMC's threads do not survive a fork.
+
+    Ctrl-C reaches the caller alone, who keeps what is finished.
+
+    Parameters
+    ----------
+    workers : int, optional
+        How many; as many as there are processors by default.
+
+    Raises
+    ------
+    EpisodeError
+        If ``workers`` is below 1, or a process ended before its call.
+
+    Examples
+    --------
+    ::
+
+        if __name__ == "__main__":  # each process imports the script
+            with processes(2) as executor:
+                futures = [executor.submit(trial, seed) for seed in range(10)]
+    """
+    workers = processors() if workers is None else workers
+    if workers < 1:
+        raise EpisodeError(f"workers is {workers}, expected at least 1")
+    others = set(active_children())
+    deaf = (signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes
+    pool = ProcessPoolExecutor(
+        workers, get_context("spawn"), initializer=signal.signal, initargs=deaf
+    )
+    try:
+        yield pool
+    except BaseException as error:
+        pool.shutdown(wait=False, cancel_futures=True)
+        for child in set(active_children()) - others:
+            child.terminate()
+        if isinstance(error, BrokenProcessPool):
+            raise EpisodeError(
+                "a process ended before its call: what it said is above, or it was short of memory"
+                " (give fewer workers). Calls must be of functions in a module, and a script must"
+                ' make them under if __name__ == "__main__":, for each process imports it'
+            ) from None
+        raise
+    pool.shutdown()
+
+
+def processors() -> int:
+    """How many this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
