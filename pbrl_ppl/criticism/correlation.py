@@ -101,7 +101,7 @@ def _lagged(
     """Correlation with series some intervals before, or of each cell with itself."""
     values, pairs = [], []
     for lag in range(1, LAGS + 1) if series is None else range(LAGS + 1):
-        end = len(number) - lag
+        end = max(len(number) - lag, 0)
         same = number[lag:] == number[:end]
         later, counts = white[lag:][same], seen[lag:][same]
         if series is None:

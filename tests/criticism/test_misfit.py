@@ -51,6 +51,13 @@ def test_clean_data_of_another_engine_pass(make_history) -> None:
     assert {test.name for test in found.tests} == set(RATES)
 
 
+def test_trajectories_shorter_than_the_lags_are_tested() -> None:
+    for intervals in range(1, 7):
+        mode = Disc(1, intervals, FINE).mode(np.random.default_rng(1))
+        names = {test.name for test in misfit(mode).tests}
+        assert names == set(RATES) - ({COMMANDS} if intervals == 1 else set())  # one does not vary
+
+
 def test_a_disturbance_without_memory_is_an_acceleration() -> None:
     """It is independent of all there is: that it is there is all that can be said."""
     rng = np.random.default_rng(7)
