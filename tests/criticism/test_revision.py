@@ -14,7 +14,8 @@ from pbrl_ppl.criticism import revise
 from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
-from pbrl_ppl.errors import EffectError
+from pbrl_ppl.errors import EffectError, HistoryError
+from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.free_puck import BOX, MASS, box2d, fitted
 from tests.helpers.places import load
 
@@ -213,6 +214,19 @@ def test_computed_velocities_are_recognised_and_the_effect_is_found(make_history
     spread = np.sqrt(step.after.covariance[place, place])
     assert abs(step.after.phi[place] - 0.3) < 4 * spread  # a false alarm in 1e-4
     assert spread < 0.02
+
+
+@pytest.mark.one_stack
+def test_a_recording_in_which_nothing_moves_is_refused_at_once(clean) -> None:
+    still = clean[0].assign(**dict.fromkeys((*STATE, *WRENCH), 0.0))
+    stages = []
+    with pytest.raises(HistoryError, match="nothing moves: every number"):
+        loop([still, clean[1]], progress=stages.append)
+    assert stages == []
+    (history,) = histories([still])
+    with pytest.raises(HistoryError, match="nothing moves"):
+        pp.physics_model(BOX, history, trajectories=True)
+    pp.physics_model(BOX, history)  # Eq. 11 has a noise of its own
 
 
 @pytest.mark.slow
