@@ -12,10 +12,7 @@ from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
-from pbrl_ppl.criticism.unexplained import (
-    FALSE_ALARM,
-    Left,
-)
+from pbrl_ppl.criticism.unexplained import FALSE_ALARM, Left, noise_alone
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
@@ -80,7 +77,7 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
     """
     dependence = find_dependence(mode, seed=seed)
     of_correlation, correlations = correlation_tests(mode)
-    of_forecasts, growth = _forecasts(mode, horizon)
+    of_forecasts, growth = _forecasts(mode, noise_alone(mode, left), horizon)
     tests = (
         _acceleration(left),
         *of_correlation,
@@ -142,24 +139,25 @@ def _acceleration(left: Left) -> ResidualTest:
     return ResidualTest(ACCELERATION, p_value, float(left.relative[worst]), passed, sentence)
 
 
-def _forecasts(mode: Mode, horizon: int) -> tuple[ResidualTest, Growth]:
-    """Whether errors grow with the length of a forecast as noise alone makes them."""
+def _forecasts(mode: Mode, sigma: Array, horizon: int) -> tuple[ResidualTest, Growth]:
+    """Whether errors grow with the length of a forecast as noise alone, sigma, makes them."""
     noise = mode.problem.trajectory_noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
     longest = min(horizon, int(lengths.max()))
     steps = np.unique(np.geomspace(1, longest, min(longest, _LENGTHS)).round().astype(int))
-    every = [forecast(mode.problem, mode.phi, mode.sigma, int(n)) for n in steps]
+    every = [forecast(mode.problem, mode.phi, sigma, int(n)) for n in steps]
     told = every[-1]
     worst, p_value, name = 0.0, 1.0, ""
-    for d in np.unique(told.dimension):
+    dimensions = np.unique(told.dimension)
+    for d in dimensions:
         own = told.dimension == d
         z = (told.error[:, own] ** 2 / told.variance[:, own])[np.isfinite(told.error[:, own])]
         if not z.size:
             continue
         # forecasts overlap by half, so that half of them count
-        chance = float(chi2.sf(z.sum() / 2, max(z.size / 2, 1)))
+        chance = len(dimensions) * float(chi2.sf(z.sum() / 2, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
-            worst, p_value, name = float(np.sqrt(z.mean())), chance, STATE[d]
+            worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]
     passed = p_value > FALSE_ALARM or worst < _WORSE
     dt = mode.problem.scene.time_step
     seconds = longest * dt
