@@ -131,6 +131,7 @@ class Findings:
                         "identifiable": candidate.identifiable,
                         "looks": candidate.looks,
                         "detectable": candidate.detectable,
+                        "why": candidate.why,
                     }
                     for candidate in self.candidates
                 ],

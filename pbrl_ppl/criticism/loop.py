@@ -149,6 +149,7 @@ def _revised(
     if remains > (LARGE_IF_SMALL if left.worst < SMALL else LARGE_REMAINDER):
         # part of a misfit goes to whatever is there: no name is to be had from that
         say("no effect of the catalogue explains what is missing")
+        selection.withdraw(added)
         added, current, left = [], declared, before
         misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(prior)
     say("sampling the posterior of the declared model")
@@ -159,8 +160,8 @@ def _revised(
         revised = _posterior(current, method, seed, draws, say)
     say("comparing errors on held-out data")
     models = Models(declared, current, posterior, revised, before, left)
-    candidates = tuple(signature.candidate for signature in first)
-    return put_together(train, held_out, models, candidates, added, misfit, tuple(selection.small))
+    candidates, small = selection.explained(first), tuple(selection.small)
+    return put_together(train, held_out, models, candidates, added, misfit, small)
 
 
 def _prior_test(

@@ -40,6 +40,8 @@ class Candidate:
     detectable : dict of str to float
         Smallest size of each parameter that these data would show (nine times of ten, at a p-value
         of 0.01), the others being nothing; infinite where they would not show any.
+    why : str
+        Why the loop added it or did not; empty where nothing was decided.
     """
 
     effect: str
@@ -53,6 +55,7 @@ class Candidate:
     identifiable: float
     looks: int = 1
     detectable: Mapping[str, float] = field(default_factory=dict)
+    why: str = ""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Candidate, Findings
+from pbrl_ppl.criticism import (
+    ADEQUATE,
+    NOT_CONVERGED,
+    TRIED,
+    TRY_P,
+    UNEXPLAINED,
+    Candidate,
+    Findings,
+)
 from pbrl_ppl.model import ACCELERATION
 from pbrl_ppl.posterior import draws, group
 
@@ -66,6 +74,17 @@ def verdict_in_words(findings: Findings) -> str:
     if len(findings.added) > 1:
         return f"{len(findings.added)} things were missing: {found}."
     return f"Something was missing: {found}."
+
+
+def rejected_in_words(findings: Findings) -> str:
+    """Say why the leading candidates, of those that chance does not explain, were not added."""
+    there = {(added.effect, added.body) for added in findings.added}
+    told = [
+        f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
+        for one in findings.candidates
+        if one.why and one.p_value < TRY_P and (one.effect, one.body) not in there
+    ]
+    return f"Not added: {'; '.join(told[:TRIED])}." if told else ""
 
 
 def unseen_in_words(findings: Findings) -> str:

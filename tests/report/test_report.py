@@ -23,7 +23,7 @@ from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.report import render
-from pbrl_ppl.report.words import number, verdict_in_words
+from pbrl_ppl.report.words import number, rejected_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 
@@ -102,6 +102,18 @@ def test_page_where_nothing_is_missing() -> None:
     assert "chance alone brings one that close in 37 % of all cases" in text
     assert "fell by" not in text and "After:" not in text
     assert "Where it remains" not in text
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_candidates_that_were_not_added_say_why() -> None:
+    findings = made_up()
+    said = ("added", "fits less well than linear drag, by 12.0 nats", "p = 0.04: chance")
+    told = [replace(c, why=w) for c, w in zip(findings.candidates, said, strict=False)]
+    findings = replace(findings, candidates=(*told, findings.candidates[-1]))
+    assert rejected_in_words(findings) == f"Not added: quadratic drag on the cart ({said[1]})."
+    assert rejected_in_words(made_up()) == ""
+    text = Page(render(findings)).text
+    assert "What became of it" in text and said[1] in text and said[2] in text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -362,6 +374,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "identifiable",
         "looks",
         "detectable",
+        "why",
     ]
     assert list(got["error"]) == ["before", "after", "noise_floor"]
     assert got["error"]["before"]["normalised_rmse"] == 2.4
