@@ -59,7 +59,7 @@ class Selection:
     why : dict of (str, str) to str
         Why an effect on a body was added or not, as the last round that it was tried in has it.
     small : list of Candidate
-        Those that are certain and do not matter.
+        Of the last round, the best that is certain and does not matter, if there is one.
     """
 
     scene: Scene
@@ -75,6 +75,7 @@ class Selection:
     def best_addition(self, mode: Mode, ranked: list[Signature]) -> Step | None:
         """Refit with the leading candidates; the best that held-out data confirm, or None."""
         order = [attached.effect.name for attached in self.missing(mode)]
+        self.small.clear()
 
         def rank(item: tuple[Signature, Mode]) -> float:
             signature, fitted = item
@@ -146,7 +147,8 @@ class Selection:
         if share < MIN_ERROR_FALL:
             size = f"changes predictions by {100 * share:.2g} %"
             self._note(signature, f"{size}: less than {100 * MIN_ERROR_FALL:g} % does not matter")
-            self.small.append(signature.candidate)
+            if not self.small:  # of others it is not known whether they are there beside it
+                self.small.append(signature.candidate)
             return None
         self._note(signature, "added")
         return Step(signature, inseparable(signature, ranked), fitted, total, error)
@@ -166,6 +168,7 @@ class Selection:
         """Take back what was added: most of what was missing remains with it."""
         for step in steps:
             self._note(step.signature, "withdrawn: most of what is missing remains with it")
+        self.small.clear()  # beside what is no longer there
 
     def explained(self, ranked: list[Signature]) -> tuple[Candidate, ...]:
         """Candidates that say what became of them."""

@@ -23,7 +23,7 @@ from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.report import render
-from pbrl_ppl.report.words import number, rejected_in_words, verdict_in_words
+from pbrl_ppl.report.words import number, rejected_in_words, unseen_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 
@@ -114,6 +114,21 @@ def test_candidates_that_were_not_added_say_why() -> None:
     assert rejected_in_words(made_up()) == ""
     text = Page(render(findings)).text
     assert "What became of it" in text and said[1] in text and said[2] in text
+
+
+def test_what_is_small_is_said_to_be_there() -> None:
+    for verdict, others in (("adequate", "quadratic drag"), ("effects-added", "constant force")):
+        findings = made_up(verdict)
+        one = findings.candidates[len(findings.added)]
+        findings = replace(findings, small=(replace(one, body="Cart_2"),))
+        said = f" There is {one.effect.replace('_', ' ')} on the Cart 2, which changes"
+        assert said in verdict_in_words(findings)
+        assert verdict_in_words(findings).endswith("predictions by less than 1 %.")
+        small = replace(findings, small=(one,))
+        assert unseen_in_words(small).startswith(f"These data would not show: {others}")
+    # what remains may be what looks like it
+    findings = replace(made_up("unexplained"), small=made_up().candidates[:1])
+    assert "linear drag" not in verdict_in_words(findings)
 
 
 @pytest.mark.usefixtures("undrawn")
