@@ -22,6 +22,7 @@ from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.errors import PriorWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode
@@ -85,6 +86,11 @@ def revise(
         If the histories do not fit each other or are too short.
     EffectError
         If the scene declares an unknown effect.
+
+    Warns
+    -----
+    PriorWarning
+        Before anything is fitted, if the declared prior could not have made ``train``.
     """
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
@@ -121,6 +127,9 @@ def _revised(
     effects = attach(scene, (), catalogue)
     say("looking whether the prior could have made the data")
     prior = _prior_test(scene, train, effects, seed)
+    if not prior.passed:  # of wrong units nobody wants the fit
+        hint = "the declared prior does not explain this recording, unless a missing effect is why"
+        warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
     say("fitting the declared model")
     declared = declared_mode(scene, train, effects, seed=seed, substeps=substeps, say=say)
     say("scoring what the model might lack")

@@ -4,6 +4,7 @@ Most are of a free puck, for a loop on it takes seconds; each loop is run once.
 """
 
 import json
+import warnings
 
 import numpy as np
 import pytest
@@ -14,13 +15,17 @@ from pbrl_ppl.criticism import revise
 from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
-from pbrl_ppl.errors import EffectError, HistoryError
+from pbrl_ppl.errors import EffectError, HistoryError, PriorWarning
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.free_puck import BOX, MASS, box2d, fitted
 from tests.helpers.places import load
 
-# a posterior of few draws is enough to test a verdict, and says that it is one
-pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+pytestmark = [
+    # a posterior of few draws is enough to test a verdict, and says that it is one
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
+    # of a missing effect too, where it is large
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.PriorWarning"),
+]
 #: Of each of four chains: about 250 effective ones, where a verdict needs 100.
 DRAWS = 150
 #: The Gaussian at the mode will do where the claim is a verdict's, not that of the chains.
@@ -143,6 +148,25 @@ def test_nonsense_is_never_adequate(wrong, clean) -> None:
     assert found.verdict != "adequate"
     assert found.unexplained is not None
     assert not all(test.passed for test in found.tests)
+
+
+class Fitting(Exception):
+    """The loop began to fit."""
+
+
+def until_it_fits(stage: str) -> None:
+    if stage.startswith("fitting"):
+        raise Fitting
+
+
+def test_wrong_units_are_told_before_the_fit(clean) -> None:
+    told = pytest.warns(PriorWarning, match="vx of puck changes .* check units")
+    with told, pytest.raises(Fitting):
+        loop([millinewtons(frame) for frame in clean], progress=until_it_fits)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(Fitting):
+            loop(clean, progress=until_it_fits)
 
 
 @pytest.mark.slow
