@@ -53,9 +53,8 @@ def verdict_in_words(findings: Findings) -> str:
         )
     if findings.verdict == ADEQUATE:
         return (
-            "Nothing was found missing: what the declared model leaves passed all tests of"
-            " measurement noise (an unexplained acceleration, whiteness, forecasts, dependence on"
-            f" state, command and time).{_small(findings)}"
+            "Nothing was found missing: what the declared model leaves passed all tests that were"
+            f" made ({joined(test.name for test in findings.tests)}).{_small(findings)}"
         )
     if findings.verdict == UNEXPLAINED and not found:
         return f"Something is missing that no effect in the catalogue explains: {rest}."

@@ -56,7 +56,7 @@ def test_trajectories_shorter_than_the_lags_are_tested() -> None:
     for intervals in range(1, 7):
         mode = Disc(1, intervals, FINE).mode(np.random.default_rng(1))
         names = {test.name for test in misfit(mode).tests}
-        assert names == set(RATES) - ({COMMANDS} if intervals == 1 else set())  # one does not vary
+        assert names == {ACCELERATION, FORECASTS, DEPENDENCE}  # of the others there is nothing yet
 
 
 def test_forecasts_of_few_intervals_are_as_good_as_their_noise() -> None:
