@@ -15,7 +15,7 @@ from pbrl_ppl.criticism.resolution import shift
 from pbrl_ppl.criticism.results import Acceleration, Added, Candidate, Estimate, Numerical
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.selection import Step
-from pbrl_ppl.criticism.unexplained import Left
+from pbrl_ppl.criticism.unexplained import Left, noise_alone
 from pbrl_ppl.history import History
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import compare, identify, interval, versions
@@ -89,7 +89,7 @@ def put_together(
         unexplained=misfit.unexplained,
         before=before,
         after=after,
-        noise_floor=held_out.noise_floor(revised, rollout),
+        noise_floor=held_out.noise_floor(revised, noise_alone(revised, models.left_after), rollout),
         posterior_before=models.before,
         posterior_after=models.after,
         residuals_before=held_out.residuals(declared, revised),

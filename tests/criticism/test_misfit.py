@@ -10,8 +10,15 @@ import pytest
 from scipy.stats import binom
 
 from pbrl_ppl.criticism.misfit import ACCELERATION, FORECASTS, find_misfit
-from pbrl_ppl.criticism.unexplained import FALSE_ALARM, MATTERS, Left, unexplained_acceleration
+from pbrl_ppl.criticism.unexplained import (
+    FALSE_ALARM,
+    MATTERS,
+    Left,
+    noise_alone,
+    unexplained_acceleration,
+)
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
+from tests.helpers.histories import NOISE
 
 WHITENESS, COMMANDS = "whiteness", "correlation with commands"
 DEPENDENCE = "dependence on state, command and time"
@@ -63,7 +70,12 @@ def test_forecasts_of_few_intervals_are_as_good_as_their_noise() -> None:
     """Six do not tell errors of measuring from what a step adds: a third of such data failed."""
     rng = np.random.default_rng(5)
     disc = Disc(2, 3, FINE)
-    assert not any(FORECASTS in failed(disc.mode(rng)) for _ in range(4))
+    for _ in range(4):
+        mode = disc.mode(rng)
+        left = unexplained_acceleration(mode)
+        assert FORECASTS not in failed(mode)
+        # and the floor of the report is one that the disc's sensors can have
+        assert (noise_alone(mode, left)[:6] > 0.1 * np.array(NOISE)).all()
 
 
 def test_a_disturbance_without_memory_is_an_acceleration() -> None:
