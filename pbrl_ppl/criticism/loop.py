@@ -180,9 +180,10 @@ def _prior_test(
     problem = Problem.of(scene, train, effects, horizon=telling_horizon(train), threads=2)
     checked = prior_predictive_check(build_model(problem), draws=PRIOR_DRAWS, seed=seed)
     share = float(checked.dataset["share_beyond"].max())
-    return ResidualTest(
-        PRIOR, float("nan"), share, not checked.sentences, "; ".join(checked.summary)
-    )
+    said, *more = checked.summary
+    if more:
+        said = f"{said}; so it is with {len(more)} more"
+    return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, said)
 
 
 def _remains(before: Left, after: Left) -> float:
