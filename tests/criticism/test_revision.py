@@ -90,6 +90,8 @@ def test_a_catalogued_effect_is_named_with_its_size(make_history) -> None:
     assert low <= 0.3 <= high  # of one seed: it does in 94 % of all
     assert high - low < 0.02
     assert added.elpd_difference > 2 * added.elpd_difference_se
+    assert found.candidates[0].why == "added"
+    assert all(one.why for one in found.candidates)
     assert all(test.passed for test in found.tests)
     before, after = found.acceleration.before, found.acceleration.after
     assert after["vx"] < 0.1 * before["vx"]
