@@ -45,6 +45,10 @@ class UninformedWarning(UserWarning):
     """A fit in which the data say nothing about a parameter: its posterior is its prior."""
 
 
+class PriorWarning(UserWarning):
+    """A recording that the declared prior could not have made: units, or hyper-parameters."""
+
+
 class RefitWarning(UserWarning):
     """An update for which the earlier draws were no use, so that all data were fitted anew."""
 

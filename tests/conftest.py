@@ -41,6 +41,7 @@ ON_MODES = (
     "criticism/test_remainder.py",
     "criticism/test_resolution.py",
     "criticism/test_scan.py",
+    "criticism/test_selection.py",
     "criticism/test_structure_search.py",
     "model/test_contact_noise.py",
     "model/test_trajectories.py",

@@ -178,8 +178,9 @@ def close_loop(
         print_json(loop.findings.to_dict() | {"report": output / "report.html"} | remainder)
     else:
         typer.echo(report.verdict_in_words(loop.findings))
-        if unseen := report.unseen_in_words(loop.findings):
-            typer.echo(unseen)
+        for words in (report.rejected_in_words, report.unseen_in_words):
+            if said := words(loop.findings):
+                typer.echo(said)
         if remainder:
             typer.echo(remainder["learned_remainder"]["words"])
         typer.echo(f"report: {output / 'report.html'}")

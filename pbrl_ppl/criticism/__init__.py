@@ -21,7 +21,7 @@ from pbrl_ppl.criticism.results import (
 )
 from pbrl_ppl.criticism.rivals import Rival, fit_rivals, kept_groups, named_effects
 from pbrl_ppl.criticism.score import DECISIVE, Signature, inseparable, rank_candidates, twins
-from pbrl_ppl.criticism.selection import MIN_ELPD, MIN_ELPD_SE, TRIED
+from pbrl_ppl.criticism.selection import MIN_ELPD, MIN_ELPD_SE, TRIED, TRY_P
 
 __all__ = [
     "ADEQUATE",
@@ -31,6 +31,7 @@ __all__ = [
     "NOT_CONVERGED",
     "PRODUCTS",
     "TRIED",
+    "TRY_P",
     "UNEXPLAINED",
     "Acceleration",
     "Added",

@@ -58,7 +58,7 @@ class _Correlation:
 
 
 def correlation_tests(mode: Mode) -> tuple[tuple[ResidualTest, ...], Correlations]:
-    """Test whiteness over lags, and correlation with present and past commands.
+    """Test whiteness over lags, and correlation with present and past commands, of enough data.
 
     Parameters
     ----------
@@ -68,7 +68,7 @@ def correlation_tests(mode: Mode) -> tuple[tuple[ResidualTest, ...], Correlation
     Returns
     -------
     tests : tuple of ResidualTest
-        Of whiteness, and of commands where there are any.
+        Of whiteness, and of commands where there are any; none that so few data cannot fail.
     correlations : Correlations
         For a picture.
     """
@@ -79,13 +79,14 @@ def correlation_tests(mode: Mode) -> tuple[tuple[ResidualTest, ...], Correlation
     scene, places = mode.problem.scene, noise.cells.places
     cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
     own = _lagged(white, seen, number, None)
-    tests = [_whiteness(own, share, cells)]
+    tests = [_whiteness(own, share, cells)] if (own.pairs > _PAIRS).any() else []
     commands, names = _commands(mode)
     driven = None
     if names:
         driven = _lagged(white, seen, number, commands)
         p_value = _driven_by_chance(white, seen, number, commands)
-        tests.append(_driven(driven, p_value, share, cells, names))
+        if p_value is not None:
+            tests.append(_driven(driven, p_value, share, cells, names))
     return tuple(tests), Correlations(
         tuple(cells),
         own.values[:, 0],
@@ -101,7 +102,7 @@ def _lagged(
     """Correlation with series some intervals before, or of each cell with itself."""
     values, pairs = [], []
     for lag in range(1, LAGS + 1) if series is None else range(LAGS + 1):
-        end = len(number) - lag
+        end = max(len(number) - lag, 0)
         same = number[lag:] == number[:end]
         later, counts = white[lag:][same], seen[lag:][same]
         if series is None:
@@ -147,8 +148,8 @@ def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTes
 
 def _driven_by_chance(
     white: Array, seen: NDArray[np.bool_], number: NDArray[np.intp], commands: Array
-) -> float:
-    """Chance of so much regression of errors on commands of several lags.
+) -> float | None:
+    """Chance of so much regression of errors on commands of several lags; None of too few data.
 
     Commands that are held are correlated over lags, so their correlations with errors are not
     independent of each other: what regression on all of them explains is chi-squared.
@@ -168,7 +169,7 @@ def _driven_by_chance(
         u = u[:, size > 1e-6 * size.max(initial=0.0)]
         statistic += float(((u.T @ white[own, cell]) ** 2).sum())
         count += u.shape[1]
-    return float(chi2.sf(statistic, max(count, 1)))
+    return float(chi2.sf(statistic, count)) if count else None
 
 
 def _driven(

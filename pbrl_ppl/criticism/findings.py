@@ -132,6 +132,7 @@ class Findings:
                         "looks": candidate.looks,
                         "detectable": candidate.detectable,
                         "caps": candidate.caps,
+                        "why": candidate.why,
                     }
                     for candidate in self.candidates
                 ],

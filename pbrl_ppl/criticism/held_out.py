@@ -99,14 +99,17 @@ class HeldOut:
             elpd=float(_elpd(problem, phi[chosen], sigma[chosen]).sum()),
         )
 
-    def noise_floor(self, mode: Mode, rollout: int) -> Errors:
-        """Noise floor: errors from the noise of measurements alone, at both ends of a forecast."""
+    def noise_floor(self, mode: Mode, sigma: Array, rollout: int) -> Errors:
+        """Noise floor: errors from the noise of measurements alone, at both ends of a forecast.
+
+        Its size is that of ``sigma``, see :func:`pbrl_ppl.criticism.unexplained.noise_alone`.
+        """
         problem = self.problem(mode)
         noise = problem.trajectory_noise
         at_best, cells = -noise.log_scale(mode.sigma).sum(), noise.seen.sum()
         return Errors(
-            one_step_rmse=forecast(problem, mode.phi, mode.sigma, 1).floor(),
-            rollout_rmse=forecast(problem, mode.phi, mode.sigma, rollout).floor(),
+            one_step_rmse=forecast(problem, mode.phi, sigma, 1).floor(),
+            rollout_rmse=forecast(problem, mode.phi, sigma, rollout).floor(),
             normalised_rmse=1.0,
             elpd=float(at_best - 0.5 * cells * (1.0 + np.log(2 * np.pi))),
         )

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, derived_velocities, measured_alone
+from pbrl_ppl.model import cells_of, check_moves
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE
 
@@ -33,7 +34,8 @@ def checked_histories(
     Raises
     ------
     HistoryError
-        If they are of other bodies, another time step or other measured dimensions.
+        If they are of other bodies, another time step or other measured dimensions, or nothing
+        moves in the first.
     """
     names = [body.name for body in scene.moving]
     for which, history in (("training", train), ("test", test)):
@@ -50,6 +52,7 @@ def checked_histories(
             )
     derived = derived_velocities(train)
     train, test = measured_alone(train, derived), measured_alone(test, derived)
+    check_moves(cells_of(scene, train), scene)
     known, asked = (
         np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
         for history in (train, test)

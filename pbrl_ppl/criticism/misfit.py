@@ -12,10 +12,7 @@ from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
-from pbrl_ppl.criticism.unexplained import (
-    FALSE_ALARM,
-    Left,
-)
+from pbrl_ppl.criticism.unexplained import FALSE_ALARM, Left, noise_alone
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
@@ -23,6 +20,8 @@ Array = NDArray[np.float64]
 
 #: Names of tests, of which all a model is good for depends.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
+#: And of another.
+DEPENDENCE = "dependence on state, command and time"
 #: Forecasts may be this many times worse than noise alone makes them.
 _WORSE = 1.5
 #: Lengths of forecasts that a picture shows, at most.
@@ -56,6 +55,11 @@ class Misfit:
         needed = (ACCELERATION, FORECASTS, PRIOR)
         return all(test.passed for test in self.tests if test.name in needed)
 
+    @property
+    def predictable(self) -> float:
+        """Share of the errors that recorded quantities predict; 0 where none is sure."""
+        return next(test.size for test in self.tests if test.name == DEPENDENCE)
+
     def with_test(self, test: ResidualTest) -> Misfit:
         """The same with one test more; what it says is where the structure is if no other fails."""
         unexplained = self.unexplained
@@ -80,13 +84,13 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
     """
     dependence = find_dependence(mode, seed=seed)
     of_correlation, correlations = correlation_tests(mode)
-    of_forecasts, growth = _forecasts(mode, horizon)
+    of_forecasts, growth = _forecasts(mode, noise_alone(mode, left), horizon)
     tests = (
         _acceleration(left),
         *of_correlation,
         of_forecasts,
         ResidualTest(
-            "dependence on state, command and time",
+            DEPENDENCE,
             1.0 if dependence is None else dependence.p_value,
             0.0 if dependence is None else dependence.share,
             dependence is None,
@@ -142,24 +146,25 @@ def _acceleration(left: Left) -> ResidualTest:
     return ResidualTest(ACCELERATION, p_value, float(left.relative[worst]), passed, sentence)
 
 
-def _forecasts(mode: Mode, horizon: int) -> tuple[ResidualTest, Growth]:
-    """Whether errors grow with the length of a forecast as noise alone makes them."""
+def _forecasts(mode: Mode, sigma: Array, horizon: int) -> tuple[ResidualTest, Growth]:
+    """Whether errors grow with the length of a forecast as noise alone, sigma, makes them."""
     noise = mode.problem.trajectory_noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
     longest = min(horizon, int(lengths.max()))
     steps = np.unique(np.geomspace(1, longest, min(longest, _LENGTHS)).round().astype(int))
-    every = [forecast(mode.problem, mode.phi, mode.sigma, int(n)) for n in steps]
+    every = [forecast(mode.problem, mode.phi, sigma, int(n)) for n in steps]
     told = every[-1]
     worst, p_value, name = 0.0, 1.0, ""
-    for d in np.unique(told.dimension):
+    dimensions = np.unique(told.dimension)
+    for d in dimensions:
         own = told.dimension == d
         z = (told.error[:, own] ** 2 / told.variance[:, own])[np.isfinite(told.error[:, own])]
         if not z.size:
             continue
         # forecasts overlap by half, so that half of them count
-        chance = float(chi2.sf(z.sum() / 2, max(z.size / 2, 1)))
+        chance = len(dimensions) * float(chi2.sf(z.sum() / 2, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
-            worst, p_value, name = float(np.sqrt(z.mean())), chance, STATE[d]
+            worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]
     passed = p_value > FALSE_ALARM or worst < _WORSE
     dt = mode.problem.scene.time_step
     seconds = longest * dt

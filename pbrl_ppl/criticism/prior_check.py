@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
+from scipy.stats import binom
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History, longest_gap
@@ -24,6 +25,8 @@ QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
 #: with 200 draws: at most 0.08 on sound problems, at least 0.14 with a mass 100 times too large.
 #: The share inside the interval tells less: all cells share one phi, which may be in a tail.
 MOST_BEYOND = 0.11
+#: And that so many do must be less likely than this: of few cells one lies beyond soon enough.
+_BY_CHANCE = 1e-3
 _FEWEST = 50
 #: Changes so many times the errors of measuring say something of the parameters.
 _WELL_BEYOND = 5.0
@@ -45,7 +48,8 @@ class PriorCheck:
         - ``measured_largest`` (body, state): the largest measured change;
         - ``share_inside`` (body, state): share of the measured cells inside the central 94 % of
           their own predictions;
-        - ``share_beyond`` (body, state): share that lies beyond all of them.
+        - ``share_beyond`` (body, state): share that lies beyond all of them;
+        - ``cells`` (body, state): how many were measured.
     seconds : float
         Length of a segment (s).
     draws, diverged : int
@@ -65,8 +69,12 @@ class PriorCheck:
             for state in self.dataset["state"].values:
                 changes = self.dataset.sel(body=body, state=state)
                 unit = STATE_UNITS[STATE.index(str(state))]
-                share = float(changes["share_beyond"])
+                share, cells = float(changes["share_beyond"]), int(changes["cells"])
                 if not share > MOST_BEYOND:  # or not measured
+                    continue
+                # either end of a cell's own draws is as likely as any place between two of them
+                chance = binom.sf(round(share * cells) - 1, cells, 2 / (self.draws + 1))
+                if chance > _BY_CHANCE:
                     continue
                 found.append(
                     f"{state} of {body} changes by up to {float(changes['measured_largest']):.3g}"
@@ -237,5 +245,6 @@ def _compare(predicted: Array, measured: Array) -> xr.Dataset:
             "measured_largest": (dims, np.nanmax(np.abs(own), axis=0) * safe),
             "share_inside": (dims, inside.sum(axis=0) / total * safe),
             "share_beyond": (dims, beyond.sum(axis=0) / total * safe),
+            "cells": (dims, seen.sum(axis=0)),
         }
     ).transpose("body", "state", "quantile")

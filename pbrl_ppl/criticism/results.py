@@ -43,6 +43,8 @@ class Candidate:
         it shows best; empty where there is no size without a place.
     caps : bool
         Whether smaller is stronger, as of a limit: larger ones than ``detectable`` are not seen.
+    why : str
+        Why the loop added it or did not; empty where nothing was decided.
     """
 
     effect: str
@@ -57,6 +59,7 @@ class Candidate:
     looks: int = 1
     detectable: Mapping[str, float] = field(default_factory=dict)
     caps: bool = False
+    why: str = ""
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -46,11 +46,26 @@ class Step:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """The data and the catalogue that effects are chosen by."""
+    """The data and the catalogue that effects are chosen by, and what became of each effect.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared one.
+    catalogue : tuple of Effect
+        Effects to consider.
+    say : callable
+        Told what takes long.
+    why : dict of (str, str) to str
+        Why an effect on a body was added or not, as the last round that it was tried in has it.
+    small : list of Candidate
+        Of the last round, the best that is certain and does not matter, if there is one.
+    """
 
     scene: Scene
     catalogue: tuple[Effect, ...]
     say: Callable[[str], None]
+    why: dict[tuple[str, str], str] = field(default_factory=dict, init=False)
     small: list[Candidate] = field(default_factory=list, init=False)
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
@@ -60,6 +75,7 @@ class Selection:
     def best_addition(self, mode: Mode, ranked: list[Signature]) -> Step | None:
         """Refit with the leading candidates; the best that held-out data confirm, or None."""
         order = [attached.effect.name for attached in self.missing(mode)]
+        self.small.clear()
 
         def rank(item: tuple[Signature, Mode]) -> float:
             signature, fitted = item
@@ -68,7 +84,7 @@ class Selection:
             penalty = 0.5 * fitting * np.log(shown)
             return float(_log_likelihood(fitted) - penalty)
 
-        waiting = _distinct(ranked, order)[:TRIED]
+        waiting = self._worth_a_refit(ranked, order)
         while waiting:
             # those far behind the first wait until it has failed
             enough = WORTH_A_REFIT * waiting[0].candidate.statistic
@@ -82,11 +98,41 @@ class Selection:
                 best = max(ranks.values())
                 tied = [item for item, value in ranks.items() if value > best - TIE]
                 item = min(tied, key=lambda pair: order.index(pair[0].attached.effect.name))
-                del ranks[item]
+                own = ranks.pop(item)
                 step = self._confirm(mode, *item, ranked)
-                if step is not None:
-                    return step
+                if step is None:
+                    continue
+                for (other, _), value in ranks.items():
+                    self._note(other, _behind(own - value, step.signature, other))
+                for other in waiting:
+                    self._note(other, f"too far behind {_named(item[0], other)} to be refitted")
+                return step
         return None
+
+    def _worth_a_refit(self, ranked: list[Signature], order: list[str]) -> list[Signature]:
+        """Significant candidates, best first; of twins, the one that the catalogue names first.
+
+        The noise's shape is scored and never added: misfit would pass for noise. A scene declares
+        it.
+        """
+        kept: list[Signature] = []
+        for signature in sorted(ranked, key=lambda entry: order.index(entry.attached.effect.name)):
+            same = [earlier for earlier in kept if twins(signature, earlier)]
+            if isinstance(signature.attached.effect.stage, Noise):
+                self._note(signature, "the noise's shape is scored and never added: declare it")
+            elif signature.candidate.p_value >= TRY_P:
+                # of one that came close before, what it was is better known by that round
+                if _key(signature) not in self.why:
+                    chance = f"p = {signature.candidate.p_value:.2g}"
+                    self._note(signature, f"{chance}: what chance brings is not tried")
+            elif same:
+                self._note(signature, f"the same as {_named(same[0], signature)} in these data")
+            else:
+                kept.append(signature)
+        kept.sort(key=lambda entry: entry.log_p)
+        for signature in kept[TRIED:]:
+            self._note(signature, f"behind the {TRIED} that are refitted in a round")
+        return kept[:TRIED]
 
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
@@ -94,11 +140,17 @@ class Selection:
         """Accept an improvement that cross-validation is sure of and that matters."""
         fitted = with_enough_substeps(fitted, self.say)
         total, error = _gain(mode, fitted)
-        if total < MIN_ELPD or total < MIN_ELPD_SE * error:
+        if not _sure(total, error):
+            self._note(signature, _unsure(total, error))
             return None
-        if _share(mode, fitted) < MIN_ERROR_FALL:
-            self.small.append(signature.candidate)
+        share = _share(mode, fitted)
+        if share < MIN_ERROR_FALL:
+            size = f"changes predictions by {100 * share:.2g} %"
+            self._note(signature, f"{size}: less than {100 * MIN_ERROR_FALL:g} % does not matter")
+            if not self.small:  # of others it is not known whether they are there beside it
+                self.small.append(signature.candidate)
             return None
+        self._note(signature, "added")
         return Step(signature, inseparable(signature, ranked), fitted, total, error)
 
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
@@ -106,10 +158,24 @@ class Selection:
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
             without = self._without(mode, step.signature.attached)
             total, error = _gain(without, mode)
-            if total < MIN_ELPD or total < MIN_ELPD_SE * error:
+            if not _sure(total, error):
+                self._note(step.signature, f"needless beside later ones: {_unsure(total, error)}")
                 mode = without
                 steps = [addition for addition in steps if addition is not step]
         return mode, sorted(steps, key=lambda addition: -addition.elpd_difference)
+
+    def withdraw(self, steps: list[Step]) -> None:
+        """Take back what was added: most of what was missing remains with it."""
+        for step in steps:
+            self._note(step.signature, "withdrawn: most of what is missing remains with it")
+        self.small.clear()  # beside what is no longer there
+
+    def explained(self, ranked: list[Signature]) -> tuple[Candidate, ...]:
+        """Candidates that say what became of them."""
+        return tuple(replace(own.candidate, why=self.why.get(_key(own), "")) for own in ranked)
+
+    def _note(self, signature: Signature, why: str) -> None:
+        self.why[_key(signature)] = why
 
     def _without(self, mode: Mode, effect: Attached) -> Mode:
         kept = tuple(attached for attached in mode.problem.physics.effects if attached != effect)
@@ -133,19 +199,31 @@ def refitted(mode: Mode, signature: Signature) -> Mode:
     return trajectory_mode(problem, inside(layout.priors, phi), mode.sigma)
 
 
-def _distinct(ranked: list[Signature], order: list[str]) -> list[Signature]:
-    """Significant candidates, best first; of twins, the one that the catalogue names first.
+def _key(signature: Signature) -> tuple[str, str]:
+    return signature.candidate.effect, signature.candidate.body
 
-    The noise's shape is scored and never added: misfit would pass for noise. A scene declares it.
-    """
-    kept: list[Signature] = []
-    for signature in sorted(ranked, key=lambda entry: order.index(entry.attached.effect.name)):
-        if isinstance(signature.attached.effect.stage, Noise):
-            continue
-        significant = signature.candidate.p_value < TRY_P
-        if significant and not any(twins(signature, earlier) for earlier in kept):
-            kept.append(signature)
-    return sorted(kept, key=lambda entry: entry.log_p)
+
+def _named(signature: Signature, beside: Signature) -> str:
+    """An effect in words, with its body where the other one's is another."""
+    name, body = signature.attached.effect.name.replace("_", " "), signature.attached.body
+    return name if body == beside.attached.body else f"{name} on {body}"
+
+
+def _behind(nats: float, best: Signature, own: Signature) -> str:
+    """Why one that was refitted was not taken, but another that fits so much better."""
+    if nats < TIE:
+        return f"fits no better than {_named(best, own)}, which is simpler"
+    return f"fits less well than {_named(best, own)}, by {nats:.1f} nats"
+
+
+def _sure(total: float, error: float) -> bool:
+    """Whether a gain in cross-validated density is one to act on."""
+    return total >= MIN_ELPD and total >= MIN_ELPD_SE * error
+
+
+def _unsure(total: float, error: float) -> str:
+    needed = max(MIN_ELPD, MIN_ELPD_SE * error)
+    return f"cross-validation gains {total:.1f} ± {error:.1f} nats, {needed:.1f} are needed"
 
 
 def _gain(before: Mode, after: Mode) -> tuple[float, float]:

@@ -94,6 +94,20 @@ def unexplained_acceleration(mode: Mode) -> Left:
     return Left(names, size, relative, _p_values(mode), _numerical(mode))
 
 
+def noise_alone(mode: Mode, left: Left) -> Array:
+    """Noise parameters as they are if what is not certain is nothing, shape (parameter,).
+
+    Few data do not tell an error of measuring from what a step adds: the mode gives all to one.
+    """
+    problem, places = mode.problem, mode.problem.trajectory_noise.cells.accelerations
+    held = {
+        place: _NOTHING * problem.noise_prior[0][place]
+        for place, certain in zip(places, left.certain, strict=True)
+        if not certain
+    }
+    return profile_sigma(problem, problem.residual(mode.phi), mode.phi, held)
+
+
 def innovations_over_steps(mode: Mode) -> Array:
     """Typical size of each cell's innovations as a share of what a step changes, shape (cell,)."""
     noise, segments = mode.problem.trajectory_noise, mode.problem.segments

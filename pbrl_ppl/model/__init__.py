@@ -1,6 +1,6 @@
 """Table 1, Eqs. 11 and 12, the engine as a pytensor Op, and the `pm.Model` made of them."""
 
-from pbrl_ppl.model.cells import ACCELERATION, JOLT, Cells
+from pbrl_ppl.model.cells import ACCELERATION, JOLT, Cells, check_moves
 from pbrl_ppl.model.data import Data
 from pbrl_ppl.model.declaration import build_model, physics_model, prior_predictive_draws
 from pbrl_ppl.model.library import ParameterLibrary
@@ -48,6 +48,7 @@ __all__ = [
     "build_layout",
     "build_model",
     "cells_of",
+    "check_moves",
     "estimate_sigma",
     "index_priors",
     "linearised",

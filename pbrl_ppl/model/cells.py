@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import fill_hinges
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA, wrapped
@@ -124,3 +125,19 @@ class Cells:
         """Body and place among the columns of each cell."""
         body, dimension = np.divmod(self.places, 6)
         return body, np.searchsorted(self.columns, dimension)
+
+
+def check_moves(cells: Cells, scene: Scene) -> None:
+    """Refuse a recording in which nothing moves, which has no noise to infer either.
+
+    Raises
+    ------
+    HistoryError
+        If no number that was measured ever changes.
+    """
+    if not cells.sensors and not cells.rates:
+        names = ", ".join(body.name for body in scene.dynamic)
+        raise HistoryError(
+            f"history: nothing moves: every number that was measured of {names} stays exactly the"
+            " same, which tells nothing; record a motion, or check the columns"
+        )

@@ -92,7 +92,7 @@ def physics_model(
     EffectError
         If an effect is unknown or does not apply.
     HistoryError
-        If the history has nothing to fit at this horizon.
+        If the history has nothing to fit at this horizon, or nothing moves in whole trajectories.
     SimulationError
         If bodies start deep inside each other or a wall, or a hinge's bodies apart.
     ValueError

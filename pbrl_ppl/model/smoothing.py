@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import History, hung_bodies, longest_gap, unseen
-from pbrl_ppl.model.cells import Cells
+from pbrl_ppl.model.cells import Cells, check_moves
 from pbrl_ppl.model.problem import Problem
 from pbrl_ppl.model.sensitivity import Sensitivity
 from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
@@ -57,12 +57,18 @@ def along_trajectories(
     -------
     Problem
         Of horizon 1, its noise a :class:`TrajectoryNoise`.
+
+    Raises
+    ------
+    HistoryError
+        If nothing moves.
     """
     history = problem.data.history
     states = first_states(history)
     states = foreseen(problem.on(replace(problem.data, horizon=1, states=states)), phi)
     if cells is None:
         cells = cells_of(problem.scene, history)
+        check_moves(cells, problem.scene)
         medians = tuple(noise_medians(cells, history, states).tolist())
         problem = problem.with_noise(prior=(medians, SPREAD), scalar=False, trajectories=None)
     data = replace(problem.data, horizon=1, states=states, columns=cells.columns)

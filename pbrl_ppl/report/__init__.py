@@ -13,7 +13,7 @@ from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
 from pbrl_ppl.report.posterior_report import render_posterior
 from pbrl_ppl.report.scene_plots import animate_plan, draw_goal, draw_motion, draw_scene
 from pbrl_ppl.report.style import png
-from pbrl_ppl.report.words import unseen_in_words, verdict_in_words
+from pbrl_ppl.report.words import rejected_in_words, unseen_in_words, verdict_in_words
 
 __all__ = [
     "Log",
@@ -38,6 +38,7 @@ __all__ = [
     "plot_trace",
     "png",
     "read_manifest",
+    "rejected_in_words",
     "render_posterior",
     "summary",
     "unseen_in_words",

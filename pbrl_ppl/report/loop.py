@@ -280,6 +280,11 @@ def close_loop(
     EffectError
         If the scene declares an unknown effect.
 
+    Warns
+    -----
+    PriorWarning
+        Before anything is fitted, if the declared prior could not have made ``train``.
+
     Examples
     --------
     ::

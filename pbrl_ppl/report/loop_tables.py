@@ -137,7 +137,7 @@ def candidate_table(findings: Findings) -> Table:
     return Table(
         "Candidates of the first round, best first",
         ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
-         "Identifiable", "Would be seen from"),
+         "Identifiable", "Would be seen from", "What became of it"),
         [
             (
                 (plain(candidate.effect), candidate.body),
@@ -147,10 +147,11 @@ def candidate_table(findings: Findings) -> Table:
                 _sizes(candidate, candidate.estimate),
                 f"{number(100 * candidate.identifiable, 2)} %",
                 _sizes(candidate, candidate.detectable) or "–",
+                candidate.why or "–",
             )
             for candidate in findings.candidates
         ],
-        words=(4, 6),
+        words=(4, 6, 7),
         marks=[
             "added" if (each.effect, each.body) in added else "" for each in findings.candidates
         ],

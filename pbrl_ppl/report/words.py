@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Candidate, Findings
+from pbrl_ppl.criticism import (
+    ADEQUATE,
+    NOT_CONVERGED,
+    TRIED,
+    TRY_P,
+    UNEXPLAINED,
+    Candidate,
+    Findings,
+)
 from pbrl_ppl.model import ACCELERATION
 from pbrl_ppl.posterior import draws, group
 
@@ -44,15 +52,9 @@ def verdict_in_words(findings: Findings) -> str:
             " parameters tighter priors."
         )
     if findings.verdict == ADEQUATE:
-        small = joined(
-            f"{plain(candidate.effect)} on the {plain(candidate.body)}"
-            for candidate in findings.small
-        )
-        beside = f" {small.capitalize()} is present, and changes predictions by less than 1 %."
         return (
-            "Nothing was found missing: what the declared model leaves passed all tests of"
-            " measurement noise (an unexplained acceleration, whiteness, forecasts, dependence on"
-            f" state, command and time).{beside if small else ''}"
+            "Nothing was found missing: what the declared model leaves passed all tests that were"
+            f" made ({joined(test.name for test in findings.tests)}).{_small(findings)}"
         )
     if findings.verdict == UNEXPLAINED and not found:
         return f"Something is missing that no effect in the catalogue explains: {rest}."
@@ -64,16 +66,37 @@ def verdict_in_words(findings: Findings) -> str:
     if left is not None:
         return f"Something was missing: {found}. A pattern remains that nothing explains: {rest}."
     if len(findings.added) > 1:
-        return f"{len(findings.added)} things were missing: {found}."
-    return f"Something was missing: {found}."
+        return f"{len(findings.added)} things were missing: {found}.{_small(findings)}"
+    return f"Something was missing: {found}.{_small(findings)}"
+
+
+def _small(findings: Findings) -> str:
+    """Say what is there without mattering; where a pattern remains, that may be it instead."""
+    return "".join(
+        f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
+        " less than 1 %."
+        for one in findings.small
+    )
+
+
+def rejected_in_words(findings: Findings) -> str:
+    """Say why the leading candidates, of those that chance does not explain, were not added."""
+    there = {(added.effect, added.body) for added in findings.added}
+    told = [
+        f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
+        for one in findings.candidates
+        if one.why and one.p_value < TRY_P and (one.effect, one.body) not in there
+    ]
+    return f"Not added: {'; '.join(told[:TRIED])}." if told else ""
 
 
 def unseen_in_words(findings: Findings) -> str:
-    """Say how small an effect must be for these data not to show it; nothing of those added.
+    """Say how small an effect must be for these data not to show it; nothing of those shown.
 
     An obstacle has no size without a place: what has none is named, for nothing was said of it.
     """
     there = {(added.effect, added.body) for added in findings.added}
+    there |= {(small.effect, small.body) for small in findings.small}
     sizes, silent = [], []
     for candidate in findings.candidates:
         if (candidate.effect, candidate.body) in there:

@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,19 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     assert scene.substeps == 4
     assert train.n_transitions == test.n_transitions == 4
     assert options == {"seed": 1, "draws": None, "method": "metropolis"}
+
+
+@pytest.mark.usefixtures("files", "calls")
+def test_close_loop_says_why_leaders_were_not_added(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    found = made_up()
+    told = tuple(replace(one, why="fits less well") for one in found.candidates)
+    loop = Loop(replace(found, candidates=told))
+    monkeypatch.setattr(report, "close_loop", lambda *args, **options: loop)
+    assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert said[1] == "Not added: quadratic drag on the cart (fits less well)."
 
 
 @pytest.mark.usefixtures("files")

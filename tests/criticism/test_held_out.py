@@ -158,5 +158,5 @@ def test_a_test_history_may_measure_less(frames) -> None:
     with pytest.raises(Begun):
         revise(BOX, history(frames[0]), blind, progress=begin)
     mode = fitted(BOX, frames[0])
-    told = HeldOut(blind, 1).noise_floor(mode, 5)
+    told = HeldOut(blind, 1).noise_floor(mode, mode.sigma, 5)
     assert set(told.one_step_rmse) == set(STATE) - {"omega"}

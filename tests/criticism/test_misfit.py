@@ -10,8 +10,15 @@ import pytest
 from scipy.stats import binom
 
 from pbrl_ppl.criticism.misfit import ACCELERATION, FORECASTS, find_misfit
-from pbrl_ppl.criticism.unexplained import FALSE_ALARM, MATTERS, Left, unexplained_acceleration
+from pbrl_ppl.criticism.unexplained import (
+    FALSE_ALARM,
+    MATTERS,
+    Left,
+    noise_alone,
+    unexplained_acceleration,
+)
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
+from tests.helpers.histories import NOISE
 
 WHITENESS, COMMANDS = "whiteness", "correlation with commands"
 DEPENDENCE = "dependence on state, command and time"
@@ -31,12 +38,13 @@ def failed(mode):
 
 
 @pytest.mark.long
-def test_each_fails_on_clean_data_no_more_often_than_it_says() -> None:
+@pytest.mark.parametrize(("trajectories", "intervals"), [(4, 12), (4, 5), (1, 10), (3, 2), (1, 4)])
+def test_each_fails_on_clean_data_no_more_often_than_it_says(trajectories, intervals) -> None:
     rng = np.random.default_rng(5)
     failures = dict.fromkeys(RATES, 0)
     for i in range(100):
         if i % 20 == 0:  # five sets of commands, which are held for up to three intervals
-            disc = Disc(intervals=12, scene=FINE, hold=1 + i // 20 % 3, seed=i)
+            disc = Disc(trajectories, intervals, FINE, hold=1 + i // 20 % 3, seed=i)
         for test in misfit(disc.mode(rng), seed=i).tests:
             failures[test.name] += not test.passed
     for name, count in failures.items():
@@ -49,6 +57,25 @@ def test_clean_data_of_another_engine_pass(make_history) -> None:
     assert found.unexplained is None
     assert found.predicts
     assert {test.name for test in found.tests} == set(RATES)
+
+
+def test_trajectories_shorter_than_the_lags_are_tested() -> None:
+    for intervals in range(1, 7):
+        mode = Disc(1, intervals, FINE).mode(np.random.default_rng(1))
+        names = {test.name for test in misfit(mode).tests}
+        assert names == {ACCELERATION, FORECASTS, DEPENDENCE}  # of the others there is nothing yet
+
+
+def test_forecasts_of_few_intervals_are_as_good_as_their_noise() -> None:
+    """Six do not tell errors of measuring from what a step adds: a third of such data failed."""
+    rng = np.random.default_rng(5)
+    disc = Disc(2, 3, FINE)
+    for _ in range(4):
+        mode = disc.mode(rng)
+        left = unexplained_acceleration(mode)
+        assert FORECASTS not in failed(mode)
+        # and the floor of the report is one that the disc's sensors can have
+        assert (noise_alone(mode, left)[:6] > 0.1 * np.array(NOISE)).all()
 
 
 def test_a_disturbance_without_memory_is_an_acceleration() -> None:

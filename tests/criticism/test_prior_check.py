@@ -102,6 +102,23 @@ def test_a_mass_wrong_by_a_thousand_is_named(scene, history, factor) -> None:
     assert {"vx", "vy"} <= named(check(factor * CART["mass"]))
 
 
+def test_one_of_few_changes_may_lie_beyond_all_draws(scene, history) -> None:
+    """By chance one of six does in every ninth recording; three do if the units are wrong."""
+    check = prior_predictive_check(physics_model(scene, history), draws=100)
+
+    def told(share: float, cells: int) -> bool:
+        few = check.dataset.assign(
+            share_beyond=check.dataset["share_beyond"] * 0 + share,
+            cells=check.dataset["cells"] * 0 + cells,
+        )
+        return bool(dataclasses.replace(check, dataset=few).sentences)
+
+    assert not told(1 / 6, 6)
+    assert told(3 / 6, 6)
+    assert not told(1.0, 1)
+    assert told(0.12, 100)
+
+
 def test_missing_cells_count_on_neither_side(scene, history) -> None:
     rows = history.to_dataframe()
     rows.loc[rows.index % 3 == 1, "x"] = np.nan

@@ -19,12 +19,23 @@ from pbrl_ppl.criticism import revise
 from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
-from pbrl_ppl.errors import ConvergenceWarning, EffectError, PosteriorError
-from tests.helpers.free_puck import BOX, DISC, MASS, box2d, fitted
+from pbrl_ppl.errors import (
+    ConvergenceWarning,
+    EffectError,
+    HistoryError,
+    PosteriorError,
+    PriorWarning,
+)
+from pbrl_ppl.state import STATE, WRENCH
+from tests.helpers.free_puck import BOX, MASS, box2d, fitted
 from tests.helpers.places import load
 
-# a posterior of few draws is enough to test a verdict, and says that it is one
-pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+pytestmark = [
+    # a posterior of few draws is enough to test a verdict, and says that it is one
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
+    # of a missing effect too, where it is large
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.PriorWarning"),
+]
 #: Of each of four chains: about 250 effective ones, where a verdict needs 100.
 DRAWS = 150
 #: The Gaussian at the mode will do where the claim is a verdict's, not that of the chains.
@@ -112,6 +123,8 @@ def test_a_catalogued_effect_is_named_with_its_size(make_history) -> None:
     assert low <= 0.3 <= high  # of one seed: it does in 94 % of all
     assert high - low < 0.02
     assert added.elpd_difference > 2 * added.elpd_difference_se
+    assert found.candidates[0].why == "added"
+    assert all(one.why for one in found.candidates)
     assert all(test.passed for test in found.tests)
     before, after = found.acceleration.before, found.acceleration.after
     assert after["vx"] < 0.1 * before["vx"]
@@ -170,6 +183,25 @@ def test_nonsense_is_never_adequate(wrong, clean) -> None:
     assert found.verdict != "adequate"
     assert found.unexplained is not None
     assert not all(test.passed for test in found.tests)
+
+
+class Fitting(Exception):
+    """The loop began to fit."""
+
+
+def until_it_fits(stage: str) -> None:
+    if stage.startswith("fitting"):
+        raise Fitting
+
+
+def test_wrong_units_are_told_before_the_fit(clean) -> None:
+    told = pytest.warns(PriorWarning, match="of puck changes .* check units.*; so it is with")
+    with told, pytest.raises(Fitting):
+        loop([millinewtons(frame) for frame in clean], progress=until_it_fits)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(Fitting):
+            loop(clean, progress=until_it_fits)
 
 
 @pytest.mark.slow
@@ -241,6 +273,19 @@ def test_computed_velocities_are_recognised_and_the_effect_is_found(make_history
     spread = np.sqrt(step.after.covariance[place, place])
     assert abs(step.after.phi[place] - 0.3) < 4 * spread  # a false alarm in 1e-4
     assert spread < 0.02
+
+
+@pytest.mark.one_stack
+def test_a_recording_in_which_nothing_moves_is_refused_at_once(clean) -> None:
+    still = clean[0].assign(**dict.fromkeys((*STATE, *WRENCH), 0.0))
+    stages = []
+    with pytest.raises(HistoryError, match="nothing moves: every number"):
+        loop([still, clean[1]], progress=stages.append)
+    assert stages == []
+    (history,) = histories([still])
+    with pytest.raises(HistoryError, match="nothing moves"):
+        pp.physics_model(BOX, history, trajectories=True)
+    pp.physics_model(BOX, history)  # Eq. 11 has a noise of its own
 
 
 @pytest.mark.slow
@@ -328,8 +373,7 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
     monkeypatch.setattr(loop_module, "fit", rough)
     monkeypatch.setattr(loop_module, "build_model", lambda problem: problem)
     mode = _Mode(SimpleNamespace(with_physics=lambda threads: None))
-    shared = loop_module._Loop(DISC, None, None, seed=1, method=method, say=print)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        shared.posterior(mode, None)
+        loop_module._posterior(mode, method, 1, None, print)
     assert len(caught) == said

@@ -66,6 +66,7 @@ def test_the_fitted_friction_predicts_held_out_pushes(recorded) -> None:
     assert turned <= 1.7
 
 
+@pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.PriorWarning")  # without the friction, yes
 @pytest.mark.long
 def test_the_loop_names_the_friction(recorded) -> None:
     """Nothing of the table is declared; 3.2 mm and 2.1 degrees without it, fitted."""

@@ -23,7 +23,7 @@ from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.report import render
-from pbrl_ppl.report.words import number, unseen_in_words, verdict_in_words
+from pbrl_ppl.report.words import number, rejected_in_words, unseen_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 
@@ -97,7 +97,10 @@ def test_page_explains_its_words() -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_page_where_nothing_is_missing() -> None:
     text = page("adequate").text
-    assert "Nothing was found missing: what the declared model leaves passed all tests of" in text
+    assert (
+        "Nothing was found missing: what the declared model leaves passed all tests that were made"
+        " (unexplained acceleration, and whiteness)." in text
+    )
     assert "These data would not show: linear drag below 0.0200 kg/s; quadratic drag below" in text
     assert "chance alone brings one that close in 37 % of all cases" in text
     assert "fell by" not in text and "After:" not in text
@@ -114,6 +117,33 @@ def test_what_would_not_be_seen_has_a_side_or_is_named() -> None:
         "These data would not show: saturation above 8.00 kg/s. Nothing can be said of how large"
         " these would have to be: hidden obstacle."
     )
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_candidates_that_were_not_added_say_why() -> None:
+    findings = made_up()
+    said = ("added", "fits less well than linear drag, by 12.0 nats", "p = 0.04: chance")
+    told = [replace(c, why=w) for c, w in zip(findings.candidates, said, strict=False)]
+    findings = replace(findings, candidates=(*told, findings.candidates[-1]))
+    assert rejected_in_words(findings) == f"Not added: quadratic drag on the cart ({said[1]})."
+    assert rejected_in_words(made_up()) == ""
+    text = Page(render(findings)).text
+    assert "What became of it" in text and said[1] in text and said[2] in text
+
+
+def test_what_is_small_is_said_to_be_there() -> None:
+    for verdict, others in (("adequate", "quadratic drag"), ("effects-added", "constant force")):
+        findings = made_up(verdict)
+        one = findings.candidates[len(findings.added)]
+        findings = replace(findings, small=(replace(one, body="Cart_2"),))
+        said = f" There is {one.effect.replace('_', ' ')} on the Cart 2, which changes"
+        assert said in verdict_in_words(findings)
+        assert verdict_in_words(findings).endswith("predictions by less than 1 %.")
+        small = replace(findings, small=(one,))
+        assert unseen_in_words(small).startswith(f"These data would not show: {others}")
+    # what remains may be what looks like it
+    findings = replace(made_up("unexplained"), small=made_up().candidates[:1])
+    assert "linear drag" not in verdict_in_words(findings)
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -375,6 +405,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "looks",
         "detectable",
         "caps",
+        "why",
     ]
     assert list(got["error"]) == ["before", "after", "noise_floor"]
     assert got["error"]["before"]["normalised_rmse"] == 2.4
