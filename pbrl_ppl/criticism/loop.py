@@ -35,7 +35,7 @@ MOST_ADDED = 5
 #: With more than this share of what was missing (of its square) left there are no names to be had;
 #: where what remains is small (a share of the bodies' acceleration), more may.
 LARGE_REMAINDER, SMALL, LARGE_IF_SMALL = 0.2, 0.01, 0.5
-#: As many may, where no more than this share of what could be predicted of errors still can be:
+#: As many may, where less than this share of what could be predicted of errors still can be:
 #: then the names are what the errors follow, and the rest comes by chance, as a motor's ripple.
 MOST_PREDICTABLE = 0.1
 #: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
@@ -160,7 +160,8 @@ def _revised(
     remains = _remains(before, left) if added and misfit.unexplained is not None else 0.0
     if remains > (LARGE_IF_SMALL if left.worst < SMALL else LARGE_REMAINDER):
         without = find_misfit(declared, before, horizon=horizon, seed=seed)
-        if remains > LARGE_IF_SMALL or misfit.predictable > MOST_PREDICTABLE * without.predictable:
+        followed = misfit.predictable < MOST_PREDICTABLE * without.predictable
+        if remains > LARGE_IF_SMALL or not followed:
             # part of a misfit goes to whatever is there: no name is to be had from that
             say("no effect of the catalogue explains what is missing")
             selection.withdraw(added)

@@ -27,7 +27,7 @@ from pbrl_ppl.errors import (
     PriorWarning,
 )
 from pbrl_ppl.state import STATE, WRENCH
-from tests.helpers.free_puck import BOX, MASS, box2d, fitted
+from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
 from tests.helpers.places import load
 
 pytestmark = [
@@ -141,6 +141,24 @@ def test_an_effect_outside_the_catalogue_gets_no_wrong_name(make_history) -> Non
     assert found.candidates[0].effect == "quadratic_drag"
     assert found.verdict == "unexplained"
     assert found.unexplained.body == "puck"
+
+
+@pytest.mark.slow
+def test_what_comes_by_chance_takes_no_name_away() -> None:
+    """Two fifths of what was missing remain, and nothing predicts them: the rest is the drag's."""
+    disc = Disc(8, 20, drag=1.2)
+    rng = np.random.default_rng(2)
+    jolts = rng.normal(0.0, (0.45, 0.45, 0.0), disc.pushes.shape)
+    train, test = disc.frame(rng, pushed=jolts), disc.frame(rng, pushed=jolts[::-1])
+    drags = [effect for effect in pp.catalogue if effect.name.endswith("drag")]
+    found = loop((train, test), DISC, catalogue=drags)
+    assert found.verdict == "unexplained"  # and that something remains is said
+    assert [one.effect for one in found.added] == ["linear_drag"]
+    estimate = found.added[0].parameters["coefficient"]
+    assert abs(estimate.mean - 1.2) < 3 * estimate.sd
+    before, after = found.acceleration.before, found.acceleration.after
+    assert after["vx"] ** 2 > 0.2 * before["vx"] ** 2
+    assert after["vx"] == pytest.approx(0.45, rel=0.2)
 
 
 @pytest.mark.one_stack
