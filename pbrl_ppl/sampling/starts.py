@@ -19,6 +19,8 @@ from pbrl_ppl.sampling.metropolis import Gaussian
 
 Array = NDArray[np.float64]
 
+#: Where a posterior is tried, in standard deviations, and by how much it has fallen at the first.
+_FAR, _LOW = (2.0, 4.0, 8.0, 16.0), 2.5
 #: Steps of the noise a round. Along trajectories there are two noises, one of which may vanish.
 _CHEAP, _CHEAP_ALONG = 5, 30
 
@@ -99,9 +101,51 @@ def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     ]
     mean, scale = np.array(pairs).reshape(-1, 2).T
     covariance = scale[:, None] * mode.covariance * scale
+    covariance = widened(problem, mode, mean, covariance)
     deviation = np.sqrt(np.diag(covariance))
     shrink = np.minimum(deviation, 2.0) / deviation
     return mean, shrink[:, None] * covariance * shrink + 1e-12 * np.eye(len(scale))
+
+
+def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Array:
+    """Covariance in the sampler's space, widened where the posterior falls off more slowly.
+
+    At a kink or a bump of few contacts the curvature says that a parameter is known, which the
+    posterior farther off does not bear out; an adapting chain would take long to find that.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says what the posterior is.
+    mode : Mode
+        Where the covariance was taken, with its noise.
+    mean, covariance : ndarray
+        The mode in the sampler's space and its Laplace covariance, shapes (p,) and (p, p).
+    """
+    variance = np.diag(covariance)
+    ends = np.array([*_FAR, *(-far for far in _FAR)])[:, None]
+    top = _log_density(problem, mean[None], mode.sigma)
+    stretch = np.ones(len(mean))
+    # one at a time, for each is a rollout of all data; the others stay where they are
+    for i, step in enumerate(np.diag(np.sqrt(variance))):
+        fall = top - _log_density(problem, mean + ends * step, mode.sigma)
+        # of either side, no farther than to the first that has fallen
+        inside = np.nan_to_num(fall.reshape(2, -1), nan=np.inf) < _LOW
+        steps = np.logical_and.accumulate(inside, axis=1).sum(axis=1)
+        stretch[i] = np.array([_FAR[0], *_FAR])[steps].mean() / _FAR[0]
+    return np.asarray(covariance + np.diag(variance * (stretch**2 - 1.0)))
+
+
+def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
+    """Log-posterior but for a constant at points (point, p) of the sampler's space."""
+    priors = problem.layout.priors
+    phi = np.column_stack([constrain(prior, u[:, i]) for i, prior in enumerate(priors)])
+    slope = np.column_stack([unconstrain(prior, phi[:, i])[1] for i, prior in enumerate(priors)])
+    with np.errstate(all="ignore"):
+        likelihood = problem.log_density(problem.residual(phi), sigma, phi).sum(axis=-1)
+        return np.asarray(
+            likelihood + problem.layout.log_prior(phi).sum(axis=-1) - np.log(slope).sum(axis=-1)
+        )
 
 
 def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
