@@ -96,6 +96,8 @@ def test_closing_the_loop(run, tmp_path, capsys) -> None:
     assert pictures(tmp_path) == {"03_candidates", "03_errors", "03_rollout"}
 
 
+# what the model lacks is large, and the loop says so before it fits
+@pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.PriorWarning")
 def test_your_own_effect(run, tmp_path) -> None:
     names = run("04_your_own_effect.py", TRAJECTORIES=5, INTERVALS=15, METHOD="laplace")
     (added,) = names["loop"].added

@@ -165,8 +165,8 @@ def test_motion_plays_and_is_scrubbed_by_keyboard(browser: Any, files: dict[str,
     page.wait_for_timeout(300)
     midway = page.evaluate(moved)
     assert midway != last
-    until(page, f"{clock} === '1.20 s of 1.20 s'")
-    assert page.inner_text("#play") == "Play" and page.evaluate(moved) == last
+    until(page, "document.querySelector('#play').innerText === 'Play'")
+    assert page.evaluate(clock) == "1.20 s of 1.20 s" and page.evaluate(moved) == last
     page.focus("#scrub")
     page.keyboard.press("Home")
     first = page.evaluate(moved)
