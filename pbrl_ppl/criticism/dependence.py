@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import rankdata
 
 from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.criticism.unexplained import (
@@ -154,7 +155,7 @@ def _features(mode: Mode, body: int) -> Array:
 
 def _kernels(features: Array) -> Iterator[Array]:
     """One Gaussian kernel a quantity, on ranks scaled to unit range, shape (n, n) each."""
-    ranks = np.argsort(np.argsort(features, axis=0), axis=0) / max(len(features) - 1, 1)
+    ranks = (rankdata(features, axis=0) - 1) / max(len(features) - 1, 1)  # equal ones share theirs
     varies = np.ptp(features, axis=0) > 1e-9
     for rank, moves in zip(ranks.T, varies, strict=True):
         difference = rank[:, None] - rank

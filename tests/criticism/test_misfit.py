@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from pbrl_ppl.criticism.misfit import ACCELERATION, FORECASTS, find_misfit
+from pbrl_ppl.criticism.dependence import _kernels
+from pbrl_ppl.criticism.misfit import ACCELERATION, DEPENDENCE, FORECASTS, find_misfit
 from pbrl_ppl.criticism.unexplained import (
     FALSE_ALARM,
     MATTERS,
@@ -21,7 +22,6 @@ from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
 from tests.helpers.histories import NOISE
 
 WHITENESS, COMMANDS = "whiteness", "correlation with commands"
-DEPENDENCE = "dependence on state, command and time"
 #: Chance that each fails on clean data, as stated; the permutation test has a level of its own.
 RATES = {ACCELERATION: FALSE_ALARM, WHITENESS: FALSE_ALARM, COMMANDS: FALSE_ALARM,
          FORECASTS: FALSE_ALARM, DEPENDENCE: 0.01}  # fmt: skip
@@ -155,6 +155,13 @@ def test_a_force_that_takes_two_quantities_depends_on_their_product(make_history
     assert DEPENDENCE in {test.name for test in found.tests if not test.passed}
     assert found.unexplained.depends_on.startswith("angular speed × ")
     assert found.unexplained.dimension in ("forward speed", "sideways speed")
+
+
+def test_equal_quantities_are_as_close_as_can_be() -> None:
+    """A torque that is mostly zero says nothing of the order of the rows."""
+    (kernel,) = _kernels(np.array([[0.0], [0.0], [2.0], [0.0]]))
+    np.testing.assert_array_equal(kernel[0], kernel[3])
+    assert kernel[0, 0] == kernel[0, 3] == 1.0 > kernel[0, 2]
 
 
 def test_same_seed_same_tests(make_history) -> None:
