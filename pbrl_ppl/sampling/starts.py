@@ -122,6 +122,8 @@ def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Arr
     mean, covariance : ndarray
         The mode in the sampler's space and its Laplace covariance, shapes (p,) and (p, p).
     """
+    if not len(mean):
+        return covariance
     variance = np.diag(covariance)
     ends = np.array([*_FAR, *(-far for far in _FAR)])[:, None]
     top = _log_density(problem, mean[None], mode.sigma)
@@ -137,15 +139,21 @@ def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Arr
 
 
 def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
-    """Log-posterior but for a constant at points (point, p) of the sampler's space."""
-    priors = problem.layout.priors
-    phi = np.column_stack([constrain(prior, u[:, i]) for i, prior in enumerate(priors)])
-    slope = np.column_stack([unconstrain(prior, phi[:, i])[1] for i, prior in enumerate(priors)])
+    """Log-posterior but for a constant at points (point, p) of the sampler's space.
+
+    There is none where numbers end: at a mass of zero, or at the end of a support.
+    """
+    priors, height = problem.layout.priors, np.full(len(u), -np.inf)
     with np.errstate(all="ignore"):
-        likelihood = problem.log_density(problem.residual(phi), sigma, phi).sum(axis=-1)
-        return np.asarray(
-            likelihood + problem.layout.log_prior(phi).sum(axis=-1) - np.log(slope).sum(axis=-1)
-        )
+        phi = np.column_stack([constrain(prior, u[:, i]) for i, prior in enumerate(priors)])
+        slopes = [unconstrain(prior, phi[:, i])[1] for i, prior in enumerate(priors)]
+        slope = np.log(np.column_stack(slopes)).sum(axis=1)
+        there = np.isfinite(phi).all(axis=1) & np.isfinite(slope)
+        if there.any():
+            own = phi[there]
+            likelihood = problem.log_density(problem.residual(own), sigma, own).sum(axis=-1)
+            height[there] = likelihood + problem.layout.log_prior(own).sum(axis=-1) - slope[there]
+    return height
 
 
 def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:

@@ -21,12 +21,14 @@ def gaussian(problem, u, sigma):
     return -0.5 * np.einsum("...i,ij,...j->...", u, np.linalg.inv(COVARIANCE), u)
 
 
+@pytest.mark.one_stack
 def test_a_gaussian_s_covariance_stays_as_it_is(monkeypatch) -> None:
     monkeypatch.setattr(starts, "_log_density", gaussian)
     found = starts.widened(None, MODE, np.zeros(2), COVARIANCE)
     np.testing.assert_array_equal(found, COVARIANCE)
 
 
+@pytest.mark.one_stack
 def test_it_is_widened_where_the_posterior_falls_off_more_slowly(monkeypatch) -> None:
     """A bump at the top is ten times as narrow as the hill, on one side or on both."""
     narrow = np.diag([0.01, 0.01])
@@ -42,6 +44,7 @@ def test_it_is_widened_where_the_posterior_falls_off_more_slowly(monkeypatch) ->
     assert 0.3 < found[1] < 1.0  # 1 on one side, 0.1 on the other
 
 
+@pytest.mark.one_stack
 def test_its_density_is_that_of_the_model_in_the_sampler_s_space() -> None:
     """But for a constant, which is that of the likelihood."""
     scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
@@ -62,3 +65,14 @@ def test_its_density_is_that_of_the_model_in_the_sampler_s_space() -> None:
         density = problem.log_density(problem.residual(phi), mode.sigma).sum()
         expected = density + problem.layout.log_prior(phi).sum() + np.log(slopes).sum()
         assert value == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.one_stack
+def test_there_is_no_density_where_numbers_end() -> None:
+    scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
+    history = simulated_history(scene, CART, seed=7, trajectories=2, intervals=3)
+    problem = Problem.of(scene, history, attach(scene))
+    far = np.full((2, problem.layout.size), [[1e4], [-1e4]])
+    assert (starts._log_density(problem, far, np.ones(6)) == -np.inf).all()
+    nothing = starts.widened(problem, MODE, np.zeros(0), np.zeros((0, 0)))
+    assert nothing.shape == (0, 0)
