@@ -30,7 +30,8 @@ FITTED = (
     "planning/test_planning_files.py",
     "planning/test_planning_modes.py",
 )
-#: Of a room that does import them, files whose tests stand on modes or on samplers of our own.
+#: Of a room that does import them, files whose tests stand on modes or on samplers of our own, and
+#: those that look at pages in a browser.
 ON_MODES = (
     "agents/test_box2d_world.py",
     "agents/test_library_agent.py",
@@ -46,6 +47,7 @@ ON_MODES = (
     "model/test_contact_noise.py",
     "model/test_trajectories.py",
     "modes/test_configurations.py",
+    "report/test_pages.py",
     "sampling/test_emulator.py",
 )
 #: Files that workers begin with: the longest first, and they fill up with the short ones. The

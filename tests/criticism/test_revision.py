@@ -212,6 +212,7 @@ def until_it_fits(stage: str) -> None:
         raise Fitting
 
 
+@pytest.mark.one_stack
 def test_wrong_units_are_told_before_the_fit(clean) -> None:
     told = pytest.warns(PriorWarning, match="of puck changes .* check units.*; so it is with")
     with told, pytest.raises(Fitting):

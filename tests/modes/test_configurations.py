@@ -313,7 +313,7 @@ def test_two_joints_are_found() -> None:
     assert best.probability > 0.999
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bodies_that_lie_in_each_other_are_no_proof_of_a_joint() -> None:
     """Shapes are rough: what says which bodies are joined is how they move.
 

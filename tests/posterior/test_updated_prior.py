@@ -272,7 +272,7 @@ def test_the_updated_scene_holds_the_posterior_s_moments(parts, first) -> None:
     assert prior["linear_drag_coefficient"]["mu"] == pytest.approx(drag.mean(), rel=0.02)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_two_parts_are_as_good_as_one(parts, first) -> None:
     """Posterior of A as the prior of B against the fit to A and B at once.
 

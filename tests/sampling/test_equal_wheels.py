@@ -36,7 +36,9 @@ def grid() -> np.ndarray:
     [
         pytest.param({"w_theta": {"mu": 0.6, "kappa": 0.7}}, 1, id="angle known roughly"),
         # half a turn is the same to this prior: it is folded, and twice the angle has a mean
-        pytest.param({"mu_x": {"mu": 0.2, "sigma": 0.4}}, 2, id="frictions differ"),
+        pytest.param(
+            {"mu_x": {"mu": 0.2, "sigma": 0.4}}, 2, id="frictions differ", marks=pytest.mark.long
+        ),
     ],
 )
 def test_the_posterior_is_the_declared_one(prior, turns) -> None:

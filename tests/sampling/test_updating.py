@@ -266,7 +266,7 @@ def test_old_files_have_no_prior_of_the_noise(parts, first, one) -> None:
     assert problem.noise.prior[1] == spread
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_other_data_are_fitted_anew(parts, first, monkeypatch) -> None:
     """The masses are others now: nearly no draw is left, and the answer is the refit's."""
     shorten(monkeypatch, draws=500, tune=300)
