@@ -98,7 +98,8 @@ class Row:
         if self.findings is None or self.oracle is None or not self.oracle.rollout_rmse:
             return None
         own, best = self.findings["error"]["after"]["rollout_rmse"], self.oracle.rollout_rmse
-        return float(np.sqrt(np.mean([(own[name] / best[name]) ** 2 for name in best]))) - 1.0
+        ratios = [own[name] / best[name] for name in best if name in own]
+        return float(np.sqrt(np.mean(np.square(ratios)))) - 1.0 if ratios else None
 
     def within(self) -> list[bool]:
         """Of each parameter of the right effect, if it was named: is the truth in the interval."""

@@ -66,12 +66,12 @@ def verdict_in_words(findings: Findings) -> str:
     if left is not None:
         return f"Something was missing: {found}. A pattern remains that nothing explains: {rest}."
     if len(findings.added) > 1:
-        return f"{len(findings.added)} things were missing: {found}.{_small(findings)}"
-    return f"Something was missing: {found}.{_small(findings)}"
+        return f"{len(findings.added)} things were missing: {found}."
+    return f"Something was missing: {found}."
 
 
 def _small(findings: Findings) -> str:
-    """Say what is there without mattering; where a pattern remains, that may be it instead."""
+    """Say what is there without mattering; beside what was added the table of candidates does."""
     return "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
         " less than 1 %."
