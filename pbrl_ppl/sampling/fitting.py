@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -103,7 +104,7 @@ def _metropolis(job: Job) -> Any:
     options["extra"] = evened_logp(model, problem)
     if job.mode.others and len(blocks) == 1:
         hills = [gaussian_blocks(model, peak)[0] for peak in job.mode.others]
-        jumps = Jumps((gaussian_blocks(model, job.mode)[0], *hills))
+        jumps = Jumps((deepcopy(blocks[0]), *hills))  # the block itself adapts
     else:
         jumps = None
     # an exact step of one block, in engine steps; where that is little, looking ahead is no use
