@@ -9,15 +9,13 @@ import numpy as np
 from scipy.stats import beta
 
 from pbrl_ppl.criticism import (
-    MIN_ELPD,
-    MIN_ELPD_SE,
+    DEFAULT,
     TRIED,
+    Change,
     Signature,
-    cross_validated,
-    folds,
+    gain,
     inseparable,
     rank_candidates,
-    standard_error,
     twins,
 )
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
@@ -122,7 +120,7 @@ def select_effects(
         better = step.addition(lacking, {each.attached: mode})
         if better is not None and better[0].attached != each.attached:
             found, mode = (*others, better[0]), better[1]
-        elif not _worth_it(*step.gain(mode, lacking)):
+        elif not _worth_it(step.gain(mode, lacking)):
             found = others
             mode = search((*declared, *(other.attached for other in others)))
     while len(found) < MOST_ADDED and not _foretold(mode, floor):
@@ -183,28 +181,23 @@ class _Step:
             tied = [each for each, height in heights.items() if height > top - _TIE]
             best = min(tied, key=rank)
             del heights[best]
-            gain, error = self.gain(fits[best], mode)
-            if _worth_it(gain, error):
+            gained = self.gain(fits[best], mode)
+            if _worth_it(gained):
                 revision = Revision(
                     best.attached,
                     mode.problem.segments.n,
                     min(1.0, _p_value(mode, best) * len(missing)),
-                    gain,
-                    error,
+                    gained.total,
+                    gained.error,
                     inseparable(best, ranked),
                 )
                 search(best)
                 return revision, fits[best]
         return None
 
-    def gain(self, mode: Mode, without: Mode) -> tuple[float, float]:
-        """Gain in cross-validated log predictive density, and its standard error."""
-        fold = folds(mode)
-        density, before = (
-            cross_validated(_floored(each, self.floor), fold) for each in (mode, without)
-        )
-        gains = density - before
-        return float(gains.sum()), standard_error(gains)
+    def gain(self, mode: Mode, without: Mode) -> Change:
+        """Gain in cross-validated log predictive density."""
+        return gain(_floored(without, self.floor), _floored(mode, self.floor))
 
 
 def _significant(
@@ -254,8 +247,8 @@ def _height(mode: Mode, signature: Signature, floor: float) -> float:
     return float(likelihood - 0.5 * signature.candidate.dof * np.log(problem.segments.n))
 
 
-def _worth_it(gain: float, error: float) -> bool:
-    return gain >= max(MIN_ELPD, MIN_ELPD_SE * error)
+def _worth_it(gained: Change) -> bool:
+    return gained.total >= max(DEFAULT.min_elpd, gained.needed(DEFAULT.min_elpd_se))
 
 
 def _floored(mode: Mode, floor: float) -> Mode:

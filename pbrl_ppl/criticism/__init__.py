@@ -1,6 +1,7 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
-from pbrl_ppl.criticism.cross_validation import cross_validated, folds, standard_error
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.cross_validation import Change, gain
 from pbrl_ppl.criticism.dependence import PRODUCTS
 from pbrl_ppl.criticism.findings import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
 from pbrl_ppl.criticism.loop import revise
@@ -21,21 +22,21 @@ from pbrl_ppl.criticism.results import (
 )
 from pbrl_ppl.criticism.rivals import Rival, fit_rivals, kept_groups, named_effects
 from pbrl_ppl.criticism.score import DECISIVE, Signature, inseparable, rank_candidates, twins
-from pbrl_ppl.criticism.selection import MIN_ELPD, MIN_ELPD_SE, TRIED, TRY_P
+from pbrl_ppl.criticism.selection import TRIED
 
 __all__ = [
     "ADEQUATE",
     "DECISIVE",
-    "MIN_ELPD",
-    "MIN_ELPD_SE",
+    "DEFAULT",
     "NOT_CONVERGED",
     "PRODUCTS",
     "TRIED",
-    "TRY_P",
     "UNEXPLAINED",
     "Acceleration",
     "Added",
     "Candidate",
+    "Change",
+    "Criteria",
     "Errors",
     "Findings",
     "PriorCheck",
@@ -45,9 +46,8 @@ __all__ = [
     "Signature",
     "Unexplained",
     "criticise",
-    "cross_validated",
     "fit_rivals",
-    "folds",
+    "gain",
     "inseparable",
     "kept_groups",
     "learn_remainder",
@@ -55,7 +55,6 @@ __all__ = [
     "prior_predictive_check",
     "rank_candidates",
     "revise",
-    "standard_error",
     "telling_horizon",
     "twins",
 ]

@@ -8,11 +8,20 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.criticism import findings
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.criticism.misfit import Misfit
 from pbrl_ppl.criticism.resolution import shift
-from pbrl_ppl.criticism.results import Acceleration, Added, Candidate, Estimate, Numerical
+from pbrl_ppl.criticism.results import (
+    Acceleration,
+    Added,
+    Candidate,
+    Errors,
+    Estimate,
+    Numerical,
+    Unexplained,
+)
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.selection import Step
 from pbrl_ppl.criticism.unexplained import Left, noise_alone
@@ -20,9 +29,6 @@ from pbrl_ppl.history import History
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
-
-#: Chains with a larger R-hat or fewer effective draws give no verdict.
-WORST_RHAT, LEAST_ESS = 1.05, 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,9 +48,11 @@ def put_together(
     held_out: HeldOut,
     models: Models,
     candidates: tuple[Candidate, ...],
+    small: tuple[Candidate, ...],
     steps: list[Step],
     misfit: Misfit,
-    small: tuple[Candidate, ...],
+    criteria: Criteria,
+    horizon: int,
 ) -> Findings:
     """Findings from what the loop's stages gave: verdict, held-out errors, provenance.
 
@@ -58,25 +66,32 @@ def put_together(
         The declared and the revised one.
     candidates : tuple of Candidate
         Of the first round.
+    small : tuple of Candidate
+        Effects that are significant and negligible.
     steps : list of Step
         Effects that were added.
     misfit : Misfit
         What the revised model leaves.
-    small : tuple of Candidate
-        Effects that are certain and do not matter.
+    criteria : Criteria
+        Which chains have converged.
+    horizon : int
+        Intervals of forecasts, where held-out trajectories are as long.
     """
     declared, revised = models.declared, models.revised
     scene = declared.problem.scene
-    rollout = held_out.rollout_horizon(scene.time_step)
+    rollout = held_out.longest(horizon)
     before = held_out.errors(declared, revised, models.before, rollout)
     after = before
     if revised is not declared:
         after = held_out.errors(revised, revised, models.after, rollout)
     verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
+    unexplained = misfit.unexplained
     # names that leave an acceleration unexplained are the nearest there are at best
-    if misfit.unexplained is not None and not (steps and misfit.predicts):
+    if unexplained is not None and not (steps and misfit.predicts):
         verdict = findings.UNEXPLAINED
-    if not all(map(converged, (models.before, models.after))):
+    if steps and after.normalised_rmse > before.normalised_rmse:
+        verdict, unexplained = findings.UNEXPLAINED, unexplained or _worse(before, after)
+    if not all(converged(posterior, criteria) for posterior in (models.before, models.after)):
         verdict = findings.NOT_CONVERGED
     added = tuple(_added(step, revised, models.after) for step in steps)
     keep_groups(models.after, added)
@@ -86,7 +101,7 @@ def put_together(
         numerical=Numerical(scene.substeps, revised.problem.physics.substeps, shift(revised)),
         candidates=candidates,
         added=added,
-        unexplained=misfit.unexplained,
+        unexplained=unexplained,
         before=before,
         after=after,
         noise_floor=held_out.noise_floor(revised, noise_alone(revised, models.left_after), rollout),
@@ -131,11 +146,28 @@ def _acceleration(before: Left, after: Left) -> Acceleration:
     )
 
 
-def converged(posterior: Any) -> bool:
+def converged(posterior: Any, criteria: Criteria = DEFAULT) -> bool:
     """Whether chains agree well enough for a verdict; warnings begin earlier."""
     attrs = posterior.attrs
     r_hat, ess = attrs.get("max_rhat", np.inf), attrs.get("min_ess", 0.0)
-    return bool(r_hat <= WORST_RHAT and ess >= LEAST_ESS)
+    return bool(r_hat <= criteria.worst_rhat and ess >= criteria.least_ess)
+
+
+def _worse(before: Errors, after: Errors) -> Unexplained:
+    """What is said where the revised model's held-out error is the larger one."""
+    rise = after.normalised_rmse / before.normalised_rmse - 1.0
+    return Unexplained(
+        body="",
+        dimension="",
+        depends_on="nothing that was recorded",
+        share=0.0,
+        p_value=float("nan"),
+        sentence=(
+            "the revised model forecasts the held-out trajectories worse than the declared one: its"
+            f" error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
+            f" {before.normalised_rmse:.3g} times the noise"
+        ),
+    )
 
 
 def _added(step: Step, revised: Mode, posterior: Any) -> Added:

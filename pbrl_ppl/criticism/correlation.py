@@ -12,17 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Correlations, ResidualTest
-from pbrl_ppl.criticism.unexplained import (
-    FALSE_ALARM,
-    MATTERS_IN_A_STEP,
-    innovations_over_steps,
-)
+from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE, WRENCH
 
 Array = NDArray[np.float64]
 
+_WHITENESS, _COMMANDS = "whiteness", "correlation with commands"
 #: Lags of either test.
 LAGS = 5
 #: A share of the innovations' variance that matters.
@@ -51,24 +49,28 @@ class _Correlation:
         lag, series, cell = np.unravel_index(int(np.argmax(size)), size.shape)
         return int(lag), int(series), int(cell)
 
-    def matters(self, share: Array) -> bool:
+    def matters(self, share: Array, negligible: float) -> bool:
         """Whether any is large against what a step changes, and against the noise."""
-        large = (self.values**2 > _SHARE) & (np.abs(self.values) * share > MATTERS_IN_A_STEP)
+        large = (self.values**2 > _SHARE) & (np.abs(self.values) * share > negligible)
         return bool((large & (self.pairs > _PAIRS)).any())
 
 
-def correlation_tests(mode: Mode) -> tuple[tuple[ResidualTest, ...], Correlations]:
+def correlation_tests(
+    mode: Mode, criteria: Criteria = DEFAULT
+) -> tuple[tuple[ResidualTest, ...], Correlations]:
     """Test whiteness over lags, and correlation with present and past commands, of enough data.
 
     Parameters
     ----------
     mode : Mode
         Of whole trajectories.
+    criteria : Criteria
+        What is significant, and what negligible.
 
     Returns
     -------
     tests : tuple of ResidualTest
-        Of whiteness, and of commands where there are any; none that so few data cannot fail.
+        Of whiteness and of commands; untested where the data cannot fail them.
     correlations : Correlations
         For a picture.
     """
@@ -79,14 +81,24 @@ def correlation_tests(mode: Mode) -> tuple[tuple[ResidualTest, ...], Correlation
     scene, places = mode.problem.scene, noise.cells.places
     cells = [f"{STATE[p % len(STATE)]} of {scene.moving[p // len(STATE)].name}" for p in places]
     own = _lagged(white, seen, number, None)
-    tests = [_whiteness(own, share, cells)] if (own.pairs > _PAIRS).any() else []
+    few = "too few pairs of intervals"
+    tests = [
+        _whiteness(own, share, cells, criteria)
+        if (own.pairs > _PAIRS).any()
+        else ResidualTest.untested(_WHITENESS, few)
+    ]
     commands, names = _commands(mode)
     driven = None
     if names:
         driven = _lagged(white, seen, number, commands)
         p_value = _driven_by_chance(white, seen, number, commands)
-        if p_value is not None:
-            tests.append(_driven(driven, p_value, share, cells, names))
+        tests.append(
+            ResidualTest.untested(_COMMANDS, few)
+            if p_value is None
+            else _driven(driven, p_value, share, cells, names, criteria)
+        )
+    else:
+        tests.append(ResidualTest.untested(_COMMANDS, "no command varies"))
     return tuple(tests), Correlations(
         tuple(cells),
         own.values[:, 0],
@@ -132,9 +144,11 @@ def _commands(mode: Mode) -> tuple[Array, list[str]]:
     return np.array(columns).reshape(len(columns), segments.n).T, names
 
 
-def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTest:
+def _whiteness(
+    own: _Correlation, share: Array, cells: list[str], criteria: Criteria
+) -> ResidualTest:
     p_value = own.p_value
-    passed = p_value > FALSE_ALARM or not own.matters(share)
+    passed = p_value > criteria.false_alarm or not own.matters(share, criteria.negligible)
     lag, _, cell = own.worst(np.ones(len(cells)) if passed else share)
     worst = float(own.values[lag, 0, cell])
     sentence = "errors of one interval say nothing of those of the next"
@@ -143,7 +157,7 @@ def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTes
             f"the error of {cells[cell]} is correlated with itself"
             f" {lag + 1} interval{'s' * (lag > 0)} later ({worst:.2f})"
         )
-    return ResidualTest("whiteness", p_value, abs(worst), passed, sentence)
+    return ResidualTest(_WHITENESS, p_value, abs(worst), passed, sentence)
 
 
 def _driven_by_chance(
@@ -173,9 +187,14 @@ def _driven_by_chance(
 
 
 def _driven(
-    driven: _Correlation, p_value: float, share: Array, cells: list[str], names: list[str]
+    driven: _Correlation,
+    p_value: float,
+    share: Array,
+    cells: list[str],
+    names: list[str],
+    criteria: Criteria,
 ) -> ResidualTest:
-    passed = p_value > FALSE_ALARM or not driven.matters(share)
+    passed = p_value > criteria.false_alarm or not driven.matters(share, criteria.negligible)
     lag, series, cell = driven.worst(np.ones(len(cells)) if passed else share)
     worst = float(driven.values[lag, series, cell])
     sentence = "errors say nothing of present and past commands"
@@ -185,4 +204,4 @@ def _driven(
             f"the error of {cells[cell]} is correlated with {names[series].replace('_', ' ')}"
             f" {when} ({worst:.2f})"
         )
-    return ResidualTest("correlation with commands", p_value, abs(worst), passed, sentence)
+    return ResidualTest(_COMMANDS, p_value, abs(worst), passed, sentence)

@@ -1,12 +1,18 @@
-"""Cross-validation over whole training trajectories, by one Newton step a fold."""
+"""Cross-validation over whole training trajectories, from the model linearised at its mode."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm, t
 
-from pbrl_ppl.modes import Mode
-from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
+from pbrl_ppl.criticism.forecast import forecast
+from pbrl_ppl.model import robust
+from pbrl_ppl.modes import Mode, profile_sigma
+from pbrl_ppl.parameters import box, differentiate, inside, prior_residual, prior_slopes
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -15,6 +21,58 @@ Ints = NDArray[np.intp]
 LEAST_FOLDS = 8
 #: A step that a bound shortens by more than this (standard deviations) is stopped by it.
 _ROUNDING = 1e-6
+#: Steps of derivatives are a posterior standard deviation, and at most this share of the prior's;
+#: those by whitened residuals are shorter.
+_WIDEST, _NEAR = 0.1, 1e-4
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Each fold under the posterior of all others.
+
+    Parameters
+    ----------
+    density : ndarray
+        Log predictive density of each fold, shape (fold,).
+    phi, sigma : ndarray
+        Parameters and noise parameters fitted without it, shapes (fold, p) and (fold, parameter).
+    """
+
+    density: Array
+    phi: Array
+    sigma: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Change:
+    """Sum over folds of what one model gains over another.
+
+    Parameters
+    ----------
+    total : float
+        The sum.
+    error : float
+        Its standard error; infinite for a single fold.
+    folds : int
+        Number of folds.
+    """
+
+    total: float
+    error: float
+    folds: int
+
+    @classmethod
+    def of(cls, gains: Array) -> Change:
+        """Sum the gains of independent folds, shape (fold,)."""
+        n = len(gains)
+        error = float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else np.inf
+        return cls(float(gains.sum()), error, n)
+
+    def needed(self, errors: float) -> float:
+        """Smallest sum that is as certain as so many standard errors of many folds are."""
+        if self.folds < 2:
+            return np.inf
+        return float(t.isf(norm.sf(errors), self.folds - 1)) * self.error
 
 
 def folds(mode: Mode) -> Ints:
@@ -33,14 +91,59 @@ def folds(mode: Mode) -> Ints:
     return np.unique(trajectory * runs + run, return_inverse=True)[1].astype(np.intp)
 
 
-def cross_validated(mode: Mode, fold: Ints) -> Array:
-    """Log predictive density of each fold under the posterior of all others, shape (fold,).
+def leave_out(mode: Mode, fold: Ints) -> LeftOut:
+    """Fit each fold's complement and judge the fold by it.
 
-    The whitened residual z is linear in the parameters about the mode, with Jacobian J and
-    posterior precision A of all data; without the rows of a fold the precision is
-    ``B = A - J_f' J_f``, and the fold's density is that of a Gaussian whose square is
-    ``z_f' z_f + z_f' J_f B^-1 J_f' z_f`` and whose log-determinant is ``log |A| - log |B|``
-    (leave-out formulas of linear regression). The noise parameters stay.
+    The noise is estimated anew without the fold, whose measurements count as missing. The whitened
+    residual z under that noise is linear in the parameters about the mode, with Jacobian J; B is
+    the posterior precision without the fold's rows f. From the top of that posterior, the fold's
+    density is that of a Gaussian of covariance ``I + J_f B^-1 J_f'``.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of whole trajectories.
+    fold : ndarray of int
+        Fold of each transition, from 0 on.
+    """
+    problem, phi = mode.problem, mode.phi
+    priors, count = problem.layout.priors, int(fold.max()) + 1
+    scale = np.sqrt(np.maximum(np.diag(mode.covariance), 1e-300))
+    slopes = prior_slopes(priors, phi) * scale
+    # beside the data: the prior, and what a circle or a tail's curvature adds
+    rows = mode.jacobian * scale
+    whole = np.diag(np.linalg.inv(mode.covariance / np.outer(scale, scale))) if len(phi) else slopes
+    prior = np.diag(np.maximum(slopes**2, whole - (rows**2).sum(axis=0)))
+    pull = slopes * prior_residual(priors, phi)
+    residual, without = problem.residual(phi), _linearised(mode, scale)
+    density, sigmas = np.empty(count), np.empty((count, len(mode.sigma)))
+    phis = np.empty((count, len(phi)))
+    for f in range(count):
+        own = fold == f
+        sigma, z, jacobian = without(own)
+        out, inner = (jacobian[rows].reshape(z[rows].size, len(phi)) for rows in (own, ~own))
+        precision = inner.T @ inner + prior
+        move, free = _to_top(mode, precision, inner.T @ z[~own].ravel() + pull, scale)
+        at_top = z[own].ravel() + out @ move
+        gained = 0.5 * float((z[own] ** 2).sum() - (at_top**2).sum())
+        precision, out = precision[free][:, free], out[:, free]
+        both = precision + out.T @ out
+        part = out.T @ at_top
+        spread = np.linalg.slogdet(both)[1] - np.linalg.slogdet(precision)[1]
+        gained += 0.5 * float(part @ np.linalg.solve(both, part) - spread)
+        density[f] = problem.log_density(residual, sigma, phi)[own].sum() + gained
+        phis[f], sigmas[f] = inside(priors, phi + scale * move), sigma
+    return LeftOut(density, phis, sigmas)
+
+
+def gain(before: Mode, after: Mode) -> Change:
+    """Gain in cross-validated log predictive density of one model over another."""
+    fold = folds(after)
+    return Change.of(leave_out(after, fold).density - leave_out(before, fold).density)
+
+
+def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) -> Array:
+    """Sum of squared errors of forecasts of each fold, by what was fitted without it.
 
     Parameters
     ----------
@@ -48,35 +151,75 @@ def cross_validated(mode: Mode, fold: Ints) -> Array:
         Of whole trajectories.
     fold : ndarray of int
         Fold of each transition.
+    left_out : LeftOut
+        Of these folds.
+    intervals : int
+        Length of the forecasts.
+
+    Returns
+    -------
+    ndarray
+        Shape (fold, cell), SI units squared; NaN where no forecast begins or nothing was measured.
     """
-    problem, p = mode.problem, len(mode.phi)
-    residual = mode.whitened_residual()
-    n, cells = residual.shape
-    scale = np.sqrt(np.maximum(np.diag(mode.covariance), 1e-300))
-    jacobian = mode.jacobian.reshape(n, cells, p) * scale
-    density = problem.log_density(problem.residual(mode.phi), mode.sigma, mode.phi)
-    grams = np.array([_gram(jacobian[fold == f]) for f in range(fold.max() + 1)])
-    slopes = prior_slopes(problem.layout.priors, mode.phi) * scale
-    whole = np.linalg.inv(mode.covariance / np.outer(scale, scale)) if p else np.eye(0)
-    prior = np.diag(np.maximum(slopes**2, np.diag(whole - grams.sum(axis=0))))
-    # a climb ends near the top, and what one fold alone knows of would be pulled far from there
-    gradient = np.einsum("kcp,kc->p", jacobian, residual)
-    gradient += slopes * prior_residual(problem.layout.priors, mode.phi)
-    precision = grams.sum(axis=0) + prior
-    move, free = _to_top(mode, precision, gradient, scale)
-    at_top = residual + jacobian @ move
-    density = density + 0.5 * (residual**2 - at_top**2).sum(axis=1)
-    jacobian, grams = jacobian[..., free], grams[:, free][:, :, free]
-    prior, log_whole = prior[free][:, free], np.linalg.slogdet(precision[free][:, free])[1]
-    result = np.empty(fold.max() + 1)
-    for f in range(len(result)):
-        own = fold == f
-        pull = np.einsum("kcp,kc->p", jacobian[own], at_top[own])
-        values, vectors = np.linalg.eigh(np.delete(grams, f, axis=0).sum(axis=0) + prior)
-        values = np.maximum(values, 1e-300)
-        square = float(((vectors.T @ pull) ** 2 / values).sum())
-        result[f] = density[own].sum() - 0.5 * (square + log_whole - np.log(values).sum())
-    return result
+    cells = len(mode.problem.trajectory_noise.cells.places)
+    squares = np.full((len(left_out.phi), cells), np.nan)
+    for f, (phi, sigma) in enumerate(zip(left_out.phi, left_out.sigma, strict=True)):
+        told = forecast(mode.problem, phi, sigma, intervals, within=fold == f)
+        seen = np.isfinite(told.error)
+        total = np.where(seen, told.error, 0.0) ** 2
+        squares[f] = np.where(seen.any(axis=0), total.sum(axis=0), np.nan)
+    return squares
+
+
+def _linearised(
+    mode: Mode, scale: Array
+) -> Callable[[NDArray[np.bool_]], tuple[Array, Array, Array]]:
+    """Noise parameters, whitened residual and Jacobian of all rows, fitted without some of them.
+
+    The latter have the shapes (transition, cell) and (transition, cell, p), the Jacobian by the
+    parameters in units of ``scale``. Under Eq. 11 the noise stays.
+    """
+    problem, phi, p = mode.problem, mode.phi, len(mode.phi)
+    if problem.trajectories is None:
+        z = problem.robust(phi, mode.sigma)
+        jacobian = mode.jacobian.reshape(*z.shape, p) * scale
+        return lambda own: (mode.sigma, z, jacobian)
+    noise, residual = problem.trajectories, problem.residual(phi)
+    nu = noise.of_cells(problem.nu(phi), residual.shape)
+    slopes = _residual_slopes(mode, scale)
+    nothing = np.zeros_like(noise.begin)
+    still = replace(noise, begin=nothing, measured=nothing)
+
+    def without(own: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+        hidden = replace(noise, seen=noise.seen & ~own[:, None], sigma=mode.sigma)
+        sigma = profile_sigma(problem.with_noise(trajectories=hidden), residual, phi)
+        z = noise.whiten(residual, sigma)
+        white = still.filtered(slopes, sigma)[0]
+        weight = (robust(z + _NEAR, nu) - robust(z - _NEAR, nu)) / (2 * _NEAR)
+        return sigma, robust(z, nu), np.moveaxis(white * weight, 0, -1)
+
+    return without
+
+
+def _residual_slopes(mode: Mode, scale: Array) -> Array:
+    """Derivative of the cells' residuals by parameters in units of ``scale``.
+
+    Shape (p, transition, cell).
+    """
+    problem, priors = mode.problem, mode.problem.layout.priors
+    cells = problem.trajectory_noise.cells
+    if not priors:
+        return np.zeros((0, problem.segments.n, len(cells.places)))
+    lower, upper = box(priors)
+    widest = _WIDEST / np.maximum(np.abs(prior_slopes(priors, mode.phi)), 1e-300)
+
+    def residual(points: Array) -> Array:
+        return np.nan_to_num(cells.of_residual(problem.residual(points)))
+
+    steps = np.minimum(scale, widest)
+    steps[list(problem.tails)] = 0.0  # they change the density, not the residual
+    slopes = differentiate(residual, mode.phi, steps, lower, upper) * scale
+    return np.ascontiguousarray(np.moveaxis(slopes, -1, 0))
 
 
 def _to_top(
@@ -98,13 +241,3 @@ def _to_top(
             break
         free &= ~stopped
     return move, free
-
-
-def _gram(rows: Array) -> Array:
-    """Precision that rows of a Jacobian (transition, cell, p) give, shape (p, p)."""
-    return np.asarray(np.einsum("kcp,kcq->pq", rows, rows))
-
-
-def standard_error(gains: Array) -> float:
-    """Standard error of a sum of independent gains."""
-    return float(np.sqrt(len(gains)) * gains.std(ddof=1)) if len(gains) > 1 else np.inf

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import rankdata
 
+from pbrl_ppl.criticism.criteria import Criteria
+from pbrl_ppl.criticism.cross_validation import folds
 from pbrl_ppl.criticism.results import Unexplained
-from pbrl_ppl.criticism.unexplained import (
-    MATTERS_IN_A_STEP,
-    innovations_over_steps,
-)
+from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
@@ -22,7 +22,10 @@ Array = NDArray[np.float64]
 FALSE_ALARM = 0.01
 #: Less than this share of the residual's variance does not matter.
 SMALLEST_SHARE = 0.02
-_PERMUTATIONS = 499
+#: Permutations a body: the smallest p-value is a fifth of what is significant.
+_PERMUTATIONS = 500
+#: Fewer transitions than this tell nothing.
+_FEWEST = 20
 _FOLDS = 5
 _RIDGE = 1.0
 #: More transitions than this say the same more slowly.
@@ -68,33 +71,54 @@ PRODUCTS = {
 }
 
 
-def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
+@dataclass(frozen=True)
+class Dependence:
+    """Result of the test for dependence.
+
+    Parameters
+    ----------
+    tested : bool
+        Whether there were enough transitions for it.
+    found : Unexplained or None
+        Where the structure is strongest; None if none is significant.
+    """
+
+    tested: bool
+    found: Unexplained | None = None
+
+
+def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Dependence:
     """Test whether the innovations of a fitted model still depend on state, action or time.
 
     A kernel ridge regression with one smooth term a quantity, or product of two, predicts the
-    residual of trajectories that it was not trained on; the null distribution comes from shuffling
-    the transitions.
+    residual of trajectories that it was not trained on, or of runs within few trajectories; the
+    null distribution comes from shuffling the transitions.
 
     Parameters
     ----------
     mode : Mode
         A fitted model.
+    criteria : Criteria
+        What is negligible.
     seed : int
         Of the shuffling and the folds.
 
     Returns
     -------
-    Unexplained or None
-        Where the structure is strongest; None if there is none beyond chance.
+    Dependence
+        Where the structure is strongest.
     """
     rng = np.random.default_rng(seed)
     problem = mode.problem
     n = problem.segments.n
+    if n < _FEWEST:
+        return Dependence(tested=False)
     tests = len(problem.scene.dynamic)
+    permutations = _PERMUTATIONS * tests - 1
     chosen = np.sort(rng.permutation(n)[:_MOST])
     places = mode.problem.trajectory_noise.cells.places
     innovations = mode.whitened_residual()[chosen]
-    groups = problem.segments.trajectory[chosen]
+    groups = folds(mode)[chosen]
     relative = innovations_over_steps(mode)
     best: Unexplained | None = None
     for i, body in enumerate(problem.scene.moving):
@@ -107,16 +131,17 @@ def find_dependence(mode: Mode, *, seed: int = 0) -> Unexplained | None:
         smoother = _cross_validated(_summed(features), groups, rng)
         shares = _explained(smoother, y)
         null = np.array(
-            [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(_PERMUTATIONS)]
+            [_explained(smoother, y[rng.permutation(len(y))]).max() for _ in range(permutations)]
         )
         at = int(np.argmax(shares))
         size = np.sqrt(max(float(shares[at]), 0.0)) * relative[own[of[at]]]
-        p_value = float((1 + (null >= shares[at]).sum()) / (1 + _PERMUTATIONS)) * tests
-        if p_value > FALSE_ALARM or shares[at] < SMALLEST_SHARE or size < MATTERS_IN_A_STEP:
+        p_value = float((1 + (null >= shares[at]).sum()) / (1 + permutations)) * tests
+        small = shares[at] < SMALLEST_SHARE or size < criteria.negligible
+        if p_value > FALSE_ALARM or small:
             continue
         if best is None or shares[at] > best.share:
             best = _describe(body.name, names[at], features, y[:, at], shares[at], p_value)
-    return best
+    return Dependence(tested=True, found=best)
 
 
 def _in_both_frames(
@@ -171,7 +196,7 @@ def _summed(features: Array) -> Array:
 
 
 def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Matrix that predicts each transition from those of other trajectories."""
+    """Matrix that predicts each transition from those of other groups."""
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))
     for held in np.array_split(names, min(_FOLDS, len(names))):

@@ -52,6 +52,12 @@ class Forecast:
         return result
 
 
+def longest_forecast(problem: Problem) -> int:
+    """Intervals of the longest forecasts that all trajectories have, from settled states."""
+    shortest = int(problem.data.history.dataset["n_rows"].min()) - 1
+    return max(1, shortest - min(_SETTLED, shortest // 2))
+
+
 def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
     """States given what was measured up to them, shape (trajectory, time, body, 6), SI units."""
     noise = problem.trajectory_noise
@@ -68,7 +74,15 @@ def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
     return cells.completed(problem.scene, states)
 
 
-def forecast(problem: Problem, phi: Array, sigma: Array, intervals: int) -> Forecast:
+def forecast(
+    problem: Problem,
+    phi: Array,
+    sigma: Array,
+    intervals: int,
+    *,
+    within: NDArray[np.bool_] | None = None,
+    allowed: Array | None = None,
+) -> Forecast:
     """Predict several intervals from filtered states all along the trajectories.
 
     Parameters
@@ -79,6 +93,11 @@ def forecast(problem: Problem, phi: Array, sigma: Array, intervals: int) -> Fore
         Parameters and noise parameters, shapes (p,) and (parameter,).
     intervals : int
         How far.
+    within : ndarray of bool, optional
+        Transitions in which forecasts may begin, shape (transition,).
+    allowed : ndarray, optional
+        A constant acceleration of each velocity whose errors the expected square contains, shape
+        (velocity,), m/s^2 and rad/s^2.
     """
     noise = problem.trajectory_noise
     cells, segments = noise.cells, problem.segments
@@ -91,7 +110,12 @@ def forecast(problem: Problem, phi: Array, sigma: Array, intervals: int) -> Fore
             rows = begin + np.arange(first, length - intervals + 1)
             told = noise.seen[rows + intervals - 1].any(axis=1)
             starts.append(rows[told][:: max(1, intervals // 2)])
-    at = np.concatenate(starts)
+    at = np.concatenate(starts) if starts else np.zeros(0, dtype=np.intp)
+    if within is not None:
+        at = at[within[at]]
+    if not len(at):
+        none = np.zeros((0, len(cells.places)))
+        return Forecast(none, none, cells.places % len(STATE))
     trajectory, step = segments.trajectory[at], segments.step[at]
     every = at[:, None] + np.arange(intervals)
     states = filtered_states(problem, phi, sigma)[trajectory, step]
@@ -100,11 +124,17 @@ def forecast(problem: Problem, phi: Array, sigma: Array, intervals: int) -> Fore
     observed = problem.data.history.dataset["observed"].to_numpy()
     error = cells.wrapped(cells.of(observed[trajectory, step + intervals]) - ends)
     covariance = _spread(noise, sigma, at, step)
+    pushes = np.zeros((len(cells.places), 0))
+    if allowed is not None:
+        rate = cells.pushed[cells.always] - len(cells.sensors)
+        pushes = (cells.push[cells.always] * allowed[rate][:, None]).T
+    pushed = np.zeros((len(at), *pushes.shape))
     for i in range(intervals):
         slope = noise.slope[every[:, i]]
         covariance = slope @ covariance @ slope.transpose(0, 2, 1)
+        pushed = slope @ pushed + pushes
     variance = np.diagonal(covariance, axis1=1, axis2=2) + cells.errors(sigma) ** 2
-    return Forecast(error, variance, cells.places % len(STATE))
+    return Forecast(error, variance + (pushed**2).sum(axis=2), cells.places % len(STATE))
 
 
 def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array:

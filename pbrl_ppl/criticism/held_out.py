@@ -26,6 +26,15 @@ ROLLOUT_SECONDS = 1.0
 _DRAWS = 100
 
 
+def rollout_horizon(history: History, time_step: float) -> int:
+    """Intervals of a recording's forecasts: a second, or a whole trajectory.
+
+    More than a second where bodies are seen less often.
+    """
+    longest = int(history.dataset["n_rows"].min()) - 1
+    return min(longest, max(longest_gap(history), round(ROLLOUT_SECONDS / time_step)))
+
+
 @dataclass(frozen=True, eq=False)
 class HeldOut:
     """Held-out trajectories, and the seed of the draws that models are judged with.
@@ -76,14 +85,9 @@ class HeldOut:
             if seen[:, dimension == d].any()
         }
 
-    def rollout_horizon(self, time_step: float) -> int:
-        """Intervals of the forecasts in the error table: a second, or a whole trajectory.
-
-        More than a second where bodies are seen less often.
-        """
-        longest = int(self.history.dataset["n_rows"].min()) - 1
-        least = longest_gap(self.history)
-        return min(longest, max(least, round(ROLLOUT_SECONDS / time_step)))
+    def longest(self, intervals: int) -> int:
+        """Intervals of forecasts that all of its trajectories have, at most so many."""
+        return min(intervals, int(self.history.dataset["n_rows"].min()) - 1)
 
     def errors(self, mode: Mode, scale: Mode, posterior: Any, rollout: int) -> Errors:
         """Errors of a model; ``scale`` is the model whose noise is the unit."""

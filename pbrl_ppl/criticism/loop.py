@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.assembly import Models, converged, put_together
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.findings import Findings
-from pbrl_ppl.criticism.held_out import HeldOut
+from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
 from pbrl_ppl.criticism.histories import checked_histories, named
 from pbrl_ppl.criticism.misfit import PRIOR, find_misfit
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
@@ -30,14 +31,6 @@ from pbrl_ppl.physics import try_effect
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Scene
 
-#: Effects added at most.
-MOST_ADDED = 5
-#: With more than this share of what was missing (of its square) left there are no names to be had;
-#: where what remains is small (a share of the bodies' acceleration), more may.
-LARGE_REMAINDER, SMALL, LARGE_IF_SMALL = 0.2, 0.01, 0.5
-#: As many may, where less than this share of what could be predicted of errors still can be:
-#: then the names are what the errors follow, and the rest comes by chance, as a motor's ripple.
-MOST_PREDICTABLE = 0.1
 #: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
 DRAWS, INDEPENDENT, LEAST_TUNE = (300, 1000), (125,), 100
 #: Draws from the prior, of which some must reach what was measured.
@@ -54,6 +47,7 @@ def revise(
     substeps: int | None = None,
     draws: int | None = None,
     method: str = "metropolis",
+    criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Findings:
     """Fit a declared model, trace its residual to missing effects, add them, and compare.
@@ -75,6 +69,8 @@ def revise(
         Posterior draws of each chain; by default 300, or 1000 where chains have not converged.
     method : str
         Of :func:`pbrl_ppl.fit`, for the posteriors; with ``laplace`` the verdict stands on modes.
+    criteria : Criteria
+        Thresholds of the decisions.
     progress : callable, optional
         Told the name of each stage.
 
@@ -98,7 +94,7 @@ def revise(
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
         return _revised(
-            scene, train, test, tuple(catalogue), seed, substeps, draws, method,
+            scene, train, test, tuple(catalogue), seed, substeps, draws, method, criteria,
             progress or (lambda stage: None),
         )  # fmt: skip
 
@@ -112,11 +108,14 @@ def _revised(
     substeps: int | None,
     draws: int | None,
     method: str,
+    criteria: Criteria,
     say: Callable[[str], None],
 ) -> Findings:
     """Go through the stages of :func:`revise`."""
     if test is None:
         train, test = train.split(0.25, seed)
+    elif scene.test_is_later:  # what lasts from some trajectory on holds in it
+        test = test.numbered(float(train.dataset["number"].max()) + 1.0)
     if substeps is not None:
         scene.replace(substeps=substeps)  # it is checked there
     train, test, derived = checked_histories(scene, train, test)
@@ -126,7 +125,7 @@ def _revised(
     for effect in catalogue:
         if effect not in full_catalogue:
             try_effect(effect, scene, train)
-    selection = Selection(scene, catalogue, say)
+    selection = Selection(scene, catalogue, criteria, say)
     effects = attach(scene, (), catalogue)
     say("looking whether the prior could have made the data")
     prior = _prior_test(scene, train, effects, seed)
@@ -134,12 +133,12 @@ def _revised(
         hint = "the declared prior does not explain this recording, unless a missing effect is why"
         warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
     say("fitting the declared model")
-    declared = declared_mode(scene, train, effects, seed=seed, substeps=substeps, say=say)
+    declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
     say("scoring what the model might lack")
     first = rank_candidates(declared, selection.missing(declared))
     current, ranked = declared, first
     added: list[Step] = []
-    while ranked and len(added) < MOST_ADDED:
+    while ranked and len(added) < criteria.most_added:
         step = selection.best_addition(current, ranked)
         if step is None:
             break
@@ -151,40 +150,49 @@ def _revised(
         say("checking that each added effect is still needed")
         current, added = selection.prune(current, added)
     say("testing what is left")
-    before, left = unexplained_acceleration(declared), unexplained_acceleration(current)
-    horizon = held_out.rollout_horizon(scene.time_step)
+    before, left = (unexplained_acceleration(mode, criteria) for mode in (declared, current))
+    horizon = rollout_horizon(train, scene.time_step)
     with_added = prior
     if added and not prior.passed:  # what was missing may be why
-        with_added = _prior_test(scene, train, current.problem.physics.effects, seed)
+        own = dict(zip(current.problem.layout.labels, current.phi.tolist(), strict=True))
+        held = {label: own[label] for each in added for label in each.signature.attached.labels}
+        effects = current.problem.physics.effects
+        with_added = _prior_test(scene, train, effects, seed, held)
     misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(with_added)
     remains = _remains(before, left) if added and misfit.unexplained is not None else 0.0
-    if remains > (LARGE_IF_SMALL if left.worst < SMALL else LARGE_REMAINDER):
+    small = left.worst < criteria.negligible
+    if remains > (criteria.large_if_small if small else criteria.large_remainder):
         without = find_misfit(declared, before, horizon=horizon, seed=seed)
-        followed = misfit.predictable < MOST_PREDICTABLE * without.predictable
-        if remains > LARGE_IF_SMALL or not followed:
+        followed = misfit.predictable < criteria.most_predictable * without.predictable
+        if remains > criteria.large_if_small or not followed:
             # part of a misfit goes to whatever is there: no name is to be had from that
             say("no effect of the catalogue explains what is missing")
             selection.withdraw(added)
             added, current, left = [], declared, before
             misfit = without.with_test(prior)
     say("sampling the posterior of the declared model")
-    posterior = _posterior(declared, method, seed, draws, say)
+    posterior = _posterior(declared, method, seed, draws, criteria, say)
     revised = posterior
     if added:
         say("sampling the posterior of the revised model")
-        revised = _posterior(current, method, seed, draws, say)
+        revised = _posterior(current, method, seed, draws, criteria, say)
     say("comparing errors on held-out data")
     models = Models(declared, current, posterior, revised, before, left)
-    candidates, small = selection.explained(first), tuple(selection.small)
-    return put_together(train, held_out, models, candidates, added, misfit, small)
+    told = selection.explained(first), tuple(selection.small)
+    return put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
 
 
 def _prior_test(
-    scene: Scene, train: History, effects: tuple[Attached, ...], seed: int
+    scene: Scene,
+    train: History,
+    effects: tuple[Attached, ...],
+    seed: int,
+    held: Mapping[str, float] | None = None,
 ) -> ResidualTest:
-    """Whether the prior of a model with these effects could have made the data, as a test."""
+    """Whether the prior could have made the data, with some parameters held, as a test."""
     problem = Problem.of(scene, train, effects, horizon=telling_horizon(train), threads=2)
-    checked = prior_predictive_check(build_model(problem), draws=PRIOR_DRAWS, seed=seed)
+    model = build_model(problem)
+    checked = prior_predictive_check(model, draws=PRIOR_DRAWS, seed=seed, held=held)
     share = float(checked.dataset["share_beyond"].max())
     said, *more = checked.summary
     if more:
@@ -198,7 +206,12 @@ def _remains(before: Left, after: Left) -> float:
 
 
 def _posterior(
-    mode: Mode, method: str, seed: int, draws: int | None, say: Callable[[str], None]
+    mode: Mode,
+    method: str,
+    seed: int,
+    draws: int | None,
+    criteria: Criteria,
+    say: Callable[[str], None],
 ) -> Any:
     """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
     # a chain a processor: more threads would wait for each other
@@ -215,7 +228,7 @@ def _posterior(
             )  # fmt: skip
         if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
             raise KeyboardInterrupt
-        if converged(fitted):
+        if converged(fitted, criteria):
             break
         say(f"the chains have not converged after {n} draws each")
     for warning in caught:  # of the last; independent draws are no chains that converge

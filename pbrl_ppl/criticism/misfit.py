@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.correlation import correlation_tests
-from pbrl_ppl.criticism.dependence import find_dependence
+from pbrl_ppl.criticism.criteria import Criteria
+from pbrl_ppl.criticism.dependence import Dependence, find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
-from pbrl_ppl.criticism.unexplained import FALSE_ALARM, Left, noise_alone
+from pbrl_ppl.criticism.unexplained import Left, noise_alone
+from pbrl_ppl.model import bodies_acceleration
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
@@ -22,8 +24,6 @@ Array = NDArray[np.float64]
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
 #: And of another.
 DEPENDENCE = "dependence on state, command and time"
-#: Forecasts may be this many times worse than noise alone makes them.
-_WORSE = 1.5
 #: Lengths of forecasts that a picture shows, at most.
 _LENGTHS = 6
 
@@ -82,31 +82,24 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
     seed : int
         Of permutations.
     """
-    dependence = find_dependence(mode, seed=seed)
-    of_correlation, correlations = correlation_tests(mode)
-    of_forecasts, growth = _forecasts(mode, noise_alone(mode, left), horizon)
+    dependence = find_dependence(mode, left.criteria, seed=seed)
+    of_correlation, correlations = correlation_tests(mode, left.criteria)
+    of_forecasts, growth = _forecasts(mode, noise_alone(mode, left), horizon, left.criteria)
     tests = (
         _acceleration(left),
         *of_correlation,
         of_forecasts,
-        ResidualTest(
-            DEPENDENCE,
-            1.0 if dependence is None else dependence.p_value,
-            0.0 if dependence is None else dependence.share,
-            dependence is None,
-            "what is left depends on no recorded quantity"
-            if dependence is None
-            else dependence.sentence,
-        ),
+        _dependence(dependence),
     )
     failed = [test for test in tests if not test.passed]
     if not failed:
         return Misfit(tests, None, correlations, growth)
-    if dependence is None:
+    where = dependence.found
+    if where is None:
         first = failed[0]
         noise = mode.problem.trajectory_noise
         body, dimension = _where(mode, left, noise.cells.places)
-        dependence = Unexplained(
+        where = Unexplained(
             body=body,
             dimension=dimension,
             depends_on="nothing that was recorded",
@@ -114,7 +107,17 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
             p_value=first.p_value,
             sentence=first.sentence,
         )
-    return Misfit(tests, dependence, correlations, growth)
+    return Misfit(tests, where, correlations, growth)
+
+
+def _dependence(dependence: Dependence) -> ResidualTest:
+    if not dependence.tested:
+        return ResidualTest.untested(DEPENDENCE, "too few transitions")
+    found = dependence.found
+    if found is None:
+        sentence = "the innovations depend on no recorded quantity"
+        return ResidualTest(DEPENDENCE, 1.0, 0.0, True, sentence)
+    return ResidualTest(DEPENDENCE, found.p_value, found.share, False, found.sentence)
 
 
 def _where(mode: Mode, left: Left, places: NDArray[np.intp]) -> tuple[str, str]:
@@ -133,27 +136,35 @@ def _acceleration(left: Left) -> ResidualTest:
     worst = int(np.argmax(np.where(left.certain if passed else left.matters, left.relative, -1.0)))
     unit = "rad/s²" if left.names[worst] == "omega" else "m/s²"
     some = bool(left.certain.any())
-    sentence = "no acceleration is left unexplained beyond what chance brings"
+    sentence = "no unexplained acceleration is significant"
     if some:
         sentence = (
-            f"an acceleration of {left.size[worst]:.2g} {unit} in {left.names[worst]} is left"
-            f" unexplained in each interval, {100 * left.relative[worst]:.2g} % of what the bodies'"
-            " own is"
+            f"an acceleration of {left.size[worst]:.2g} {unit} in {left.names[worst]} is"
+            f" unexplained in each interval, {100 * left.relative[worst]:.2g} % of the bodies'"
+            " acceleration"
         )
         if not left.beyond_engine[worst]:
             sentence += ": engines differ by as much in their steps"
+        elif passed:
+            sentence += ", which is negligible"
     p_value = float(min(1.0, left.p_value[worst] * len(left.names)))
     return ResidualTest(ACCELERATION, p_value, float(left.relative[worst]), passed, sentence)
 
 
-def _forecasts(mode: Mode, sigma: Array, horizon: int) -> tuple[ResidualTest, Growth]:
-    """Whether errors grow with the length of a forecast as noise alone, sigma, makes them."""
+def _forecasts(
+    mode: Mode, sigma: Array, horizon: int, criteria: Criteria
+) -> tuple[ResidualTest, Growth]:
+    """Whether errors grow with the length of a forecast as noise, sigma, makes them.
+
+    What a negligible acceleration that lasts adds to that is no misfit.
+    """
     noise = mode.problem.trajectory_noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
     longest = min(horizon, int(lengths.max()))
     steps = np.unique(np.geomspace(1, longest, min(longest, _LENGTHS)).round().astype(int))
     every = [forecast(mode.problem, mode.phi, sigma, int(n)) for n in steps]
-    told = every[-1]
+    allowed = criteria.negligible * bodies_acceleration(mode.problem)
+    told = forecast(mode.problem, mode.phi, sigma, longest, allowed=allowed)
     worst, p_value, name = 0.0, 1.0, ""
     dimensions = np.unique(told.dimension)
     for d in dimensions:
@@ -165,13 +176,14 @@ def _forecasts(mode: Mode, sigma: Array, horizon: int) -> tuple[ResidualTest, Gr
         chance = len(dimensions) * float(chi2.sf(z.sum() / 2, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]
-    passed = p_value > FALSE_ALARM or worst < _WORSE
+    passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
     dt = mode.problem.scene.time_step
     seconds = longest * dt
     sentence = f"forecasts of {seconds:g} s are as good as noise lets them be"
     if not passed:
         sentence = (
-            f"after {seconds:g} s the error of {name} is {worst:.1f} times what noise alone makes"
+            f"after {seconds:g} s the error of {name} is {worst:.1f} times what noise and"
+            f" {100 * criteria.negligible:g} % of the bodies' acceleration make"
         )
     growth = Growth(
         steps * dt, tuple(each.rmse() for each in every), tuple(each.floor() for each in every)

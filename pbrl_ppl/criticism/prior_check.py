@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,6 +28,9 @@ QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
 MOST_BEYOND = 0.11
 #: And that so many do must be less likely than this: of few cells one lies beyond soon enough.
 _BY_CHANCE = 1e-3
+#: Draws reach a change that is off by this share of the usual one: start states have errors, and a
+#: missing effect makes others; wrong units make factors.
+_SLACK = 0.25
 _FEWEST = 50
 #: Changes so many times the errors of measuring say something of the parameters.
 _WELL_BEYOND = 5.0
@@ -96,7 +100,13 @@ class PriorCheck:
         return self.sentences or ("the declared priors could have made data like these",)
 
 
-def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> PriorCheck:
+def prior_predictive_check(
+    model: Any,
+    *,
+    draws: int = 200,
+    seed: int = 0,
+    held: Mapping[str, float] | None = None,
+) -> PriorCheck:
     """Compare measured changes over a segment with what the prior predicts for them.
 
     The noise added to the predictions is the median of sigma's prior. All of that prior would not
@@ -110,6 +120,8 @@ def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> Pr
         Draws from the prior, at least 50: what none of them reaches counts against the prior.
     seed : int
         The same seed gives the same answer.
+    held : mapping of str to float, optional
+        Parameters that have these values in every draw, by their labels.
 
     Returns
     -------
@@ -149,6 +161,8 @@ def prior_predictive_check(model: Any, *, draws: int = 200, seed: int = 0) -> Pr
     names = [block.name for block in problem.layout.blocks]
     drawn = prior_predictive_draws(model, names, draws, int(rng.integers(2**31)))
     phi = problem.layout.to_vectors(drawn, draws)
+    for label, value in (held or {}).items():
+        phi[:, problem.layout.labels.index(label)] = value
     ends = np.concatenate(
         [
             _at(problem.predict(phi[i : i + _CHUNK], problem.one_world)[..., columns], last)
@@ -225,7 +239,11 @@ def _compare(predicted: Array, measured: Array) -> xr.Dataset:
     seen = np.isfinite(measured)
     low, high = np.quantile(predicted, [QUANTILES[0], QUANTILES[-1]], axis=0)
     inside = (measured >= low) & (measured <= high)
-    beyond = (measured < predicted.min(axis=0)) | (measured > predicted.max(axis=0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # of what was never measured
+        slack = _SLACK * np.sqrt(np.nanmean(measured**2, axis=0))
+    low_end, high_end = predicted.min(axis=0) - slack, predicted.max(axis=0) + slack
+    beyond = (measured < low_end) | (measured > high_end)
     total = np.maximum(seen.sum(axis=0), 1)
     # cells that were not measured count on neither side
     pooled = np.where(seen, predicted, np.nan).reshape(-1, *measured.shape[1:])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from threadpoolctl import threadpool_limits
 
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.histories import checked_histories, named
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
@@ -49,6 +50,7 @@ def criticise(
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
     substeps: int | None = None,
+    criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Ranking:
     """Rank what a declared model might lack by the score test, without a refit.
@@ -68,6 +70,8 @@ def criticise(
         Of the search for the mode.
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
+    criteria : Criteria
+        When the engine's error is small enough.
     progress : callable, optional
         Told the name of each stage.
 
@@ -94,7 +98,7 @@ def criticise(
             say(f"taking {named(scene, derived)} for computed from positions, which count alone")
         effects = attach(scene, (), catalogue)
         say("fitting the declared model")
-        mode = declared_mode(scene, history, effects, seed=seed, substeps=substeps, say=say)
+        mode = declared_mode(scene, history, effects, seed, substeps, say, criteria)
         say("scoring what the model might lack")
         ranked = rank_candidates(mode, candidates(scene, effects, catalogue))
         left = unexplained_acceleration(mode)
@@ -110,12 +114,12 @@ def declared_mode(
     scene: Scene,
     history: History,
     effects: tuple[Attached, ...],
-    *,
     seed: int,
     substeps: int | None,
     say: Callable[[str], None],
+    criteria: Criteria = DEFAULT,
 ) -> Mode:
     """Mode of the declared model along trajectories, the engine's error small."""
     problem = Problem.of(scene, history, effects, substeps=substeps, threads=2)
     mode = find_mode(single_transitions(problem), seed=seed)
-    return with_enough_substeps(trajectory_mode(problem, mode.phi), say)
+    return with_enough_substeps(trajectory_mode(problem, mode.phi), say, criteria)

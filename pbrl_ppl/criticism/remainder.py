@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
-from pbrl_ppl.criticism.cross_validation import cross_validated, folds, standard_error
+from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.cross_validation import gain
 from pbrl_ppl.criticism.rivals import likeliest_mode
-from pbrl_ppl.criticism.selection import MIN_ELPD, MIN_ELPD_SE
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learned_remainder
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -100,9 +100,8 @@ def learn_remainder(
         effect = _learned(mode, body, seed)
         say("fitting the model with the learned remainder")
         refitted = _refitted(mode, effect, body)
-        fold = folds(refitted)
-        gains = cross_validated(refitted, fold) - cross_validated(mode, fold)
-        if gains.sum() < max(MIN_ELPD, MIN_ELPD_SE * standard_error(gains)):
+        gained = gain(mode, refitted)
+        if gained.total < max(DEFAULT.min_elpd, gained.needed(DEFAULT.min_elpd_se)):
             raise FitError(
                 f"nothing to learn: a force on {body} that follows its velocity does not help on"
                 " trajectories that were left out"

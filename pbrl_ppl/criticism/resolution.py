@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pbrl_ppl.model import smoothed
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.modes import Mode, trajectory_mode
 
 #: A doubling of the substeps may move innovations by this share of their noise.
@@ -14,12 +15,17 @@ SMALL_SHIFT = 0.1
 MOST_SUBSTEPS = 640
 #: Linearised elsewhere, the same mode's log-posterior differs by less.
 _BETTER = 5.0
-#: What a step adds if it is next to nothing, as a share of the prior's median.
-_LITTLE = 0.1
+#: An unexplained acceleration of more than this share of the bodies' is no numerical error, and one
+#: that a doubling moves by less than this share of itself neither.
+_LARGE, _STILL = 0.1, 0.1
 
 
-def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
-    """Double the substeps until that no longer moves predictions, and refit.
+def with_enough_substeps(
+    mode: Mode,
+    say: Callable[[str], None],
+    criteria: Criteria = DEFAULT,
+) -> Mode:
+    """Double the substeps until neither predictions nor the acceleration test move, and refit.
 
     The engine's error is all but the same at neighbouring parameters, so it is looked at where the
     model was fitted with fewer. At the end smoothing begins anew: where a climb took up too large a
@@ -29,23 +35,26 @@ def with_enough_substeps(mode: Mode, say: Callable[[str], None]) -> Mode:
         begin = substeps = mode.problem.physics.substeps
         while shift(mode, substeps) > SMALL_SHIFT and substeps < MOST_SUBSTEPS:
             substeps *= 2
-        if substeps == begin:
-            fresh = _afresh(mode)
-            if fresh.log_posterior < mode.log_posterior + _BETTER:
-                return mode
+        if substeps > begin:
+            mode = _refined(mode, substeps, say)
+            continue
+        fresh = trajectory_mode(mode.problem, mode.phi)
+        if fresh.log_posterior > mode.log_posterior + _BETTER:
             mode = fresh
             continue
-        say(f"using {substeps} engine steps an interval")
-        finer = mode.problem.with_physics(substeps=substeps)
-        mode = trajectory_mode(finer, mode.phi, mode.sigma)
+        left = unexplained_acceleration(mode, criteria)
+        if not left.matters.any() or left.worst > _LARGE or substeps >= MOST_SUBSTEPS:
+            return mode
+        finer = _refined(mode, 2 * substeps, say)
+        moved = left.relative - unexplained_acceleration(finer, criteria).relative
+        if (np.abs(moved[left.matters]) < _STILL * left.relative[left.matters]).all():
+            return mode
+        mode = finer
 
 
-def _afresh(mode: Mode) -> Mode:
-    """The better of two modes: smoothed anew, and smoothed as if steps added next to nothing."""
-    problem = mode.problem
-    sigma = problem.quiet(mode.sigma, _LITTLE)
-    quiet = trajectory_mode(smoothed(problem, mode.phi, sigma), mode.phi, sigma)
-    return max(trajectory_mode(problem, mode.phi), quiet, key=lambda found: found.log_posterior)
+def _refined(mode: Mode, substeps: int, say: Callable[[str], None]) -> Mode:
+    say(f"using {substeps} engine steps an interval")
+    return trajectory_mode(mode.problem.with_physics(substeps=substeps), mode.phi, mode.sigma)
 
 
 def shift(mode: Mode, substeps: int | None = None) -> float:

@@ -78,6 +78,8 @@ class ResidualTest:
         Whether there is nothing, or too little to matter.
     sentence : str
         The result in words.
+    tested : bool
+        Whether the data could fail the test; one that they could not was not passed either.
     """
 
     name: str
@@ -85,6 +87,12 @@ class ResidualTest:
     size: float
     passed: bool
     sentence: str
+    tested: bool = True
+
+    @classmethod
+    def untested(cls, name: str, why: str) -> ResidualTest:
+        """Result of a test that the data cannot fail."""
+        return cls(name, float("nan"), 0.0, True, f"not tested: {why}", tested=False)
 
 
 @dataclass(frozen=True, eq=False)

@@ -259,7 +259,7 @@ def _best_look(
     for look in tried:
         rows = np.pad(look.signature, ((0, len(residual) - len(look.signature)), (0, 0)))
         columns = list(look.columns)
-        sides = np.zeros(len(columns), dtype=np.intp) if columns else np.ones(1, dtype=np.intp)
+        sides = _sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
         scales = _scales(attached)[columns] if columns else np.ones(1)
         found = _evidence(rows, q, residual, sides, scales)
         units.append(found.unit)

@@ -6,23 +6,22 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pbrl_ppl.criticism.cross_validation import cross_validated, folds, standard_error
+from pbrl_ppl.criticism.criteria import Criteria
+from pbrl_ppl.criticism.cross_validation import Change, folds, forecast_squares, leave_out
+from pbrl_ppl.criticism.forecast import longest_forecast
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, twins
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, trajectory_mode
-from pbrl_ppl.parameters import inside, prior_slopes
+from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
 
-#: A candidate is tried if chance alone gives its statistic less often than this (corrected).
-TRY_P = 0.01
-#: It is kept if it gains this much log predictive density, in nats and in standard errors ...
-MIN_ELPD, MIN_ELPD_SE = 4.0, 2.0
-#: ... and what it does to the predictions is this share of their noise or more.
-MIN_ERROR_FALL = 0.01
+Array = NDArray[np.float64]
+
 #: Candidates that are refitted in a round.
 TRIED = 4
 #: A candidate with less than this share of the leader's statistic waits until that has failed.
@@ -54,6 +53,8 @@ class Selection:
         The declared one.
     catalogue : tuple of Effect
         Effects to consider.
+    criteria : Criteria
+        When an effect is accepted.
     say : callable
         Told what takes long.
     why : dict of (str, str) to str
@@ -64,6 +65,7 @@ class Selection:
 
     scene: Scene
     catalogue: tuple[Effect, ...]
+    criteria: Criteria
     say: Callable[[str], None]
     why: dict[tuple[str, str], str] = field(default_factory=dict, init=False)
     small: list[Candidate] = field(default_factory=list, init=False)
@@ -120,11 +122,11 @@ class Selection:
             same = [earlier for earlier in kept if twins(signature, earlier)]
             if isinstance(signature.attached.effect.stage, Noise):
                 self._note(signature, "the noise's shape is scored and never added: declare it")
-            elif signature.candidate.p_value >= TRY_P:
+            elif signature.candidate.p_value >= self.criteria.try_p:
                 # of one that came close before, what it was is better known by that round
                 if _key(signature) not in self.why:
                     chance = f"p = {signature.candidate.p_value:.2g}"
-                    self._note(signature, f"{chance}: what chance brings is not tried")
+                    self._note(signature, f"not significant ({chance})")
             elif same:
                 self._note(signature, f"the same as {_named(same[0], signature)} in these data")
             else:
@@ -137,29 +139,68 @@ class Selection:
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
-        """Accept an improvement that cross-validation is sure of and that matters."""
-        fitted = with_enough_substeps(fitted, self.say)
-        total, error = _gain(mode, fitted)
-        if not _sure(total, error):
-            self._note(signature, _unsure(total, error))
+        """Accept an improvement that cross-validation is sure of and that is not negligible."""
+        fitted = with_enough_substeps(fitted, self.say, self.criteria)
+        if why := self._implausible(fitted, signature):
+            self._note(signature, why)
             return None
-        share = _share(mode, fitted)
-        if share < MIN_ERROR_FALL:
+        density, forecasts = _gains(mode, fitted)
+        if why := self._unsure(density, forecasts):
+            self._note(signature, why)
+            return None
+        share, negligible = _share(mode, fitted), self.criteria.negligible
+        if self._certain(forecasts):
+            share = max(share, forecasts.total)
+        if share < negligible:
             size = f"changes predictions by {100 * share:.2g} %"
-            self._note(signature, f"{size}: less than {100 * MIN_ERROR_FALL:g} % does not matter")
+            self._note(signature, f"{size}: less than {100 * negligible:g} % is negligible")
             if not self.small:  # of others it is not known whether they are there beside it
                 self.small.append(signature.candidate)
             return None
         self._note(signature, "added")
-        return Step(signature, inseparable(signature, ranked), fitted, total, error)
+        step = density.total, density.error
+        return Step(signature, inseparable(signature, ranked), fitted, *step)
+
+    def _implausible(self, mode: Mode, signature: Signature) -> str:
+        """Why the fitted size of an effect is not accepted; empty if it is."""
+        attached = signature.attached
+        if not _told(mode, attached):
+            return "the data do not inform its size"
+        layout = mode.problem.layout
+        places = [layout.labels.index(label) for label in attached.labels]
+        away = np.abs(prior_residual(layout.priors, mode.phi)[places])
+        worst = int(np.argmax(away))
+        if away[worst] < self.criteria.far_out:
+            return ""
+        parameter = attached.effect.parameters[worst]
+        size = f"{mode.phi[places[worst]]:.3g} {parameter.unit.removesuffix('1')}".rstrip()
+        return (
+            f"{parameter.name} = {size} lies {away[worst]:.0f} prior scales out; a wider prior of"
+            " the effect would allow it"
+        )
+
+    def _certain(self, change: Change) -> bool:
+        return change.total >= change.needed(self.criteria.min_elpd_se)
+
+    def _unsure(self, density: Change, forecasts: Change) -> str:
+        """Why a gain in density, and a fall of forecasts' errors, do not do; empty if they do."""
+        criteria = self.criteria
+        needed = max(criteria.min_elpd, density.needed(criteria.min_elpd_se))
+        if -forecasts.total > max(criteria.negligible, forecasts.needed(criteria.min_elpd_se)):
+            return f"errors of cross-validated forecasts rise by {-100 * forecasts.total:.2g} %"
+        if density.total >= needed:
+            return ""
+        if density.total >= criteria.min_elpd and self._certain(forecasts):
+            return ""
+        gained = f"{density.total:.1f} ± {density.error:.1f} nats"
+        return f"cross-validation gains {gained}, {needed:.1f} are needed"
 
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
         """Drop effects that later ones have made unnecessary; what gained most comes first."""
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
             without = self._without(mode, step.signature.attached)
-            total, error = _gain(without, mode)
-            if not _sure(total, error):
-                self._note(step.signature, f"needless beside later ones: {_unsure(total, error)}")
+            if why := self._unsure(*_gains(without, mode)):
+                self._note(step.signature, f"needless beside later ones: {why}")
                 mode = without
                 steps = [addition for addition in steps if addition is not step]
         return mode, sorted(steps, key=lambda addition: -addition.elpd_difference)
@@ -216,21 +257,35 @@ def _behind(nats: float, best: Signature, own: Signature) -> str:
     return f"fits less well than {_named(best, own)}, by {nats:.1f} nats"
 
 
-def _sure(total: float, error: float) -> bool:
-    """Whether a gain in cross-validated density is one to act on."""
-    return total >= MIN_ELPD and total >= MIN_ELPD_SE * error
+def _gains(before: Mode, after: Mode) -> tuple[Change, Change]:
+    """Gain in cross-validated log predictive density, and relative fall of forecasts' errors.
 
-
-def _unsure(total: float, error: float) -> str:
-    needed = max(MIN_ELPD, MIN_ELPD_SE * error)
-    return f"cross-validation gains {total:.1f} ± {error:.1f} nats, {needed:.1f} are needed"
-
-
-def _gain(before: Mode, after: Mode) -> tuple[float, float]:
-    """Gain in cross-validated log predictive density, and its standard error."""
+    The forecasts are as long as the recording lets them be; the mean is taken over what was
+    measured, each in units of the errors before.
+    """
     fold = folds(after)
-    gains = cross_validated(after, fold) - cross_validated(before, fold)
-    return float(gains.sum()), standard_error(gains)
+    models = [leave_out(mode, fold) for mode in (before, after)]
+    intervals = longest_forecast(after.problem)
+    worse, better = (
+        forecast_squares(mode, fold, left_out, intervals)
+        for mode, left_out in zip((before, after), models, strict=True)
+    )
+    return Change.of(models[1].density - models[0].density), relative_fall(worse, better)
+
+
+def relative_fall(before: Array, after: Array) -> Change:
+    """Share by which errors fall, from sums of squares of folds and cells, shape (fold, cell).
+
+    A fold or cell without forecasts is NaN. To first order, half of what the squares fall by.
+    """
+    some = np.isfinite(before).any(axis=1)
+    before, after = before[some], after[some]
+    if not len(before):
+        return Change(0.0, np.inf, 0)
+    unit = np.nansum(before, axis=0)
+    cells = unit > 0
+    falls = np.nan_to_num((before - after)[:, cells] / unit[cells]).mean(axis=1) / 2
+    return Change.of(falls)
 
 
 def _share(before: Mode, after: Mode) -> float:

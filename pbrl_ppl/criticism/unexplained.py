@@ -8,23 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pbrl_ppl.modes import Mode, profile_sigma
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.model import bodies_acceleration
+from pbrl_ppl.modes import NOTHING, Mode, profile_sigma
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
-
-#: Chance of calling nothing something.
-FALSE_ALARM = 1e-3
-#: A share of the bodies' own acceleration that matters.
-MATTERS = 0.0015
-#: An error that comes back is one of measuring as well, and those of real sensors are larger: the
-#: share of what a step changes that matters.
-MATTERS_IN_A_STEP = 0.01
-#: What a doubling of the substeps changes is about half of the engine's error, and whatever made
-#: the data may have one too: less than so many times that change is no misfit.
-ENGINES = 3.0
-#: What counts as no noise, as a share of its prior's median.
-_NOTHING = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +32,8 @@ class Left:
         Of the likelihood ratio against none.
     numerical : ndarray
         Change of the bodies' accelerations if the substeps are doubled, root mean square, as size.
+    criteria : Criteria
+        What is significant, and what negligible.
     """
 
     names: tuple[str, ...]
@@ -50,21 +41,23 @@ class Left:
     relative: Array
     p_value: Array
     numerical: Array
+    criteria: Criteria = DEFAULT
 
     @property
     def certain(self) -> NDArray[np.bool_]:
-        """Which are more than chance brings."""
-        return np.asarray(self.p_value * len(self.names) < FALSE_ALARM)
+        """Which are significant."""
+        return np.asarray(self.p_value * len(self.names) < self.criteria.false_alarm)
 
     @property
     def beyond_engine(self) -> NDArray[np.bool_]:
         """Which are larger than what engines make of the same model."""
-        return np.asarray(self.size > ENGINES * self.numerical)
+        return np.asarray(self.size > self.criteria.engines * self.numerical)
 
     @property
     def matters(self) -> NDArray[np.bool_]:
-        """Which are certain, beyond the engine's error, and large enough to matter."""
-        return np.asarray(self.certain & self.beyond_engine & (self.relative >= MATTERS))
+        """Which are significant, beyond the engine's error, and not negligible."""
+        large = self.relative >= self.criteria.negligible
+        return np.asarray(self.certain & self.beyond_engine & large)
 
     @property
     def worst(self) -> float:
@@ -77,21 +70,14 @@ class Left:
         return float((np.where(self.certain, self.relative, 0.0) ** 2).sum())
 
 
-def unexplained_acceleration(mode: Mode) -> Left:
+def unexplained_acceleration(mode: Mode, criteria: Criteria = DEFAULT) -> Left:
     """Size of the acceleration that the model of a mode leaves unexplained."""
     noise = mode.problem.trajectory_noise
     cells = noise.cells
-    segments = mode.problem.segments
-    change = segments.observed[:, 0] - segments.start
-    dt = mode.problem.scene.time_step
-    typical = []
-    for d in cells.rates:
-        own = cells.places[cells.places % len(STATE) == d] // len(STATE)
-        typical.append(np.sqrt(np.mean((change[:, own, d] / dt) ** 2)))
     size = mode.sigma[cells.accelerations]
-    relative = size / np.maximum(typical, 1e-300)
+    relative = size / np.maximum(bodies_acceleration(mode.problem), 1e-300)
     names = tuple(STATE[d] for d in cells.rates)
-    return Left(names, size, relative, _p_values(mode), _numerical(mode))
+    return Left(names, size, relative, _p_values(mode), _numerical(mode), criteria)
 
 
 def noise_alone(mode: Mode, left: Left) -> Array:
@@ -101,7 +87,7 @@ def noise_alone(mode: Mode, left: Left) -> Array:
     """
     problem, places = mode.problem, mode.problem.trajectory_noise.cells.accelerations
     held = {
-        place: _NOTHING * problem.noise_prior[0][place]
+        place: NOTHING * problem.noise_prior[0][place]
         for place, certain in zip(places, left.certain, strict=True)
         if not certain
     }
@@ -145,7 +131,7 @@ def _p_values(mode: Mode) -> Array:
     places = problem.trajectory_noise.cells.accelerations
     here, p_values = best(mode.sigma), np.empty(len(places))
     for i, place in enumerate(places):
-        held = {place: _NOTHING * median[place]}
+        held = {place: NOTHING * median[place]}
         without = profile_sigma(problem, residual, mode.phi, held)
         p_values[i] = 0.5 * chi2.sf(max(2 * (here - best(without)), 0.0), 1)
     return p_values

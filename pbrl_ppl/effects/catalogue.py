@@ -11,6 +11,7 @@ from pbrl_ppl.effects.constant_torque import constant_torque
 from pbrl_ppl.effects.dead_zone import dead_zone
 from pbrl_ppl.effects.distance_joint import distance_joint
 from pbrl_ppl.effects.effect import Effect
+from pbrl_ppl.effects.force_cutoff import force_cutoff
 from pbrl_ppl.effects.force_gain import force_gain
 from pbrl_ppl.effects.frame_rotation import frame_rotation
 from pbrl_ppl.effects.gravity_tilt import gravity_tilt
@@ -57,6 +58,7 @@ catalogue: tuple[Effect, ...] = (
     wheel,
     actuator_delay,
     dead_zone,
+    force_cutoff,
     saturation,
     magnus_force,
     spring,

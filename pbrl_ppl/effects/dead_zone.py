@@ -1,7 +1,9 @@
-"""Dead zone of an actuator: a force below a threshold is lost."""
+"""Dead zone of an actuator: what exceeds a threshold acts."""
 
 import math
 from typing import Any
+
+import numpy as np
 
 from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.scans import force_levels
@@ -10,26 +12,26 @@ from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
-#: The likelihood has a step at each size that was commanded: no climb finds the right one.
-_LOOKS = 200
+_LOOKS = 20
 
 
 def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
-    if math.hypot(wrench[0], wrench[1]) < parameters[0]:
-        wrench[0] = 0.0
-        wrench[1] = 0.0
+    size = math.hypot(wrench[0], wrench[1])
+    share = 1.0 - parameters[0] / size if size > parameters[0] else 0.0
+    wrench[0] *= share
+    wrench[1] *= share
 
 
 def _scan(scene: Scene, history: History, body: Body) -> Any:
-    """Thresholds between the sizes of the forces that were commanded."""
-    return force_levels(history, body, _LOOKS)
+    """A small threshold, then some among the sizes of the forces that were commanded."""
+    return np.vstack([[[np.nan]], force_levels(history, body, _LOOKS)])
 
 
 dead_zone = Effect(
     "dead_zone",
     (EffectParameter("threshold", "N", Prior("half_normal", sigma=10.0)),),
-    "a push weaker than a threshold does nothing: the actuator has play or sticks",
-    "dead zone of an actuator",
+    "only what exceeds a threshold of the push acts: the actuator has play or friction",
+    "dead zone of an actuator (G. Tao and P. V. Kokotovic, 1994)",
     Command(_law),
     scan=_scan,
 )

@@ -10,6 +10,7 @@ from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.state import wrapped
 
 _LOOKS = 8
 
@@ -22,9 +23,16 @@ def _law(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
 
 
 def _scan(scene: Scene, history: History, body: Body) -> Any:
-    """Angles of rest all around; the stiffness is differentiated."""
+    """Angles of rest opposite to which the body does not go; the stiffness is differentiated.
+
+    There the torque would jump, and such a saw-tooth fits whatever is missing. A body that goes all
+    around has none of these, and all angles are tried.
+    """
     angles = np.linspace(-np.pi, np.pi, _LOOKS, endpoint=False)
-    return np.array([(np.nan, angle) for angle in angles])
+    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
+    off = np.abs(wrapped(theta[np.isfinite(theta), None] - angles))
+    smooth = off.max(axis=0, initial=0.0) < np.pi - np.pi / _LOOKS
+    return np.array([(np.nan, angle) for angle in (angles[smooth] if smooth.any() else angles)])
 
 
 torsion_spring = Effect(

@@ -11,7 +11,13 @@ from pbrl_ppl.model.likelihood import (
     robust,
     whiten,
 )
-from pbrl_ppl.model.log_posterior import log_noise_prior, log_posterior, log_prior, noise_law
+from pbrl_ppl.model.log_posterior import (
+    log_noise_prior,
+    log_posterior,
+    log_prior,
+    noise_law,
+    noise_prior_slope,
+)
 from pbrl_ppl.model.noise import Noise, estimate_sigma, sigma_prior
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
@@ -20,6 +26,7 @@ from pbrl_ppl.model.sensitivity import Sensitivity
 from pbrl_ppl.model.simulation import simulated_trajectories, with_measurements
 from pbrl_ppl.model.smoothing import (
     along_trajectories,
+    bodies_acceleration,
     cells_of,
     linearised,
     single_transitions,
@@ -45,6 +52,7 @@ __all__ = [
     "TrajectoryNoise",
     "Transition",
     "along_trajectories",
+    "bodies_acceleration",
     "build_layout",
     "build_model",
     "cells_of",
@@ -58,6 +66,7 @@ __all__ = [
     "log_prior",
     "next_state_random",
     "noise_law",
+    "noise_prior_slope",
     "physics_model",
     "prior_predictive_draws",
     "robust",

@@ -252,7 +252,12 @@ def _noise(problem: Problem) -> Any:
         return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
     parts, mu = [pt.zeros(0)], np.log(median)
     for name, own in problem.noise_variables.items():
-        parts.append(pm.LogNormal(name, mu=mu[: len(own)], sigma=spread, dims=_NOISE_DIMS[name]))
+        centre, dims = mu[: len(own)], _NOISE_DIMS[name]
+        if name == ACCELERATION:
+            variable = pm.Exponential(name, scale=np.exp(centre) / np.log(2.0), dims=dims)
+        else:
+            variable = pm.LogNormal(name, mu=centre, sigma=spread, dims=dims)
+        parts.append(variable)
         mu = mu[len(own) :]
     return pt.concatenate(parts)
 

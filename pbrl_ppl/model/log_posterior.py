@@ -12,7 +12,11 @@ Ints = NDArray[np.intp]
 
 
 def noise_law(problem: Problem) -> tuple[Array, float]:
-    """P(sigma): mean of log sigma, one a free sigma, and its standard deviation; it is normal.
+    """P(sigma): log of each sigma's median, and the standard deviation of log sigma.
+
+    Errors of measuring are log-normal. An unexplained acceleration is exponential, whatever the
+    spread says: a penalised-complexity prior (Simpson et al., Statistical Science 32, 2017), under
+    which motion follows the physics unless the data say otherwise.
 
     Parameters
     ----------
@@ -22,9 +26,9 @@ def noise_law(problem: Problem) -> tuple[Array, float]:
     Returns
     -------
     centre : ndarray
-        Mean of log sigma, shape (state,), or (1,) for a scalar sigma.
+        Logarithm of the medians, shape (state,), or (1,) for a scalar sigma.
     spread : float
-        Standard deviation of log sigma.
+        Standard deviation of log sigma where it is log-normal.
     """
     median, spread = problem.noise_prior
     centre = np.log(median)
@@ -35,7 +39,21 @@ def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
     """Log-density of log sigma, shape (...), at (..., state), or (..., 1) for a scalar sigma."""
     centre, spread = noise_law(problem)
     normal = -0.5 * ((log_sigma - centre) / spread) ** 2 - np.log(spread) - 0.5 * np.log(2 * np.pi)
-    return np.asarray(normal.sum(axis=-1))
+    if problem.trajectories is None:
+        return np.asarray(normal.sum(axis=-1))
+    # of sigma / scale, whose density is exp(-sigma / scale)
+    u = log_sigma - centre + np.log(np.log(2.0))
+    return np.asarray(np.where(problem.exponential, u - np.exp(u), normal).sum(axis=-1))
+
+
+def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
+    """Derivative of :func:`log_noise_prior` by log sigma, same shape."""
+    centre, spread = noise_law(problem)
+    normal = (centre - log_sigma) / spread**2
+    if problem.trajectories is None:
+        return np.asarray(normal)
+    u = log_sigma - centre + np.log(np.log(2.0))
+    return np.where(problem.exponential, 1.0 - np.exp(u), normal)
 
 
 def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = None) -> Array:

@@ -23,9 +23,12 @@ from pbrl_ppl.state import STATE, THETA
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-#: Medians of the noise parameters' priors, as shares of what the states do in a step, and the
-#: priors' log-scale.
-SENSOR_SHARE, STEP_SHARE, JOLT_SHARE, SPREAD = 0.1, 0.01, 0.1, 2.0
+#: Medians of the log-normal priors of errors of measuring and of contact accelerations, as shares
+#: of what the states do in a step, and their log-scale.
+SENSOR_SHARE, JOLT_SHARE, SPREAD = 0.1, 0.1, 2.0
+#: An unexplained acceleration is larger than this share of the bodies' acceleration with so much
+#: probability: physics is nearly deterministic, and a random force follows whatever is smooth.
+ACCELERATION_SHARE, ACCELERATION_CHANCE = 0.1, 0.01
 #: A state that was not measured may be this many times as large as any that is estimated.
 _FAR = 10.0
 #: Error of measuring what does not move at all (m, rad, m/s, rad/s).
@@ -66,6 +69,7 @@ def along_trajectories(
     history = problem.data.history
     states = first_states(history)
     states = foreseen(problem.on(replace(problem.data, horizon=1, states=states)), phi)
+    given = cells is not None
     if cells is None:
         cells = cells_of(problem.scene, history)
         check_moves(cells, problem.scene)
@@ -76,7 +80,14 @@ def along_trajectories(
     if sigma is None:
         sigma = _guess(problem, cells, phi)
     noise = _sloped(problem, cells, phi, sigma, cells.errors(sigma))
-    return smoothed(problem.with_noise(trajectories=noise), phi, sigma)
+    problem = smoothed(problem.with_noise(trajectories=noise), phi, sigma)
+    if not given:  # the noise of measurements adds to the changes of states as measured
+        moved = noise_medians(cells, history, problem.data.smoothed_states)
+        steps = list(cells.accelerations)
+        least = problem.noise_prior[0].copy()
+        least[steps] = np.minimum(least[steps], moved[steps])
+        problem = problem.with_noise(prior=(tuple(least.tolist()), SPREAD))
+    return problem
 
 
 def single_transitions(problem: Problem) -> Problem:
@@ -247,7 +258,8 @@ def noise_medians(cells: Cells, history: History, states: Array) -> Array:
     )
     dt = float(history.dataset.attrs["time_step"])
     sensors = SENSOR_SHARE * seen[list(cells.sensors)]
-    steps = STEP_SHARE * each[list(cells.rates)] / dt
+    share = ACCELERATION_SHARE * np.log(2.0) / -np.log(ACCELERATION_CHANCE)
+    steps = share * _vectors(each, cells.rates) / dt
     jolts = JOLT_SHARE * each[list(cells.jolts)] / dt
     return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts]), 1e-9))
 
@@ -258,6 +270,23 @@ def _typical(cells: Cells, changes: list[Array]) -> Array:
     own = square.mean(axis=0)[cells.places]
     of = cells.places % len(STATE)
     return np.array([np.sqrt(own[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
+
+
+def _vectors(each: Array, rates: tuple[int, ...]) -> Array:
+    """Sizes (6,) of velocities' changes, those of x and y as one vector, shape (rate,)."""
+    plane = [d for d in rates if d % _RATE != THETA]
+    size = float(np.sqrt((each[plane] ** 2).sum()))
+    return np.array([each[d] if d % _RATE == THETA else size for d in rates])
+
+
+def bodies_acceleration(problem: Problem) -> Array:
+    """Root mean square acceleration of the bodies along smoothed trajectories, shape (velocity,).
+
+    Of x and y it is that of the vector, whatever the axes' directions (m/s^2); of omega in rad/s^2.
+    """
+    cells, segments = problem.trajectory_noise.cells, problem.segments
+    change = segments.observed[:, 0] - segments.start
+    return _vectors(_typical(cells, [change]), cells.rates) / problem.scene.time_step
 
 
 def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:

@@ -12,7 +12,7 @@ from pbrl_ppl.modes.configurations import (
 from pbrl_ppl.modes.joint_search import weigh
 from pbrl_ppl.modes.laplace import Mode, posterior_steps
 from pbrl_ppl.modes.library_choice import choose_from_library
-from pbrl_ppl.modes.noise import profile_sigma
+from pbrl_ppl.modes.noise import NOTHING, profile_sigma
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.modes.trajectories import (
     find_trajectory_mode,
@@ -22,6 +22,7 @@ from pbrl_ppl.modes.trajectories import (
 
 __all__ = [
     "ATTRIBUTE",
+    "NOTHING",
     "Mode",
     "Pair",
     "Weighed",

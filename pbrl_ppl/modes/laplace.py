@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pbrl_ppl.model import Problem, log_posterior
-from pbrl_ppl.modes.noise import FAR_OFF, noise_covariance, profile_sigma
+from pbrl_ppl.modes.noise import FAR_OFF, noise_gaussian, profile_sigma
 from pbrl_ppl.modes.tails import best_tails, tail_precision
 from pbrl_ppl.parameters import box, differentiate, inside, likeliest, prior_residual
 from pbrl_ppl.physics import PartedSimulator
@@ -68,14 +68,17 @@ class Mode:
         jitter = 1e-15 * np.eye(len(self.phi))
         return np.asarray(np.linalg.cholesky(self.covariance + jitter), dtype=float)
 
-    def noise_covariance(self) -> Array:
-        """Laplace covariance of the logarithm of sigma, shape (parameter, parameter)."""
+    def noise_gaussian(self) -> tuple[Array, Array]:
+        """Laplace approximation of the logarithm of sigma: mean and covariance.
+
+        Shapes (parameter,) and (parameter, parameter).
+        """
         if self.problem.trajectories is not None:
             residual = self.problem.residual(self.phi)
-            return noise_covariance(self.problem, residual, self.sigma, self.phi)
+            return noise_gaussian(self.problem, residual, self.sigma, self.phi)
         # half the inverse of the number of measurements
         counts = self.problem.observations.measured.sum((0, 1, 2))
-        return np.diag(0.5 / np.maximum(counts, 1))
+        return np.log(self.sigma), np.diag(0.5 / np.maximum(counts, 1))
 
     def draws(self, rng: np.random.Generator, n: int) -> Array:
         """Draws of phi from the Laplace approximation, cut at the supports, shape (n, p)."""

@@ -10,7 +10,13 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import wrightomega
 
-from pbrl_ppl.model import Problem, TrajectoryNoise, log_noise_prior, noise_law
+from pbrl_ppl.model import (
+    Problem,
+    TrajectoryNoise,
+    log_noise_prior,
+    noise_law,
+    noise_prior_slope,
+)
 
 Array = NDArray[np.float64]
 
@@ -20,6 +26,8 @@ FAR_OFF = 1e3
 _LEAST = 1e-9
 #: How far the logarithm of a noise parameter may be from where trajectories were linearised.
 _FAR = 6.0
+#: What counts as no unexplained acceleration, as a share of its prior's median.
+NOTHING = 1e-3
 #: Step of second differences in the logarithm of a noise parameter.
 _SECOND = 0.05
 
@@ -70,6 +78,10 @@ def _of_trajectories(
     gaussian = problem.nu(phi) is None
     begin = np.log(noise.sigma)
     bounds = [(b - _FAR, b + _FAR) for b in begin]
+    for place in np.flatnonzero(problem.exponential).tolist():
+        least = np.log(NOTHING * problem.noise_prior[0][place])
+        begin[place] = max(begin[place], least)
+        bounds[place] = (least, max(bounds[place][1], least + _FAR))
     for place, value in held.items():
         begin[place] = np.log(value)
         bounds[place] = (begin[place], begin[place])
@@ -93,10 +105,9 @@ def _cost_and_slope(
     problem: Problem, noise: TrajectoryNoise, residual: Array, log_sigma: Array
 ) -> tuple[float, Array]:
     """Minus the log-density of Gaussian noise parameters, and its derivative by their logarithm."""
-    centre, spread = noise_law(problem)
     likelihood, slope = noise.score(residual, np.exp(log_sigma))
     cost = float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
-    return cost, 1.0 + (log_sigma - centre) / spread**2 - slope
+    return cost, 1.0 - noise_prior_slope(problem, log_sigma) - slope
 
 
 def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
@@ -136,8 +147,13 @@ def gaussian_profile(problem: Problem, square: Array) -> Array:
     return np.asarray(likelihood + log_noise_prior(problem, t) - t.sum(axis=-1))
 
 
-def noise_covariance(problem: Problem, residual: Array, sigma: Array, phi: Array) -> Array:
-    """Laplace covariance of the logarithm of the noise parameters, by second differences.
+def noise_gaussian(
+    problem: Problem, residual: Array, sigma: Array, phi: Array
+) -> tuple[Array, Array]:
+    """Laplace approximation of the logarithm of the noise parameters, by second differences.
+
+    Its mean is the mode of the density of the logarithm: that of the parameters themselves has
+    unexplained accelerations of nothing, about which no logarithm is normal.
 
     Parameters
     ----------
@@ -152,17 +168,24 @@ def noise_covariance(problem: Problem, residual: Array, sigma: Array, phi: Array
 
     Returns
     -------
-    ndarray
-        Shape (parameter, parameter); no direction is wider than the prior.
+    mean, covariance : ndarray
+        Shapes (parameter,) and (parameter, parameter); no direction is wider than the prior.
     """
-    at, n = np.log(sigma), len(sigma)
     spread = noise_law(problem)[1]
+    begin, n = np.log(sigma), len(sigma)
+    floor = np.log(0.1 * problem.noise_prior[0])
+    begin = np.where(problem.exponential, np.maximum(begin, floor), begin)
+
+    def cost(at: Array) -> float:
+        return _cost(problem, residual, phi, at) - float(at.sum())
+
+    at = minimize(cost, begin, method="L-BFGS-B", bounds=[(b - _FAR, b + _FAR) for b in begin]).x
 
     def moved(*places: tuple[int, float]) -> float:
         point = at.copy()
         for place, step in places:
             point[place] += step
-        return _cost(problem, residual, phi, point)
+        return cost(point)
 
     middle, hessian, h = moved(), np.empty((n, n)), _SECOND
     for i in range(n):
@@ -172,4 +195,4 @@ def noise_covariance(problem: Problem, residual: Array, sigma: Array, phi: Array
             mixed += moved((i, -h), (j, -h)) - moved((i, -h), (j, h))
             hessian[i, j] = hessian[j, i] = mixed / (4 * h**2)
     values, vectors = np.linalg.eigh(hessian)
-    return np.asarray((vectors / np.maximum(values, spread**-2)) @ vectors.T)
+    return at, np.asarray((vectors / np.maximum(values, spread**-2)) @ vectors.T)

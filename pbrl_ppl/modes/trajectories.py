@@ -22,6 +22,9 @@ Array = NDArray[np.float64]
 
 #: Rounds at most; one that moves phi by less than this, in standard deviations, is the last.
 _ROUNDS, _SETTLED = 6, 0.2
+#: A second climb begins with unexplained accelerations of this share of their prior's median:
+#: errors of measuring and unexplained accelerations trade places, and have a hill each.
+_QUIET = 0.1
 #: Rounds of a climb between two linearisations.
 _CLIMB = 5
 #: Climbs of a search, and how much farther apart than draws from single transitions they begin.
@@ -56,6 +59,8 @@ def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
 def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) -> Mode:
     """Mode with the transitions of a trajectory whitened together, linearised at smoothed states.
 
+    The higher of two that begin with the given noise and with next to no unexplained acceleration.
+
     Parameters
     ----------
     problem : Problem
@@ -74,12 +79,21 @@ def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) ->
         cells = None if problem.trajectories is None else problem.trajectories.cells
         problem = along_trajectories(problem, phi, cells=cells)
         sigma = None
-    noise = problem.trajectories
-    if noise is not None and sigma is None:
-        sigma = noise.sigma
+    if sigma is None:
+        sigma = problem.trajectory_noise.sigma
+    mode = _climbed(problem, phi, sigma)
+    quiet = mode.problem.quiet(mode.sigma, _QUIET)
+    if not np.array_equal(quiet, mode.sigma):
+        problem = smoothed(mode.problem, mode.phi, quiet)
+        mode = max(mode, _climbed(problem, mode.phi, quiet), key=lambda own: own.log_posterior)
+    return mode
+
+
+def _climbed(problem: Problem, phi: Array, sigma: Array) -> Mode:
+    """Mode from states smoothed with these noise parameters, by climbs and smoothing in turn."""
     for i in range(_ROUNDS):
         if i:
-            problem = smoothed(problem, phi, np.asarray(sigma))
+            problem = smoothed(problem, phi, sigma)
         mode = find_mode(problem, initial=phi, rounds=_CLIMB)
         change = _change(mode, phi)
         phi, sigma = mode.phi, mode.sigma

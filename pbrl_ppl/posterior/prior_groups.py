@@ -43,13 +43,17 @@ def prior_groups(
         return {}
     centre, spread = noise_law(problem)
     noise = [Prior("log_normal", mu=float(mu), sigma=spread) for mu in centre]
+    steps = problem.exponential[: len(centre)]
+    scale = np.exp(centre) / np.log(2.0)
     # apart from the generator of the predictions
     rng = np.random.default_rng([seed, 1])
     drawn = np.empty(phi.shape)
     for i, prior in enumerate(layout.priors):
         drawn[:, i] = prior.sample(rng, len(phi))
     louder = prior_draws(noise, rng, len(phi))
+    louder = np.where(steps, rng.exponential(scale, louder.shape), louder)
     density = np.stack([prior.log_density(sigma[:, i]) for i, prior in enumerate(noise)], axis=1)
+    density = np.where(steps, -np.log(scale) - sigma[:, : len(scale)] / scale, density)
     return {
         "prior": _like(problem, posterior, beside(layout, drawn, phi), louder),
         "log_prior": _like(problem, posterior.drop_attrs(), layout.log_prior(phi), density),

@@ -9,9 +9,9 @@ import numpy as np
 
 from pbrl_ppl.criticism import (
     ADEQUATE,
+    DEFAULT,
     NOT_CONVERGED,
     TRIED,
-    TRY_P,
     UNEXPLAINED,
     Candidate,
     Findings,
@@ -85,7 +85,7 @@ def rejected_in_words(findings: Findings) -> str:
     told = [
         f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
         for one in findings.candidates
-        if one.why and one.p_value < TRY_P and (one.effect, one.body) not in there
+        if one.why and one.p_value < DEFAULT.try_p and (one.effect, one.body) not in there
     ]
     return f"Not added: {'; '.join(told[:TRIED])}." if told else ""
 

@@ -159,9 +159,9 @@ def _laplace(job: Job) -> Any:
     rng, mode = np.random.default_rng(job.seed), job.mode
     shape = job.chains, job.draws
     phi = mode.draws(rng, job.chains * job.draws)
-    factor = np.linalg.cholesky(mode.noise_covariance())
-    louder = rng.standard_normal((len(phi), len(mode.sigma))) @ factor.T
-    sigma = mode.sigma * np.exp(louder)
+    centre, covariance = mode.noise_gaussian()
+    louder = rng.standard_normal((len(phi), len(centre))) @ np.linalg.cholesky(covariance).T
+    sigma = np.exp(centre + louder)
     values = mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
     return as_trace(job.model, values, {"accept": np.ones(shape)})
 

@@ -159,7 +159,7 @@ def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
 def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     """Mean and covariance of log sigma: the latter half the inverse of the measurements."""
     if problem.trajectories is not None:
-        return np.log(mode.sigma), mode.noise_covariance()
+        return mode.noise_gaussian()
     counts = problem.observations.measured.sum((0, 1, 2))
     mean = np.log(mode.sigma)
     if problem.noise.scalar:
@@ -172,13 +172,14 @@ def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[st
     problem, priors = mode.problem, mode.problem.layout.priors
     low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
     factor, starts = mode.factor, []
-    wide: float | Array = 0.1
+    centre, wide = np.log(mode.sigma), np.full(len(mode.sigma), 0.1)
     if problem.trajectories is not None:
-        wide = np.minimum(2.0 * np.sqrt(np.diag(mode.noise_covariance())), 2.0)
+        centre, covariance = mode.noise_gaussian()
+        wide = np.minimum(2.0 * np.sqrt(np.diag(covariance)), 2.0)
     for _ in range(chains):
         moved = mode.phi + 2.0 * factor @ rng.standard_normal(len(mode.phi))
         moved = np.where((moved < low) | (moved > high), mode.phi, moved)
-        sigma = mode.sigma * np.exp(wide * rng.standard_normal(len(mode.sigma)))
+        sigma = np.exp(centre + wide * rng.standard_normal(len(centre)))
         starts.append(problem.named(inside(priors, moved), sigma))
     return starts
 

@@ -58,6 +58,9 @@ class Scene:
     noise : tuple of (str, float)
         Standard deviation of measuring a state dimension where it is known (m, rad, m/s, rad/s),
         for the likelihood of whole trajectories, which infers the others; a dict will do.
+    test_is_later : bool
+        Whether a test recording was made after the training recording, so that what lasts from some
+        trajectory on, such as a payload, holds in it.
 
     Raises
     ------
@@ -79,6 +82,7 @@ class Scene:
     walls: tuple[Wall, ...] = ()
     joints: tuple[Joint, ...] = ()
     noise: tuple[tuple[str, float], ...] = ()
+    test_is_later: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "gravity", vector(self.gravity, 2, "[world]: gravity"))
@@ -96,6 +100,10 @@ class Scene:
                 " time_step, or fewer of them"
             )
         object.__setattr__(self, "substeps", int(steps))
+        if not isinstance(self.test_is_later, bool):
+            raise SceneError(
+                f"[world]: test_is_later is {self.test_is_later!r}, expected true or false"
+            )
         for key, kind in (("bodies", Body), ("walls", Wall), ("joints", Joint)):
             parts = tuple(getattr(self, key))
             for part in parts:
@@ -200,7 +208,11 @@ class Scene:
         """Return TOML text from which `from_toml` builds an equal scene."""
         world = ("gravity", "normal_gravity", "time_step", "substeps")
         sections: list[tuple[str, dict[str, Any]]] = [
-            ("[world]", {key: getattr(self, key) for key in world})
+            (
+                "[world]",
+                {key: getattr(self, key) for key in world}
+                | {"test_is_later": None if self.test_is_later else False},
+            )
         ]
         if self.noise:
             sections.append(("[noise]", dict(self.noise)))

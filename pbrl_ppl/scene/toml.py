@@ -16,7 +16,7 @@ Table = dict[str, Any]
 
 KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "the file": (("world",), ("noise", "body", "wall", "joint")),
-    "[world]": (("time_step",), ("gravity", "normal_gravity", "substeps")),
+    "[world]": (("time_step",), ("gravity", "normal_gravity", "substeps", "test_is_later")),
     "[noise]": ((), STATE),
     "body": (
         ("name", "shape"),

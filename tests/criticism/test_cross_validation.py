@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from pbrl_ppl.criticism.cross_validation import LEAST_FOLDS, cross_validated, folds, standard_error
+from pbrl_ppl.criticism.cross_validation import LEAST_FOLDS, Change, folds, leave_out
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.model import Problem, along_trajectories, log_prior
@@ -69,14 +69,14 @@ def test_one_step_is_the_integral_over_all_parameters(scene) -> None:
     own = mode(scene)
     fold = folds(own)
     # of log densities of about 125 a fold
-    np.testing.assert_allclose(cross_validated(own, fold), by_quadrature(own, fold), atol=0.01)
+    np.testing.assert_allclose(leave_out(own, fold).density, by_quadrature(own, fold), atol=0.01)
 
 
 def test_one_step_is_near_a_fit_without_each_trajectory() -> None:
     """Refits take the noise from the other trajectories too, which one step does not."""
     own = mode(DRAGGED)
     fold = folds(own)
-    quick, slow = cross_validated(own, fold), by_refits(own, DRAGGED, fold)
+    quick, slow = leave_out(own, fold).density, by_refits(own, DRAGGED, fold)
     # nine parameters of the noise in eight folds cost about a nat a fold: 0.3 to 1.4 were measured
     assert (np.abs(quick - slow) < 2.5).all()
     assert 0 < (quick - slow).mean() < 1.5
@@ -85,11 +85,11 @@ def test_one_step_is_near_a_fit_without_each_trajectory() -> None:
 def test_the_gain_of_an_effect_is_that_of_refits() -> None:
     without, with_drag = mode(DISC), mode(DRAGGED)
     fold = folds(with_drag)
-    gain = cross_validated(with_drag, fold) - cross_validated(without, fold)
+    gain = leave_out(with_drag, fold).density - leave_out(without, fold).density
     refitted = by_refits(with_drag, DRAGGED, fold) - by_refits(without, DISC, fold)
     # 60 against 69 and a standard error of 15: without the drag, noise grows with the fold
     assert gain.sum() > 20
-    assert abs(gain.sum() - refitted.sum()) < standard_error(gain)
+    assert abs(gain.sum() - refitted.sum()) < Change.of(gain).error
 
 
 def test_trajectories_are_folds_and_few_of_them_are_cut() -> None:
@@ -108,11 +108,11 @@ def test_where_a_climb_ended_near_the_top_changes_nothing() -> None:
     """A step of one standard deviation off: what one fold alone knew of was once charged for it."""
     own = mode(DRAGGED)
     fold = folds(own)
-    expected = cross_validated(own, fold)
+    expected = leave_out(own, fold).density
     for direction in own.factor.T:
         moved = replace(own, phi=own.phi + direction)
         moved = replace(moved, jacobian=finish(own.problem, moved.phi, own.sigma, 0.0).jacobian)
-        np.testing.assert_allclose(cross_validated(moved, fold), expected, atol=0.1)
+        np.testing.assert_allclose(leave_out(moved, fold).density, expected, atol=0.1)
 
 
 def test_a_parameter_at_its_bound_is_held_there() -> None:
@@ -131,7 +131,7 @@ def test_runs_of_a_trajectory_are_refitted_too() -> None:
     short = mode(DISC, 3)
     fold = folds(short)
     # without the drag the fit is bent: 0.03 was measured
-    np.testing.assert_allclose(cross_validated(short, fold), by_quadrature(short, fold), atol=0.1)
+    np.testing.assert_allclose(leave_out(short, fold).density, by_quadrature(short, fold), atol=0.1)
 
 
 def test_folds_are_worth_less_than_the_fit_says() -> None:
@@ -139,10 +139,11 @@ def test_folds_are_worth_less_than_the_fit_says() -> None:
     own = mode(DRAGGED)
     fold = folds(own)
     density = own.problem.log_density(own.problem.residual(own.phi), own.sigma, own.phi)
-    assert cross_validated(own, fold).sum() < density.sum()
+    assert leave_out(own, fold).density.sum() < density.sum()
 
 
 def test_standard_error_is_that_of_a_sum() -> None:
     gains = np.array([1.0, 2.0, 4.0, 5.0])
-    assert standard_error(gains) == pytest.approx(2 * gains.std(ddof=1))
-    assert standard_error(gains[:1]) == np.inf
+    assert Change.of(gains).total == 12.0
+    assert Change.of(gains).error == pytest.approx(2 * gains.std(ddof=1))
+    assert Change.of(gains[:1]).error == np.inf
