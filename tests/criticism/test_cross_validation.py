@@ -30,16 +30,22 @@ def mode(scene: Scene, trajectories: int = 8) -> Mode:
 
 
 def by_quadrature(mode: Mode, fold: np.ndarray) -> np.ndarray:
-    """Log density of each fold under the posterior of the others, on a grid of all parameters."""
+    """Log density of each fold under the posterior of the others, on a grid of all parameters.
+
+    The noise is that which the others give.
+    """
     problem, p = mode.problem, len(mode.phi)
     # seven standard deviations either way, four or more points to each
     axes = np.meshgrid(*[np.linspace(-7, 7, 61)] * p, indexing="ij")
     grid = np.stack([axis.ravel() for axis in axes], axis=1)
     phi = mode.phi + grid @ mode.factor.T
-    density = np.array([problem.log_density(problem.residual(x), mode.sigma, x) for x in phi])
+    residuals = [problem.residual(x) for x in phi]
     prior = np.array([log_prior(problem, x, mode.sigma) for x in phi])
     result = []
-    for f in range(fold.max() + 1):
+    for f, sigma in enumerate(leave_out(mode, fold).sigma):
+        density = np.array(
+            [problem.log_density(r, sigma, x) for r, x in zip(residuals, phi, strict=True)]
+        )
         rest = density[:, fold != f].sum(axis=1) + prior
         rest -= logsumexp(rest)
         result.append(logsumexp(rest + density[:, fold == f].sum(axis=1)))
@@ -73,13 +79,12 @@ def test_one_step_is_the_integral_over_all_parameters(scene) -> None:
 
 
 def test_one_step_is_near_a_fit_without_each_trajectory() -> None:
-    """Refits take the noise from the other trajectories too, which one step does not."""
     own = mode(DRAGGED)
     fold = folds(own)
     quick, slow = leave_out(own, fold).density, by_refits(own, DRAGGED, fold)
-    # nine parameters of the noise in eight folds cost about a nat a fold: 0.3 to 1.4 were measured
+    # with the noise of all data, which knows the fold, it was 0.3 to 1.4 too high in the mean
     assert (np.abs(quick - slow) < 2.5).all()
-    assert 0 < (quick - slow).mean() < 1.5
+    assert abs((quick - slow).mean()) < 0.3
 
 
 def test_the_gain_of_an_effect_is_that_of_refits() -> None:
@@ -112,7 +117,8 @@ def test_where_a_climb_ended_near_the_top_changes_nothing() -> None:
     for direction in own.factor.T:
         moved = replace(own, phi=own.phi + direction)
         moved = replace(moved, jacobian=finish(own.problem, moved.phi, own.sigma, 0.0).jacobian)
-        np.testing.assert_allclose(leave_out(moved, fold).density, expected, atol=0.1)
+        # the noise of other folds is estimated where the climb ended: 0.13 was measured
+        np.testing.assert_allclose(leave_out(moved, fold).density, expected, atol=0.2)
 
 
 def test_a_parameter_at_its_bound_is_held_there() -> None:
@@ -123,7 +129,7 @@ def test_a_parameter_at_its_bound_is_held_there() -> None:
         problem = Problem.of(scene, History.from_dataframe(still, scene), attach(scene))
         modes.append(trajectory_mode(problem, find_mode(problem, seed=1).phi))
     fold = folds(modes[0])
-    gain = cross_validated(modes[1], fold) - cross_validated(modes[0], fold)
+    gain = leave_out(modes[1], fold).density - leave_out(modes[0], fold).density
     assert abs(gain.sum()) < 3.0
 
 

@@ -17,6 +17,7 @@ import pbrl_ppl as pp
 from pbrl_ppl.criticism import loop as loop_module
 from pbrl_ppl.criticism import revise
 from pbrl_ppl.criticism.histories import checked_histories
+from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.errors import (
@@ -173,7 +174,7 @@ def test_what_comes_by_chance_takes_no_name_away() -> None:
 )
 def test_selection_has_no_name_for_what_is_outside(name, size, richer, make_history) -> None:
     mode = fitted(BOX, box2d(make_history, 4, **{name: size})[0])
-    selection = Selection(BOX, without(name, *richer), lambda stage: None)
+    selection = Selection(BOX, without(name, *richer), DEFAULT, lambda stage: None)
     step = selection.best_addition(mode, rank_candidates(mode, selection.missing(mode)))
     if step is not None:  # then most of what was missing remains
         before, after = mode.sigma[6:], step.after.sigma[6:]
@@ -285,7 +286,7 @@ def test_computed_velocities_are_recognised_and_the_effect_is_found(make_history
         observed = history.dataset["observed"].to_numpy()[..., 3:]
         assert np.isnan(observed).all()
     mode = fitted(BOX, train)
-    selection = Selection(BOX, pp.catalogue, lambda stage: None)
+    selection = Selection(BOX, pp.catalogue, DEFAULT, lambda stage: None)
     step = selection.best_addition(mode, rank_candidates(mode, selection.missing(mode)))
     assert step.signature.candidate.effect == "linear_drag"
     place = step.after.problem.layout.labels.index("linear_drag_coefficient[puck]")
@@ -312,7 +313,7 @@ def test_a_carts_drag_is_chosen_and_known_to_a_hundredth(shared_data) -> None:
     """Without draws: the mode and its covariance say what the posterior will."""
     scene, train, _ = load(shared_data / "cart-linear-drag")
     mode = fitted(scene, train)
-    selection = Selection(scene, pp.catalogue, lambda stage: None)
+    selection = Selection(scene, pp.catalogue, DEFAULT, lambda stage: None)
     step = selection.best_addition(mode, rank_candidates(mode, selection.missing(mode)))
     assert step.signature.candidate.effect == "linear_drag"
     place = step.after.problem.layout.labels.index("linear_drag_coefficient[cart]")

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.criticism import revise
+from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.effects import catalogue
@@ -21,7 +22,7 @@ def test_friction_of_a_pivot_of_another_engine_is_chosen() -> None:
     """Without draws: the mode and its covariance say what the posterior will."""
     scene, train, _ = load(FOLDER, FOLDER / "recorded")
     mode = fitted(scene, train)
-    selection = Selection(scene, catalogue, lambda stage: None)
+    selection = Selection(scene, catalogue, DEFAULT, lambda stage: None)
     step = selection.best_addition(mode, rank_candidates(mode, selection.missing(mode)))
     assert step.signature.candidate.effect == "pivot_friction"
     place = step.after.problem.layout.labels.index("pivot_friction_torque[arm]")

@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.criticism import selection as module
+from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.cross_validation import Change
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.effects import catalogue
@@ -16,7 +18,7 @@ TRIED = ("linear_drag", "quadratic_drag", "torque_gain", "inertia_scale", "const
 
 def selection(*names: str) -> Selection:
     chosen = tuple(effect for effect in catalogue if effect.name in names)
-    return Selection(FINE, chosen, lambda stage: None)
+    return Selection(FINE, chosen, DEFAULT, lambda stage: None)
 
 
 @pytest.fixture(scope="module")
@@ -41,7 +43,7 @@ def test_each_candidate_says_what_became_of_it(weak) -> None:
     }
     assert why["quadratic_drag"].startswith("fits less well than linear drag, by ")
     assert why["torque_gain"] == "the same as inertia scale in these data"
-    assert why["constant_torque"].startswith("p = ")
+    assert why["constant_torque"].startswith("not significant (p = ")
     assert why["heavy_tails"] == "the noise's shape is scored and never added: declare it"
     chosen.withdraw(steps)
     why = {one.effect: one.why for one in chosen.explained(first)}
@@ -51,7 +53,8 @@ def test_each_candidate_says_what_became_of_it(weak) -> None:
 def test_a_gain_that_is_not_sure_is_told(weak, monkeypatch) -> None:
     chosen = selection("linear_drag")
     ranked = rank_candidates(weak, chosen.missing(weak))
-    monkeypatch.setattr(module, "_gain", lambda before, after: (3.1, 2.4))
+    gains = Change(3.1, 2.4, 100_000), Change(0.0, np.inf, 0)
+    monkeypatch.setattr(module, "_gains", lambda before, after: gains)
     assert chosen.best_addition(weak, ranked) is None
     (only,) = chosen.explained(ranked)
     assert only.why == "cross-validation gains 3.1 ± 2.4 nats, 4.8 are needed"
@@ -66,7 +69,7 @@ def test_what_is_certain_and_does_not_matter_is_told_once() -> None:
         assert chosen.best_addition(mode, ranked) is None
         assert [one.effect for one in chosen.small] == ["linear_drag"]
     said = chosen.explained(ranked)[0].why
-    assert said.startswith("changes predictions by 0.") and said.endswith("1 % does not matter")
+    assert said.startswith("changes predictions by 0.") and said.endswith("1 % is negligible")
     # where the model has another that explains it, nothing is there any more
     leader = next(one for one in ranked if one.candidate.effect == "quadratic_drag")
     drags = module.refitted(mode, leader)
