@@ -16,8 +16,8 @@ from scipy.stats import norm
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import loop as loop_module
 from pbrl_ppl.criticism import revise
-from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.errors import (
