@@ -5,13 +5,15 @@ import re
 import subprocess
 import sys
 import warnings
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from pbrl_ppl import report
-from pbrl_ppl.cli import main
+from pbrl_ppl.cli import main, terminal
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
 from pbrl_ppl.report import loop as loop_module
 from pbrl_ppl.report.loop import FILES, Loop
@@ -98,6 +100,17 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     assert scene.substeps == 4
     assert train.n_transitions == test.n_transitions == 4
     assert options == {"seed": 1, "draws": None, "method": "metropolis"}
+
+
+def test_a_status_line_has_the_stage_and_the_time_elapsed(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    running = terminal.Stage()
+    running.name = "sampling [all]"
+    now[0] = 281.4
+    shown = StringIO()
+    Console(file=shown, width=80).print(running)
+    assert shown.getvalue() == "sampling [all], 181 s\n"
 
 
 @pytest.mark.usefixtures("files")
