@@ -163,10 +163,9 @@ def close_loop(
     if as_json:
         print_json(loop.findings.to_dict() | {"report": output / "report.html"} | remainder)
     else:
-        for line in report.in_brief(loop.findings, output):
+        words = remainder["learned_remainder"]["words"] if remainder else ""
+        for line in report.in_brief(loop.findings, output, words):
             typer.echo(line)
-        if remainder:
-            typer.echo(remainder["learned_remainder"]["words"])
     if loop.verdict == NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
 

@@ -6,22 +6,22 @@ from pathlib import Path
 
 import numpy as np
 
-from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, Added, Findings
+from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Added, Findings
 from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import (
     accepted,
     depends_on_records,
     digits_of,
+    error_in_words,
     joined,
     number,
     plain,
     quantity,
-    unit_in_words,
     verdict_in_words,
 )
 
 
-def in_brief(findings: Findings, folder: str | Path) -> list[str]:
+def in_brief(findings: Findings, folder: str | Path, remainder: str = "") -> list[str]:
     """Summarise findings in about ten lines.
 
     Parameters
@@ -30,6 +30,8 @@ def in_brief(findings: Findings, folder: str | Path) -> list[str]:
         What was found.
     folder : str or pathlib.Path
         Where the results are, to name in commands.
+    remainder : str
+        What a learned remainder does, or why there is none, where one was asked for.
     """
     left, folder = findings.unexplained, Path(folder)
     lines = [f"Verdict: {findings.verdict}. {verdict_in_words(findings)}"]
@@ -37,7 +39,8 @@ def in_brief(findings: Findings, folder: str | Path) -> list[str]:
     lines += _errors(findings)
     if left is not None and left.body:
         lines.append(f"Where: {left.dimension} of the {plain(left.body)}.")
-    lines.append(f"Next: {_next(findings, folder)}")
+    lines += [f"Remainder: {remainder}"] if remainder else []
+    lines.append(f"Next: {_next(findings, folder, bool(remainder))}")
     lines.append(f"Report: {folder / 'report.html'}; posteriors before.nc and after.nc beside it.")
     return lines
 
@@ -78,19 +81,20 @@ def _errors(findings: Findings) -> list[str]:
             f" {both(before.rollout_rmse[name], after.rollout_rmse.get(name, np.nan))}"
             f" {UNITS[name]} (noise floor {number(floor.rollout_rmse.get(name))})"
         )
-    unit = unit_in_words(findings)
-    return [f"{text}.", *([f"  {unit}"] if unit else [])]
+    note = error_in_words(findings)
+    return [f"{text}.", *([f"  {note}"] if note else [])]
 
 
-def _next(findings: Findings, folder: Path) -> str:
+def _next(findings: Findings, folder: Path, tried: bool) -> str:
     """Say what to do next."""
     left = findings.unexplained
     if findings.verdict == NOT_CONVERGED:
         return "close the loop again with more --draws, or with tighter priors in the scene."
     if left is not None and depends_on_records(findings):
+        learn = findings.verdict == UNEXPLAINED and not tried
         return (
             f"open the report, which plots the residual against {left.depends_on}; write an effect"
-            " for it, or close the loop again with --learn-remainder."
+            f" for it{', or close the loop again with --learn-remainder' if learn else ''}."
         )
     if left is not None:
         return "open the report; record more quantities, or longer."

@@ -19,13 +19,13 @@ from pbrl_ppl.state import INPUT, STATE
 
 Array = NDArray[np.float64]
 
-#: Quantities whose bins explain less than this share of what is left are no law of it.
+#: Further quantities whose bins explain less than this share of the residual are left out.
 _SMALLEST_SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """What is left of a body's force or torque, against a quantity that it follows.
+    """Residual force or torque of a body against a quantity that it depends on.
 
     Parameters
     ----------

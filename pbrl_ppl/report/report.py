@@ -44,9 +44,9 @@ from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import (
     accepted,
     depends_on_records,
+    error_in_words,
     gains_in_words,
     rejected_in_words,
-    unit_in_words,
     verdict_in_words,
 )
 
@@ -119,7 +119,7 @@ def render(
         motion=animation(findings, held_out_motions(findings, held_out, effects)),
         verdict=verdict_in_words(findings),
         accepted=accepted(findings),
-        unit=unit_in_words(findings),
+        note=error_in_words(findings),
         rejected=rejected_in_words(findings),
         depends=depends_on_records(findings),
         remainder=remainder,

@@ -23,6 +23,8 @@ _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 #: A p-value below this is beyond what the asymptotic distribution of a statistic can say.
 _SMALLEST_P = 1e-16
+#: A held-out error of more than this many times the noise is not what an adequate model has.
+_TOO_LARGE = 1.5
 
 
 def remainder_in_words(before: Any, after: Any) -> str:
@@ -107,15 +109,20 @@ def depends_on_records(findings: Findings) -> bool:
     return left is not None and not left.depends_on.startswith("nothing")
 
 
-def unit_in_words(findings: Findings) -> str:
-    """Say what the unit of normalised errors holds, if that is more than measurement noise."""
-    if findings.unexplained is None and not significant_acceleration(findings):
-        return ""
-    model = "revised" if findings.added else "declared"
-    return (
-        f"The unit is the noise fitted with the {model} model, which takes up what that leaves"
-        " unexplained: an error of 1.00 does not mean that nothing is missing."
-    )
+def error_in_words(findings: Findings) -> str:
+    """Say what a held-out error means where its figure alone would contradict the verdict."""
+    model, after = "revised" if findings.added else "declared", findings.after.normalised_rmse
+    if findings.unexplained is not None or significant_acceleration(findings):
+        return (
+            f"The unit is the noise fitted with the {model} model, which takes up what that leaves"
+            " unexplained: an error of 1.00 does not mean that nothing is missing."
+        )
+    if after > _TOO_LARGE and findings.verdict != NOT_CONVERGED:
+        return (
+            "The verdict is of the fitted recordings alone: the held-out ones differ from the"
+            f" {model} model by {number(after)} times the noise (another load, wear, calibration?)."
+        )
+    return ""
 
 
 def rejected_in_words(findings: Findings) -> str:

@@ -83,6 +83,16 @@ def test_the_unit_of_an_error_takes_up_what_is_unexplained() -> None:
         assert ONE not in text_of(made_up(verdict))
 
 
+def test_a_held_out_error_that_the_verdict_does_not_lead_to_expect_is_explained() -> None:
+    for verdict, model in (("adequate", "declared"), ("effects-added", "revised")):
+        findings = made_up(verdict)
+        for error, told in ((3.0, True), (1.2, False)):
+            far = replace(findings, after=replace(findings.after, normalised_rmse=error))
+            said = f"the held-out ones differ from the {model} model by 3.00 times the noise"
+            assert (said in text_of(far)) == told
+            assert any(said in line for line in in_brief(far, "out")) == told
+
+
 def test_intervals_of_effects_that_the_verdict_rejects_are_left_out() -> None:
     stuck = replace(made_up(), verdict="not-converged")
     for findings in (nearest(), stuck):
@@ -212,6 +222,10 @@ def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:
     assert "detection limit" in every["adequate"][-2]
     assert "Where: omega of the cart." in every["unexplained"]
     assert "plots the residual against omega" in every["unexplained"][-2]
+    assert "--learn-remainder" in every["unexplained"][-2]
+    learned = in_brief(made_up("unexplained"), "out", "a force without a law")
+    assert learned[-3] == "Remainder: a force without a law"
+    assert "--learn-remainder" not in learned[-2]
     assert "--draws" in every["not-converged"][-2]
     alone = replace(made_up(), added=(replace(made_up().added[0], not_separable_from=()),))
     assert in_brief(alone, "out")[-2] == (
