@@ -33,19 +33,6 @@ from pbrl_ppl.cli.terminal import (
 if TYPE_CHECKING:
     from pbrl_ppl.report import Loop, Source
 
-#: Share of the time that is over when a stage begins, as measured on a recorded cart with chains.
-SHARES = {
-    "loading the sampler": 0.01,
-    "looking whether the prior could have made the data": 0.03,
-    "fitting the declared model": 0.04,
-    "scoring what the model might lack": 0.05,
-    "testing what is left": 0.13,
-    "sampling the posterior of the declared model": 0.14,
-    "sampling the posterior of the revised model": 0.44,
-    "comparing errors on held-out data": 0.98,
-    "writing the report": 0.99,
-}
-
 
 class Method(StrEnum):
     """How posteriors are drawn."""
@@ -143,8 +130,7 @@ def close_loop(
         raise typer.BadParameter("expected SCENE and TRAIN, or --many MANIFEST")
     if jobs > 1 or scheduler is not None:
         raise typer.BadParameter("--jobs and --scheduler are for --many")
-    shares = SHARES if method is Method.METROPOLIS else None
-    with interruptible(), stages(quiet, shares) as progress:
+    with interruptible(), stages(quiet) as progress:
         check_can_make(output)  # before the long work, which would be lost
         progress("reading the scene and the histories")
         declared, histories = load_own(
@@ -177,13 +163,9 @@ def close_loop(
     if as_json:
         print_json(loop.findings.to_dict() | {"report": output / "report.html"} | remainder)
     else:
-        typer.echo(report.verdict_in_words(loop.findings))
-        for words in (report.rejected_in_words, report.unseen_in_words):
-            if said := words(loop.findings):
-                typer.echo(said)
-        if remainder:
-            typer.echo(remainder["learned_remainder"]["words"])
-        typer.echo(f"report: {output / 'report.html'}")
+        words = remainder["learned_remainder"]["words"] if remainder else ""
+        for line in report.in_brief(loop.findings, output, words):
+            typer.echo(line)
     if loop.verdict == NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
 
@@ -191,7 +173,7 @@ def close_loop(
 def _remainder(
     loop: Loop, folder: Path, source: Source, seed: int, progress: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
-    """Learn what is left, and put it with the loop's results, or say why there is nothing."""
+    """Learn a force for the residual and save it with the results, or say why there is none."""
     from pbrl_ppl.errors import FitError
 
     path = folder / "remainder.nc"

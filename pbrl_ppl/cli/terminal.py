@@ -6,13 +6,14 @@ import re
 import sys
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+from rich.text import Text
 
 if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
@@ -78,40 +79,37 @@ def stated_noise(scene: Scene, given: list[str] | None) -> Scene:
 
 
 @contextmanager
-def stages(
-    quiet: bool, shares: Mapping[str, float] | None = None
-) -> Iterator[Callable[[str], None]]:
-    """Show stages on stderr: a status line on a terminal, one line each elsewhere.
-
-    Parameters
-    ----------
-    quiet : bool
-        Show nothing.
-    shares : mapping of str to float, optional
-        Share of the whole time that is usually over when a stage begins; from it follow how far the
-        work is, and how long it will still take.
-    """
+def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
+    """Show stages on stderr with the time elapsed: on a terminal the present one runs on."""
     console = Console(stderr=True, quiet=quiet, highlight=False, markup=False)
-    begin = time.monotonic()
-    with console.status("starting") as status:
+    running = Stage()
+    with console.status(running):
 
         def progress(stage: str) -> None:
-            spent = time.monotonic() - begin
-            far = _how_far(spent, (shares or {}).get(stage, 0.0))
-            console.print(f"[{spent:5.1f} s{far}] {stage}", soft_wrap=True)
-            status.update(f"{stage} ({far.removeprefix(', ')})" if far else stage)
+            console.print(f"[{running.elapsed:5.1f} s] {stage}", soft_wrap=True)
+            running.name = stage
 
         yield progress
 
 
-def _how_far(spent: float, share: float) -> str:
-    """How far the work is, and how long it will still take if it goes on so."""
-    return f", {share:3.0%}, about {spent / share - spent:.0f} s left" if share else ""
+class Stage:
+    """The present stage and the time elapsed, as a status line that is drawn again and again."""
+
+    def __init__(self) -> None:
+        self.name, self._begin = "starting", time.monotonic()
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds since the start."""
+        return time.monotonic() - self._begin
+
+    def __rich__(self) -> Text:
+        return Text(f"{self.name}, {self.elapsed:.0f} s")
 
 
 @contextmanager
 def interruptible(state: str = "nothing was written") -> Iterator[None]:
-    """Say what is left; results are renamed into place as the last thing."""
+    """Turn an interrupt into its exit code; results are renamed into place as the last thing."""
     try:
         yield
     except KeyboardInterrupt:

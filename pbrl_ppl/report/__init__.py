@@ -1,5 +1,6 @@
 """Plots and reports; the only place that imports matplotlib."""
 
+from pbrl_ppl.report.brief import in_brief
 from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
 from pbrl_ppl.report.contact_plots import draw_contacts
 from pbrl_ppl.report.effect_plots import plot_candidates
@@ -13,7 +14,6 @@ from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
 from pbrl_ppl.report.posterior_report import render_posterior
 from pbrl_ppl.report.scene_plots import animate_plan, draw_goal, draw_motion, draw_scene
 from pbrl_ppl.report.style import png
-from pbrl_ppl.report.words import rejected_in_words, unseen_in_words, verdict_in_words
 
 __all__ = [
     "Log",
@@ -28,6 +28,7 @@ __all__ = [
     "draw_goal",
     "draw_motion",
     "draw_scene",
+    "in_brief",
     "in_words",
     "plot_calibration",
     "plot_candidates",
@@ -38,10 +39,7 @@ __all__ = [
     "plot_trace",
     "png",
     "read_manifest",
-    "rejected_in_words",
     "render_posterior",
     "summary",
-    "unseen_in_words",
-    "verdict_in_words",
     "write_page",
 ]

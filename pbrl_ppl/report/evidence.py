@@ -1,4 +1,4 @@
-"""Where and when the data speak for what was added, from the recordings in posterior files."""
+"""Evidence for the added effects by state dimension and transition of the fitted recording."""
 
 from __future__ import annotations
 
@@ -80,14 +80,14 @@ class Evidence:
         return dict(sorted(sums, key=lambda item: -item[1]))
 
     def in_words(self) -> str:
-        """Where most of the gain is, for a reader."""
+        """Say where the gain is largest, for a reader."""
         total, sums = float(self.nats.sum()), self.by_cell
         first = next(iter(sums))
         carriers = len(self.carriers())
         said = (
             f"The revised model makes the recording that was fitted {total:,.0f} nats likelier."
-            f" Most of it is in {first} ({100 * sums[first] / total:.0f} %), and {carriers} of"
-            f" {len(self.nats)} transitions hold 80 % of the gains."
+            f" The largest share is in {first} ({100 * sums[first] / total:.0f} %), and {carriers}"
+            f" of {len(self.nats)} transitions hold 80 % of the gains."
         )
         return said if total > 0 else "The recording that was fitted is no likelier."
 

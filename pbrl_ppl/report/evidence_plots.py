@@ -1,4 +1,4 @@
-"""Pictures of where and when the data speak for an effect, and of laws that are wanted."""
+"""Plots of the evidence for an effect, and of residual forces against what they depend on."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _shares(axes: Axes, evidence: Evidence) -> None:
 
 
 def plot_laws(laws: Sequence[Law], width: float = WIDE) -> Figure:
-    """What is left of a force against the quantities that it follows, with means and a curve."""
+    """Plot residual forces against the quantities that they depend on, with means and a curve."""
     figure, panels = blank_figure(width, 3.6, 1, max(len(laws), 1))
     for axes, law in zip(panels, laws, strict=False):
         order = np.argsort(law.x)
@@ -115,11 +115,11 @@ def plot_laws(laws: Sequence[Law], width: float = WIDE) -> Figure:
             law.centre, law.mean, 2 * np.nan_to_num(law.error), fmt="o", color=AFTER, markersize=4,
             label="mean ± 2 se",
         )  # fmt: skip
-        axes.plot(law.x[order], law.curve, color=BEFORE, linewidth=1.8, label="closest simple law")
+        axes.plot(law.x[order], law.curve, color=BEFORE, linewidth=1.8, label="simple curve")
         reach = 1.25 * float(np.quantile(np.abs(law.y), 0.98))
         if reach > 0:  # a few far off would hide the rest
             axes.set_ylim(-reach, reach)
-        axes.set_title(f"{100 * max(law.curve_share, 0):.0f} % of it", fontsize=10)
+        axes.set_title(f"R² {max(law.curve_share, 0):.2f}", fontsize=10)
         axes.set_xlabel(f"{law.quantity} ({law.x_unit})".replace(" (1)", ""))
     if laws:
         panels[0].set_ylabel(f"{laws[0].y_name}, {laws[0].dimension} ({laws[0].y_unit})")

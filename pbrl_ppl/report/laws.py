@@ -1,4 +1,4 @@
-"""Which law is wanted: what the model leaves of a force, against the quantity that it follows."""
+"""Residual forces against the recorded quantities that they depend on."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import problem_of
 from pbrl_ppl.report.evidence import binned, recorded
 from pbrl_ppl.report.motion import likeliest
+from pbrl_ppl.report.words import depends_on_records
 from pbrl_ppl.state import INPUT, STATE
 
 Array = NDArray[np.float64]
 
-#: Quantities whose bins explain less than this share of what is left are no law of it.
+#: Further quantities whose bins explain less than this share of the residual are left out.
 _SMALLEST_SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Law:
-    """What is left of a body's force or torque, against a quantity that it follows.
+    """Residual force or torque of a body against a quantity that it depends on.
 
     Parameters
     ----------
@@ -64,16 +65,18 @@ class Law:
 
 
 def find_laws(findings: Findings, effects: Iterable[Effect], most: int = 3) -> list[Law]:
-    """What the model leaves, against the quantities that it follows, the named one first.
+    """Return residual forces against the quantity that they depend on, and others like it.
 
     The residual force is what each step adds to the smoothed states beyond the model, over the time
     step, times the body's posterior mean mass or moment.
 
-    Empty where nothing is unexplained, no body is named, or the posterior does not hold its
-    recording.
+    Empty where the test of dependence passed, no body is named, or the posterior does not hold
+    its recording.
     """
     left = findings.unexplained
-    if left is None or not left.body or not recorded(findings.posterior_after):
+    if left is None or not left.body or not depends_on_records(findings):
+        return []
+    if not recorded(findings.posterior_after):
         return []
     problem = problem_of(findings.posterior_after, tuple(effects))
     phi, _ = likeliest(problem, findings.posterior_after)
@@ -91,8 +94,9 @@ def find_laws(findings: Findings, effects: Iterable[Effect], most: int = 3) -> l
         if np.ptp(x) > 1e-9
     ]
     laws.sort(key=lambda law: (law.quantity != left.depends_on, -law.curve_share))
-    kept = [law for law in laws[:most] if law.share > _SMALLEST_SHARE]
-    return kept or laws[: int(laws[0].quantity == left.depends_on) if laws else 0]
+    if not laws or laws[0].quantity != left.depends_on:
+        return []
+    return [laws[0], *(law for law in laws[1:most] if law.share > _SMALLEST_SHARE)]
 
 
 def _residual(problem: Problem, phi: Array, body: int, dimension: str) -> tuple[str, Array] | None:

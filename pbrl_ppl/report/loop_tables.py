@@ -1,17 +1,19 @@
-"""Tables of a closed loop: errors, what is left, candidates, and where the evidence is."""
+"""Tables of a closed loop: errors, residual tests, candidates, and evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
 from pbrl_ppl.criticism import Candidate, Findings
+from pbrl_ppl.effects import Effect
 from pbrl_ppl.report.evidence import Evidence
+from pbrl_ppl.report.limits import limits_in_words, measured_parameters
 from pbrl_ppl.report.page import Table
 from pbrl_ppl.report.style import UNITS
-from pbrl_ppl.report.words import chance, number, plain, quantity
+from pbrl_ppl.report.words import chance, number, percent, plain, quantity
 
 #: Transitions in the table of those that carry most.
 _CARRIERS = 8
@@ -90,7 +92,7 @@ def loo_table(findings: Findings) -> Table | None:
 
 
 def acceleration_table(findings: Findings) -> Table:
-    """Acceleration that is left unexplained, and its share of the bodies' own."""
+    """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
     told = findings.acceleration
     rows = []
     for name, before in told.before.items():
@@ -102,25 +104,26 @@ def acceleration_table(findings: Findings) -> Table:
             (
                 name,
                 *(number(value) for value in values),
-                *(f"{number(100 * share, 2)} %" for share in shares),
+                *(percent(share) for share in shares),
                 "rad/s²" if name == "omega" else "m/s²",
+                "yes" if told.certain_after.get(name) else "no",
             )
         )
     both = ("Before", "After") if findings.added else ("Declared model",)
     shared = ("Before, share", "After, share") if findings.added else ("Share",)
     return Table(
-        "Acceleration that the model leaves unexplained (standard deviation in an interval)",
-        ("Velocity", *both, *shared, "Unit"),
+        "Unexplained acceleration (standard deviation in an interval)",
+        ("Velocity", *both, *shared, "Unit", "Significant"),
         rows,
-        words=(1 + len(both) + len(shared),),
+        words=(1 + len(both) + len(shared), 2 + len(both) + len(shared)),
     )
 
 
 def residual_test_table(findings: Findings) -> Table:
-    """Tests of what the model leaves."""
+    """Tabulate the tests of the model's residual."""
     which = "revised" if findings.added else "declared"
     return Table(
-        f"Tests of what the {which} model leaves, on the recordings that it was fitted to",
+        f"Tests of the {which} model's residual, on the recordings that it was fitted to",
         ("Test", "Result", "p", "Passed"),
         [
             (test.name, test.sentence, chance(test.p_value), "yes" if test.passed else "no")
@@ -131,22 +134,23 @@ def residual_test_table(findings: Findings) -> Table:
     )
 
 
-def candidate_table(findings: Findings) -> Table:
-    """Candidates of the first round."""
+def candidate_table(findings: Findings, effects: Iterable[Effect]) -> Table:
+    """Tabulate the candidates of the first round."""
+    effects = tuple(effects)
     added = {(each.effect, each.body) for each in findings.added}
     return Table(
         "Candidates of the first round, best first",
         ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
-         "Identifiable", "Would be seen from", "What became of it"),
+         "Identifiable", "Detection limit", "Decision"),
         [
             (
                 (plain(candidate.effect), candidate.body),
                 number(candidate.statistic),
                 str(candidate.dof),
                 chance(candidate.p_value),
-                _sizes(candidate, candidate.estimate),
-                f"{number(100 * candidate.identifiable, 2)} %",
-                _sizes(candidate, candidate.detectable) or "–",
+                _estimates(candidate, measured_parameters(candidate, findings, effects)),
+                percent(candidate.identifiable),
+                limits_in_words(candidate, findings, effects) or "–",
                 candidate.why or "–",
             )
             for candidate in findings.candidates
@@ -158,10 +162,11 @@ def candidate_table(findings: Findings) -> Table:
     )  # fmt: skip
 
 
-def _sizes(candidate: Candidate, values: Mapping[str, float]) -> str:
+def _estimates(candidate: Candidate, names: Iterable[str]) -> str:
     return ", ".join(
-        f"{plain(name)} {quantity(value, candidate.units.get(name, ''))}"
-        for name, value in values.items()
+        f"{plain(name)} {quantity(candidate.estimate[name], candidate.units[name])}"
+        for name in names
+        if name in candidate.estimate
     )
 
 

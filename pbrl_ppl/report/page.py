@@ -17,12 +17,12 @@ from matplotlib.figure import Figure
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.report.style import NARROW, WIDE, png
 from pbrl_ppl.report.words import (
-    chance,
     change,
     digits_of,
     joined,
     number,
-    odds,
+    p_equals,
+    percent,
     plain,
     quantity,
 )
@@ -108,7 +108,7 @@ def render_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for written in (number, chance, odds, plain, joined, change, quantity):
+    for written in (number, percent, p_equals, plain, joined, change, quantity):
         environment.filters[written.__name__] = written
     environment.filters["data"] = _data
     picture = {name: _picture(draw) for name, draw in pictures.items()}

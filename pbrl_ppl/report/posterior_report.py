@@ -159,13 +159,13 @@ def _headline(posterior: Any, said: Any) -> str:
     if said is None:
         return f"{text}: {len(scalars(posterior).data_vars)} parameters"
     verdicts = [width.verdict for width in said.parameters]
-    counts = (
-        (verdicts.count("informed"), "the data inform"),
-        (verdicts.count("weak"), "weakly"),
-        (verdicts.count("prior only"), "not beyond the prior"),
-    )
-    parts = [f"{count} {words}" for count, words in counts if count]
-    return f"{text}: of {len(verdicts)} parameters {', '.join(parts)}"
+    informed, weak, kept = map(verdicts.count, ("informed", "weak", "prior only"))
+    text += f". The data inform {informed} of {len(verdicts)} parameters"
+    if weak:
+        text += f", {weak} more weakly"
+    if kept:
+        text += f"; {kept} {'keep their' if kept > 1 else 'keeps its'} prior"
+    return f"{text}."
 
 
 def _predicts(covered: Any, missing: dict[str, str]) -> str:

@@ -41,7 +41,14 @@ from pbrl_ppl.report.posterior_rows import (
 from pbrl_ppl.report.residual_plots import plot_correlations, plot_growth
 from pbrl_ppl.report.scene_plots import plot_recording
 from pbrl_ppl.report.style import UNITS
-from pbrl_ppl.report.words import gains_in_words, unseen_in_words, verdict_in_words
+from pbrl_ppl.report.words import (
+    accepted,
+    depends_on_records,
+    error_in_words,
+    gains_in_words,
+    rejected_in_words,
+    verdict_in_words,
+)
 
 Array = NDArray[np.float64]
 
@@ -80,7 +87,8 @@ def render(
     rows = posterior_rows(
         table, effects, units, method=str(findings.posterior_after.attrs.get("method", ""))
     )
-    evidence, laws = find_evidence(findings, effects), find_laws(findings, effects)
+    evidence = find_evidence(findings, effects) if accepted(findings) else None
+    laws = find_laws(findings, effects)
     poses = recorded_poses(findings.posterior_before)
     pictures: dict[str, Callable[[float], Figure]] = {
         "rollout": partial(_drawn, plot_rollout, findings),
@@ -100,7 +108,7 @@ def render(
         pictures["laws"] = partial(_drawn, plot_laws, laws)
     if findings.candidates:
         pictures["candidates"] = partial(_drawn, plot_candidates, findings)
-    if findings.added:
+    if accepted(findings):
         pictures["added"] = partial(_drawn, plot_added, findings)
     said = findings.identifiability
     return render_page(
@@ -110,7 +118,10 @@ def render(
         source=source or Source(),
         motion=animation(findings, held_out_motions(findings, held_out, effects)),
         verdict=verdict_in_words(findings),
-        unseen=unseen_in_words(findings),
+        accepted=accepted(findings),
+        note=error_in_words(findings),
+        rejected=rejected_in_words(findings),
+        depends=depends_on_records(findings),
         remainder=remainder,
         gains=gains_in_words(findings.before.rollout_rmse, findings.after.rollout_rmse, UNITS),
         evidence=evidence,
@@ -120,7 +131,7 @@ def render(
         loo=loo_table(findings),
         acceleration=acceleration_table(findings),
         tests=residual_test_table(findings),
-        candidates=candidate_table(findings),
+        candidates=candidate_table(findings, effects),
         posterior=parameter_table(rows, "Posterior of all parameters"),
         count=len(rows),
         bad=[row for row in rows if row["failed"]],

@@ -13,7 +13,7 @@ from pbrl_ppl.criticism import (
     NOT_CONVERGED,
     TRIED,
     UNEXPLAINED,
-    Candidate,
+    Added,
     Findings,
 )
 from pbrl_ppl.model import ACCELERATION
@@ -21,8 +21,10 @@ from pbrl_ppl.posterior import draws, group
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-#: A size in SI units beyond which nothing is: what the data would show from here on, they never do.
-_NEVER = 1e6
+#: A p-value below this is beyond what the asymptotic distribution of a statistic can say.
+_SMALLEST_P = 1e-16
+#: A held-out error of more than this many times the noise is not what an adequate model has.
+_TOO_LARGE = 1.5
 
 
 def remainder_in_words(before: Any, after: Any) -> str:
@@ -52,10 +54,7 @@ def verdict_in_words(findings: Findings) -> str:
             " parameters tighter priors."
         )
     if findings.verdict == ADEQUATE:
-        return (
-            "Nothing was found missing: what the declared model leaves passed all tests that were"
-            f" made ({joined(test.name for test in findings.tests)}).{_small(findings)}"
-        )
+        return _adequate(findings)
     if findings.verdict == UNEXPLAINED and not found:
         return f"Something is missing that no effect in the catalogue explains: {rest}."
     if findings.verdict == UNEXPLAINED:
@@ -70,17 +69,64 @@ def verdict_in_words(findings: Findings) -> str:
     return f"Something was missing: {found}."
 
 
-def _small(findings: Findings) -> str:
-    """Say what is there without mattering; beside what was added the table of candidates does."""
-    return "".join(
+def _adequate(findings: Findings) -> str:
+    """Say how adequate the model is: what passed, and which negligible misfit is significant."""
+    tests = len(findings.tests)
+    passed = f"the declared model passes all {tests} tests of its residual"
+    # beside what was added the table of candidates has them
+    small = "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
         " less than 1 %."
         for one in findings.small
     )
+    remains = significant_acceleration(findings)
+    if remains > 0:
+        return (
+            f"Adequate to {percent(remains)} of the bodies' acceleration: {passed}. An acceleration"
+            " of that size is left unexplained in each interval: significant, but too small to"
+            f" matter, or within the error of the engine.{small}"
+        )
+    missing = "Nothing that matters was" if small else "Nothing was"
+    return f"{missing} found missing: {passed}.{small}"
+
+
+def significant_acceleration(findings: Findings) -> float:
+    """Return the largest significant unexplained acceleration over that of the bodies, or 0."""
+    told = findings.acceleration
+    sizes = (told.relative_after[name] for name, sure in told.certain_after.items() if sure)
+    return max(sizes, default=0.0)
+
+
+def accepted(findings: Findings) -> tuple[Added, ...]:
+    """Return the added effects that the verdict stands for: none where it is another."""
+    stands = findings.verdict not in (UNEXPLAINED, NOT_CONVERGED)
+    return findings.added if stands else ()
+
+
+def depends_on_records(findings: Findings) -> bool:
+    """Return whether the residual depends on a recorded quantity: the dependence test failed."""
+    left = findings.unexplained
+    return left is not None and not left.depends_on.startswith("nothing")
+
+
+def error_in_words(findings: Findings) -> str:
+    """Say what a held-out error means where its figure alone would contradict the verdict."""
+    model, after = "revised" if findings.added else "declared", findings.after.normalised_rmse
+    if findings.unexplained is not None or significant_acceleration(findings):
+        return (
+            f"The unit is the noise fitted with the {model} model, which takes up what that leaves"
+            " unexplained: an error of 1.00 does not mean that nothing is missing."
+        )
+    if after > _TOO_LARGE and findings.verdict != NOT_CONVERGED:
+        return (
+            "The verdict is of the fitted recordings alone: the held-out ones differ from the"
+            f" {model} model by {number(after)} times the noise (another load, wear, calibration?)."
+        )
+    return ""
 
 
 def rejected_in_words(findings: Findings) -> str:
-    """Say why the leading candidates, of those that chance does not explain, were not added."""
+    """Say why the leading significant candidates were not added."""
     there = {(added.effect, added.body) for added in findings.added}
     told = [
         f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
@@ -88,36 +134,6 @@ def rejected_in_words(findings: Findings) -> str:
         if one.why and one.p_value < DEFAULT.try_p and (one.effect, one.body) not in there
     ]
     return f"Not added: {'; '.join(told[:TRIED])}." if told else ""
-
-
-def unseen_in_words(findings: Findings) -> str:
-    """Say how small an effect must be for these data not to show it; nothing of those shown.
-
-    An obstacle has no size without a place: what has none is named, for nothing was said of it.
-    """
-    there = {(added.effect, added.body) for added in findings.added}
-    there |= {(small.effect, small.body) for small in findings.small}
-    sizes, silent = [], []
-    for candidate in findings.candidates:
-        if (candidate.effect, candidate.body) in there:
-            continue
-        of = f" of the {plain(candidate.body)}" if len(findings.scene.dynamic) > 1 else ""
-        for name, size in candidate.detectable.items():
-            which = plain(candidate.effect)
-            if len(candidate.detectable) > 1:
-                which = f"{which} ({plain(name)})"
-            sizes.append(f"{which}{of} {_unseen(candidate, name, size)}")
-        if not candidate.detectable:
-            silent.append(f"{plain(candidate.effect)}{of}")
-    text = f"These data would not show: {'; '.join(sizes)}." if sizes else ""
-    rest = f"Nothing can be said of how large these would have to be: {'; '.join(silent)}."
-    return f"{text} {rest if silent else ''}".strip()
-
-
-def _unseen(candidate: Candidate, name: str, size: float) -> str:
-    if size > _NEVER:
-        return "of any size"
-    return f"{'above' if candidate.caps else 'below'} {quantity(size, candidate.units[name])}"
 
 
 def plain(name: str) -> str:
@@ -161,27 +177,30 @@ def quantity(value: float, unit: str, digits: int = 3) -> str:
     return f"{number(value, digits)} {unit.removesuffix('1')}".rstrip()
 
 
+def percent(share: float) -> str:
+    """Write a share in per cent, with two significant digits."""
+    return f"{number(100 * share, 2)} %"
+
+
 def chance(p_value: float) -> str:
-    """Write a p-value: two digits, and no pretence of exactness where it underflowed.
+    """Write a p-value: two significant digits, and a bound below 1e-16.
 
     Examples
     --------
-    >>> chance(0.0312), chance(1e-80), chance(0.0)
-    ('0.031', '1.0 × 10⁻⁸⁰', '< 10⁻³⁰⁰')
+    >>> chance(0.0312), chance(3e-8), chance(1e-80)
+    ('0.031', '3.0e-8', '< 1e-16')
     """
-    return "< 10⁻³⁰⁰" if p_value < 1e-300 else number(p_value, 2)
+    if p_value < _SMALLEST_P:
+        return f"< {_SMALLEST_P:.0e}"
+    if p_value < 1e-4:
+        return f"{p_value:.1e}".replace("e-0", "e-")
+    return number(p_value, 2)
 
 
-def odds(p_value: float) -> str:
-    """Write a p-value as odds: how often chance alone does it."""
-    if p_value < 1e-300:
-        return "less than once in 10³⁰⁰ times"
-    if p_value > 0.1:
-        return f"in {100 * p_value:.0f} % of all cases"
-    if p_value > 1e-6:
-        return f"once in {1 / p_value:,.0f} times"
-    power = int(np.floor(-np.log10(p_value)))
-    return f"less than once in 10{str(power).translate(_RAISED)} times"
+def p_equals(p_value: float) -> str:
+    """Write ``p = 0.031`` or ``p < 1e-16``."""
+    text = chance(p_value)
+    return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
 def change(before: float, after: float) -> str:
@@ -195,26 +214,27 @@ def change(before: float, after: float) -> str:
 def gains_in_words(
     before: Mapping[str, float], after: Mapping[str, float], units: Mapping[str, str]
 ) -> str:
-    """Say how the errors of all state dimensions changed: how many fell, the most and the least.
+    """Say how the errors of all state dimensions changed: how many fell, the most, and a rise.
 
     Examples
     --------
     >>> gains_in_words({"x": 0.2, "omega": 1.0}, {"x": 0.1, "omega": 0.1}, {"x": "m"})
-    'fell in 2 of 2 state dimensions: most in omega (by 90 %, from 1.00 to 0.100), least in x (by 50 %, from 0.200 to 0.100 m)'
-    """  # noqa: E501
+    'fell in 2 of 2 state dimensions, most in omega (by 90 %, from 1.00 to 0.100)'
+    """
     shares = {d: after[d] / before[d] for d in before if d in after and before[d] > 0}
     if not shares:
         return ""
-    order = sorted(shares, key=lambda dimension: shares[dimension])
-    fell = sum(share < 0.995 for share in shares.values())
+    best, worst = min(shares, key=shares.__getitem__), max(shares, key=shares.__getitem__)
 
     def told(name: str) -> str:
         size = f"from {number(before[name])} to {quantity(after[name], units.get(name, ''))}"
-        part = change(before[name], after[name]).removeprefix("fell ")
-        return f"{name} ({part}, {size})"
+        return f"{name} (by {100 * abs(1 - shares[name]):.0f} %, {size})"
 
-    text = f"fell in {fell} of {len(shares)} state dimensions: most in {told(order[0])}"
-    return text if len(order) == 1 else f"{text}, least in {told(order[-1])}"
+    fell = sum(share < 0.995 for share in shares.values())
+    parts = [f"fell in {fell} of {len(shares)} state dimensions, most in {told(best)}"] * (fell > 0)
+    if shares[worst] > 1.005:
+        parts.append(f"rose{' most' if fell < len(shares) - 1 else ''} in {told(worst)}")
+    return "; it ".join(parts) or "did not change"
 
 
 def joined(parts: Iterable[str], word: str = "and") -> str:

@@ -1,17 +1,19 @@
 """The command line: results on success, one message and exit code 2 on bad input."""
 
 import os
+import re
 import subprocess
 import sys
 import warnings
-from dataclasses import replace
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from pbrl_ppl import report
-from pbrl_ppl.cli import main
+from pbrl_ppl.cli import main, terminal
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
 from pbrl_ppl.report import loop as loop_module
 from pbrl_ppl.report.loop import FILES, Loop
@@ -78,12 +80,18 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     captured = capsys.readouterr()
     assert code == 0
     assert captured.out.splitlines() == [
-        "Something was missing: a force against the motion that grows with the speed (linear drag)"
-        " on the cart.",
-        "These data would not show: quadratic drag below 0.0200 kg/m; constant force (force x)"
-        " below 0.0200 N; constant force (force y) below 0.0200 N; inertia scale below 0.0200.",
-        "report: a/out/report.html",
+        "Verdict: effects-added. Something was missing: a force against the motion that grows with"
+        " the speed (linear drag) on the cart.",
+        "  linear drag on the cart: coefficient 3.00 kg/s (94 % interval 2.81 to 3.19); these data"
+        " cannot tell it from quadratic drag",
+        "Held-out error: 2.40 -> 1.02 times the noise; of x 2.00 s ahead 0.0192 -> 0.00816 m"
+        " (noise floor 0.00800).",
+        "Next: pbrl-ppl suggest a/out/after.nc -o next.csv: a recording that tells these effects"
+        " apart.",
+        "Report: a/out/report.html; posteriors before.nc and after.nc beside it.",
     ]
+    # the time elapsed and the stage, no guess of the time remaining
+    assert all(re.fullmatch(r"\[ *\d+\.\d s\] .+", line) for line in captured.err.splitlines())
     stages = [line.partition("] ")[2] for line in captured.err.splitlines()]
     assert "fitting [all] of it" in stages
     assert stages[-1] == "writing the report"
@@ -94,17 +102,15 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     assert options == {"seed": 1, "draws": None, "method": "metropolis"}
 
 
-@pytest.mark.usefixtures("files", "calls")
-def test_close_loop_says_why_leaders_were_not_added(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = made_up()
-    told = tuple(replace(one, why="fits less well") for one in found.candidates)
-    loop = Loop(replace(found, candidates=told))
-    monkeypatch.setattr(report, "close_loop", lambda *args, **options: loop)
-    assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 0
-    said = capsys.readouterr().out.splitlines()
-    assert said[1] == "Not added: quadratic drag on the cart (fits less well)."
+def test_a_status_line_has_the_stage_and_the_time_elapsed(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = [100.0]
+    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    running = terminal.Stage()
+    running.name = "sampling [all]"
+    now[0] = 281.4
+    shown = StringIO()
+    Console(file=shown, width=80).print(running)
+    assert shown.getvalue() == "sampling [all], 181 s\n"
 
 
 @pytest.mark.usefixtures("files")

@@ -55,12 +55,13 @@ def test_the_law_that_is_wanted_is_the_drag() -> None:
     assert slope == pytest.approx(-DRAG, rel=0.25)
     assert "q" in first.form
     assert len(plot_laws(laws).axes) == len(laws)
-    # named by nobody, it is found all the same
+    # where the test of dependence passed, or names another quantity, nothing speaks against it
     left = Unexplained("puck", "y", "nothing that was recorded", 0.5, 0.001, "y is off")
-    others = find_laws(replace(unexplained(), unexplained=left), catalogue)
+    for other in (left, replace(left, body=""), replace(left, depends_on="colour")):
+        assert find_laws(replace(unexplained(), unexplained=other), catalogue) == []
+    named = replace(left, depends_on="velocity y")
+    others = find_laws(replace(unexplained(), unexplained=named), catalogue)
     assert (others[0].quantity, others[0].dimension) == ("velocity y", "vy")
-    nowhere = replace(left, body="")
-    assert find_laws(replace(unexplained(), unexplained=nowhere), catalogue) == []
 
 
 def test_a_law_may_follow_whatever_an_error_may_depend_on() -> None:

@@ -33,7 +33,7 @@ def test_page_of_a_file(generation: str) -> None:
     html = render_posterior(load_posterior(file(generation)))
     stands_alone(html, pictures=7)
     text = Page(html).text
-    assert "Posterior of puck: of 1 parameters 1 the data inform" in text
+    assert "Posterior of puck. The data inform 1 of 1 parameters." in text
     assert "Did the sampler work? Yes. The chains agree" in text
     assert "This file holds no draws from the prior." in text
     assert "In the central 94 %" in text and "elpd_loo (nats; more is better)" in text
@@ -46,7 +46,7 @@ def test_page_of_whole_trajectories() -> None:
     html = render_posterior(revised().posterior_after)
     stands_alone(html, pictures=7)
     text = Page(html).text
-    assert "Posterior of puck with linear drag of puck: of 2 parameters 2 the data inform" in text
+    assert "Posterior of puck with linear drag of puck. The data inform 2 of 2 parameters." in text
     assert "likelihood of whole trajectories; sampler laplace" in text
     assert "No chains. Independent draws" in text and "Not converged" not in text
     assert "trajectories=True" in text and "no draws from the prior" not in text

@@ -1,0 +1,248 @@
+"""One story a report, and on the terminal: no figure beside a verdict that it contradicts."""
+
+from dataclasses import replace
+
+import pytest
+
+from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
+from pbrl_ppl.effects import Effect, EffectParameter, catalogue
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.report import page as page_module
+from pbrl_ppl.report.brief import in_brief
+from pbrl_ppl.report.limits import limits_in_words
+from pbrl_ppl.report.report import render
+from pbrl_ppl.report.words import gains_in_words, verdict_in_words
+from tests.helpers.html import Page
+from tests.helpers.made_up import made_up
+from tests.helpers.revised import revised, unexplained
+
+pytestmark = [
+    pytest.mark.usefixtures("undrawn"),
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
+]
+
+ONE = "does not mean that nothing is missing"
+
+
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page without its pictures, which take nearly all of its time."""
+    nothing = "data:image/png;base64,"
+    monkeypatch.setattr(page_module, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
+
+
+def text_of(findings: Findings) -> str:
+    return Page(render(findings)).text
+
+
+def nearest() -> Findings:
+    """Unexplained, with the nearest effect in the model."""
+    left = made_up("unexplained")
+    return replace(
+        made_up(),
+        verdict="unexplained",
+        unexplained=left.unexplained,
+        tests=left.tests,
+        acceleration=left.acceleration,
+    )
+
+
+def with_acceleration(findings: Findings, **sizes: tuple[float, bool]) -> Findings:
+    """Findings with these relative accelerations left, each significant or not."""
+    shares = {name: share for name, (share, _) in sizes.items()}
+    sure = {name: certain for name, (_, certain) in sizes.items()}
+    return replace(findings, acceleration=Acceleration(shares, shares, shares, shares, sure))
+
+
+def test_negligible_acceleration_is_in_the_headline() -> None:
+    findings = with_acceleration(
+        made_up("adequate"), vx=(0.0051, True), vy=(0.3, False), omega=(0.004, True)
+    )
+    said = verdict_in_words(findings)
+    assert said == (
+        "Adequate to 0.51 % of the bodies' acceleration: the declared model passes all 2 tests of"
+        " its residual. An acceleration of that size is left unexplained in each interval:"
+        " significant, but too small to matter, or within the error of the engine."
+    )
+    text = text_of(findings)
+    assert said in text and ONE in text
+    assert "vy 0.300 30 % m/s² no" in text and "vx 0.00510 0.51 % m/s² yes" in text
+    lines = in_brief(findings, "out")
+    assert lines[0] == f"Verdict: adequate. {said}"
+    nothing = with_acceleration(findings, vx=(0.0051, False))
+    assert verdict_in_words(nothing).startswith("Nothing was found missing: ")
+    assert ONE not in text_of(nothing) + "".join(in_brief(nothing, "out"))
+
+
+def test_the_unit_of_an_error_takes_up_what_is_unexplained() -> None:
+    for findings in (made_up("unexplained"), nearest()):
+        assert ONE in text_of(findings)
+        assert any(ONE in line for line in in_brief(findings, "out"))
+    for verdict in ("adequate", "effects-added"):
+        assert ONE not in text_of(made_up(verdict))
+
+
+def test_a_held_out_error_that_the_verdict_does_not_lead_to_expect_is_explained() -> None:
+    for verdict, model in (("adequate", "declared"), ("effects-added", "revised")):
+        findings = made_up(verdict)
+        for error, told in ((3.0, True), (1.2, False)):
+            far = replace(findings, after=replace(findings.after, normalised_rmse=error))
+            said = f"the held-out ones differ from the {model} model by 3.00 times the noise"
+            assert (said in text_of(far)) == told
+            assert any(said in line for line in in_brief(far, "out")) == told
+
+
+def test_intervals_of_effects_that_the_verdict_rejects_are_left_out() -> None:
+    stuck = replace(made_up(), verdict="not-converged")
+    for findings in (nearest(), stuck):
+        text = text_of(findings)
+        for claim in ("How sure.", "How large.", "with 94 % probability", "Adding linear drag"):
+            assert claim not in text
+        assert "Posterior densities of the parameters of" not in render(findings)
+        assert not any("94 % interval" in line for line in in_brief(findings, "out"))
+    assert "nearest effects (linear drag), which do not explain the data" in text_of(nearest())
+    assert "How large." in text_of(made_up())
+    # evidence for a rejected effect too
+    real = revised()
+    assert "nats likelier" in text_of(real)
+    assert "nats likelier" not in text_of(replace(real, verdict="unexplained"))
+
+
+def test_dependence_is_shown_only_where_its_test_failed() -> None:
+    failed = text_of(unexplained())
+    assert "depends on velocity x (near" in failed
+    assert "depends on no recorded quantity" not in failed
+    left = Unexplained(
+        "puck", "vx", "nothing that was recorded", 3.1, 0.0, "after 1 s vx of Puck is off"
+    )
+    passed = text_of(replace(unexplained(), unexplained=left))
+    assert "The residual depends on no recorded quantity: record more quantities" in passed
+    assert "R² =" not in passed and "velocity x" not in passed
+    assert "After 1 s vx of Puck is off." in passed  # with its capitals
+    assert "310 %" not in passed  # a factor is no share
+    assert "In vx of the puck (p < 1e-16)." in passed
+    # a test that names no body has no p-value
+    assert "Where it remains" not in text_of(
+        replace(unexplained(), unexplained=replace(left, body=""))
+    )
+
+
+def test_a_candidate_with_a_large_score_says_why_it_was_not_added() -> None:
+    findings = made_up("adequate")
+    first = replace(findings.candidates[0], p_value=1e-20, why="changes predictions by 0.2 %")
+    text = text_of(replace(findings, candidates=(first, *findings.candidates[1:])))
+    assert "came closest (p < 1e-16); it was not added: changes predictions by 0.2 %." in text
+
+
+def candidate(effect: str, caps: bool = False, **sizes: float) -> Candidate:
+    named = {each.name: each for each in catalogue}
+    units = {p.name: p.unit for p in named[effect].parameters}
+    return Candidate(
+        effect, "cart", "", 1.0, 1, 0.5, dict.fromkeys(units, 0.25), units, 1.0,
+        detectable=sizes, caps=caps,
+    )  # fmt: skip
+
+
+def test_limits_of_what_was_not_measured_are_left_out() -> None:
+    findings = made_up()
+    seen = {name: findings.residuals_after[name] for name in ("x", "y", "theta")}
+    blind = replace(findings, residuals_after=seen)
+    bias = candidate("sensor_bias", x=0.01, y=0.01, theta=0.02, vx=0.3, vy=0.3, omega=0.1)
+    positions = "x 0.0100 m, y 0.0100 m, theta 0.0200 rad"
+    assert limits_in_words(bias, blind, catalogue) == positions
+    velocities = "vx 0.300 m/s, vy 0.300 m/s, omega 0.100 rad/s"
+    assert limits_in_words(bias, findings, catalogue) == f"{positions}, {velocities}"
+    text = text_of(replace(blind, candidates=(bias,)))
+    assert "x 0.250 m, y 0.250 m, theta 0.250 rad 100 %" in text  # estimates too
+    # a coordinate of another effect is no measurement
+    offset = candidate("com_offset", x=0.01, y=0.02)
+    kept = limits_in_words(offset, replace(findings, residuals_after={}), catalogue)
+    assert kept == "x 0.0100 m, y 0.0200 m"
+
+
+def test_limits_beyond_the_prior_are_no_limits() -> None:
+    findings = made_up()
+
+    def said(one: Candidate) -> str:
+        return limits_in_words(one, findings, catalogue)
+
+    # normal, sigma 20 N: 99.9 % are within 3.29 sigma, 65.8 N
+    assert said(candidate("constant_force", force_x=60.0, force_y=116317.0)) == (
+        "force x 60.0 N, force y no plausible size"
+    )
+    assert said(candidate("constant_force", force_x=70.0, force_y=70.0)) == "no plausible size"
+    assert said(candidate("dead_zone", threshold=float("inf"))) == "no plausible size"
+    assert said(candidate("hidden_obstacle")) == ""
+    # a gain of 1 does nothing: its limit is a distance from there
+    assert said(candidate("force_gain", factor=0.05)) == "factor 1.00 ± 0.0500"
+    # a smaller cap is stronger: log-normal, mu 2.5, sigma 1.5: one of a thousand is below 0.12 N
+    assert said(candidate("saturation", True, limit=8.0)) == "limit up to 8.00 N"
+    assert said(candidate("saturation", True, limit=0.1)) == "no plausible size"
+    # of an effect that is looked up nowhere the size alone is known
+    assert limits_in_words(candidate("dead_zone", threshold=1e4), findings, ()) == (
+        "threshold 10,000 N"
+    )
+    own = Effect(
+        "dead_zone", (EffectParameter("threshold", "N", Prior("half_normal", sigma=1e5)),), "",
+        "", catalogue[0].stage,
+    )  # fmt: skip
+    assert limits_in_words(candidate("dead_zone", threshold=1e4), findings, [own]) == (
+        "threshold 10,000 N"
+    )
+
+
+def test_gains_name_what_changed() -> None:
+    units = {"x": "m", "theta": "rad"}
+    before = {"x": 0.2, "theta": 0.025}
+    assert gains_in_words(before, {"x": 0.1, "theta": 0.025}, units) == (
+        "fell in 1 of 2 state dimensions, most in x (by 50 %, from 0.200 to 0.100 m)"
+    )
+    assert gains_in_words(before, {"x": 0.1, "theta": 0.05}, units) == (
+        "fell in 1 of 2 state dimensions, most in x (by 50 %, from 0.200 to 0.100 m); it rose in"
+        " theta (by 100 %, from 0.0250 to 0.0500 rad)"
+    )
+    assert gains_in_words(before, before, units) == "did not change"
+
+
+def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:
+    five = replace(made_up(), added=made_up().added * 5)
+    verdicts = ("adequate", "effects-added", "unexplained", "not-converged")
+    every = {verdict: in_brief(made_up(verdict), "out") for verdict in verdicts}
+    assert max(map(len, every.values())) <= 6 and len(in_brief(five, "out")) <= 10
+    for verdict, lines in every.items():
+        assert lines[0].startswith(f"Verdict: {verdict}. ")
+        assert sum(line.startswith("Held-out error: ") for line in lines) == 1
+        assert lines[-1].startswith("Report: out/report.html")
+        assert lines[-2].startswith("Next: ")
+        assert not any("would not show" in line or "plausible" in line for line in lines)
+    assert (
+        "Held-out error: 1.01 times the noise; of x 2.00 s ahead 0.00808 m" in every["adequate"][1]
+    )
+    assert "detection limit" in every["adequate"][-2]
+    assert "Where: omega of the cart." in every["unexplained"]
+    assert "plots the residual against omega" in every["unexplained"][-2]
+    assert "--learn-remainder" in every["unexplained"][-2]
+    learned = in_brief(made_up("unexplained"), "out", "a force without a law")
+    assert learned[-3] == "Remainder: a force without a law"
+    assert "--learn-remainder" not in learned[-2]
+    assert "--draws" in every["not-converged"][-2]
+    alone = replace(made_up(), added=(replace(made_up().added[0], not_separable_from=()),))
+    assert in_brief(alone, "out")[-2] == (
+        "Next: open the report; plan and update with the posterior after.nc."
+    )
+    left = replace(made_up("unexplained").unexplained, depends_on="nothing that was recorded")
+    nowhere = in_brief(replace(made_up("unexplained"), unexplained=replace(left, body="")), "out")
+    assert not any(line.startswith("Where: ") for line in nowhere)
+    assert nowhere[-2] == "Next: open the report; record more quantities, or longer."
+
+
+def test_the_error_far_ahead_is_of_the_dimension_that_is_worst() -> None:
+    """Worst in units of the noise floor, of the declared model."""
+    findings = made_up()
+    far = findings.before.rollout_rmse | {"theta": 0.3}
+    findings = replace(findings, before=replace(findings.before, rollout_rmse=far))
+    assert (
+        "; of theta 2.00 s ahead 0.300 -> 0.0163 rad (noise floor 0.0160)."
+        in (in_brief(findings, "out")[2])
+    )
