@@ -86,7 +86,8 @@ def test_adequate_says_what_would_have_been_seen(adequate) -> None:
         ("constant_force", "force_x", 0.1),
         ("actuator_delay", "share", 0.12),
         ("constant_torque", "torque", 0.004),
-        ("dead_zone", "threshold", 2.0),
+        ("dead_zone", "threshold", 0.3),
+        ("force_cutoff", "threshold", 2.0),
     ):
         assert 0 < sizes[effect][parameter] < hidden
     assert sizes["hidden_obstacle"] == {}
@@ -395,5 +396,5 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
     mode = _Mode(SimpleNamespace(with_physics=lambda threads: None))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        loop_module._posterior(mode, method, 1, None, print)
+        loop_module._posterior(mode, method, 1, None, DEFAULT, print)
     assert len(caught) == said

@@ -20,13 +20,13 @@ EFFECTS = {effect.name: effect for effect in catalogue}
 
 @pytest.fixture(scope="module")
 def mode(make_history):
-    return fitted(BOX, box2d(make_history, 3, dead_zone=2.0)[0])
+    return fitted(BOX, box2d(make_history, 3, force_cutoff=2.0)[0])
 
 
 def test_looks_are_paid_for(mode) -> None:
     found = {one.candidate.effect: one for one in rank_candidates(mode, candidates(BOX, ()))}
     assert found["linear_drag"].candidate.looks == 1
-    scanned = found["dead_zone"]
+    scanned = found["force_cutoff"]
     n = scanned.candidate.looks
     assert n > 10
     # a whole change has one sign: half of a chi-squared, times the looks
@@ -41,13 +41,13 @@ def test_what_is_not_scanned_is_differentiated(mode) -> None:
     moments = {(look.values[1], look.values[2]) for look in tried}
     assert (0.5, 0.0) in moments  # from the second trajectory on
     assert any(time > 0 for _, time in moments)
-    whole = looks(mode, EFFECTS["dead_zone"].on("puck"))
+    whole = looks(mode, EFFECTS["force_cutoff"].on("puck"))
     assert {look.columns for look in whole} == {()}
 
 
 def test_a_signature_is_what_the_effect_does(mode) -> None:
     """The change that a look at the truth predicts is what brings the residual down."""
-    thresholds = looks(mode, EFFECTS["dead_zone"].on("puck"))
+    thresholds = looks(mode, EFFECTS["force_cutoff"].on("puck"))
     residual = mode.whitened_residual().ravel()
 
     def left(look) -> float:
@@ -67,14 +67,14 @@ def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
     assert sizes == {"factor": pytest.approx(needed / 5.0)}
     whole = [Look(np.array([value]), signature, ()) for value in (1.0, 2.0, 3.0)]
     units = [np.array([change]) for change in (1.0, 9.0, 12.0)]
-    assert smallest_of_looks(EFFECTS["dead_zone"], whole, units, 2) == {"threshold": 2.0}
+    assert smallest_of_looks(EFFECTS["force_cutoff"], whole, units, 2) == {"threshold": 2.0}
     assert smallest_of_looks(EFFECTS["saturation"], whole, units, 2) == {"limit": 3.0}
-    none = smallest_of_looks(EFFECTS["dead_zone"], whole[:1], units[:1], 2)
+    none = smallest_of_looks(EFFECTS["force_cutoff"], whole[:1], units[:1], 2)
     assert none == {"threshold": np.inf}
     there = [Look(np.zeros(3), signature, ())]
     assert smallest_of_looks(EFFECTS["hidden_obstacle"], there, units[1:2], 2) == {}
     assert caps(EFFECTS["saturation"], whole)
-    assert not caps(EFFECTS["dead_zone"], whole)
+    assert not caps(EFFECTS["force_cutoff"], whole)
     assert not caps(EFFECTS["mass_change"], free)
 
 
@@ -93,7 +93,7 @@ def test_sizes_of_what_is_scanned_are_seen(make_history) -> None:
 def test_p_values_of_scans_are_no_smaller_than_chance_makes_them() -> None:
     """Looks are paid for by a union bound, and an obstacle's are where the data bounced most."""
     disc = Disc(scene=DISC.replace(substeps=40, noise=dict(zip(STATE, NOISE, strict=True))))
-    names = ("mass_change", "dead_zone", "saturation", "spring", "hidden_obstacle")
+    names = ("mass_change", "force_cutoff", "saturation", "spring", "hidden_obstacle")
     tried = [EFFECTS[name].on("puck") for name in names]
     rng = np.random.default_rng(12)
     found = {name: [] for name in names}

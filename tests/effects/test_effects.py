@@ -20,7 +20,12 @@ MASS = 2.0
 INERTIA = MASS * BOX.unit_moment
 NAMES = [effect.name for effect in catalogue]
 #: How far from nothing shows an effect, where 0.3 is too little or too much.
-AWAY = {"dead_zone": 5.0, "magnus_force": 0.01, "saturation": 1.0 - BY_NAME["saturation"].null[0]}
+AWAY = {
+    "dead_zone": 5.0,
+    "force_cutoff": 5.0,
+    "magnus_force": 0.01,
+    "saturation": 1.0 - BY_NAME["saturation"].null[0],
+}
 PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
 
 

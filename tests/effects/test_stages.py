@@ -112,12 +112,14 @@ def test_the_interval_before_is_the_row_before() -> None:
 
 
 @PATHS
-def test_a_dead_zone_swallows_weak_forces_and_no_torque(path) -> None:
-    for force, kept in (((0.6, 0.7), False), ((0.8, 0.7), True)):
-        end = simulate(
-            free(), {"dead_zone": 1.0}, [[state()]], inputs((*force, 0.3)), path=path
-        )[0, 0, 0]  # fmt: skip
-        assert end[3:5] == pytest.approx(np.array(force) / MASS * kept, abs=1e-9)
+@pytest.mark.parametrize(("name", "kept"), [("force_cutoff", 1.0), ("dead_zone", None)])
+def test_an_actuators_threshold_swallows_weak_forces_and_no_torque(name, kept, path) -> None:
+    """A cut-off passes a stronger force in full, a dead zone what exceeds the threshold."""
+    for force, strong in (((0.6, 0.7), False), ((0.8, 0.7), True)):
+        end = simulate(free(), {name: 1.0}, [[state()]], inputs((*force, 0.3)), path=path)[0, 0, 0]
+        share = kept or 1.0 - 1.0 / np.hypot(*force)
+        expected = np.array(force) / MASS * share * strong
+        assert end[3:5] == pytest.approx(expected, abs=1e-9)
         assert end[5] == pytest.approx(0.3 / (MASS * BOX.unit_moment))
 
 
