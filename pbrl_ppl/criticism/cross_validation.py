@@ -21,9 +21,9 @@ Ints = NDArray[np.intp]
 LEAST_FOLDS = 8
 #: A step that a bound shortens by more than this (standard deviations) is stopped by it.
 _ROUNDING = 1e-6
-#: Steps of derivatives are a posterior standard deviation, and at most this share of the prior's;
-#: those by whitened residuals are shorter.
-_WIDEST, _NEAR = 0.1, 1e-4
+#: Steps of derivatives are a posterior standard deviation where that is less than this share of the
+#: prior's; those by whitened residuals are short.
+_INFORMED, _NEAR = 0.7, 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +95,11 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
     """Fit each fold's complement and judge the fold by it.
 
     The noise is estimated anew without the fold, whose measurements count as missing. The whitened
-    residual z under that noise is linear in the parameters about the mode, with Jacobian J; B is
-    the posterior precision without the fold's rows f. From the top of that posterior, the fold's
-    density is that of a Gaussian of covariance ``I + J_f B^-1 J_f'``.
+    residual z under that noise is linear in the parameters about the mode, with Jacobian J and
+    posterior precision A of all data; without the rows of a fold the precision is
+    ``B = A - J_f' J_f``, and the fold's density is that of a Gaussian whose square is
+    ``z_f' z_f + z_f' J_f B^-1 J_f' z_f`` and whose log-determinant is ``log |A| - log |B|``
+    (leave-out formulas of linear regression).
 
     Parameters
     ----------
@@ -112,8 +114,11 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
     slopes = prior_slopes(priors, phi) * scale
     # beside the data: the prior, and what a circle or a tail's curvature adds
     rows = mode.jacobian * scale
-    whole = np.diag(np.linalg.inv(mode.covariance / np.outer(scale, scale))) if len(phi) else slopes
-    prior = np.diag(np.maximum(slopes**2, whole - (rows**2).sum(axis=0)))
+    least = slopes**2
+    if len(phi):
+        inverse = np.linalg.inv(mode.covariance / np.outer(scale, scale))
+        least = np.maximum(least, np.diag(inverse) - (rows**2).sum(axis=0))
+    prior = np.diag(least)
     pull = slopes * prior_residual(priors, phi)
     residual, without = problem.residual(phi), _linearised(mode, scale)
     density, sigmas = np.empty(count), np.empty((count, len(mode.sigma)))
@@ -122,15 +127,20 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
         own = fold == f
         sigma, z, jacobian = without(own)
         out, inner = (jacobian[rows].reshape(z[rows].size, len(phi)) for rows in (own, ~own))
-        precision = inner.T @ inner + prior
-        move, free = _to_top(mode, precision, inner.T @ z[~own].ravel() + pull, scale)
+        rest = inner.T @ inner + prior
+        whole = rest + out.T @ out
+        # a climb ends near the top, and what one fold alone knows of would be pulled far from there
+        gradient = out.T @ z[own].ravel() + inner.T @ z[~own].ravel() + pull
+        move, free = _to_top(mode, whole, gradient, scale)
         at_top = z[own].ravel() + out @ move
         gained = 0.5 * float((z[own] ** 2).sum() - (at_top**2).sum())
-        precision, out = precision[free][:, free], out[:, free]
-        both = precision + out.T @ out
-        part = out.T @ at_top
-        spread = np.linalg.slogdet(both)[1] - np.linalg.slogdet(precision)[1]
-        gained += 0.5 * float(part @ np.linalg.solve(both, part) - spread)
+        slope = out[:, free].T @ at_top
+        values, vectors = np.linalg.eigh(rest[free][:, free])
+        values = np.maximum(values, 1e-300)
+        part = vectors.T @ slope
+        spread = np.linalg.slogdet(whole[free][:, free])[1] - np.log(values).sum()
+        gained -= 0.5 * float((part**2 / values).sum() + spread)
+        move[free] += vectors @ (part / values)
         density[f] = problem.log_density(residual, sigma, phi)[own].sum() + gained
         phis[f], sigmas[f] = inside(priors, phi + scale * move), sigma
     return LeftOut(density, phis, sigmas)
@@ -211,12 +221,13 @@ def _residual_slopes(mode: Mode, scale: Array) -> Array:
     if not priors:
         return np.zeros((0, problem.segments.n, len(cells.places)))
     lower, upper = box(priors)
-    widest = _WIDEST / np.maximum(np.abs(prior_slopes(priors, mode.phi)), 1e-300)
+    informed = scale * np.abs(prior_slopes(priors, mode.phi)) < _INFORMED
 
     def residual(points: Array) -> Array:
         return np.nan_to_num(cells.of_residual(problem.residual(points)))
 
-    steps = np.minimum(scale, widest)
+    # of what the data do not inform a long step would cross thresholds that nothing else does
+    steps = np.where(informed, scale, 1e-3 * np.minimum(scale, 1.0))
     steps[list(problem.tails)] = 0.0  # they change the density, not the residual
     slopes = differentiate(residual, mode.phi, steps, lower, upper) * scale
     return np.ascontiguousarray(np.moveaxis(slopes, -1, 0))

@@ -26,8 +26,12 @@ from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import MODELS, load
 
-# a posterior of few draws is enough to test a verdict, and says that it is one
-pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+pytestmark = [
+    # a posterior of few draws is enough to test a verdict, and says that it is one
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
+    # a ball of which all is known but the drag cannot have fallen so
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.PriorWarning"),
+]
 
 FINE = DISC.replace(substeps=40)
 #: Effects that are quickly ranked.
@@ -50,10 +54,12 @@ def missing(share: float, lasting: bool) -> Mode:
     return disc.mode(rng, more)
 
 
-@pytest.mark.parametrize("lasting", [False, True])
-def test_a_negligible_acceleration_passes_every_test(lasting) -> None:
-    mode = missing(0.4 * DEFAULT.negligible, lasting)
+@pytest.mark.parametrize(("share", "lasting"), [(0.4, False), (0.2, True)])
+def test_a_negligible_acceleration_passes_every_test(share, lasting) -> None:
+    """One that lasts counts for more than one that is drawn anew in each interval."""
+    mode = missing(share * DEFAULT.negligible, lasting)
     left = unexplained_acceleration(mode)
+    assert left.certain[0]
     assert find_misfit(mode, left, horizon=30, seed=1).unexplained is None
 
 
@@ -175,7 +181,7 @@ def test_few_folds_need_more_standard_errors() -> None:
     gains = np.random.default_rng(1).normal(1.0, 1.0, 400)
     many, few = Change.of(gains), Change.of(gains[:8])
     assert many.needed(2.0) == pytest.approx(2.0 * many.error, rel=0.01)
-    assert few.needed(2.0) == pytest.approx(2.36 * few.error, rel=0.01)  # Student's t, 7 degrees
+    assert few.needed(2.0) == pytest.approx(2.43 * few.error, rel=0.01)  # Student's t, 7 degrees
     assert Change.of(gains[:1]).needed(2.0) == np.inf
 
 
@@ -230,7 +236,7 @@ def test_a_load_that_lasts_holds_in_a_later_recording() -> None:
 
 
 def test_dependence_of_many_bodies_can_be_significant() -> None:
-    """Eight discs, of which one is held back by a spring: p is below a hundredth of 1/500 each."""
+    """Eight discs, of which one is pushed twice as hard along x as was logged."""
     names = [f"puck{i}" for i in range(8)]
     body = FINE.bodies[0]
     scene = FINE.replace(bodies=tuple(replace(body, name=name) for name in names))
@@ -240,7 +246,7 @@ def test_dependence_of_many_bodies_can_be_significant() -> None:
         frame = disc.frame(np.random.default_rng(i)).assign(body=name)
         frame["x"] += 10.0 * i  # apart
         if i == 3:
-            frame["vx"] += 0.1 * np.sin(2.0 * frame["y"])
+            frame["force_x"] *= 0.5
         frames.append(frame)
     mode = fitted(scene, pd.concat(frames).sort_values(["trajectory", "step"], kind="stable"))
     found = find_dependence(mode, DEFAULT, seed=1).found
@@ -253,7 +259,7 @@ def test_dependence_within_a_single_trajectory_is_tested() -> None:
     frame = Disc(1, 120, FINE).frame(np.random.default_rng(1))
     clean = find_dependence(fitted(FINE, frame), DEFAULT, seed=1)
     assert clean.tested and clean.found is None
-    frame["vx"] += 0.1 * np.sin(2.0 * frame["y"])
+    frame["force_x"] *= 0.5
     assert find_dependence(fitted(FINE, frame), DEFAULT, seed=1).found is not None
 
 
