@@ -1,17 +1,20 @@
 """The scoreboard of attribution: whether the loop names what is missing, and nothing else.
 
-    python analysis/attribution_benchmark.py --cache out/attribution     # hours; go on after Ctrl-C
-    python analysis/attribution_benchmark.py --quick                     # a tenth of the cases
+    python analysis/attribution_benchmark.py --cache out/attribution     # go on after Ctrl-C
+    python analysis/attribution_benchmark.py --cache out/attribution --part 1/3 --json board.json
+    python analysis/attribution_benchmark.py --quick --method laplace    # a tenth of the cases
     python analysis/attribution_benchmark.py --only cart-linear_drag --verbose
-    python analysis/attribution_benchmark.py --list
+    python analysis/attribution_benchmark.py --seed 1 --list             # another board
     python analysis/attribution_benchmark.py --measured double_pendulum push    # no cases: minutes
 
-Box2D makes the data (models/shopping_cart/make_history.py): a cart on a wheel, a free puck and a
-pendulum, each effect at three sizes; each with itself left out of the catalogue; effects that are
-not in it; clean data; and logs that are nonsense. An oracle that knows what is hidden says which
-cases can be told at all: scores are over those. Where the measured pendulum lies beside the
-project, the loop's forecasts of it are told too (``--only`` leaves them out); those of the other
-measured recordings take minutes each, and are told where ``--measured`` names them.
+Box2D and MuJoCo make the data. A seed draws the cases: bodies (carts on a wheel, free boxes,
+pendulums, pairs, double pendulums), recordings, noises, and what is hidden: an effect of the
+catalogue; one that is left out of it; one that is not in it; nothing; and logs that are nonsense.
+An oracle that knows what is hidden says which cases can be told at all: scores are over those. Each
+tenth case has the loop's own sampler, the others Laplace's approximation. Where the measured
+pendulum lies beside the project, the loop's forecasts of it are told too (``--only`` leaves them
+out, and all but the last part do); those of the other measured recordings take minutes each, and
+are told where ``--measured`` names them.
 """
 
 from __future__ import annotations
@@ -30,15 +33,15 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from attribution.cases import Case, a_tenth, all_cases
+from attribution.cases import METHODS, Case, a_tenth, all_cases
 from attribution.measured import MEASURED, SHARED, SWING, pendulum_errors
-from attribution.one_case import Row, cache_path, load, run_case, save, sources
+from attribution.one_case import Row, about, cache_path, load, run_case, save, sources
 from attribution.scores import score
 from attribution.words import plain, score_table, table, told
 from rich.console import Console
 
 #: Seconds that a case takes a worker, before any has been timed.
-SECONDS_A_CASE = 100.0
+SECONDS_A_CASE = 25.0
 #: Cases after which a worker starts anew: compiled models add up in its memory.
 CASES_A_WORKER = 20
 _WIDTH = 170
@@ -61,24 +64,18 @@ def end_worker(number: int, frame: object) -> None:
     os._exit(1)
 
 
-def results(
-    cases: list[Case],
-    executor: Executor,
-    seed: int,
-    draws: int | None,
-    method: str,
-    cache: Path | None,
-) -> Iterator[Row]:
-    """Rows as they are done; those in the cache are not made again."""
+def results(cases: list[Case], executor: Executor, options: argparse.Namespace) -> Iterator[Row]:
+    """Rows as they are done; those in the cache are not made again, but for failures."""
     waiting: dict[Future[Row], Case] = {}
     stale, now = 0, sources()
+    seed, draws = options.seed, options.draws
     for case in cases:
-        kept = cache and load(cache_path(cache, case, seed, draws, method))
-        if kept:
-            stale += kept.sources != now
-            yield kept
+        row = kept(case, options)
+        if row and row.error is None:
+            stale += row.sources != now
+            yield row
         else:
-            waiting[executor.submit(run_case, case, seed, draws, method)] = case
+            waiting[executor.submit(run_case, case, seed, draws, options.limit)] = case
     if stale:
         say(
             f"{stale} rows of the cache were made with other files of this version of pbrl_ppl;"
@@ -90,12 +87,19 @@ def results(
         if error is not None:  # of the worker, not of the case
             cure = "it may be short of memory: run again with fewer --workers and the same --cache"
             why = f"{type(error).__name__}: {error}; {cure}"
-            yield Row(case.name, case.kind, case.body, case.effect, error=why)
-            continue
-        row = future.result()
-        if cache is not None:
-            save(row, cache_path(cache, case, seed, draws, method))
+            row = Row(**about(case), error=why)
+        else:
+            row = future.result()
+        if options.cache is not None:
+            save(row, cache_path(options.cache, case, seed, draws))
         yield row
+
+
+def kept(case: Case, options: argparse.Namespace) -> Row | None:
+    """The row of a case in the cache, if it is there."""
+    if options.cache is None:
+        return None
+    return load(cache_path(options.cache, case, options.seed, options.draws))
 
 
 def in_batches(cases: list[Case], options: argparse.Namespace) -> Iterator[Row]:
@@ -111,26 +115,24 @@ def in_batches(cases: list[Case], options: argparse.Namespace) -> Iterator[Row]:
         )
         batch = cases[begin : begin + size]
         try:
-            yield from results(
-                batch, executor, options.seed, options.draws, options.method, options.cache
-            )
+            yield from results(batch, executor, options)
         finally:
             executor.shutdown(wait=False, cancel_futures=True)
             for child in multiprocessing.active_children():
                 child.terminate()
 
 
-def watched(rows: Iterator[Row], total: int, kept: int, verbose: bool) -> list[Row]:
+def watched(rows: Iterator[Row], total: int, made: int, verbose: bool) -> list[Row]:
     """Collect rows, telling progress and the time left; Ctrl-C keeps those that are done.
 
-    The first ``kept`` of the ``total`` rows come from the cache, at once.
+    The first ``made`` of the ``total`` rows come from the cache, at once.
     """
     done: list[Row] = []
     begin = time.monotonic()
     try:
         for row in rows:
             done.append(row)
-            a_row = (time.monotonic() - begin) / max(len(done) - kept, 1)
+            a_row = (time.monotonic() - begin) / max(len(done) - made, 1)
             left = (total - len(done)) * a_row
             say(
                 f"{len(done)}/{total} {row.name}: {row.error or row.verdict}, {row.seconds:.0f} s;"
@@ -149,7 +151,7 @@ def _duration(seconds: float) -> str:
 
 def chosen(options: argparse.Namespace) -> list[Case]:
     """The cases asked for, shuffled: those done by an interrupted run stand for all."""
-    cases = all_cases(options.repeats)
+    cases = all_cases(options.seed, options.method)
     if options.quick:
         cases = a_tenth(cases)
     if options.only:
@@ -169,22 +171,40 @@ def parsed() -> argparse.Namespace:
         "--measured", nargs="+", choices=MEASURED, help="measured recordings, and no cases"
     )
     parser.add_argument("--list", action="store_true", help="print the cases' names and stop")
-    parser.add_argument("--repeats", type=int, default=1, help="each case so often, new data each")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="another seed draws other cases")
     parser.add_argument("--draws", type=int, help="posterior draws a chain; the loop's by default")
     parser.add_argument(
-        "--method", default="metropolis", choices=("metropolis", "laplace"),
-        help="laplace: no chains, intervals from the modes' Gaussians; in a quarter of the time",
+        "--method", choices=METHODS,
+        help="of all cases; by default metropolis of each tenth, and laplace (no chains, intervals"
+        " from the modes' Gaussians) of the others",
     )  # fmt: skip
+    parser.add_argument(
+        "--part", type=part, default=(1, 1), metavar="I/N",
+        help="run the I-th of N parts; all write to the same --cache, and --json has what is there",
+    )  # fmt: skip
+    parser.add_argument(
+        "--limit", type=int, default=180, help="seconds after which a case fails; 0 is none"
+    )
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--cache", type=Path, help="folder that keeps each case's result")
     parser.add_argument("--json", metavar="FILE", help="write scores and rows; - is stdout")
     parser.add_argument("--verbose", action="store_true", help="tell each case in full")
     options = parser.parse_args()
-    for name in ("repeats", "workers"):
-        if getattr(options, name) < 1:
-            parser.error(f"--{name} is {getattr(options, name)}, expected 1 or more")
+    for name, least in (("workers", 1), ("limit", 0), ("seed", 0)):
+        if getattr(options, name) < least:
+            parser.error(f"--{name} is {getattr(options, name)}, expected {least} or more")
     return options
+
+
+def part(text: str) -> tuple[int, int]:
+    """Which of how many parts."""
+    try:
+        i, n = (int(number) for number in text.split("/"))
+    except ValueError:
+        i, n = 0, 0
+    if not 1 <= i <= n:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected I/N with I from 1 to N: 1/3")
+    return i, n
 
 
 def write(name: str | None, found: Mapping[str, object]) -> None:
@@ -216,21 +236,22 @@ def main() -> None:
     if options.list:
         print("\n".join(sorted(case.name for case in cases)))
         return
-    kinds = Counter(case.kind for case in cases)
-    kept = 0
-    if options.cache:
-        settings = options.seed, options.draws, options.method
-        made = [cache_path(options.cache, case, *settings).is_file() for case in cases]
-        cases = [cases[i] for i in np.argsort(np.logical_not(made), kind="stable")]
-        kept = sum(made)
+    i, n = options.part
+    mine = cases[i - 1 :: n]
+    made = [bool((row := kept(case, options)) and row.error is None) for case in mine]
+    mine = [mine[k] for k in np.argsort(np.logical_not(made), kind="stable")]
+    kinds = Counter(case.kind for case in mine)
     say(
-        f"{len(cases)} cases ({', '.join(f'{n} {kind}' for kind, n in kinds.items())}),"
-        f" {kept} of them in the cache; about"
-        f" {_duration((len(cases) - kept) * SECONDS_A_CASE / options.workers)}"
+        f"{len(mine)} cases ({', '.join(f'{k} {kind}' for kind, k in kinds.items())}),"
+        f" {sum(made)} of them in the cache; about"
+        f" {_duration((len(mine) - sum(made)) * SECONDS_A_CASE / options.workers)}"
     )
-    rows = watched(in_batches(cases, options), len(cases), kept, options.verbose)
-    scores = score(rows)
-    if not options.only:
+    rows = watched(in_batches(mine, options), len(mine), sum(made), options.verbose)
+    names = {row.name for row in rows}
+    others = (kept(case, options) for case in cases if case.name not in names)
+    rows += [row for row in others if row is not None]
+    scores = score(rows) | {"cases_not_run": len(cases) - len(rows)}
+    if not options.only and i == n:
         say("the measured pendulum" + ("" if SWING.is_dir() else f": none at {SWING}"))
         scores |= pendulum_errors(seed=options.seed)
     console.print(table(rows), score_table(scores))

@@ -81,7 +81,8 @@ def _terms(state: Array, wrench: Array, before: Array) -> dict[str, Terms]:
             ("actuator_rotation", "force across"): aside,
             ("force_gain", f"force_{axis}"): push,
             ("actuator_delay", f"change of force_{axis}"): held - push,
-            ("dead_zone", f"weak force_{axis}"): weak * push,
+            ("force_cutoff", f"weak force_{axis}"): weak * push,
+            ("dead_zone", f"force_{axis}, at most some"): (1.0 - capped) * push,
             ("saturation", f"strong force_{axis}"): capped * push,
         }
 

@@ -20,15 +20,13 @@ import numpy as np
 import pbrl_ppl as pp
 from attribution.baselines import ask_baselines
 from attribution.cases import CATALOGUED, Case
-from attribution.oracle import Oracle, ask, declared_mode, true_parameters
+from attribution.oracle import Oracle, ask, declared_mode, sized, true_parameters
 from pbrl_ppl.criticism import revise
 
 #: Parameters of which more than one value is the truth: any number between two trajectories.
 _AMBIGUOUS = {("mass_change", "trajectory")}
-#: Seconds after which a case is given up.
-LONGEST = 3600
 #: Changes of what a row means make cached ones useless.
-_FORMAT = 2
+_FORMAT = 3
 
 
 @dataclass(frozen=True)
@@ -37,10 +35,12 @@ class Row:
 
     Parameters
     ----------
-    name, kind, body : str
-        Of the case.
-    effect : str, optional
-        What is hidden.
+    name, kind, body, method : str
+        Of the case; the body's sort.
+    effect, on : str, optional
+        What is hidden, and on which body.
+    strength : float, optional
+        Its force or torque over the body's usual ones; of angles, gains and shares itself.
     truth : dict of str to float
         Its parameters.
     oracle : Oracle, optional
@@ -60,7 +60,10 @@ class Row:
     name: str
     kind: str
     body: str
+    method: str
     effect: str | None = None
+    on: str | None = None
+    strength: float | None = None
     truth: dict[str, float] = field(default_factory=dict)
     oracle: Oracle | None = None
     baselines: dict[str, str | None] = field(default_factory=dict)
@@ -90,6 +93,19 @@ class Row:
         return self.oracle is not None and self.oracle.detects
 
     @property
+    def matters(self) -> bool:
+        """Whether knowing the effect makes forecasts better, by the oracle."""
+        return self.oracle is not None and self.oracle.matters
+
+    @property
+    def worse(self) -> bool:
+        """Whether what was added makes the held-out error larger."""
+        if self.findings is None or not self.added:
+            return False
+        before, after = (self.findings["error"][key] for key in ("before", "after"))
+        return bool(after["normalised_rmse"] > before["normalised_rmse"])
+
+    @property
     def excess(self) -> float | None:
         """How much larger the revised model's errors of forecasts are than the oracle's, a share.
 
@@ -106,30 +122,31 @@ class Row:
         return [
             estimate["hdi"][0] <= self.truth[name] <= estimate["hdi"][1]
             for one in self.added
-            if one["effect"] == self.effect
+            if one["effect"] == self.effect and one["body"] == self.on
             for name, estimate in one["parameters"].items()
             if (self.effect, name) not in _AMBIGUOUS
         ]
 
 
-def run_case(case: Case, seed: int, draws: int | None = None, method: str = "metropolis") -> Row:
+def run_case(case: Case, seed: int, draws: int | None = None, limit: int = 0) -> Row:
     """Make a case's data, ask the oracle, run the loop; a failure is a row that says so.
 
-    A case that takes too long is one.
+    A case that takes longer than ``limit`` seconds is one; 0 is no limit.
     """
     begin = time.perf_counter()
-    known: dict[str, Any] = {"name": case.name, "kind": case.kind, "body": case.body}
+    known: dict[str, Any] = about(case)
     try:
-        known |= {"effect": case.effect, "truth": true_parameters(case), "sources": sources()}
-        with warnings.catch_warnings(), _limited(case.name):
+        with warnings.catch_warnings(), _limited(case.name, limit):
             warnings.simplefilter("ignore")
+            case = sized(case, seed)
+            known |= {"strength": case.strength, "truth": true_parameters(case)}
             train, test = case.histories(seed)
             if case.effect is not None:
                 declared = declared_mode(case, train, seed)
                 known["oracle"] = ask(case, declared, test, seed)
-                if case.kind == CATALOGUED:
+                if case.kind == CATALOGUED and len(case.body.names) == 1:
                     known["baselines"] = ask_baselines(declared)
-            known["findings"] = _loop(case, train, test, seed, draws, method)
+            known["findings"] = _loop(case, train, test, seed, draws)
     except Exception as error:
         place = traceback.extract_tb(error.__traceback__)[-1]
         where = f"{Path(place.filename).name}:{place.lineno}"
@@ -137,8 +154,14 @@ def run_case(case: Case, seed: int, draws: int | None = None, method: str = "met
     return Row(**known, seconds=time.perf_counter() - begin)
 
 
+def about(case: Case) -> dict[str, Any]:
+    """Return what a row has of its case, whatever comes of it."""
+    known = {name: getattr(case, name) for name in ("name", "kind", "method", "effect", "on")}
+    return known | {"body": case.body.sort, "sources": sources()}
+
+
 @contextmanager
-def _limited(name: str) -> Iterator[None]:
+def _limited(name: str, limit: int) -> Iterator[None]:
     """Stop what takes too long, where the system lets us: in a process's main thread."""
     if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "SIGALRM"):
         yield
@@ -146,11 +169,11 @@ def _limited(name: str) -> Iterator[None]:
 
     def stop(number: int, frame: object) -> None:
         raise TimeoutError(
-            f"no end after {LONGEST} s; see where with --only {name} --workers 1 --verbose"
+            f"no end after {limit} s; see where with --only {name} --workers 1 --verbose --limit 0"
         )
 
     before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(LONGEST)
+    signal.alarm(limit)
     try:
         yield
     finally:
@@ -159,24 +182,19 @@ def _limited(name: str) -> Iterator[None]:
 
 
 def _loop(
-    case: Case,
-    train: pp.History,
-    test: pp.History,
-    seed: int,
-    draws: int | None,
-    method: str,
+    case: Case, train: pp.History, test: pp.History, seed: int, draws: int | None
 ) -> dict[str, Any]:
     """What the loop finds, with the seconds at which each of its stages began."""
     begin = time.perf_counter()
     stages: list[tuple[float, str]] = []
     found = revise(
-        case.scene,
+        case.body.scene,
         train,
         test,
         catalogue=case.catalogue,
         seed=seed,
         draws=draws if case.draws is None else case.draws,
-        method=method if case.draws is None else "metropolis",
+        method=case.method,
         progress=lambda stage: stages.append((time.perf_counter() - begin, stage)),
     )
     return found.to_dict() | {"stages": stages, "loop_seconds": time.perf_counter() - begin}
@@ -191,21 +209,20 @@ def sources() -> str:
     return digest.hexdigest()[:12]
 
 
-def cache_path(folder: Path, case: Case, seed: int, draws: int | None, method: str) -> Path:
+def cache_path(folder: Path, case: Case, seed: int, draws: int | None) -> Path:
     """Where the row of a case is kept: its name, and a hash of version and settings."""
     catalogue = [effect.name for effect in case.catalogue]
-    scene = case.scene.to_toml()
-    settings = (_FORMAT, pp.__version__, case, case.setup, scene, catalogue, seed, draws, method)
+    scene = case.body.scene.to_toml()
+    settings = (_FORMAT, pp.__version__, case, scene, catalogue, seed, draws)
     return folder / f"{case.name}-{hashlib.sha256(repr(settings).encode()).hexdigest()[:12]}.json"
 
 
 def save(row: Row, path: Path) -> None:
-    """Write a row; a failure is not kept, for it may be cured."""
-    if row.error is None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial = path.with_suffix(".partial")
-        partial.write_text(json.dumps(asdict(row)))
-        partial.replace(path)
+    """Write a row."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(asdict(row)))
+    partial.replace(path)
 
 
 def load(path: Path) -> Row | None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import numpy as np
 from scipy.stats import chi2
 
 import pbrl_ppl as pp
+from attribution.bodies import mh
 from attribution.cases import OUTSIDE, Case
 from attribution.outside import OUTSIDE_EFFECTS, parameters_of
+from attribution.sizes import STRONGEST
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.criticism.resolution import with_enough_substeps
@@ -19,6 +22,13 @@ from pbrl_ppl.parameters import inside
 
 #: Chance alone gives what the oracle calls detected less often than this.
 CERTAIN = 1e-4
+#: An effect matters where the oracle's model forecasts better by this share.
+MATTERS = 0.01
+#: The strength of the first pilot recording, how many there are at most, between which statistics
+#: one says where the limit is, and the statistic that the next one is to have.
+_PILOT, _PILOTS, _BETWEEN, _AIM = 0.01, 3, (8.0, 60.0), 25.0
+#: Process noise absorbs what is large: there the statistic grows more slowly than the square.
+_ABSORBED = 0.75
 
 
 @dataclass(frozen=True)
@@ -34,16 +44,25 @@ class Oracle:
     rollout_rmse : dict of str to float
         Errors of forecasts on the trajectories to judge by, of the model with the effect, as in
         ``report.json``.
+    gain : float
+        By what share that model's error of forecasts is below the declared model's; errors are in
+        units of the true noise, root mean square over what is measured.
     """
 
     statistic: float
     p_value: float
     rollout_rmse: dict[str, float] = field(default_factory=dict)
+    gain: float = 1.0
 
     @property
     def detects(self) -> bool:
         """Whether the data show the effect to one who knows it."""
         return self.p_value < CERTAIN
+
+    @property
+    def matters(self) -> bool:
+        """Whether knowing the effect makes forecasts better."""
+        return self.gain >= MATTERS
 
 
 def true_effect(case: Case) -> pp.Effect:
@@ -56,28 +75,68 @@ def true_effect(case: Case) -> pp.Effect:
 
 def true_parameters(case: Case) -> dict[str, float]:
     """What is hidden, as the effect's own parameters."""
-    if case.value is None:
+    if case.value is None or case.on is None:
         return {}
-    return parameters_of(true_effect(case), case.value)
+    hidden = case.value
+    setup = case.body.setups[case.body.names.index(case.on)]
+    if case.effect == "actuator_lag":
+        hidden = float(np.max(hidden)) / setup.time_step
+    elif case.effect == "stiction_patch":
+        hidden = float(np.max(hidden)) * setup.mass * mh.NORMAL_GRAVITY
+    return parameters_of(true_effect(case), hidden)
 
 
 def declared_mode(case: Case, train: pp.History, seed: int) -> Mode:
     """Fit the declared model to single transitions."""
-    return find_mode(Problem.of(case.scene, train, attach(case.scene)), seed=seed)
+    scene = case.body.scene
+    return find_mode(Problem.of(scene, train, attach(scene)), seed=seed)
+
+
+def sized(case: Case, seed: int) -> Case:
+    """Return the case with its strength: a multiple of the smallest that the oracle detects.
+
+    Near the limit the statistic grows with the square of the strength; pilot recordings say how
+    fast.
+    """
+    if case.factor is None:
+        return case
+    enough = chi2.isf(CERTAIN, len(true_effect(case).parameters))
+    low, high = _BETWEEN
+    strength, statistic = _PILOT, 0.0
+    for attempt in range(_PILOTS):
+        if attempt:
+            power = 0.5 if statistic < low else _ABSORBED
+            strength = min(STRONGEST, strength * (_AIM / max(statistic, 1.0)) ** power)
+        pilot = case.at(strength)
+        declared = declared_mode(pilot, pilot.histories(seed, coarse=True)[0], seed)
+        statistic = _compared(pilot, declared)[2]
+        if low < statistic < high:
+            break
+    return case.at(case.factor * strength * float(np.sqrt(enough / max(statistic, 1.0))))
 
 
 def ask(case: Case, declared: Mode, test: pp.History, seed: int) -> Oracle:
     """Fit the declared model with the hidden effect and without, and compare the likelihoods."""
+    without, best, statistic = _compared(case, declared)
+    # what lasts lasts in what was recorded later
+    held_out = HeldOut(test.numbered(case.body.setups[0].n_train), seed)
+    horizon = held_out.rollout_horizon(case.body.scene.time_step)
+    plain, errors = (
+        forecast(held_out.problem(mode), mode.phi, mode.sigma, horizon).rmse()
+        for mode in (without, best)
+    )
+    noise = case.body.noise
+    before, after = (np.hypot.reduce([e[d] / noise[d] for d in e]) for e in (plain, errors))
+    p_value = float(chi2.sf(statistic, len(true_effect(case).parameters)))
+    return Oracle(statistic, p_value, errors, float(1 - after / before))
+
+
+def _compared(case: Case, declared: Mode) -> tuple[Mode, Mode, float]:
+    """Return the modes without the effect and with it, and twice the gain in log-likelihood."""
     without = trajectory_mode(declared.problem, declared.phi)
     without = with_enough_substeps(without, lambda stage: None)
-    added = true_effect(case).on(case.scene.moving[0].name)
-    best = _with(without, added, true_parameters(case))
-    statistic = max(0.0, 2 * (_log_likelihood(best) - _log_likelihood(without)))
-    held_out = HeldOut(test, seed)
-    horizon = held_out.rollout_horizon(case.scene.time_step)
-    errors = forecast(held_out.problem(best), best.phi, best.sigma, horizon).rmse()
-    p_value = float(chi2.sf(statistic, len(added.effect.parameters)))
-    return Oracle(statistic, p_value, errors)
+    best = _with(without, true_effect(case).on(str(case.on)), true_parameters(case))
+    return without, best, max(0.0, 2 * (_log_likelihood(best) - _log_likelihood(without)))
 
 
 def _with(mode: Mode, added: Attached, values: dict[str, float]) -> Mode:

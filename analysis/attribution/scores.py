@@ -1,18 +1,20 @@
-"""Scores of rows: how often the right name was said, none where none was to be had, a wrong one."""
+"""Scores of rows: how often the right effect was named, a wrong one, or none."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
 from attribution.baselines import WAYS
-from attribution.bodies import BODIES
-from attribution.cases import CATALOGUED, CLEAN, LEFT_OUT, NONSENSE, OUTSIDE
+from attribution.bodies import CHAIN, PAIR, twins
+from attribution.cases import CATALOGUED, CLEAN, LEFT_OUT, METHODS, NONSENSE, OUTSIDE
 from attribution.one_case import Row
 
 #: What may come of a case in which something is hidden; each has one.
-NAMED, ABSTAINED, MISNAMED, MISSED = "named", "abstained", "misnamed", "missed"
+NAMED, EXTRA, ABSTAINED, MISNAMED = "named", "extra name", "abstained", "misnamed"
+MISSED, NEGLIGIBLE = "missed", "negligible"
 #: What may come of the others.
 RIGHT, FALSE_ALARM, REFUSED, ACCEPTED = "right", "false alarm", "refused", "accepted"
 _NO_VERDICT = ("not-converged", "failed")
@@ -28,16 +30,18 @@ def outcome(row: Row) -> str:
     if verdict in _NO_VERDICT:
         return verdict
     if verdict == "adequate":
-        return MISSED
-    if row.kind == CATALOGUED and _named_first(row):
-        return NAMED
+        return MISSED if row.matters else NEGLIGIBLE
+    right = [_is_right(row, one) for one in row.added]
+    if row.kind == CATALOGUED and any(right):
+        return NAMED if all(right) else EXTRA
     return ABSTAINED if row.open or verdict == "unexplained" else MISNAMED
 
 
-def _named_first(row: Row) -> bool:
-    """Whether the first name is the right one, or of a group that holds it."""
-    first = row.added[:1]
-    return any(row.effect in (one["effect"], *one["not_separable_from"]) for one in first)
+def _is_right(row: Row, one: Mapping[str, Any]) -> bool:
+    """Whether a name is the right one, a twin of it, or of a group that holds it, on its body."""
+    same = twins(row.body, row.effect)
+    names = (one["effect"], *one["not_separable_from"])
+    return row.kind == CATALOGUED and one["body"] == row.on and any(n in same for n in names)
 
 
 def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
@@ -46,36 +50,50 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
     Returns
     -------
     dict
-        Over the cases that the oracle detects: ``naming``, share of catalogued ones in which the
-        right effect comes first; ``abstention``, share of left-out and outside ones in which the
-        loop says that something remains; ``misnamed`` and ``missed``, shares of all of them with a
-        wrong name and nothing said to remain, and called adequate. ``false_alarms``: share of
-        clean cases that are not adequate. ``coverage``: share of true values of correctly named
-        effects inside the interval. ``excess``: median, over catalogued cases, of by how much the
-        revised model's errors of forecasts exceed the oracle's, a share. ``baseline_naming``: the
-        best of the usual ways' shares of names among the same, each beside it; a twin is right.
-        ``nonsense_adequate``: number of nonsense cases called
-        adequate. ``detected``, ``cases``, ``failed``, ``not_converged``: numbers. ``seconds``: sum.
+        Over the cases that the oracle detects, but for those that do not matter and are called
+        adequate (``negligible``, their number): ``naming``, share of catalogued ones with the right
+        effect's name and no other; ``overcautious``, share of these ones with the right name alone
+        and the verdict ``unexplained``; ``extra_names``, number with a wrong name beside the right
+        one; ``abstention``, share of left-out and outside ones in which the loop says that
+        something remains; ``misnamed`` and ``missed``, shares of all of them with wrong names alone
+        and nothing said to remain, and called adequate; ``wrong_names_open``, number with a wrong
+        name of which something is said to remain. ``false_alarms``: share of clean cases that are
+        not adequate. ``worse_after``: number of all cases with an effect added whose held-out error
+        grew. ``coverage``: share of true values of correctly named effects inside the interval.
+        ``excess``: median, over catalogued cases, of by how much the revised model's errors of
+        forecasts exceed the oracle's, a share. ``baseline_naming``: the best of the usual ways'
+        shares of names among those of one body, each beside it; a twin is right.
+        ``nonsense_adequate``: number of nonsense cases called adequate. ``detected``, ``cases``,
+        ``failed``, ``not_converged``, ``method_laplace``, ``method_metropolis``: numbers.
+        ``seconds``: sum.
     """
-    hidden = [row for row in rows if row.kind in (CATALOGUED, LEFT_OUT, OUTSIDE) and row.detected]
+    detected = [row for row in rows if row.kind in (CATALOGUED, LEFT_OUT, OUTSIDE) and row.detected]
+    hidden = [row for row in detected if outcome(row) != NEGLIGIBLE]
     catalogued = [row for row in hidden if row.kind == CATALOGUED]
     nameless = [row for row in hidden if row.kind != CATALOGUED]
+    named = [row for row in catalogued if outcome(row) == NAMED]
     return {
         "naming": _share(outcome(row) == NAMED for row in catalogued),
+        "overcautious": _share(
+            outcome(row) == NAMED and row.verdict == "unexplained" for row in catalogued
+        ),
+        "extra_names": sum(outcome(row) == EXTRA for row in catalogued),
         "abstention": _share(outcome(row) == ABSTAINED for row in nameless),
         "misnamed": _share(outcome(row) == MISNAMED for row in hidden),
         "missed": _share(outcome(row) == MISSED for row in hidden),
+        "wrong_names_open": sum(outcome(row) == ABSTAINED and bool(row.added) for row in hidden),
         "false_alarms": _share(outcome(row) == FALSE_ALARM for row in rows if row.kind == CLEAN),
-        "coverage": _share(
-            inside for row in catalogued if outcome(row) == NAMED for inside in row.within()
-        ),
+        "worse_after": sum(row.worse for row in rows),
+        "coverage": _share(inside for row in named for inside in row.within()),
         "excess": _median(row.excess for row in catalogued),
-        **_baselines(catalogued),
+        **_baselines([row for row in catalogued if row.body not in (PAIR, CHAIN)]),
         "nonsense_adequate": sum(outcome(row) == ACCEPTED for row in rows),
         "cases": len(rows),
-        "detected": len(hidden),
+        "detected": len(detected),
+        "negligible": len(detected) - len(hidden),
         "failed": sum(row.verdict == "failed" for row in rows),
         "not_converged": sum(row.verdict == "not-converged" for row in rows),
+        **{f"method_{method}": sum(row.method == method for row in rows) for method in METHODS},
         "seconds": round(sum(row.seconds for row in rows), 1),
     }
 
@@ -86,15 +104,9 @@ def _baselines(rows: Sequence[Row]) -> dict[str, float | None]:
     for way in WAYS:
         names = [(row.baselines.get(way), row) for row in rows]
         if any(name is not None for name, _ in names):
-            shares[way] = _share(name in _same(row) for name, row in names)
+            shares[way] = _share(name in twins(row.body, row.effect) for name, row in names)
     best = max((share for share in shares.values() if share is not None), default=None)
     return {"baseline_naming": best} | {f"naming_{way}": share for way, share in shares.items()}
-
-
-def _same(row: Row) -> tuple[str | None, ...]:
-    """Effects that are the same physics on the body as what is hidden."""
-    groups = BODIES[row.body].twins
-    return next((group for group in groups if row.effect in group), (row.effect,))
 
 
 def _median(found: Iterable[float | None]) -> float | None:

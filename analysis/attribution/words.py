@@ -16,7 +16,7 @@ _CANDIDATES = 6
 
 def table(rows: list[Row]) -> Table:
     """One row a case, what the oracle saw beside what the loop said."""
-    shown = Table("case", "oracle's p", "verdict", "added", "outcome", "in interval", "s")
+    shown = Table("case", "method", "oracle's p", "verdict", "added", "outcome", "in interval", "s")
     kind = None
     for row in sorted(rows, key=lambda row: (KINDS.index(row.kind), row.name)):
         if kind not in (None, row.kind):
@@ -25,6 +25,7 @@ def table(rows: list[Row]) -> Table:
         within = row.within()
         shown.add_row(
             row.name,
+            row.method,
             _oracle(row),
             row.error or row.verdict + ", something remains" * (row.open and bool(row.added)),
             ", ".join(map(_name, row.added)),
@@ -38,12 +39,15 @@ def table(rows: list[Row]) -> Table:
 def _oracle(row: Row) -> str:
     if row.oracle is None:
         return ""
-    return f"{row.oracle.p_value:.0e}" + " not detected" * (not row.oracle.detects)
+    return f"{row.oracle.p_value:.0e}" + (
+        " not detected" if not row.oracle.detects else " negligible" * (not row.oracle.matters)
+    )
 
 
 def _name(added: dict[str, Any]) -> str:
     others = " or ".join(added["not_separable_from"])
-    return f"{added['effect']} (or {others})" if others else str(added["effect"])
+    name = f"{added['effect']}[{added['body']}]"
+    return f"{name} (or {others})" if others else name
 
 
 def score_table(scores: dict[str, float | int | None]) -> Table:
@@ -70,11 +74,12 @@ def plain(row: Row) -> dict[str, Any]:
 
 def told(row: Row) -> str:
     """A case in full: stages, candidates, tests, what was added and what remains."""
-    lines = [f"== {row.name}: {row.verdict} ({outcome(row)}), {row.seconds:.0f} s"]
+    lines = [f"== {row.name}: {row.verdict} ({outcome(row)}), {row.method}, {row.seconds:.0f} s"]
     if row.effect is not None:
-        lines.append(f"hidden: {row.effect} {row.truth}")
+        lines.append(f"hidden: {row.effect} on {row.on} {row.truth}")
     if row.oracle is not None:
         lines.append(f"oracle: statistic {row.oracle.statistic:.1f}, p = {row.oracle.p_value:.1e}")
+        lines[-1] += f", forecasts better by {100 * row.oracle.gain:.1f} %"
     found = row.findings
     if found is None:
         return "\n".join([*lines, f"failed: {row.error}"])

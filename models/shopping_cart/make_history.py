@@ -94,7 +94,8 @@ class Effects:
     sliding_friction: tuple[float, float] = (0.0, 0.0)  # mu, radius of the ring of contact (m)
     wheel: tuple[float, ...] = (0.0,) * 5  # as Wheel has it, beside the setup's
     actuator_delay: float = 0.0  # share of the interval by which the command is late
-    dead_zone: float = 0.0  # N
+    dead_zone: float = 0.0  # N, taken from the force; a weaker one is lost
+    force_cutoff: float = 0.0  # N, a weaker force is lost, a stronger one acts whole
     mass_change: tuple[float, float, float] = (1.0, 0.0, 0.0)  # factor, from trajectory, from s
     hidden_obstacle: tuple[float, float, float] = (0.0, 0.0, 0.0)  # disc: x, y, radius (m)
     # a rod from a body point to a place, and its length (m); bodies begin where it lets them
@@ -117,6 +118,8 @@ class Effects:
     swirl_drag: float = 0.0  # N s, a torque against turning that grows with the speed
     stiction_patch: float = 0.0  # extra isotropic Coulomb friction of the floor where x > 0
     time_varying_gain: tuple[float, float] = (0.0, 1.0)  # force times 1 + a sin(2 pi t / period)
+    actuator_lag: float = 0.0  # s, time constant of a first-order lag of the command
+    stribeck: tuple[float, float] = (0.0, 1.0)  # N at rest, decaying over a speed (m/s) as Gauss
 
     def __post_init__(self) -> None:
         for f in fields(self):
@@ -235,6 +238,7 @@ def rollout(
     states = [drift(setup.hinge, -ahead, *state())]
     steps = round(setup.time_step / step)
     before = np.vstack([np.zeros(3), wrenches])
+    reached = np.zeros(3)
     for i in range(len(wrenches)):
         for j in range(steps):
             loaded = trajectory >= loaded_from and (i * steps + j) * step >= loaded_at
@@ -242,6 +246,10 @@ def rollout(
             inertia = setup.inertia * effects.inertia_scale * mass / setup.mass
             body.massData = Box2D.b2MassData(mass=mass, center=(0, 0), I=inertia * CM**2)
             wrench = before[i if j < effects.actuator_delay * steps else i + 1]
+            if effects.actuator_lag:
+                half = math.exp(-0.5 * step / effects.actuator_lag)  # to the middle of the step
+                wanted, wrench = wrench, wrench + half * (reached - wrench)
+                reached = wanted + half * (wrench - wanted)
             x, y, theta, vx, vy, omega = state()
             v, turn = complex(vx, vy), cmath.exp(1j * theta)
             time = (i * steps + j) * step
@@ -253,6 +261,10 @@ def rollout(
             omega += torque / inertia * step
             if effects.stiction_patch and x > 0:
                 v *= 1 - min(1.0, effects.stiction_patch * NORMAL_GRAVITY * step / (abs(v) or 1.0))
+            if effects.stribeck[0]:
+                size, scale = effects.stribeck
+                slowed = size * math.exp(-((abs(v) / scale) ** 2)) * step / mass
+                v *= 1 - min(1.0, slowed / (abs(v) or 1.0))
             if effects.sliding_friction[0]:
                 v, omega = rub(*effects.sliding_friction, step, mass, inertia, v, omega)
             for wheel in wheels:
@@ -316,7 +328,8 @@ def total_wrench(
     """Return the force (N) and the torque (N m) on the body: the commanded ones and the effects."""
     amplitude, period = effects.time_varying_gain
     force = complex(wrench[0], wrench[1]) * cmath.exp(1j * effects.actuator_rotation)
-    force *= abs(force) >= effects.dead_zone
+    force *= max(0.0, 1 - effects.dead_zone / (abs(force) or 1.0))
+    force *= abs(force) >= effects.force_cutoff
     force *= min(1.0, effects.saturation / (abs(force) or 1.0))
     force = complex(
         effects.anisotropic_gain[0] * force.real, effects.anisotropic_gain[1] * force.imag
@@ -428,6 +441,9 @@ def pull(
 def simulate(seed: int, setup: Setup = CART, **effects: Any) -> tuple[pd.DataFrame, pd.DataFrame]:
     """Return (train, test) in the history format; ``effects`` are the fields of `Effects`.
 
+    The test trajectories are recorded after the training ones: a load from some trajectory on is
+    on all of them.
+
     Examples
     --------
     >>> train, test = simulate(5, angular_drag=1.2)
@@ -435,13 +451,14 @@ def simulate(seed: int, setup: Setup = CART, **effects: Any) -> tuple[pd.DataFra
     rng = np.random.default_rng(seed)
     undeclared = Effects(**effects)
     train = [_trajectory(rng, setup, undeclared, k) for k in range(setup.n_train)]
-    test = [_trajectory(rng, setup, undeclared, k) for k in range(setup.n_test)]
+    test = [_trajectory(rng, setup, undeclared, k, setup.n_train) for k in range(setup.n_test)]
     return pd.concat(train, ignore_index=True), pd.concat(test, ignore_index=True)
 
 
 def _trajectory(
-    rng: np.random.Generator, setup: Setup, effects: Effects, number: int
+    rng: np.random.Generator, setup: Setup, effects: Effects, number: int, before: int = 0
 ) -> pd.DataFrame:
+    """Return one trajectory, which was recorded after so many of another recording."""
     limit = np.array(setup.start_range)
     start = np.concatenate([rng.uniform(-limit, limit), rng.normal(0.0, setup.start_sd)])
     if effects.distance_joint[4]:
@@ -449,7 +466,7 @@ def _trajectory(
     n = setup.n_intervals
     held = rng.normal(0.0, setup.wrench_sd, size=(math.ceil(n / setup.hold), 3))
     wrenches = np.repeat(held, setup.hold, axis=0)[:n].round(6)
-    states = rollout(setup, start, wrenches, effects, number)
+    states = rollout(setup, start, wrenches, effects, before + number)
     if effects.heavy_tails:
         noise = rng.standard_t(1 / effects.heavy_tails, states.shape)
     else:

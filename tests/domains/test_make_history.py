@@ -163,6 +163,8 @@ SLOWED = 1 - 0.1 * G * 0.4 / SPEED
         ({"constant_force": (1.2, -0.6)}, [1.24, -0.62, 2.0]),
         ({"constant_torque": 0.05}, [1.0, -0.5, 2.0 + 0.05 * 0.4 / INERTIA]),
         ({"stiction_patch": 0.1}, [1.0 * SLOWED, -0.5 * SLOWED, 2.0]),
+        ({"stribeck": (0.1 * 2.0 * G, 1e3)}, [1.0 * SLOWED, -0.5 * SLOWED, 2.0]),  # all but dry
+        ({"stribeck": (0.1 * 2.0 * G, 0.1)}, [1.0, -0.5, 2.0]),  # too fast for it
     ],
 )
 def test_effect_on_a_coasting_body(effects, velocities):
@@ -183,6 +185,12 @@ def test_body_force_turns_with_the_body():
         ({"actuator_rotation": 0.12}, cmath.exp(0.12j)),
         ({"time_varying_gain": (0.3, 0.4)}, 1 + 0.3 * 2 / math.pi),  # mean over half a period
         ({"saturation": 2.0}, 2.0 / abs(complex(4.0, 1.0))),
+        ({"dead_zone": 1.5}, 1 - 1.5 / abs(complex(4.0, 1.0))),  # what exceeds it passes
+        ({"dead_zone": 4.5}, 0.0),
+        ({"force_cutoff": 4.0}, 1.0),  # a stronger force acts whole
+        ({"force_cutoff": 4.5}, 0.0),
+        # 1 - exp(-t / tau), mean over 0.2 s
+        ({"actuator_lag": 0.1}, 1 - 0.5 * (1 - math.exp(-2.0))),
         ({"anisotropic_gain": (1.5, 1.5)}, 1.5),
     ],
 )
@@ -268,6 +276,18 @@ def test_history_format():
     assert train.loc[last, WRENCH].isna().all(axis=None)
     assert train.loc[~last, WRENCH].notna().all(axis=None)
     assert train.loc[train["trajectory"] == 0, "force_x"].nunique() == 3  # each held 3 intervals
+
+
+def test_a_load_from_some_trajectory_on_is_on_all_test_trajectories():
+    """They were recorded later: pushed alike from rest, they are slower by the factor."""
+    short = replace(
+        PUCK, n_train=3, n_test=2, n_intervals=2, hold=2, wrench_sd=(4.0, 4.0, 0.0),
+        start_sd=(0.0,) * 3, noise=(0.0,) * 6,
+    )  # fmt: skip
+    plain, loaded = (mh.simulate(3, short, mass_change=(k, 2.0, 0.0)) for k in (1.0, 2.0))
+    for light, heavy, factors in zip(plain, loaded, ([1, 1, 2], [2, 2]), strict=True):
+        speeds = [frame.loc[frame["step"] == 2, "vx"].to_numpy() for frame in (light, heavy)]
+        np.testing.assert_allclose(speeds[0] / speeds[1], factors, rtol=1e-3)
 
 
 def test_noise_is_what_is_asked_for():
