@@ -28,7 +28,6 @@ from .history import from_mujoco as from_mujoco
 from .model import ParameterLibrary as ParameterLibrary
 from .model import SimulatorOp as SimulatorOp
 from .model import Transition as Transition
-from .model import physics_model as physics_model
 from .modes import joint_probabilities as joint_probabilities
 from .oomdp import LWR as LWR
 from .oomdp import OOLWR as OOLWR
@@ -62,6 +61,7 @@ from .sampling import Calibration as Calibration
 from .sampling import Pooled as Pooled
 from .sampling import calibrate as calibrate
 from .sampling import fit as fit
+from .sampling import physics_model as physics_model
 from .sampling import pool as pool
 from .sampling import update as update
 from .scene import Body as Body

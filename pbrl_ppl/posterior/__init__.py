@@ -5,7 +5,7 @@ from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninfo
 from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
 from pbrl_ppl.posterior.loo_pit import loo_pit
-from pbrl_ppl.posterior.origin import problem_of, versions
+from pbrl_ppl.posterior.origin import linearised_as, problem_of, versions
 from pbrl_ppl.posterior.places import both_places, placed
 from pbrl_ppl.posterior.predictions import predicted_rows
 from pbrl_ppl.posterior.prior_groups import prior_groups
@@ -60,6 +60,7 @@ __all__ = [
     "learned_library",
     "library_probabilities",
     "likeliest_draw",
+    "linearised_as",
     "load_posterior",
     "loo_pit",
     "moment_matched",

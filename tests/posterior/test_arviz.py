@@ -8,13 +8,12 @@ import pytest
 import xarray as xr
 from pymc.stats import compute_log_prior
 
-from pbrl_ppl.model import physics_model
 from pbrl_ppl.parameters import wheels
 from pbrl_ppl.posterior import from_groups, group, groups, loo_pit, predicted_rows
 from pbrl_ppl.posterior.predictions import predictive_rows
 from pbrl_ppl.posterior.prior_groups import prior_groups
 from pbrl_ppl.posterior.store import DATATREE, az, load_posterior, save_posterior
-from pbrl_ppl.sampling import fit, update
+from pbrl_ppl.sampling import fit, physics_model, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.stacks import GENERATIONS, SCENE, file, fitted, history
