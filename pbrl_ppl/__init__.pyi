@@ -45,6 +45,8 @@ from .planning import TransitionModel as TransitionModel
 from .planning import plan as plan
 from .planning import suggest_actions as suggest_actions
 from .posterior import Identifiability as Identifiability
+from .posterior import by_number as by_number
+from .posterior import by_trajectory as by_trajectory
 from .posterior import identify as identify
 from .posterior import learned_library as learned_library
 from .posterior import library_probabilities as library_probabilities

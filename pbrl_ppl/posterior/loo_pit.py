@@ -8,6 +8,7 @@ import numpy as np
 import xarray as xr
 
 from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.posterior.leave_out import of_left_out
 from pbrl_ppl.posterior.predictions import predicted_rows
 from pbrl_ppl.posterior.store import group, groups, smoothed
 from pbrl_ppl.state import STATE, THETA, wrapped
@@ -21,7 +22,8 @@ def loo_pit(idata: Any) -> xr.DataArray:
     The probability that the model, fitted without a transition, gives to values below the measured
     one. Uniform between 0 and 1 where the predictions are calibrated; too many at the ends mean
     predictions that are too narrow, too many on one side a bias. It looks at one transition at a
-    time, and does not see errors that repeat from one to the next.
+    time, and does not see errors that repeat from one to the next. Of whole trajectories, what is
+    left out of the fit is a trajectory, and its numbers are predicted from those before them.
 
     Parameters
     ----------
@@ -48,11 +50,11 @@ def loo_pit(idata: Any) -> xr.DataArray:
     rows = predicted_rows(group(idata, "posterior"), predictive)
     samples = {"sample": ("chain", "draw")}
     predicted = predictive["next_state"].stack(samples).transpose("sample", *_CELLS)
-    likelihood = group(idata, "log_likelihood")["next_state"].stack(samples)
-    likelihood = likelihood.transpose("transition", "sample")
+    likelihood = of_left_out(idata).stack(samples).transpose("transition", "sample")
     measured = group(idata, "observed_data")["next_state"].transpose(*_CELLS)
     # smoothed with all draws, of which the tail is better known
-    weights = np.stack([smoothed(-each)[0][rows] for each in likelihood.to_numpy()], axis=1)
+    sets, which = np.unique(likelihood.to_numpy(), axis=0, return_inverse=True)
+    weights = np.stack([smoothed(-each)[0][rows] for each in sets], axis=1)[:, which.ravel()]
     weights /= weights.sum(axis=0)
     off = predicted.to_numpy() - measured.to_numpy()
     angle = measured["state"].to_numpy() == STATE[THETA]

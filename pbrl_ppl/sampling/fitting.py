@@ -254,6 +254,8 @@ def fit(
     ConvergenceWarning
         If an R-hat is over 1.01 or an effective sample size under 400, if sampling was
         interrupted, or if an evidence is too rough for the probability of a joint.
+    LinearisationWarning
+        If states smoothed anew at draws give another likelihood (``attrs["linearisation"]``, nats).
     MeetingWarning
         If bodies that were apart in the data meet under the parameters found.
     BoundWarning
