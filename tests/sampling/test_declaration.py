@@ -7,6 +7,7 @@ import pymc as pm
 import pytest
 
 import pbrl_ppl as pp
+from pbrl_ppl.cli import main
 from pbrl_ppl.errors import ConvergenceWarning, PosteriorError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import declared_problem, simulated_trajectories, smoothed
@@ -202,3 +203,20 @@ def test_a_fit_in_two_halves_is_one(model, half, history, tmp_path) -> None:
     second = {"posterior": group(gone_on, "posterior").isel(draw=slice(400, None))}
     found = errors(half, from_groups(second, {}))
     assert max(map(abs, found.values())) < 4.5, found
+
+
+def test_the_command_goes_on_with_the_same_likelihood(history, tmp_path, capsys) -> None:
+    """Old draws keep their log-likelihoods: the file says where the trajectories are linearised."""
+    (tmp_path / "scene.toml").write_text(SCENE.to_toml())
+    history.to_dataframe().to_csv(tmp_path / "train.csv", index=False)
+    given = ["fit", str(tmp_path / "scene.toml"), str(tmp_path / "train.csv"), "--quiet"]
+    given += ["--draws", "8", "--tune", "20", "--chains", "2"]
+    first, second = tmp_path / "first.nc", tmp_path / "second.nc"
+    for options in (["-o", str(first)], ["-o", str(second), "--seed", "9", "--resume", str(first)]):
+        assert main([*given, *options]) == 3  # so few draws have not converged
+    stored, gone_on = (
+        group(load_posterior(path), "log_likelihood")["next_state"].sum("transition").to_numpy()
+        for path in (first, second)
+    )
+    assert gone_on.shape == (2, 16)
+    np.testing.assert_allclose(gone_on[:, :8], stored, atol=1e-6)
