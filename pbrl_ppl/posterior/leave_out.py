@@ -69,29 +69,17 @@ def separate(idata: Any) -> Any:
     return by_trajectory(idata) if left_out(idata) == "trajectory" else idata
 
 
-def of_left_out(idata: Any) -> xr.DataArray:
-    """Log-likelihood of what is left out with each transition, with the dimension ``transition``.
-
-    All transitions of a trajectory have that of the trajectory where that is left out.
-    """
-    likelihood = group(idata, "log_likelihood")["next_state"]
-    if left_out(idata) == "transition":
-        return likelihood
-    summed = group(by_trajectory(idata), "log_likelihood")["next_state"]
-    return summed.sel(trajectory=likelihood["trajectory"])
-
-
 def by_number(idata: Any) -> Any:
     """A posterior for ``az.loo_pit``, ``az.plot_loo_pit`` and ``az.plot_ppc_pit`` (ArviZ 1.x).
 
     These want predictions of all draws and a log-likelihood of every number. Here each measured
-    number has the log-likelihood of what is left out with it, its transition, or of whole
-    trajectories its trajectory, and the draws are those that have predictions.
+    number has the log-likelihood of its transition, which is left out with it, and the draws are
+    those that have predictions.
 
     Parameters
     ----------
     idata : InferenceData or DataTree
-        As made by :func:`pbrl_ppl.fit`.
+        As made by :func:`pbrl_ppl.fit`, of single transitions (Eq. 11).
 
     Returns
     -------
@@ -104,7 +92,8 @@ def by_number(idata: Any) -> Any:
     Raises
     ------
     PosteriorError
-        If a group is missing, or the draws were reweighted by :func:`pbrl_ppl.update`.
+        If a group is missing, the draws were reweighted by :func:`pbrl_ppl.update`, or the
+        likelihood is of whole trajectories, whose transitions cannot be left out one by one.
 
     Examples
     --------
@@ -117,6 +106,11 @@ def by_number(idata: Any) -> Any:
         raise PosteriorError(
             "by_number: the draws were reweighted by update and do not belong to single"
             " predictions; fit all data anew"
+        )
+    if left_out(idata) == "trajectory":
+        raise PosteriorError(
+            "by_number: the posterior is of whole trajectories, whose later transitions have seen"
+            " the one left out; fit with trajectories=False, or take az.loo of by_trajectory"
         )
     posterior = group(idata, "posterior")
     predictive = group(idata, "posterior_predictive")["next_state"].transpose(
@@ -140,7 +134,7 @@ def by_number(idata: Any) -> Any:
         return variable.dims[2:], values.reshape(chains, draws, *values.shape[1:])
 
     thinned = {name: chosen(variable) for name, variable in posterior.data_vars.items()}
-    each = chosen(of_left_out(idata))[1][..., places[0]]
+    each = chosen(group(idata, "log_likelihood")["next_state"])[1][..., places[0]]
     own = {
         dim: (_NUMBER, np.asarray(measured[dim])[place])
         for dim, place in zip(_CELLS, places, strict=True)

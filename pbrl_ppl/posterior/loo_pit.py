@@ -8,7 +8,6 @@ import numpy as np
 import xarray as xr
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.posterior.leave_out import of_left_out
 from pbrl_ppl.posterior.predictions import predicted_rows
 from pbrl_ppl.posterior.store import group, groups, smoothed
 from pbrl_ppl.state import STATE, THETA, wrapped
@@ -22,8 +21,9 @@ def loo_pit(idata: Any) -> xr.DataArray:
     The probability that the model, fitted without a transition, gives to values below the measured
     one. Uniform between 0 and 1 where the predictions are calibrated; too many at the ends mean
     predictions that are too narrow, too many on one side a bias. It looks at one transition at a
-    time, and does not see errors that repeat from one to the next. Of whole trajectories, what is
-    left out of the fit is a trajectory, and its numbers are predicted from those before them.
+    time, and does not see errors that repeat from one to the next. Of whole
+    trajectories it is no leave-one-out: a number is predicted from those before it, and only its
+    own factor is taken out of the likelihood; those after it have seen it.
 
     Parameters
     ----------
@@ -50,11 +50,11 @@ def loo_pit(idata: Any) -> xr.DataArray:
     rows = predicted_rows(group(idata, "posterior"), predictive)
     samples = {"sample": ("chain", "draw")}
     predicted = predictive["next_state"].stack(samples).transpose("sample", *_CELLS)
-    likelihood = of_left_out(idata).stack(samples).transpose("transition", "sample")
+    likelihood = group(idata, "log_likelihood")["next_state"].stack(samples)
+    likelihood = likelihood.transpose("transition", "sample")
     measured = group(idata, "observed_data")["next_state"].transpose(*_CELLS)
     # smoothed with all draws, of which the tail is better known
-    sets, which = np.unique(likelihood.to_numpy(), axis=0, return_inverse=True)
-    weights = np.stack([smoothed(-each)[0][rows] for each in sets], axis=1)[:, which.ravel()]
+    weights = np.stack([smoothed(-each)[0][rows] for each in likelihood.to_numpy()], axis=1)
     weights /= weights.sum(axis=0)
     off = predicted.to_numpy() - measured.to_numpy()
     angle = measured["state"].to_numpy() == STATE[THETA]

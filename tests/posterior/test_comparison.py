@@ -6,8 +6,15 @@ import xarray as xr
 from scipy import stats
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.posterior import by_trajectory, compare, from_groups, group, groups, load_posterior
-from pbrl_ppl.posterior.leave_out import of_left_out
+from pbrl_ppl.posterior import (
+    by_number,
+    by_trajectory,
+    compare,
+    from_groups,
+    group,
+    groups,
+    load_posterior,
+)
 from tests.helpers.stacks import file
 
 N = 60
@@ -117,11 +124,9 @@ def test_one_trajectory_is_left_out_at_a_time() -> None:
     assert summed.dims == ("chain", "draw", "trajectory")
 
 
-def test_weights_of_a_trajectory_are_of_all_its_transitions() -> None:
-    whole = of_left_out(grouped(1.0))
-    summed = group(fitted(1.0), "log_likelihood")["next_state"].to_numpy()[..., 6:12].sum(axis=-1)
-    for place in (6, 11):
-        np.testing.assert_allclose(whole.isel(transition=place), summed)
+def test_no_number_is_left_out_of_a_trajectory() -> None:
+    with pytest.raises(PosteriorError, match="later transitions have seen the one left out"):
+        by_number(grouped(1.0))
 
 
 def test_different_things_left_out_are_not_compared() -> None:
