@@ -28,7 +28,6 @@ from .history import from_mujoco as from_mujoco
 from .model import ParameterLibrary as ParameterLibrary
 from .model import SimulatorOp as SimulatorOp
 from .model import Transition as Transition
-from .model import physics_model as physics_model
 from .modes import joint_probabilities as joint_probabilities
 from .oomdp import LWR as LWR
 from .oomdp import OOLWR as OOLWR
@@ -46,6 +45,8 @@ from .planning import TransitionModel as TransitionModel
 from .planning import plan as plan
 from .planning import suggest_actions as suggest_actions
 from .posterior import Identifiability as Identifiability
+from .posterior import by_number as by_number
+from .posterior import by_trajectory as by_trajectory
 from .posterior import identify as identify
 from .posterior import learned_library as learned_library
 from .posterior import library_probabilities as library_probabilities
@@ -62,6 +63,7 @@ from .sampling import Calibration as Calibration
 from .sampling import Pooled as Pooled
 from .sampling import calibrate as calibrate
 from .sampling import fit as fit
+from .sampling import physics_model as physics_model
 from .sampling import pool as pool
 from .sampling import update as update
 from .scene import Body as Body

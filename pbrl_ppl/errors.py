@@ -41,6 +41,10 @@ class BoundWarning(UserWarning):
     """A fit that presses a parameter against the end of its support."""
 
 
+class LinearisationWarning(UserWarning):
+    """A fit of whole trajectories whose linearised likelihood is not that of the engine."""
+
+
 class UninformedWarning(UserWarning):
     """A fit in which the data say nothing about a parameter: its posterior is its prior."""
 

@@ -17,12 +17,11 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, FitError, UninformedWarning
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.state import THETA, wrapped
 
 Array = NDArray[np.float64]

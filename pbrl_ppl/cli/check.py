@@ -67,7 +67,7 @@ def check(
         if prior:
             progress("comparing with draws from the prior")
             from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
-            from pbrl_ppl.model import physics_model
+            from pbrl_ppl.sampling import physics_model
 
             model = physics_model(declared, loaded, horizon=telling_horizon(loaded))
             checked = prior_predictive_check(model, draws=draws, seed=seed)

@@ -102,17 +102,17 @@ def fit(
         progress("loading the sampler")
         os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report, sampling
-        from pbrl_ppl.model import physics_model
         from pbrl_ppl.physics import check_history
         from pbrl_ppl.posterior import group, load_posterior, save_posterior
 
         check_history(declared, loaded, loaded.segments(1))
-        model = _declared(
-            physics_model, declared, loaded, horizon=horizon, substeps=substeps, nu=nu,
-            sigma="scalar" if scalar else "per_dimension", trajectories=trajectories,
-        )  # fmt: skip
         earlier = None if resume is None else load_posterior(resume)
         progress("looking for the mode, then sampling")
+        model = _declared(
+            sampling.physics_model, declared, loaded, horizon=horizon, substeps=substeps, nu=nu,
+            sigma="scalar" if scalar else "per_dimension", trajectories=trajectories,
+            around=earlier if trajectories else None, seed=seed,
+        )  # fmt: skip
     # the sampler has a bar of its own
     with interruptible(), warnings.catch_warnings(record=True) as caught:
         with redirect_stdout(sys.stderr):

@@ -2,7 +2,7 @@
 
 from pbrl_ppl.model.cells import ACCELERATION, JOLT, Cells, check_moves
 from pbrl_ppl.model.data import Data
-from pbrl_ppl.model.declaration import build_model, physics_model, prior_predictive_draws
+from pbrl_ppl.model.declaration import build_model, declared_problem, prior_predictive_draws
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
     Observations,
@@ -57,6 +57,7 @@ __all__ = [
     "build_model",
     "cells_of",
     "check_moves",
+    "declared_problem",
     "estimate_sigma",
     "index_priors",
     "linearised",
@@ -67,7 +68,6 @@ __all__ = [
     "next_state_random",
     "noise_law",
     "noise_prior_slope",
-    "physics_model",
     "prior_predictive_draws",
     "robust",
     "sigma_prior",

@@ -38,7 +38,7 @@ from pbrl_ppl.state import INPUT, STATE
 _NOISE_DIMS = {"sigma": "sensor", ACCELERATION: "velocity", JOLT: "velocity"}
 
 
-def physics_model(
+def declared_problem(
     scene: Scene,
     history: History,
     effects: Iterable[Effect | Attached] = (),
@@ -50,68 +50,11 @@ def physics_model(
     threads: int = 1,
     library: ParameterLibrary | None = None,
     trajectories: bool = False,
-) -> pm.Model:
-    """Declare the model of the paper's section 3.2 for a scene and a history.
+) -> Problem:
+    """Declare the problem of a scene and a history; see :func:`pbrl_ppl.physics_model`.
 
-    Parameters
-    ----------
-    scene : Scene
-        Known geometry, and which parameters are known.
-    history : History
-        Measured transitions.
-    effects : iterable of Effect or Attached
-        Effects beside those that the scene declares.
-    horizon : int
-        Intervals predicted from one measured state; 1 is Eq. 11.
-    sigma : str
-        ``per_dimension`` or ``scalar`` (the paper's Eq. 11).
-    nu : float, optional
-        Degrees of freedom of Student-t noise, for recordings full of contacts, whose residuals have
-        heavy tails; 4 is usual. Sigma is then its scale. Gaussian without it.
-    substeps : int, optional
-        Engine steps an interval; the scene's by default.
-    threads : int
-        Engine worlds that run side by side within one evaluation.
-    library : ParameterLibrary, optional
-        Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
-        ``library_index`` holds the bodies' choices, and the parameters follow from it.
-    trajectories : bool
-        Whether whole trajectories are whitened together, with two noises: ``sigma``, the error of
-        measuring a state, ``unexplained_acceleration``, what a step adds, and where bodies touch
-        ``contact_acceleration``, what comes on top of it there. Neighbours share a measured state,
-        which Eq. 11 takes as exact. The transitions are linearised about smoothed states, at the
-        prior's centre until :func:`pbrl_ppl.fit` finds the mode.
-
-    Returns
-    -------
-    pymc.Model
-        An ordinary model; its ``problem`` attribute is the :class:`Problem` it was made from.
-
-    Raises
-    ------
-    EffectError
-        If an effect is unknown or does not apply.
-    HistoryError
-        If the history has nothing to fit at this horizon, or nothing moves in whole trajectories.
-    SimulationError
-        If bodies start deep inside each other or a wall, or a hinge's bodies apart.
-    ValueError
-        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0, or
-        ``trajectories`` is given with a horizon, a library or a scalar sigma.
-    ParameterError
-        If the library does not fit the scene's bodies.
-
-    Examples
-    --------
-    >>> import pandas as pd
-    >>> from pbrl_ppl.scene.scene import Body, Shape
-    >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2)),))
-    >>> rows = pd.DataFrame({"trajectory": 0, "time": [0.0, 0.1], "body": "puck", "x": [0.0, 0.1],
-    ...     "y": 0.0, "theta": 0.0, "vx": 1.0, "vy": 0.0, "omega": 0.0,
-    ...     "force_x": 0.0, "force_y": 0.0, "torque": 0.0})
-    >>> model = physics_model(scene, History.from_dataframe(rows, scene))
-    >>> [variable.name for variable in model.free_RVs]
-    ['mass', 'r', 'mu_c', 'sigma']
+    Whole trajectories are linearised at the prior's centre, which is no place to sample about: a
+    mode has to be found first.
     """
     if sigma not in ("per_dimension", "scalar"):
         raise ValueError(f"sigma is {sigma!r}, expected 'per_dimension' or 'scalar'")
@@ -147,11 +90,11 @@ def physics_model(
     if trajectories:
         centre = np.array([prior.centre for prior in problem.layout.priors])
         problem = along_trajectories(problem, centre)
-    return build_model(problem)
+    return problem
 
 
 def build_model(problem: Problem) -> pm.Model:
-    """Declare the pm.Model of a problem; see :func:`physics_model`."""
+    """Declare the pm.Model of a problem; see :func:`pbrl_ppl.physics_model`."""
     observations, segments, layout = problem.observations, problem.segments, problem.layout
     physics, noise = problem.physics, problem.noise
     settings = (physics.scene, layout, physics.effects, physics.substeps, physics.threads,
@@ -207,7 +150,7 @@ def prior_predictive_draws(
     Parameters
     ----------
     model : pymc.Model
-        As made by :func:`physics_model`.
+        As made by :func:`pbrl_ppl.physics_model`.
     names : sequence of str
         Variables to draw, ``next_state`` among them if wanted (Eq. 13).
     draws : int
@@ -295,11 +238,11 @@ def _log_density(
     if noise is None:
         own = tail[0] if tail else None
         return next_state_logp(value, predicted, sigma, observations, nu, own)
-    # what was measured is in the noise, as deviations from the states of the linearisation
     bodies = observations.values.shape[2]
     tails = tail[0] if tail else np.full(bodies, 0.0 if nu is None else 1.0 / nu)
+    deviation = difference(value, pt.as_tensor(linearised), observations)
     residual = difference(pt.as_tensor(linearised), predicted, observations)
-    return TrajectoryDensityOp(noise)(residual, sigma, tails)
+    return TrajectoryDensityOp(noise)(deviation, residual, sigma, tails)
 
 
 def _random(

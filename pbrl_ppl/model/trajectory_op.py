@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numba
@@ -25,16 +26,25 @@ _STEP = 1e-5
 class _DensityOp(Op):
     """Base of the density and of its derivative.
 
-    Inputs are residuals (transition, 1, body, state), noise parameters (parameter,) and reciprocal
-    degrees of freedom, one a body (body,).
+    Inputs are measured minus linearised next states, linearised minus predicted ones, both of shape
+    (transition, 1, body, state), noise parameters (parameter,) and reciprocal degrees of freedom,
+    one a body (body,).
     """
 
     __props__ = ("noise",)
 
     def __init__(self, noise: TrajectoryNoise) -> None:
         self.noise = noise
+        self._given = noise
 
-    def density(self, residual: Array, sigma: Array, tail: Array) -> Array:
+    def given(self, deviation: Array) -> TrajectoryNoise:
+        """The noise with these measurements; the last one is kept, with the gains it knows."""
+        measured = self.noise.cells.of_residual(deviation)
+        if not np.array_equal(measured, self._given.measured):
+            self._given = replace(self.noise, measured=measured)
+        return self._given
+
+    def density(self, deviation: Array, residual: Array, sigma: Array, tail: Array) -> Array:
         """Log-density of each transition given those before it, shape (transition,)."""
         if not (np.isfinite(sigma).all() and (sigma > 0).all()):
             return np.full(len(residual), -np.inf)
@@ -43,7 +53,7 @@ class _DensityOp(Op):
             with np.errstate(divide="ignore"):
                 nu = 1.0 / np.maximum(tail, 0.0)[:, None]
         measured = np.ones(residual.shape, dtype=bool)
-        return log_density(residual, sigma, self.noise, measured, nu)
+        return log_density(residual, sigma, self.given(deviation), measured, nu)
 
 
 class TrajectoryDensityOp(_DensityOp):
@@ -55,9 +65,10 @@ class TrajectoryDensityOp(_DensityOp):
         The linearised trajectories.
     """
 
-    def make_node(self, residual: Any, sigma: Any, tail: Any) -> Apply:
-        """Take tensors of the shapes named in the class."""
-        inputs = [pt.cast(pt.as_tensor(value), "float64") for value in (residual, sigma, tail)]
+    def make_node(self, deviation: Any, residual: Any, sigma: Any, tail: Any) -> Apply:
+        """Take tensors of the shapes named in the base class."""
+        given = (deviation, residual, sigma, tail)
+        inputs = [pt.cast(pt.as_tensor(value), "float64") for value in given]
         return Apply(self, inputs, [pt.vector(dtype="float64")])
 
     def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
@@ -80,22 +91,24 @@ class TrajectoryDensityOp(_DensityOp):
 class _DerivativeOp(_DensityOp):
     """Derivative of a weighted sum of :class:`TrajectoryDensityOp` by its inputs."""
 
-    def make_node(self, residual: Any, sigma: Any, tail: Any, weights: Any) -> Apply:
-        inputs = [pt.as_tensor(value) for value in (residual, sigma, tail, weights)]
-        return Apply(self, inputs, [each.type() for each in inputs[:3]])
+    def make_node(
+        self, deviation: Any, residual: Any, sigma: Any, tail: Any, weights: Any
+    ) -> Apply:
+        inputs = [pt.as_tensor(value) for value in (deviation, residual, sigma, tail, weights)]
+        return Apply(self, inputs, [each.type() for each in inputs[:4]])
 
     def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
-        return list(arguments[-1][:3])
+        return list(arguments[-1][:4])
 
     def perform(self, node: Apply, inputs: Any, outputs: Any) -> None:
         for place, value in zip(outputs, self.derivatives(*inputs), strict=True):
             place[0] = value
 
     def derivatives(
-        self, residual: Array, sigma: Array, tail: Array, weights: Array
-    ) -> tuple[Array, Array, Array]:
-        """Derivatives by residual, noise parameters and tails."""
-        noise = self.noise
+        self, deviation: Array, residual: Array, sigma: Array, tail: Array, weights: Array
+    ) -> tuple[Array, Array, Array, Array]:
+        """Derivatives by the inputs, in their order."""
+        noise = self.given(deviation)
         white = noise.filtered(noise.cells.of_residual(residual)[None], sigma)[0][0]
         pull = white
         if tail.any():
@@ -109,9 +122,14 @@ class _DerivativeOp(_DensityOp):
         by_residual = np.zeros_like(residual)
         body, place = noise.cells.in_residual
         by_residual[:, 0, body, place] = by_cell
+        # a measurement moved is a linearised state moved: this residual grows, the next shrinks
+        following = np.where(noise.last[:, None], 0.0, np.roll(by_cell, -1, axis=0))
+        slope = np.roll(noise.slope, -1, axis=0)
+        by_deviation = np.zeros_like(residual)
+        by_deviation[:, 0, body, place] = by_cell - np.einsum("kab,ka->kb", slope, following)
 
         def total(sigma: Array, tail: Array) -> float:
-            return float(self.density(residual, sigma, tail) @ weights)
+            return float(self.density(deviation, residual, sigma, tail) @ weights)
 
         by_sigma = np.empty_like(sigma)
         for i, step in enumerate(_STEP * sigma):
@@ -126,7 +144,7 @@ class _DerivativeOp(_DensityOp):
             ends[1][j] = max(tail[j] - _STEP, 0.0)
             change = ends[0][j] - ends[1][j]
             by_tail[j] = (total(sigma, ends[0]) - total(sigma, ends[1])) / change
-        return by_residual, by_sigma, by_tail
+        return by_deviation, by_residual, by_sigma, by_tail
 
 
 @numba_funcify.register(TrajectoryDensityOp)
@@ -135,9 +153,9 @@ def _numba_density(op: TrajectoryDensityOp, node: Any = None, **kwargs: Any) -> 
     kind = numba.types.Array(numba.float64, 1, "C")
 
     @numba.njit
-    def density(residual, sigma, tail):  # type: ignore[no-untyped-def]
+    def density(deviation, residual, sigma, tail):  # type: ignore[no-untyped-def]
         with numba.objmode(result=kind):
-            result = op.density(residual, sigma, tail)
+            result = op.density(deviation, residual, sigma, tail)
         return result
 
     return density
@@ -150,9 +168,9 @@ def _numba_derivative(op: _DerivativeOp, node: Any = None, **kwargs: Any) -> Any
     flat = numba.types.Array(numba.float64, 1, "C")
 
     @numba.njit
-    def derivative(residual, sigma, tail, weights):  # type: ignore[no-untyped-def]
-        with numba.objmode(a=wide, b=flat, c=flat):
-            a, b, c = op.derivatives(residual, sigma, tail, weights)
-        return a, b, c
+    def derivative(deviation, residual, sigma, tail, weights):  # type: ignore[no-untyped-def]
+        with numba.objmode(a=wide, b=wide, c=flat, d=flat):
+            a, b, c, d = op.derivatives(deviation, residual, sigma, tail, weights)
+        return a, b, c, d
 
     return derivative

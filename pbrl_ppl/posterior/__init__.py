@@ -4,8 +4,9 @@ from pbrl_ppl.posterior.comparison import Comparison, compare
 from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
 from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
+from pbrl_ppl.posterior.leave_out import by_number, by_trajectory, left_out, separate
 from pbrl_ppl.posterior.loo_pit import loo_pit
-from pbrl_ppl.posterior.origin import problem_of, versions
+from pbrl_ppl.posterior.origin import linearised_as, problem_of, versions
 from pbrl_ppl.posterior.places import both_places, placed
 from pbrl_ppl.posterior.predictions import predicted_rows
 from pbrl_ppl.posterior.prior_groups import prior_groups
@@ -44,6 +45,8 @@ __all__ = [
     "Identifiability",
     "both_places",
     "both_recordings",
+    "by_number",
+    "by_trajectory",
     "checked",
     "compare",
     "complete",
@@ -58,8 +61,10 @@ __all__ = [
     "interval",
     "known_effects",
     "learned_library",
+    "left_out",
     "library_probabilities",
     "likeliest_draw",
+    "linearised_as",
     "load_posterior",
     "loo_pit",
     "moment_matched",
@@ -73,6 +78,7 @@ __all__ = [
     "save_posterior",
     "scalars",
     "scene_of",
+    "separate",
     "smoothed",
     "uninformed",
     "updated_scene",

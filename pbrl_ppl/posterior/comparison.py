@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.posterior.leave_out import left_out, separate
 from pbrl_ppl.posterior.store import DATATREE, group
 
 #: With fewer draws, the tail that Pareto's law is fitted to has fewer than twenty.
@@ -16,16 +18,16 @@ _LEAST_DRAWS = 100
 
 @dataclass(frozen=True)
 class LeaveOneOut:
-    """One model's expected log predictive density of a transition that it was not fitted to.
+    """One model's expected log predictive density of data that it was not fitted to.
 
     Parameters
     ----------
     elpd_loo, se : float
-        Summed over the transitions, and its standard error (nats).
+        Summed over all that is left out, and its standard error (nats).
     p_loo : float
         Effective number of parameters.
     high_pareto_k : int
-        Transitions whose weights are not to be relied on: Pareto k above ``good_k``.
+        Of how many the weights are not to be relied on: Pareto k above ``good_k``.
     good_k : float
         0.7, or less with few draws (Vehtari et al., 2024).
     """
@@ -39,7 +41,7 @@ class LeaveOneOut:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Two models of the same transitions, by leave-one-out cross-validation.
+    """Two models of the same data, by cross-validation.
 
     Parameters
     ----------
@@ -47,15 +49,25 @@ class Comparison:
         Of each model.
     elpd_difference, elpd_difference_se : float
         What the later one gains, and the standard error of that; zero if it is the same model.
-    transitions : int
+    count : int
         How many were left out, one at a time.
+    left_out : str
+        ``transition``, or of whole trajectories ``trajectory``.
     """
 
     before: LeaveOneOut
     after: LeaveOneOut
     elpd_difference: float
     elpd_difference_se: float
-    transitions: int
+    count: int
+    left_out: str = "transition"
+
+    @property
+    def method(self) -> str:
+        """Name of the cross-validation, and what it is over."""
+        out = "trajectory-" if self.left_out == "trajectory" else ""
+        plural = {"trajectory": "trajectories", "transition": "transitions"}[self.left_out]
+        return f"Leave-one-{out}out cross-validation on the {self.count} {plural} of the fit"
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of ``loo`` in ``report.json``."""
@@ -64,6 +76,8 @@ class Comparison:
 
 def compare(before: Any, after: Any) -> Comparison | None:
     """Compare two posteriors of the same data by leave-one-out cross-validation.
+
+    Of whole trajectories one trajectory is left out at a time, see :func:`by_trajectory`.
 
     Parameters
     ----------
@@ -74,7 +88,18 @@ def compare(before: Any, after: Any) -> Comparison | None:
     -------
     Comparison or None
         None where ArviZ cannot say: with fewer than 100 draws, or likelihoods that are not finite.
+
+    Raises
+    ------
+    PosteriorError
+        If one is of whole trajectories and the other of single transitions.
     """
+    unit = left_out(before)
+    if left_out(after) != unit:
+        raise PosteriorError(
+            f"compare: one posterior leaves out one {unit} at a time and the other one"
+            f" {left_out(after)}; fit both with or both without trajectories=True"
+        )
     for posterior in (before, after):
         sizes = group(posterior, "posterior").sizes
         if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
@@ -85,12 +110,12 @@ def compare(before: Any, after: Any) -> Comparison | None:
         import arviz as az
 
         try:
-            first = az.loo(before, pointwise=True)
-            second = first if after is before else az.loo(after, pointwise=True)
+            first = az.loo(separate(before), pointwise=True)
+            second = first if after is before else az.loo(separate(after), pointwise=True)
             difference, error = (0.0, 0.0) if after is before else _gain(az, first, second)
         except Exception:  # whatever it is, a report can do without
             return None
-    found = Comparison(_summary(first), _summary(second), difference, error, _n(first))
+    found = Comparison(_summary(first), _summary(second), difference, error, _n(first), unit)
     numbers = (found.before.elpd_loo, found.after.elpd_loo, difference, error)
     return found if np.isfinite(numbers).all() else None
 

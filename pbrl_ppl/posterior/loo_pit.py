@@ -21,7 +21,9 @@ def loo_pit(idata: Any) -> xr.DataArray:
     The probability that the model, fitted without a transition, gives to values below the measured
     one. Uniform between 0 and 1 where the predictions are calibrated; too many at the ends mean
     predictions that are too narrow, too many on one side a bias. It looks at one transition at a
-    time, and does not see errors that repeat from one to the next.
+    time, and does not see errors that repeat from one to the next. Of whole
+    trajectories it is no leave-one-out: a number is predicted from those before it, and only its
+    own factor is taken out of the likelihood; those after it have seen it.
 
     Parameters
     ----------

@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbrl_ppl.effects import (
     LEARNED_REMAINDER,
@@ -17,6 +18,7 @@ from pbrl_ppl.effects import (
     attach,
     catalogue,
 )
+from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.model import (
     Noise,
@@ -28,7 +30,7 @@ from pbrl_ppl.model import (
     with_sensitivity,
 )
 from pbrl_ppl.posterior.known_effects import known_effects
-from pbrl_ppl.posterior.recording import with_recording
+from pbrl_ppl.posterior.recording import SMOOTHED, with_recording
 from pbrl_ppl.posterior.store import (
     attributes,
     draws,
@@ -82,6 +84,51 @@ def versions() -> dict[str, str]:
         except importlib.metadata.PackageNotFoundError:
             found[name] = "not installed"
     return found
+
+
+def linearised_as(problem: Problem, idata: Any) -> Problem:
+    """The problem, its trajectories linearised where those of a posterior of the same data are.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the posterior's scene, effects and data; itself if it is one of single transitions.
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+
+    Raises
+    ------
+    PosteriorError
+        If one is of whole trajectories and the other of single transitions, or the data or the
+        parameters are others.
+    """
+    given, posterior = group(idata, "constant_data"), group(idata, "posterior")
+    of = {True: "whole trajectories", False: "single transitions"}
+    whole = problem.trajectories is not None
+    if (SMOOTHED in given) != whole:
+        raise PosteriorError(
+            f"posterior: it is of {of[not whole]}, expected {of[whole]} as the model; make"
+            f" that with trajectories={not whole}"
+        )
+    measured: NDArray[np.float64] = (
+        group(idata, "observed_data")["next_state"]
+        .transpose("transition", "step", "body", "state")
+        .to_numpy()
+    )
+    if not np.array_equal(measured, problem.measured, equal_nan=True):
+        raise PosteriorError(
+            f"posterior: it is of {len(measured)} transitions that are not the model's"
+            f" {len(problem.measured)}; pass the history that it was fitted to"
+        )
+    names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
+    missing = [name for name in names if name not in posterior]
+    if missing:
+        raise PosteriorError(f"posterior: it has no {', '.join(missing)}; of another model?")
+    if not whole:
+        return problem
+    median, spread = json.loads(str(idata.attrs["sigma_prior"]))
+    problem = with_recording(problem, given, problem.data.history.data_sha256)
+    return problem.with_noise(prior=(tuple(map(float, median)), float(spread)))
 
 
 def problem_of(

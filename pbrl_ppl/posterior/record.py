@@ -11,11 +11,17 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
+from pbrl_ppl.errors import (
+    BoundWarning,
+    ConvergenceWarning,
+    LinearisationWarning,
+    UninformedWarning,
+)
 from pbrl_ppl.model import ACCELERATION, JOLT, Problem
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
+from pbrl_ppl.posterior.linearisation import LINEARISATION, doubt, linearisation
 from pbrl_ppl.posterior.origin import origin
 from pbrl_ppl.posterior.places import placed, places
 from pbrl_ppl.posterior.predictions import predictive_rows
@@ -107,6 +113,8 @@ def complete(
     idata = placed(idata, places(problem.segments))
     if ATTRIBUTE in trace.attrs:
         idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
+    if problem.trajectories is not None and len(phi) > 1:
+        idata.attrs[LINEARISATION] = json.dumps(linearisation(problem, phi, sigma))
     return checked(problem, idata, asked)
 
 
@@ -210,6 +218,10 @@ def _trouble(
     more = f"raise draws= or thin=, or {on}"
     if "updates" in idata.attrs:  # resampled draws are no chain that could go on
         more = "these draws were reweighted by update; fit all data anew"
+    if LINEARISATION in idata.attrs:
+        doubted = doubt(json.loads(str(idata.attrs[LINEARISATION])))
+        if doubted is not None:
+            yield LinearisationWarning, doubted
     sizes = group(idata, "posterior").sizes
     if asked is not None:
         idata.attrs["interrupted"] = 1

@@ -14,6 +14,8 @@ from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
+#: Name of the smoothed states; a posterior of single transitions has none.
+SMOOTHED = "smoothed"
 #: Names of how the smoothed states follow the parameters.
 _ORIGIN, _SENSITIVITY = "smoothed_at", "sensitivity"
 #: Variables of the recording have these before their names, and before their dimensions'.
@@ -31,7 +33,7 @@ def recording(problem: Problem) -> xr.Dataset:
     )
     kept = kept.drop_vars([name for name in kept.coords if name not in kept.dims])
     dims = (f"{_PREFIX}trajectory", f"{_PREFIX}time", f"{_PREFIX}body", f"{_PREFIX}state")
-    kept["smoothed"] = (dims, problem.data.smoothed_states)
+    kept[SMOOTHED] = (dims, problem.data.smoothed_states)
     kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
     kept["linearised_at"] = (("noise_parameter",), noise.sigma)
     if noise.sensitivity is not None:
@@ -43,11 +45,11 @@ def recording(problem: Problem) -> xr.Dataset:
 
 def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Problem:
     """A problem with the whole trajectories that a posterior's constant data hold, if they do."""
-    if "smoothed" not in given:
+    if SMOOTHED not in given:
         return problem
     history = recorded(problem.scene, given, data_sha256)
     cells = cells_of(problem.scene, history)
-    states = given["smoothed"].to_numpy()
+    states = given[SMOOTHED].to_numpy()
     data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
     noise: TrajectoryNoise = linearised(
         problem.on(data), cells, given["slope"].to_numpy(), given["linearised_at"].to_numpy()
@@ -76,7 +78,7 @@ def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:
 
 def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
     """One recording after the other; empty where there are none."""
-    if "smoothed" not in new:
+    if SMOOTHED not in new:
         return xr.Dataset()
     by_transition = ["slope"]
     if _SENSITIVITY in new:
@@ -91,5 +93,5 @@ def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
         parts = [given[names].reset_coords(drop=True) for given in (held, new)]
         parts = [part.drop_vars([dim], errors="ignore") for part in parts]
         result = result.merge(xr.concat(parts, dim, join="outer"))
-    result["smoothed"] = result["smoothed"].fillna(0.0)
+    result[SMOOTHED] = result[SMOOTHED].fillna(0.0)
     return result

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.stats import gaussian_kde
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.posterior import from_groups, group, groups, loo_pit, scalars
+from pbrl_ppl.posterior import from_groups, group, groups, left_out, loo_pit, scalars, separate
 from pbrl_ppl.report.style import AFTER, BAND, BEFORE, NARROW, PLAIN, WIDE, blank_figure, legend
 
 Array = NDArray[np.float64]
@@ -161,8 +161,8 @@ def coverage(posterior: Any) -> dict[str, tuple[float, float, int]]:
     return result
 
 
-def pareto_k(posterior: Any) -> tuple[Array, float]:
-    """Pareto k of leaving each transition out, and the threshold above which it is bad.
+def pareto_k(posterior: Any) -> tuple[Array, float, str]:
+    """Pareto k, the threshold above which it is bad, and what is left out at a time.
 
     Raises
     ------
@@ -172,20 +172,20 @@ def pareto_k(posterior: Any) -> tuple[Array, float]:
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("ignore")  # of high k, which the result says
         try:
-            loo = az.loo(posterior, pointwise=True)
+            loo = az.loo(separate(posterior), pointwise=True)
         except Exception as error:  # whatever it is, a report can do without
             raise PosteriorError(f"leave-one-out cross-validation: {error}") from error
-    return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k)
+    return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
 
 
-def plot_pareto(k: Array, good: float, width: float = WIDE) -> Figure:
-    """Pareto k of every transition, and the threshold above which LOO is not to be relied on."""
+def plot_pareto(k: Array, good: float, unit: str, width: float = WIDE) -> Figure:
+    """Pareto k of every unit left out, and the threshold above which LOO is not to be relied on."""
     figure, (axes,) = blank_figure(width, 2.8, 1, 1)
     high = ~(k <= good)
     axes.axhline(good, color=BEFORE, linewidth=1.2, linestyle="--")
     axes.plot(np.flatnonzero(~high), k[~high], ".", color=AFTER, markersize=4)
     axes.plot(np.flatnonzero(high), np.nan_to_num(k[high], posinf=2.0), "x", color=BEFORE)
-    axes.set_xlabel("transition")
+    axes.set_xlabel(unit)
     axes.set_ylabel("Pareto k")
     return figure
 

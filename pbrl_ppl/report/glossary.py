@@ -38,8 +38,9 @@ STATISTICS = {
     "nat": "Unit of evidence: one nat makes the data e = 2.7 times as likely.",
     "elpd": "Expected log predictive density: how likely data are under a model that has not seen"
     " them, in nats; more is better.",
-    "LOO": "Leave-one-out cross-validation: elpd of each transition given all others.",
-    "Pareto k": "How far leaving one transition out changes the posterior; above the threshold, LOO"
+    "LOO": "Leave-one-out cross-validation: elpd of each transition given all others; of whole"
+    " trajectories leave-one-trajectory-out, elpd of each trajectory given all others.",
+    "Pareto k": "How far leaving one of them out changes the posterior; above the threshold, LOO"
     " is not to be relied on.",
     "R-hat": "Spread of all chains over that within one; 1 if they agree, at most 1.01 is wanted.",
     "ESS": "Effective sample size: how many independent draws the chains are worth; at least 400"

@@ -84,8 +84,7 @@ def loo_table(findings: Findings) -> Table | None:
         ),
     ]
     return Table(
-        f"Leave-one-out cross-validation on the {loo.transitions} transitions of the fit (az.loo,"
-        " az.compare)",
+        f"{loo.method} (az.loo, az.compare)",
         ("Measure", *(("Before", "After") if findings.added else ("Declared model",))),
         rows,
     )

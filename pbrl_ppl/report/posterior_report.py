@@ -218,7 +218,7 @@ def _loo(posterior: Any) -> Table | None:
         return None
     one = found.before
     return Table(
-        f"Leave-one-out cross-validation of {found.transitions} transitions (az.loo)",
+        f"{found.method} (az.loo)",
         ("Measure", "Value"),
         [
             ("elpd_loo (nats; more is better)", number(one.elpd_loo, 4)),

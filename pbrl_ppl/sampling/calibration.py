@@ -23,7 +23,7 @@ from rich.progress import track
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History, write_atomically
-from pbrl_ppl.model import Problem, physics_model
+from pbrl_ppl.model import Problem, declared_problem
 from pbrl_ppl.posterior import versions
 from pbrl_ppl.sampling.ranks import Calibration
 from pbrl_ppl.sampling.replication import Record, draw_truths, labels, replicate
@@ -119,11 +119,10 @@ def calibrate(
     """
     if replications < 2:
         raise ValueError(f"replications is {replications}, expected at least 2, better 200")
-    model = physics_model(
+    design = declared_problem(
         scene, history, effects, horizon=horizon, sigma=sigma, nu=nu, substeps=substeps,
         trajectories=trajectories,
     )  # fmt: skip
-    design: Problem = model.problem
     if design.layout.discrete.any():
         raise FitError(
             "calibrate: which bodies a joint joins is unknown, and ranks are for parameters that"

@@ -196,7 +196,8 @@ def fit(
 ) -> Any:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
-    Multi-start least squares finds the mode, from about which the chains start. Where the scene
+    Multi-start least squares finds the mode, from about which the chains start, if the model does
+    not hold one. Where the scene
     does not say which bodies a joint joins, every choice is fitted by itself, and their draws are
     mixed by their evidences; :func:`pbrl_ppl.joint_probabilities` gives those. A model with
     a ``library`` needs no chain: all choices are summed over.
@@ -227,7 +228,7 @@ def fit(
         A mode found before, in place of the search for one.
     resume : InferenceData or DataTree, optional
         A posterior of the same model, whose chains go on where they ended, with the new draws after
-        the old.
+        the old. Whole trajectories are linearised as they are in it.
     progress : bool
         Whether to show PyMC's progress bar.
 
@@ -245,12 +246,16 @@ def fit(
         If the model was not made by ``physics_model``, there is no such method, ``start`` is no
         mode, or both ``start`` and ``resume`` are given; for joints of unknown bodies, if there are
         too many choices, or with ``smc``, ``start`` or ``resume``.
+    PosteriorError
+        If ``resume`` is a posterior of other data or parameters.
 
     Warns
     -----
     ConvergenceWarning
         If an R-hat is over 1.01 or an effective sample size under 400, if sampling was
         interrupted, or if an evidence is too rough for the probability of a joint.
+    LinearisationWarning
+        If states smoothed anew at draws give another likelihood (``attrs["linearisation"]``, nats).
     MeetingWarning
         If bodies that were apart in the data meet under the parameters found.
     BoundWarning
@@ -310,8 +315,9 @@ def fit(
     elif resume is not None:
         trace = sampled(model, *from_posterior(problem, resume))
     else:
-        mode = _mode(problem, seed) if start is None else start
-        if mode.problem.trajectories is not None:  # linearised at the mode by now
+        held: Mode | None = getattr(model, "mode", None)  # of physics_model
+        mode = start or held or _mode(problem, seed)
+        if mode.problem.trajectories is not None and mode is not held:  # linearised at it by now
             mode = mode if start is None else following(start)
             problem = mode.problem
             model = build_model(problem)

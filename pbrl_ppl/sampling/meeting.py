@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.model import Problem, build_model
-from pbrl_ppl.posterior import parameter_draws
+from pbrl_ppl.posterior import linearised_as, parameter_draws
 
 Array = NDArray[np.float64]
 
@@ -52,9 +52,22 @@ def model_of_draws(problem: Problem, trace: Any) -> pm.Model | None:
 
 
 def as_in(model: pm.Model, idata: Any) -> pm.Model:
-    """The model with those bodies together that a posterior has together."""
-    problem, attrs = model.problem, {} if idata is None else idata.attrs
-    known = tuple(json.loads(str(attrs.get("together", "[]"))))
-    if set(known) <= set(problem.physics.together):
+    """The model with the likelihood that a posterior was sampled with.
+
+    Bodies are together that the posterior has together, and trajectories are linearised where its
+    own are.
+
+    Raises
+    ------
+    PosteriorError
+        If the posterior is of other data, or of single transitions where the model is of whole
+        trajectories, or the other way round.
+    """
+    if idata is None:
         return model
-    return build_model(problem.with_physics(together=known))
+    problem = model.problem
+    known = tuple(json.loads(str(idata.attrs.get("together", "[]"))))
+    if not set(known) <= set(problem.physics.together):
+        problem = problem.with_physics(together=known)
+    problem = linearised_as(problem, idata)
+    return model if problem is model.problem else build_model(problem)

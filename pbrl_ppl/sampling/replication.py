@@ -14,6 +14,7 @@ from pbrl_ppl.errors import (
     BoundWarning,
     ConvergenceWarning,
     FitError,
+    LinearisationWarning,
     MeetingWarning,
     UninformedWarning,
 )
@@ -39,6 +40,12 @@ Record = dict[str, list[float]]
 _AGAIN, _LONGER = 2, 4
 #: Draws from the prior are given up where fewer than one in so many is possible.
 _MOST_REDRAWN = 50
+
+
+#: Warnings of a fit that no replication repeats.
+_KNOWN = (
+    ConvergenceWarning, BoundWarning, LinearisationWarning, MeetingWarning, UninformedWarning,
+)  # fmt: skip
 
 
 class Truth(NamedTuple):
@@ -165,7 +172,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     for again in range(_AGAIN + 1):
         with warnings.catch_warnings():
             # convergence is in the result; the others are of made-up data
-            for kind in (ConvergenceWarning, BoundWarning, MeetingWarning, UninformedWarning):
+            for kind in _KNOWN:
                 warnings.simplefilter("ignore", kind)
             idata = fit(model, seed=seed, progress=False, **settings)
         if "interrupted" in idata.attrs:

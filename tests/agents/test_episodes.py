@@ -21,9 +21,8 @@ from pbrl_ppl.agents import (
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EpisodeError, UninformedWarning
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import physics_model
 from pbrl_ppl.posterior import group, load_posterior
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling import fit, physics_model
 from tests.helpers.tasks import PUCK, PUCK_TRUTH, puck_world
 
 

@@ -21,9 +21,9 @@ from pbrl_ppl.cli.scene_text import _HEAD
 from pbrl_ppl.cli.terminal import warnings_in_a_line
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import physics_model
 from pbrl_ppl.model.table1 import table1
 from pbrl_ppl.posterior import load_posterior, record
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.places import MODELS, ROOT
 

@@ -130,7 +130,7 @@ def test_a_catalogued_effect_is_named_with_its_size(make_history) -> None:
     assert all(test.passed for test in found.tests)
     before, after = found.acceleration.before, found.acceleration.after
     assert after["vx"] < 0.1 * before["vx"]
-    # leave-one-out of single transitions says so too
+    # leave-one-trajectory-out says so too
     assert found.loo.elpd_difference > 2 * found.loo.elpd_difference_se
     json.dumps(found.to_dict(), allow_nan=False)
 

@@ -6,9 +6,10 @@ import pytest
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import build_layout, physics_model
+from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Simulator, calls
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 

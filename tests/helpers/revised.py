@@ -9,8 +9,7 @@ from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
-from pbrl_ppl.model import physics_model
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling import fit, physics_model
 from tests.helpers.free_puck import DISC, Disc
 from tests.helpers.made_up import made_up
 

@@ -5,11 +5,11 @@ import pytest
 
 from pbrl_ppl.errors import GoalError, HistoryError
 from pbrl_ppl.history import History, from_segments
-from pbrl_ppl.model import Transition, along_trajectories, physics_model
+from pbrl_ppl.model import Transition, along_trajectories
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.planning import Action, ActionSet, Dynamics, Goal, plan
 from pbrl_ppl.posterior import load_posterior, problem_of, save_posterior
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 
 NOISE = np.array([1e-3, 1e-3, 2e-3, 5e-3, 5e-3, 1e-2])

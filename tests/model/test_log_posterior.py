@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from pymc.model.transform.conditioning import remove_value_transforms
 
-from pbrl_ppl.model import ParameterLibrary, log_posterior, log_prior, physics_model
+from pbrl_ppl.model import ParameterLibrary, log_posterior, log_prior
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.modes.evidence import Coordinates
 from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.parameters import prior_draws
 from pbrl_ppl.planning.dynamics import Dynamics
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history

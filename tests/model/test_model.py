@@ -12,8 +12,9 @@ from scipy import stats
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EffectError, HistoryError, SimulationError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, along_trajectories, physics_model
+from pbrl_ppl.model import Problem, along_trajectories
 from pbrl_ppl.physics import Simulator
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.carts import CART, cart_scene

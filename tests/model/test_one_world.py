@@ -11,18 +11,11 @@ from pbrl_ppl.criticism import prior_predictive_check
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import (
-    ACCELERATION,
-    Problem,
-    along_trajectories,
-    build_layout,
-    build_model,
-    physics_model,
-)
+from pbrl_ppl.model import ACCELERATION, Problem, along_trajectories, build_layout, build_model
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Simulator
 from pbrl_ppl.posterior import evaluate, from_groups, group, problem_of
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.sampling.replication import draw_truths
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE

@@ -8,11 +8,10 @@ from scipy.stats import kstest
 from scipy.stats import t as student
 
 from pbrl_ppl.history import History
-from pbrl_ppl.model import physics_model
 from pbrl_ppl.model.likelihood import log_density, next_state_logp, next_state_random, robust
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.state import STATE
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history

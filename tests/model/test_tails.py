@@ -6,10 +6,11 @@ from scipy import stats
 
 from pbrl_ppl.effects import Effect, EffectParameter, Noise, catalogue
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.model import log_posterior, physics_model
+from pbrl_ppl.model import log_posterior
 from pbrl_ppl.model.likelihood import log_norm, robust
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
+from pbrl_ppl.sampling import physics_model
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history
 

@@ -3,9 +3,11 @@
 from dataclasses import replace
 
 import numpy as np
+import pymc as pm
 import pytensor.tensor as pt
 import pytest
 from pytensor import function
+from pytensor.graph.traversal import ancestors
 from scipy.stats import multivariate_normal
 
 from pbrl_ppl.effects import attach
@@ -14,12 +16,13 @@ from pbrl_ppl.model import (
     Problem,
     along_trajectories,
     build_model,
-    physics_model,
+    declared_problem,
     simulated_trajectories,
     smoothed,
     with_measurements,
 )
 from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import wrapped
 from tests.helpers.histories import simulated_history
@@ -155,24 +158,28 @@ def test_smoothing_stops_where_no_motion_fits(problem) -> None:
 
 def test_derivative_is_that_of_differences(problem) -> None:
     noise = problem.trajectories
-    residual, sigma = pt.tensor4("residual"), pt.vector("sigma")
-    tail = pt.vector("tail")
+    given = [pt.tensor4("deviation"), pt.tensor4("residual"), pt.vector("sigma"), pt.vector("tail")]
     weights = np.random.default_rng(2).normal(size=problem.segments.n)
-    total = (TrajectoryDensityOp(noise)(residual, sigma, tail) * weights).sum()
-    value = function([residual, sigma, tail], total)
-    slopes = function([residual, sigma, tail], pt.grad(total, [residual, sigma]))
+    total = (TrajectoryDensityOp(noise)(*given) * weights).sum()
+    value = function(given, total)
+    slopes = function(given, pt.grad(total, given[:3]))
+    deviation = problem.measured - problem.observations.values
     rng = np.random.default_rng(3)
     at = problem.residual(PHI) + 1e-3 * rng.normal(size=problem.residual(PHI).shape)
     for nu in (0.0, 0.2):
         tails = np.array([nu])
-        by_residual, by_sigma = slopes(at, NOISE, tails)
+        point = deviation, at, NOISE
+        slope = slopes(*point, tails)
         for _ in range(5):
-            step = 1e-6 * rng.normal(size=at.shape)
-            change = value(at + step, NOISE, tails) - value(at - step, NOISE, tails)
-            np.testing.assert_allclose(2 * (by_residual * step).sum(), change, rtol=1e-4)
-            step = 1e-6 * NOISE * rng.normal(size=len(NOISE))
-            change = value(at, NOISE + step, tails) - value(at, NOISE - step, tails)
-            np.testing.assert_allclose(2 * (by_sigma * step).sum(), change, rtol=1e-4)
+            for i, size in enumerate((1e-6, 1e-6, 1e-6 * NOISE)):
+                step = size * rng.normal(size=point[i].shape)
+                ends = [
+                    value(*(x + sign * step if j == i else x for j, x in enumerate(point)), tails)
+                    for sign in (1, -1)
+                ]
+                np.testing.assert_allclose(
+                    2 * (slope[i] * step).sum(), ends[0] - ends[1], rtol=1e-4
+                )
 
 
 def density_of_the_model(problem) -> float:
@@ -192,6 +199,28 @@ def density_of_the_model(problem) -> float:
 def test_the_model_is_the_problem(problem) -> None:
     value = density_of_the_model(problem)
     np.testing.assert_allclose(value, problem.log_density(problem.residual(PHI), NOISE).sum())
+
+
+def test_the_data_are_in_the_model_s_graph(problem) -> None:
+    """Other measurements have the density that the filter gives them; a gap makes no difference."""
+    observed = problem.data.history.dataset["observed"].to_numpy().copy()
+    observed[1, 2, 0, :3] = np.nan
+    gappy = along_trajectories(with_measurements(problem, observed), PHI, NOISE)
+    model = build_model(gappy)
+    density = model.logp(model.observed_RVs)
+    assert model.rvs_to_values[model["next_state"]] in ancestors([density])
+    other = gappy.measured + 1e-3 * np.random.default_rng(5).normal(size=gappy.measured.shape)
+    (moved,) = model.replace_rvs_by_values([pm.logp(model["next_state"], np.nan_to_num(other))])
+    point = {"mass": PHI[:1], "linear_drag_coefficient": PHI[1:],
+             "sigma": NOISE[:6], "unexplained_acceleration": NOISE[6:]}  # fmt: skip
+    found = model.compile_fn(moved)(
+        {model.rvs_to_values[v].name: np.log(point[v.name]) for v in model.free_RVs}
+    )
+    noise = gappy.trajectories
+    deviation = noise.cells.of_residual(np.nan_to_num(other) - gappy.observations.values)
+    there = gappy.with_noise(trajectories=replace(noise, measured=deviation))
+    np.testing.assert_allclose(found, there.log_density(there.residual(PHI), NOISE))
+    assert abs(found.sum() - gappy.log_density(gappy.residual(PHI), NOISE).sum()) > 0.1
 
 
 def test_the_model_is_the_problem_where_a_body_turns_by_more_than_half_a_turn() -> None:
@@ -286,7 +315,7 @@ def test_computed_velocities_are_left_out_of_the_model() -> None:
             angles = np.unwrap(frame.loc[rows, position])
             frame.loc[rows, rate] = np.gradient(angles, PUCK.time_step)
     computed = History.from_dataframe(frame, PUCK)
-    problem = physics_model(PUCK, computed, trajectories=True).problem
+    problem = declared_problem(PUCK, computed, trajectories=True)
     assert problem.noise_variables["sigma"] == ("x", "y", "theta")
     eq_11 = physics_model(PUCK, computed).problem
     assert len(eq_11.noise_variables["sigma"]) == 6  # the paper's likelihood takes what it is given

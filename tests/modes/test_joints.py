@@ -7,9 +7,10 @@ import pytest
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.errors import FitError, ParameterError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import build_layout, physics_model
+from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Simulator
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.joints import HINGED, NAMES, POSES, reference_anchors, scene

@@ -6,10 +6,11 @@ import pytest
 
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import build_layout, physics_model
+from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.physics import PartedSimulator, Simulator, independent_parts
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.sampling.starts import gaussian_blocks
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.histories import COLUMNS

@@ -8,13 +8,12 @@ import pytest
 import xarray as xr
 from pymc.stats import compute_log_prior
 
-from pbrl_ppl.model import physics_model
 from pbrl_ppl.parameters import wheels
-from pbrl_ppl.posterior import from_groups, group, groups, loo_pit, predicted_rows
+from pbrl_ppl.posterior import by_number, from_groups, group, groups, loo_pit, predicted_rows
 from pbrl_ppl.posterior.predictions import predictive_rows
 from pbrl_ppl.posterior.prior_groups import prior_groups
 from pbrl_ppl.posterior.store import DATATREE, az, load_posterior, save_posterior
-from pbrl_ppl.sampling import fit, update
+from pbrl_ppl.sampling import fit, physics_model, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.stacks import GENERATIONS, SCENE, file, fitted, history
@@ -262,6 +261,34 @@ def test_loo_pit_is_arviz_s(idata, of_vx) -> None:
         theirs = az.loo_pit(of_vx, y="next_state")
     assert ours.dims == ("transition", "step", "body", "state")
     np.testing.assert_allclose(ours.sel(state="vx").values.ravel(), theirs, atol=0.05)
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning", "ignore::FutureWarning")
+@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::UserWarning")  # ArviZ's own
+def test_arviz_s_loo_pit_of_every_number(idata) -> None:
+    """All states at once, one number missing, an angle a turn on; as far as 200 draws can say."""
+    data = groups(idata)
+    values = data["observed_data"]["next_state"].copy(deep=True)
+    values.loc[{"state": "theta"}] += 2 * np.pi
+    values.loc[{"state": "x", "transition": 3}] = np.nan
+    data["observed_data"] = values.to_dataset(name="next_state")
+    whole = from_groups(data, idata.attrs)
+    each = by_number(whole)
+    named = {} if DATATREE else {"y": "next_state"}
+    theirs = az.loo_pit(each, **named)
+    theirs = theirs["next_state"].values if DATATREE else theirs
+    ours = loo_pit(whole).values.ravel()
+    assert theirs.shape == (71,)
+    np.testing.assert_allclose(theirs, ours[np.isfinite(ours)], atol=0.05)
+    assert az.plot_loo_pit(each, **named) is not None
+    if DATATREE:
+        assert az.plot_ppc_pit(each) is not None
+    plt.close("all")
+    kept = group(each, "posterior")["mass"].values
+    place = group(idata, "posterior_predictive")["draw"]
+    np.testing.assert_array_equal(kept, group(idata, "posterior")["mass"].sel(draw=place).values)
+    state = group(each, "observed_data")["state"].values
+    assert list(state[:6]) == ["x", "y", "theta", "vx", "vy", "omega"]
 
 
 def test_loo_pit_of_angles_and_gaps(idata) -> None:

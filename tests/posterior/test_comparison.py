@@ -5,7 +5,16 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from pbrl_ppl.posterior import compare, from_groups, group, load_posterior
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.posterior import (
+    by_number,
+    by_trajectory,
+    compare,
+    from_groups,
+    group,
+    groups,
+    load_posterior,
+)
 from tests.helpers.stacks import file
 
 N = 60
@@ -37,7 +46,7 @@ def test_two_models_of_known_elpd() -> None:
     """Monte Carlo errors of the sums are below 0.02 nats: five of them."""
     found = compare(fitted(2.0), fitted(1.0))
     gain = exact(1.0) - exact(2.0)
-    assert found.transitions == N
+    assert found.count == N
     assert found.before.elpd_loo == pytest.approx(exact(2.0).sum(), abs=0.1)
     assert found.after.elpd_loo == pytest.approx(exact(1.0).sum(), abs=0.1)
     assert found.elpd_difference == pytest.approx(gain.sum(), abs=0.1)
@@ -80,5 +89,46 @@ def test_none_where_it_cannot_be_computed(draws) -> None:
 def test_posteriors_of_both_generations() -> None:
     """The same data and model, twice fitted: nothing gained."""
     found = compare(*(load_posterior(file(generation)) for generation in ("5", "6")))
-    assert found.transitions == 12
+    assert found.count == 12
     assert abs(found.elpd_difference) < 0.5
+
+
+def grouped(spread: float, size: int = 6):
+    """The same posterior, its data in trajectories of six whose terms depend on each other."""
+    idata = fitted(spread)
+    data = groups(idata)
+    places = {"trajectory": ("transition", np.arange(N) // size)}
+    data["log_likelihood"] = data["log_likelihood"].assign_coords(places)
+    data["constant_data"] = xr.Dataset({"smoothed": 0.0})
+    return from_groups(data, {})
+
+
+def test_one_trajectory_is_left_out_at_a_time() -> None:
+    """Against the closed form of six normal data given the others; Monte Carlo error below 0.05."""
+    size = 6
+    exact = 0.0
+    for i in range(0, N, size):
+        others = np.delete(DATA, slice(i, i + size))
+        covariance = np.eye(size) + 1 / len(others)
+        law = stats.multivariate_normal(np.full(size, others.mean()), covariance)
+        exact += law.logpdf(DATA[i : i + size])
+    found = compare(grouped(1.0), grouped(1.0))
+    assert (found.count, found.left_out) == (N // size, "trajectory")
+    assert (
+        found.method
+        == "Leave-one-trajectory-out cross-validation on the 10 trajectories of the fit"
+    )
+    assert found.before.elpd_loo == pytest.approx(exact, abs=0.25)
+    assert abs(found.before.elpd_loo - compare(fitted(1.0), fitted(1.0)).before.elpd_loo) < 5
+    summed = group(by_trajectory(grouped(1.0)), "log_likelihood")["next_state"]
+    assert summed.dims == ("chain", "draw", "trajectory")
+
+
+def test_no_number_is_left_out_of_a_trajectory() -> None:
+    with pytest.raises(PosteriorError, match="later transitions have seen the one left out"):
+        by_number(grouped(1.0))
+
+
+def test_different_things_left_out_are_not_compared() -> None:
+    with pytest.raises(PosteriorError, match="leaves out one transition at a time"):
+        compare(fitted(1.0), grouped(1.0))

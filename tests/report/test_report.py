@@ -199,13 +199,17 @@ def test_page_compares_by_leave_one_out() -> None:
         "after": vars(two),
         "elpd_difference": 210.0,
         "elpd_difference_se": 19.0,
-        "transitions": 360,
+        "count": 360,
+        "left_out": "transition",
     }
     same = replace(made_up("adequate"), loo=Comparison(two, two, 0.0, 0.0, 360))
     text = Page(render(same)).text
     assert "How many have a Pareto k above 0.70 0 " in text
     assert "the revised model gains" not in text
     assert "unreliable" not in text
+    whole = replace(made_up("adequate"), loo=Comparison(two, two, 0.0, 0.0, 9, "trajectory"))
+    text = Page(render(whole)).text
+    assert "Leave-one-trajectory-out cross-validation on the 9 trajectories of the fit" in text
     # where it cannot be computed, the report does without
     assert made_up().to_dict()["loo"] is None
     assert "Leave-one-out cross-validation on" not in page("effects-added").text

@@ -14,9 +14,9 @@ from scipy import stats
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Noise, Problem, build_model, physics_model
+from pbrl_ppl.model import Noise, Problem, build_model, declared_problem
 from pbrl_ppl.report import plot_calibration, png
-from pbrl_ppl.sampling import calibrate, calibration, replication
+from pbrl_ppl.sampling import calibrate, calibration, physics_model, replication
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, Calibration, bins, holm, rank, uniformity
 from pbrl_ppl.sampling.replication import Record, Truth, draw_truths, simulated
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
@@ -553,7 +553,7 @@ def test_whole_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (truth[:, :-1] > 0).all()
     assert (truth[0] != truth[1]).all()
     # what was simulated is the design's, all but its numbers
-    problem = physics_model(scene, history, trajectories=True).problem
+    problem = declared_problem(scene, history, trajectories=True)
     (one,), _ = draw_truths(problem, 1, seed=1)
     again = simulated(problem, one.values)
     assert again.noise_prior[0] == pytest.approx(problem.noise_prior[0])

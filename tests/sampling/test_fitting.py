@@ -17,7 +17,6 @@ from pbrl_ppl.errors import (
     PosteriorError,
     UninformedWarning,
 )
-from pbrl_ppl.model import physics_model
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import origin
@@ -33,6 +32,7 @@ from pbrl_ppl.posterior.store import (
     load_posterior,
     scene_of,
 )
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.sampling.starts import unconstrain
 from pbrl_ppl.scene import Shape

@@ -18,7 +18,7 @@ from pbrl_ppl.errors import (
     RefitWarning,
 )
 from pbrl_ppl.history import History
-from pbrl_ppl.model import along_trajectories, build_model, physics_model
+from pbrl_ppl.model import along_trajectories, build_model
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import loo_pit, problem_of
 from pbrl_ppl.posterior.store import (
@@ -34,7 +34,7 @@ from pbrl_ppl.posterior.store import (
     scene_of,
     smoothed,
 )
-from pbrl_ppl.sampling import fit, update
+from pbrl_ppl.sampling import fit, physics_model, update
 from pbrl_ppl.sampling.rejuvenation import _Mover, rejuvenate
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene

@@ -9,11 +9,12 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.model import along_trajectories, physics_model, simulated_trajectories
+from pbrl_ppl.model import along_trajectories, declared_problem, simulated_trajectories
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, group, parameter_draws, problem_of
 from pbrl_ppl.posterior.store import scalars
 from pbrl_ppl.report import render_posterior
+from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
 from tests.helpers.histories import simulated_history
@@ -44,7 +45,7 @@ def both() -> History:
     """Fourteen trajectories with both noises, some of them shorter."""
     truth = {"mass": PHI[0], "linear_drag_coefficient": PHI[1]}
     design = simulated_history(SCENE, truth, seed=1, trajectories=14, intervals=5, noise=0.0)
-    problem = physics_model(SCENE, design, trajectories=True).problem
+    problem = declared_problem(SCENE, design, trajectories=True)
     measured = simulated_trajectories(problem, PHI, NOISE, np.random.default_rng(2))
     dataset = design.dataset.copy()
     dataset["observed"] = dataset["observed"].copy(data=measured)
@@ -133,7 +134,7 @@ def test_an_update_is_the_fit_of_all(both, first, whole, way, monkeypatch) -> No
         problem.log_density(problem.residual(phi[some]), sigma[some]), stored[some], rtol=1e-9
     )
     np.testing.assert_array_equal(
-        problem.measured, physics_model(SCENE, both, trajectories=True).problem.measured
+        problem.measured, declared_problem(SCENE, both, trajectories=True).measured
     )
 
 

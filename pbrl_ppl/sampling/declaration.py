@@ -1,0 +1,128 @@
+"""The model that users sample: Eq. 11, or whole trajectories linearised at their mode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import pymc as pm
+
+from pbrl_ppl.effects import Attached, Effect
+from pbrl_ppl.history import History
+from pbrl_ppl.model import ParameterLibrary, Problem, build_model, declared_problem
+from pbrl_ppl.modes import Mode, find_trajectory_mode, following, trajectory_mode
+from pbrl_ppl.posterior import linearised_as
+from pbrl_ppl.scene import Scene
+
+
+def physics_model(
+    scene: Scene,
+    history: History,
+    effects: Iterable[Effect | Attached] = (),
+    *,
+    horizon: int = 1,
+    sigma: str = "per_dimension",
+    nu: float | None = None,
+    substeps: int | None = None,
+    threads: int = 1,
+    library: ParameterLibrary | None = None,
+    trajectories: bool = False,
+    around: Any = None,
+    seed: int = 0,
+) -> pm.Model:
+    """Declare the model of the paper's section 3.2 for a scene and a history.
+
+    Parameters
+    ----------
+    scene : Scene
+        Known geometry, and which parameters are known.
+    history : History
+        Measured transitions.
+    effects : iterable of Effect or Attached
+        Effects beside those that the scene declares.
+    horizon : int
+        Intervals predicted from one measured state; 1 is Eq. 11.
+    sigma : str
+        ``per_dimension`` or ``scalar`` (the paper's Eq. 11).
+    nu : float, optional
+        Degrees of freedom of Student-t noise, for recordings full of contacts, whose residuals have
+        heavy tails; 4 is usual. Sigma is then its scale. Gaussian without it.
+    substeps : int, optional
+        Engine steps an interval; the scene's by default.
+    threads : int
+        Engine worlds that run side by side within one evaluation.
+    library : ParameterLibrary, optional
+        Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
+        ``library_index`` holds the bodies' choices, and the parameters follow from it.
+    trajectories : bool
+        Whether whole trajectories are whitened together, with two noises: ``sigma``, the error of
+        measuring a state, ``unexplained_acceleration``, what a step adds, and where bodies touch
+        ``contact_acceleration``, what comes on top of it there. Neighbours share a measured state,
+        which Eq. 11 takes as exact. The transitions are linearised about the states smoothed at the
+        posterior's mode, which is searched for here, is the initial point of ``pm.sample`` and is
+        kept as the model's ``mode`` for :func:`pbrl_ppl.fit`. Where a joint's bodies are unknown
+        there is no one mode: then about the prior's centre.
+    around : Mode, InferenceData or DataTree, optional
+        Where whole trajectories are linearised in place of a search: a mode, from which the mode is
+        climbed to, or a posterior of the same data, whose linearisation is taken as it is.
+    seed : int
+        Of the search; the same seed gives the same model.
+
+    Returns
+    -------
+    pymc.Model
+        An ordinary model, for ``pm.sample`` too; its ``problem`` attribute is the :class:`Problem`
+        it was made from.
+
+    Raises
+    ------
+    EffectError
+        If an effect is unknown or does not apply.
+    HistoryError
+        If the history has nothing to fit at this horizon, or nothing moves in whole trajectories.
+    SimulationError
+        If bodies start deep inside each other or a wall, or a hinge's bodies apart.
+    ValueError
+        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0, or
+        ``trajectories`` is given with a horizon, a library or a scalar sigma, or ``around`` without
+        it.
+    PosteriorError
+        If ``around`` is a posterior of other data, or of single transitions.
+    ParameterError
+        If the library does not fit the scene's bodies.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from pbrl_ppl.scene.scene import Body, Shape
+    >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2)),))
+    >>> rows = pd.DataFrame({"trajectory": 0, "time": [0.0, 0.1], "body": "puck", "x": [0.0, 0.1],
+    ...     "y": 0.0, "theta": 0.0, "vx": 1.0, "vy": 0.0, "omega": 0.0,
+    ...     "force_x": 0.0, "force_y": 0.0, "torque": 0.0})
+    >>> model = physics_model(scene, History.from_dataframe(rows, scene))
+    >>> [variable.name for variable in model.free_RVs]
+    ['mass', 'r', 'mu_c', 'sigma']
+    """
+    if around is not None and not trajectories:
+        raise ValueError("around is given without trajectories, expected with trajectories=True")
+    problem = declared_problem(
+        scene, history, effects, horizon=horizon, sigma=sigma, nu=nu, substeps=substeps,
+        threads=threads, library=library, trajectories=trajectories,
+    )  # fmt: skip
+    mode = None
+    if around is not None and not isinstance(around, Mode):
+        problem = linearised_as(problem, around)
+    elif problem.trajectories is not None and not problem.layout.discrete.any():
+        mode = find_trajectory_mode(problem, seed) if around is None else climbed(problem, around)
+        problem = mode.problem
+    model = build_model(problem)
+    model.mode = mode
+    if mode is not None:  # chains of pm.sample begin there
+        for name, value in problem.named(mode.phi, mode.sigma).items():
+            model.set_initval(model[name], value)
+    return model
+
+
+def climbed(problem: Problem, near: Mode) -> Mode:
+    """The mode of whole trajectories that is reached from a mode of the same parameters."""
+    return following(trajectory_mode(problem, near.phi))

@@ -1,0 +1,222 @@
+"""Models of whole trajectories: linearised at their mode, with the data, and gone on with."""
+
+import warnings
+
+import numpy as np
+import pymc as pm
+import pytest
+
+import pbrl_ppl as pp
+from pbrl_ppl.cli import main
+from pbrl_ppl.errors import ConvergenceWarning, PosteriorError
+from pbrl_ppl.history import History
+from pbrl_ppl.model import declared_problem, simulated_trajectories, smoothed
+from pbrl_ppl.posterior import convergence, from_groups, group, groups, parameter_draws
+from pbrl_ppl.posterior.store import az, load_posterior, save_posterior, scalars
+from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.state import STATE
+from tests.helpers.carts import CART, cart_scene
+from tests.helpers.histories import simulated_history
+
+TRUTH = {"mass": 2.0, "linear_drag_coefficient": 0.8}
+SENSOR, STEP = [2e-3, 2e-3, 4e-3, 1e-2, 1e-2, 2e-2], [0.3, 0.3, 0.5]
+#: The errors of measuring are stated, so that two parameters and three accelerations are left.
+SCENE = Scene(
+    time_step=0.1,
+    substeps=4,
+    bodies=(
+        Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}, effects=("linear_drag",)),
+    ),
+    noise=tuple(zip(STATE, SENSOR, strict=True)),
+)
+FIT = {"tune": 200, "cores": 1, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def history() -> History:
+    """Ten trajectories with both noises."""
+    design = simulated_history(SCENE, TRUTH, seed=1, trajectories=10, intervals=5, noise=0.0)
+    problem = declared_problem(SCENE, design, trajectories=True)
+    rng = np.random.default_rng(2)
+    measured = simulated_trajectories(problem, np.array([2.0, 0.8]), np.array(STEP), rng)
+    errors = rng.normal(size=measured.shape) * SENSOR
+    dataset = design.dataset.copy()
+    dataset["observed"] = dataset["observed"].copy(data=measured + errors)
+    return History.from_dataframe(History(dataset).to_dataframe(), SCENE)
+
+
+@pytest.fixture(scope="module")
+def model(history) -> pm.Model:
+    return pp.physics_model(SCENE, history, trajectories=True)
+
+
+@pytest.fixture(scope="module")
+def half(model):
+    return quiet(pp.fit, model, seed=1, draws=400, chains=4, **FIT)
+
+
+def quiet(function, *arguments, **options):
+    """Few draws, on purpose."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        return function(*arguments, **options)
+
+
+def likelihood(problem, phi, sigma) -> float:
+    return float(problem.log_density(problem.residual(phi), sigma).sum())
+
+
+def at(model, phi, sigma) -> float:
+    """The log-likelihood that PyMC's model has there."""
+    named = model.problem.named(phi, sigma)
+    return model.compile_logp(vars=model.observed_RVs)(
+        {model.rvs_to_values[v].name: np.log(named[v.name]) for v in model.free_RVs}
+    )
+
+
+def test_the_model_is_linearised_at_its_mode() -> None:
+    """A cart, whose wheel slips or rolls: linearised elsewhere its mode is improbable."""
+    scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
+    history = simulated_history(scene, CART, seed=1, trajectories=6)
+    model = pp.physics_model(scene, history, trajectories=True)
+    mode = model.mode
+    found = float(mode.problem.log_density(mode.problem.residual(mode.phi), mode.sigma).sum())
+    point = model.initial_point()  # in the sampler's space
+    assert model.compile_logp(vars=model.observed_RVs)(point) == pytest.approx(found)
+    anew = smoothed(mode.problem, mode.phi, mode.sigma)
+    assert likelihood(anew, mode.phi, mode.sigma) == pytest.approx(found, abs=0.5)
+    centre = declared_problem(scene, history, trajectories=True)
+    assert likelihood(centre, mode.phi, mode.sigma) < found - 100
+
+
+def test_the_same_seed_gives_the_same_model(model, history) -> None:
+    again = pp.physics_model(SCENE, history, trajectories=True, seed=0)
+    np.testing.assert_array_equal(again.mode.phi, model.mode.phi)
+    np.testing.assert_array_equal(
+        again.problem.trajectories.slope, model.problem.trajectories.slope
+    )
+
+
+def test_fit_does_not_search_again(model, monkeypatch) -> None:
+    monkeypatch.setattr("pbrl_ppl.sampling.fitting.find_trajectory_mode", None)
+    idata = pp.fit(model, method="map", progress=False)
+    phi, sigma = parameter_draws(model.problem, idata)
+    np.testing.assert_allclose(phi[0], model.mode.phi)
+    stored = float(group(idata, "log_likelihood")["next_state"].sum())
+    assert stored == pytest.approx(at(model, phi[0], sigma[0]))
+
+
+def test_around_a_mode_or_a_posterior(model, half, history, monkeypatch) -> None:
+    """Neither is a search."""
+    monkeypatch.setattr("pbrl_ppl.sampling.declaration.find_trajectory_mode", None)
+    near = pp.physics_model(SCENE, history, trajectories=True, around=model.mode)
+    sd = np.sqrt(np.diag(model.mode.covariance))
+    assert (np.abs(near.mode.phi - model.mode.phi) < sd).all()
+    same = pp.physics_model(SCENE, history, trajectories=True, around=half)
+    phi, sigma = (draws[7] for draws in parameter_draws(same.problem, half))
+    assert at(same, phi, sigma) == pytest.approx(at(model, phi, sigma), abs=1e-6)
+
+
+def test_around_what_is_of_something_else(half, history) -> None:
+    with pytest.raises(ValueError, match="around is given without trajectories"):
+        pp.physics_model(SCENE, history, around=half)
+    other = history.select(range(9))
+    with pytest.raises(PosteriorError, match="50 transitions that are not the model's 45"):
+        pp.physics_model(SCENE, other, trajectories=True, around=half)
+    single = pp.physics_model(SCENE, history)
+    with pytest.raises(PosteriorError, match="of whole trajectories, expected single transitions"):
+        pp.fit(single, resume=half)
+
+
+def test_pymc_s_predictions_are_of_the_filter(model, half) -> None:
+    """Of one draw, repeated: 300 means of 2000 within 5 standard errors, false alarm 2e-4."""
+    one = groups(half)["posterior"].isel(chain=[0], draw=[5])
+    phi, sigma = (
+        each[0] for each in parameter_draws(model.problem, from_groups({"posterior": one}, {}))
+    )
+    many = one.isel(draw=[0] * 2000).assign_coords(draw=np.arange(2000))
+    with model:
+        drawn = pm.sample_posterior_predictive(many, random_seed=1, progressbar=False)
+        prior = pm.sample_prior_predictive(draws=3, random_seed=1)
+    drawn = group(drawn, "posterior_predictive")["next_state"].to_numpy()[0]
+    noise, problem = model.problem.trajectories, model.problem
+    mean, covariance = noise.foreseen(noise.cells.of_residual(problem.residual(phi)), sigma)
+    off = (drawn - problem.observations.values)[:, :, 0, 0]
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    assert (np.abs(off.mean(axis=0) - mean) < 5 * sd / np.sqrt(2000)).all()
+    assert np.isfinite(group(prior, "prior_predictive")["next_state"]).all()
+
+
+def errors(one, other) -> dict[str, float]:
+    """Differences of means and standard deviations in their Monte Carlo standard errors."""
+    found, both = {}, [scalars(each) for each in (one, other)]
+    mean, square = [each.mean() for each in both], [(each - each.mean()) ** 2 for each in both]
+    spread = [np.sqrt(each.mean()) for each in square]
+    for name in both[0].data_vars:
+        of_mean, of_sd = [], []
+        for draws, squares, sd in zip(both, square, spread, strict=True):
+            width = float(sd[name])
+            of_mean.append(width / np.sqrt(ess(draws[name])))
+            of_sd.append(float(squares[name].std()) / (2 * width * np.sqrt(ess(squares[name]))))
+        found[f"mean of {name}"] = float(mean[1][name] - mean[0][name]) / np.hypot(*of_mean)
+        found[f"sd of {name}"] = float(spread[1][name] - spread[0][name]) / np.hypot(*of_sd)
+    return found
+
+
+def ess(values) -> float:
+    """Effective sample size of a mean."""
+    return float(np.ravel(az.ess(values.to_numpy(), method="mean"))[0])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::UserWarning", "ignore::RuntimeWarning")  # PyMC's own
+def test_pymc_samples_the_same_posterior(model, half) -> None:
+    """Ten differences in standard errors from the effective sizes: beyond 4.5 by chance, 7e-5."""
+    with model:
+        drawn = pm.sample(
+            draws=4000, tune=1000, chains=4, cores=1, step=pm.DEMetropolisZ(model.free_RVs),
+            random_seed=1, progressbar=False, compute_convergence_checks=False,
+        )  # fmt: skip
+    found = errors(drawn, half)
+    assert len(found) == 10
+    assert max(map(abs, found.values())) < 4.5, found
+
+
+@pytest.mark.slow
+def test_a_fit_in_two_halves_is_one(model, half, history, tmp_path) -> None:
+    """The model is made anew from the history; the file holds where it is linearised.
+
+    Ten differences from a whole fit beyond 4.5 standard errors come by chance once in 15,000.
+    """
+    save_posterior(half, tmp_path / "half.nc")
+    stored = load_posterior(tmp_path / "half.nc")
+    new = pp.physics_model(SCENE, history, trajectories=True, seed=5)
+    gone_on = quiet(pp.fit, new, seed=2, draws=400, resume=stored, **FIT)
+    # all draws, old and new, are of one likelihood: that of the first half
+    phi, sigma = parameter_draws(model.problem, gone_on)
+    of_all = group(gone_on, "log_likelihood")["next_state"].sum("transition").to_numpy()
+    of_half = group(half, "log_likelihood")["next_state"].sum("transition").to_numpy()
+    np.testing.assert_allclose(of_all[:, :400], of_half, atol=1e-6)
+    for i in (0, 399, 400, 799):
+        assert of_all[0, i] == pytest.approx(likelihood(model.problem, phi[i], sigma[i]), abs=1e-6)
+    assert max(convergence(gone_on)[0].values()) <= 1.05
+    second = {"posterior": group(gone_on, "posterior").isel(draw=slice(400, None))}
+    found = errors(half, from_groups(second, {}))
+    assert max(map(abs, found.values())) < 4.5, found
+
+
+def test_the_command_goes_on_with_the_same_likelihood(history, tmp_path, capsys) -> None:
+    """Old draws keep their log-likelihoods: the file says where the trajectories are linearised."""
+    (tmp_path / "scene.toml").write_text(SCENE.to_toml())
+    history.to_dataframe().to_csv(tmp_path / "train.csv", index=False)
+    given = ["fit", str(tmp_path / "scene.toml"), str(tmp_path / "train.csv"), "--quiet"]
+    given += ["--draws", "8", "--tune", "20", "--chains", "2"]
+    first, second = tmp_path / "first.nc", tmp_path / "second.nc"
+    for options in (["-o", str(first)], ["-o", str(second), "--seed", "9", "--resume", str(first)]):
+        assert main([*given, *options]) == 3  # so few draws have not converged
+    stored, gone_on = (
+        group(load_posterior(path), "log_likelihood")["next_state"].sum("transition").to_numpy()
+        for path in (first, second)
+    )
+    assert gone_on.shape == (2, 16)
+    np.testing.assert_allclose(gone_on[:, :8], stored, atol=1e-6)
