@@ -13,7 +13,7 @@ from attribution.cases import OUTSIDE, Case
 from attribution.outside import OUTSIDE_EFFECTS, parameters_of
 from attribution.sizes import STRONGEST
 from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.criticism.held_out import HeldOut
+from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.effects import Attached, attach
 from pbrl_ppl.model import Problem
@@ -120,7 +120,9 @@ def ask(case: Case, declared: Mode, test: pp.History, seed: int) -> Oracle:
     without, best, statistic = _compared(case, declared)
     # what lasts lasts in what was recorded later
     held_out = HeldOut(test.numbered(case.body.setups[0].n_train), seed)
-    horizon = held_out.rollout_horizon(case.body.scene.time_step)
+    horizon = held_out.longest(
+        rollout_horizon(without.problem.data.history, case.body.scene.time_step)
+    )
     plain, errors = (
         forecast(held_out.problem(mode), mode.phi, mode.sigma, horizon).rmse()
         for mode in (without, best)
