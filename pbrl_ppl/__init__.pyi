@@ -14,6 +14,7 @@ from .agents import World as World
 from .agents import act as act
 from .agents import run_episode as run_episode
 from .agents import run_episodes as run_episodes
+from .criticism import Criteria as Criteria
 from .criticism import Findings as Findings
 from .criticism import PriorCheck as PriorCheck
 from .criticism import prior_predictive_check as prior_predictive_check

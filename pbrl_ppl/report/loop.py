@@ -11,9 +11,11 @@ from pathlib import Path
 from typing import Any
 
 from pbrl_ppl.criticism import (
+    DEFAULT,
     UNEXPLAINED,
     Added,
     Candidate,
+    Criteria,
     Errors,
     Findings,
     Unexplained,
@@ -243,6 +245,7 @@ def close_loop(
     substeps: int | None = None,
     draws: int | None = None,
     method: str = "metropolis",
+    criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Loop:
     """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
@@ -265,6 +268,8 @@ def close_loop(
         Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
     method : str
         Of :func:`pbrl_ppl.fit`, for the posteriors; with ``laplace`` the verdict stands on modes.
+    criteria : Criteria
+        Thresholds of the decisions.
     progress : callable, optional
         Told the name of each stage.
 
@@ -306,6 +311,7 @@ def close_loop(
         substeps=substeps,
         draws=draws,
         method=method,
+        criteria=criteria,
         progress=progress,
     )
     return Loop(found, test, catalogue)

@@ -125,7 +125,12 @@ def residual_test_table(findings: Findings) -> Table:
         f"Tests of the {which} model's residual, on the recordings that it was fitted to",
         ("Test", "Result", "p", "Passed"),
         [
-            (test.name, test.sentence, chance(test.p_value), "yes" if test.passed else "no")
+            (
+                test.name,
+                test.sentence,
+                chance(test.p_value),
+                ("yes" if test.passed else "no") if test.tested else "not tested",
+            )
             for test in findings.tests
         ],
         words=(1, 3),

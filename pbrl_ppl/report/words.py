@@ -71,8 +71,10 @@ def verdict_in_words(findings: Findings) -> str:
 
 def _adequate(findings: Findings) -> str:
     """Say how adequate the model is: what passed, and which negligible misfit is significant."""
-    tests = len(findings.tests)
-    passed = f"the declared model passes all {tests} tests of its residual"
+    tested = sum(test.tested for test in findings.tests)
+    passed = f"the declared model passes all {tested} tests of its residual"
+    if untested := [test.name for test in findings.tests if not test.tested]:
+        passed += f" that these data can fail (not {joined(untested, 'nor')})"
     # beside what was added the table of candidates has them
     small = "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
