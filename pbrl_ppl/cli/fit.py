@@ -114,14 +114,14 @@ def fit(
         earlier = None if resume is None else load_posterior(resume)
         progress("looking for the mode, then sampling")
     # the sampler has a bar of its own
-    with interruptible(), warnings.catch_warnings(record=True) as caught:
+    with interruptible() as interrupts, warnings.catch_warnings(record=True) as caught:
         with redirect_stdout(sys.stderr):
             idata = sampling.fit(
                 model, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
                 resume=earlier, progress=not quiet,
             )  # fmt: skip
         save_posterior(idata, output)
-    cut = "interrupted" in idata.attrs
+    cut = bool(interrupts) or "interrupted" in idata.attrs
     for warning in caught:
         if not (cut and "was interrupted" in str(warning.message)):
             warnings.warn(warning.message, stacklevel=1)
@@ -133,10 +133,10 @@ def fit(
         print_table(None, ["parameter", *table.columns], _rows(table))
         typer.echo(f"posterior: {output}")
     if cut:
-        kept = int(group(idata, "posterior").sizes["draw"])
+        kept = group(idata, "posterior").sizes
         typer.echo(
-            f"interrupted; {kept} draws of each chain are kept in {output}; --resume {output} goes"
-            " on",
+            f"interrupted; {kept['draw']} draws of each of {kept['chain']} chains are kept in"
+            f" {output}; --resume {output} goes on",
             err=True,
         )
         raise typer.Exit(INTERRUPTED)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -110,12 +113,29 @@ def _how_far(spent: float, share: float) -> str:
 
 
 @contextmanager
-def interruptible(state: str = "nothing was written") -> Iterator[None]:
-    """Say what is left; results are renamed into place as the last thing."""
+def interruptible(state: str = "nothing was written") -> Iterator[list[int]]:
+    """Say what is left; results are renamed into place as the last thing.
+
+    Yields the interrupts so far: a sampler may end at one as if nothing had happened.
+    """
+    seen: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        seen.append(number)
+        signal.default_int_handler(number, frame)
+
+    # in the background interrupts are ignored, and stay so
+    own = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    own = own and threading.current_thread() is threading.main_thread()
+    if own:
+        signal.signal(signal.SIGINT, note)
     try:
-        yield
+        yield seen
     except KeyboardInterrupt:
         raise typer.Exit(interrupted(state)) from None
+    finally:
+        if own:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def interrupted(state: str = "nothing was written") -> int:

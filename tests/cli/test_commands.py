@@ -11,10 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import typer
 
-from pbrl_ppl import report, sampling
+from pbrl_ppl import criticism, report, sampling
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import COMMANDS, _options_of, app
 from pbrl_ppl.cli.scene_text import _HEAD
@@ -162,6 +163,36 @@ def test_three_commands_from_a_recording_to_criticism(capsys: pytest.CaptureFixt
     assert found["candidates"][0]["effect"] == "linear_drag"
     assert found["candidates"][0]["estimate"]["coefficient"] == pytest.approx(2.0, rel=0.2)
     assert found["mode"]["mass[puck]"] > 0
+
+
+@pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize(
+    "command", [["check", "--no-prior"], ["criticise"], ["close-loop"], ["fit"]]
+)
+def test_a_position_in_other_units_than_its_velocity_is_named(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the long work, which is not done here: it would come to an end with an error."""
+
+    def long_work(*args: Any, **options: Any) -> Any:
+        raise FitError("the long work")
+
+    for module, name in ((sampling, "fit"), (report, "close_loop"), (criticism, "criticise")):
+        monkeypatch.setattr(module, name, long_work)
+    name, *options = command
+    output = [] if name in ("check", "criticise") else ["-o", "out.nc"]
+    argv = [name, "scene.toml", "train.csv", *options, *output, "--quiet"]
+    main(argv)
+    assert "units" not in capsys.readouterr().err
+    frame = pd.read_csv("train.csv")
+    frame.assign(x=1000.0 * frame["x"]).to_csv("train.csv", index=False)
+    main(argv)
+    said = capsys.readouterr().err
+    assert said.startswith("warning: history train.csv: x of puck changes")
+    assert "x may be in mm; read it with --units x=mm\n" in said
+    if name == "check":
+        assert len(answer(capsys, *argv)["unit_mismatches"]) == 1
+        assert answer(capsys, *argv, "--units", "x=mm")["unit_mismatches"] == []
 
 
 def slowed(path: Path) -> None:
