@@ -319,17 +319,16 @@ def fit(
             return again(joined)
         trace = sampled(model, mode)
     # PyMC ends an interrupted run quietly, with fewer draws or with the chains that had most
-    if resume is not None:
-        chains = group(resume, "posterior").sizes["chain"]
     sizes = group(trace, "posterior").sizes
-    cut = sizes["draw"] < draws or sizes["chain"] < chains
+    all_chains = chains if resume is None else group(resume, "posterior").sizes["chain"]
+    cut = sizes["draw"] < draws or sizes["chain"] < all_chains
     if not cut and (joined := model_of_draws(problem, trace)):
         return again(joined)
     if resume is not None:
-        if sizes["chain"] < chains:
+        if sizes["chain"] < all_chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
         trace = appended(resume, trace)
-    asked = (draws, chains) if cut else None
+    asked = (draws, all_chains) if cut else None
     return complete(problem, trace, seed=seed, method=method, asked=asked)
 
 

@@ -1,10 +1,13 @@
 """The commands beside the loop: new, fit, criticise, simulate, doctor, and what all have alike."""
 
+import contextlib
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import time
 import tomllib
 import warnings
 from pathlib import Path
@@ -345,6 +348,55 @@ def test_an_interrupted_fit_gives_one_answer(
     said = capsys.readouterr().err
     assert said.count("interrupted") == 1 and "kept in puck.nc" in said
     assert "nothing was written" not in said and Path("puck.nc").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize("seconds", [0.5, 8.0])
+def test_an_interrupt_of_the_shell_ends_a_fit(seconds: float) -> None:
+    """Before and while chains run; the shell interrupts their processes too."""
+    code = "import sys; from pbrl_ppl.cli import main; sys.exit(main())"
+    argv = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "--transitions", "--draws", "100000"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *argv], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+        text=True, start_new_session=True, env=environment,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        assert any("then sampling" in line for line in process.stderr)
+        time.sleep(seconds)
+        os.killpg(process.pid, signal.SIGINT)
+        said = process.stderr.read()
+        assert process.wait(60) == 130
+    assert "Traceback" not in said and said.count("interrupted; ") == 1
+    assert ("kept in puck.nc" in said) == Path("puck.nc").exists()
+
+
+@pytest.mark.usefixtures("puck")
+def test_an_interrupt_that_a_sampler_swallowed_is_none_the_less_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It came when all chains were at their end."""
+    whole = sampling.fit
+
+    def swallowed(*args: Any, **options: Any) -> Any:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        return whole(*args, **options)
+
+    monkeypatch.setattr(sampling, "fit", swallowed)
+    fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "map"]
+    assert main(fit) == 130
+    assert "1 draws of each of 1 chains are kept in puck.nc" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("puck")
+def test_a_fit_without_convergence_exits_with_3() -> None:
+    """Of one draw there is no R-hat; a mode is one draw by definition."""
+    fit = ["fit", "scene.toml", "train.csv", "-q", "--overwrite", "-o", "puck.nc"]
+    assert main([*fit, "--method", "laplace", "--draws", "1"]) == 3
+    assert main([*fit, "--method", "map"]) == 0
 
 
 def test_doctor(capsys: pytest.CaptureFixture[str]) -> None:
