@@ -31,6 +31,7 @@ from pbrl_ppl.cli.terminal import (
     interruptible,
     stages,
     stated_noise,
+    with_substeps,
 )
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 
@@ -59,7 +60,8 @@ def fit(
         bool, typer.Option("--scalar-sigma", help="One sigma for all, with --transitions.")
     ] = False,
     nu: Annotated[
-        float | None, typer.Option(help="Degrees of freedom of Student-t noise; else Gaussian.")
+        float | None,
+        typer.Option(min=0.1, help="Degrees of freedom of Student-t noise; else Gaussian."),
     ] = None,
     noise: Errors = None,
     substeps: Substeps = None,
@@ -67,10 +69,14 @@ def fit(
         str,
         typer.Option(help="metropolis, paper, demetropolisz, smc, nuts, laplace or map."),
     ] = "metropolis",
-    draws: Annotated[int | None, typer.Option(min=1, help="Posterior draws of each chain.")] = None,
-    tune: Annotated[int | None, typer.Option(min=0, help="Tuning draws of each chain.")] = None,
-    chains: Annotated[int | None, typer.Option(min=1, help="Chains.")] = None,
-    thin: Annotated[int | None, typer.Option(min=1, help="Steps a draw.")] = None,
+    draws: Annotated[
+        int | None, typer.Option(min=1, max=1_000_000, help="Posterior draws of each chain.")
+    ] = None,
+    tune: Annotated[
+        int | None, typer.Option(min=0, max=1_000_000, help="Tuning draws of each chain.")
+    ] = None,
+    chains: Annotated[int | None, typer.Option(min=1, max=1000, help="Chains.")] = None,
+    thin: Annotated[int | None, typer.Option(min=1, max=10_000, help="Steps a draw.")] = None,
     resume: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Go on where this posterior's chains ended."),
@@ -98,7 +104,7 @@ def fit(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
             units=units, time_step=time_step,
         )  # fmt: skip
-        declared = stated_noise(declared, noise)
+        declared = with_substeps(stated_noise(declared, noise), substeps)
         progress("loading the sampler")
         os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report, sampling
@@ -108,7 +114,7 @@ def fit(
 
         check_history(declared, loaded, loaded.segments(1))
         model = _declared(
-            physics_model, declared, loaded, horizon=horizon, substeps=substeps, nu=nu,
+            physics_model, declared, loaded, horizon=horizon, nu=nu,
             sigma="scalar" if scalar else "per_dimension", trajectories=trajectories,
         )  # fmt: skip
         earlier = None if resume is None else load_posterior(resume)

@@ -80,6 +80,11 @@ def stated_noise(scene: Scene, given: list[str] | None) -> Scene:
     return scene.replace(noise=dict(scene.noise) | named_numbers(given, "--noise", "x=0.002"))
 
 
+def with_substeps(scene: Scene, substeps: int | None) -> Scene:
+    """The scene with engine steps from the option, if it was given."""
+    return scene if substeps is None else scene.replace(substeps=substeps)
+
+
 @contextmanager
 def stages(
     quiet: bool, shares: Mapping[str, float] | None = None

@@ -392,6 +392,25 @@ def test_an_interrupt_that_a_sampler_swallowed_is_none_the_less_one(
 
 
 @pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--substeps", "100000"], "substeps is 100000, expected at most 1280"),
+        (["--noise", "x=1e308"], "[noise]: x is 1e+308, expected at most 1e+09"),
+        (["--noise", "x=1e-300"], "[noise]: x is 1e-300, expected at least 1e-12"),
+        (["--time-step", "1e308"], "time_step is 1e+308, expected at most 1e+09"),
+    ],
+)
+@pytest.mark.parametrize("command", ["fit", "criticise", "close-loop"])
+def test_absurd_options_are_refused(
+    command: str, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = [] if command == "criticise" else ["-o", "out.nc"]
+    said = message(capsys, command, "scene.toml", "train.csv", *output, *options)
+    assert says in said and said.count("error") == 1
+
+
+@pytest.mark.usefixtures("puck")
 def test_a_fit_without_convergence_exits_with_3() -> None:
     """Of one draw there is no R-hat; a mode is one draw by definition."""
     fit = ["fit", "scene.toml", "train.csv", "-q", "--overwrite", "-o", "puck.nc"]
