@@ -27,7 +27,7 @@ from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model import physics_model
 from pbrl_ppl.model.table1 import table1
-from pbrl_ppl.posterior import load_posterior, record
+from pbrl_ppl.posterior import group, load_posterior, record
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.places import MODELS, ROOT
 
@@ -408,6 +408,23 @@ def test_absurd_options_are_refused(
     output = [] if command == "criticise" else ["-o", "out.nc"]
     said = message(capsys, command, "scene.toml", "train.csv", *output, *options)
     assert says in said and said.count("error") == 1
+
+
+@pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize("options", [[], ["--transitions"]])
+def test_the_command_fits_what_python_fits(options: list[str]) -> None:
+    """The defaults are alike but for one: the command takes whole trajectories."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "laplace"]
+        main([*fit, *options])
+        scene = Scene.load("scene.toml")
+        history = History.load("train.csv", scene)
+        model = physics_model(scene, history, trajectories=not options)
+        here = sampling.fit(model, seed=1, method="laplace", progress=False)
+    there = load_posterior("puck.nc")
+    for name, values in group(here, "posterior").items():
+        np.testing.assert_array_equal(values, group(there, "posterior")[name])
 
 
 @pytest.mark.usefixtures("puck")
