@@ -227,7 +227,7 @@ def _trouble(
     if rough is not None:
         yield ConvergenceWarning, rough
     if sizes["draw"] < _LEAST_DRAWS:
-        if idata.attrs["method"] != "map":  # a mode alone is one draw
+        if idata.attrs.get("method") != "map":  # a mode alone is one draw
             yield (
                 ConvergenceWarning,
                 f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
