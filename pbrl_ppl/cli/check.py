@@ -42,7 +42,10 @@ def check(
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
-    """Read a scene and a history: what is in them, what is missing, whether the prior fits."""
+    """Read a scene and a history: what is in them, what is missing, whether the prior fits.
+
+    Warns where a velocity and the changes of its position differ by the factor of a unit.
+    """
     with interruptible(), stages(quiet) as progress:
         declared, (loaded,) = load_own(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
@@ -50,7 +53,7 @@ def check(
         )  # fmt: skip
         import numpy as np
 
-        from pbrl_ppl.history import derived_velocities
+        from pbrl_ppl.history import derived_velocities, unit_mismatches
         from pbrl_ppl.physics import check_history
 
         check_history(declared, loaded, loaded.segments(1))
@@ -77,7 +80,8 @@ def check(
         found = checked and {"passed": not checked.sentences, "sentences": checked.summary}
         numbers = {"trajectories": loaded.n_trajectories, "transitions": loaded.n_transitions}
         cells = {"missing": missing, "computed": names}
-        print_json(contents | numbers | cells | {"prior": found})
+        units_differ = {"unit_mismatches": unit_mismatches(loaded)}
+        print_json(contents | numbers | cells | units_differ | {"prior": found})
 
 
 def _contents(scene: Scene, history: History) -> dict[str, Any]:

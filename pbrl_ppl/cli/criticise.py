@@ -20,6 +20,7 @@ from pbrl_ppl.cli.terminal import (
     interruptible,
     stages,
     stated_noise,
+    with_substeps,
 )
 
 if TYPE_CHECKING:
@@ -50,15 +51,13 @@ def criticise(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
             units=units, time_step=time_step,
         )  # fmt: skip
-        declared = stated_noise(declared, noise)
+        declared = with_substeps(stated_noise(declared, noise), substeps)
         progress("loading the model")
         from pbrl_ppl import criticism
         from pbrl_ppl.physics import check_history
 
         check_history(declared, loaded, loaded.segments(1))
-        found = criticism.criticise(
-            declared, loaded, seed=seed, substeps=substeps, progress=progress
-        )
+        found = criticism.criticise(declared, loaded, seed=seed, progress=progress)
     if as_json:
         print_json(
             {

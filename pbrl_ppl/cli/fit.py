@@ -31,6 +31,7 @@ from pbrl_ppl.cli.terminal import (
     interruptible,
     stages,
     stated_noise,
+    with_substeps,
 )
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 
@@ -59,7 +60,8 @@ def fit(
         bool, typer.Option("--scalar-sigma", help="One sigma for all, with --transitions.")
     ] = False,
     nu: Annotated[
-        float | None, typer.Option(help="Degrees of freedom of Student-t noise; else Gaussian.")
+        float | None,
+        typer.Option(min=0.1, help="Degrees of freedom of Student-t noise; else Gaussian."),
     ] = None,
     noise: Errors = None,
     substeps: Substeps = None,
@@ -67,10 +69,14 @@ def fit(
         str,
         typer.Option(help="metropolis, paper, demetropolisz, smc, nuts, laplace or map."),
     ] = "metropolis",
-    draws: Annotated[int | None, typer.Option(min=1, help="Posterior draws of each chain.")] = None,
-    tune: Annotated[int | None, typer.Option(min=0, help="Tuning draws of each chain.")] = None,
-    chains: Annotated[int | None, typer.Option(min=1, help="Chains.")] = None,
-    thin: Annotated[int | None, typer.Option(min=1, help="Steps a draw.")] = None,
+    draws: Annotated[
+        int | None, typer.Option(min=1, max=1_000_000, help="Posterior draws of each chain.")
+    ] = None,
+    tune: Annotated[
+        int | None, typer.Option(min=0, max=1_000_000, help="Tuning draws of each chain.")
+    ] = None,
+    chains: Annotated[int | None, typer.Option(min=1, max=1000, help="Chains.")] = None,
+    thin: Annotated[int | None, typer.Option(min=1, max=10_000, help="Steps a draw.")] = None,
     resume: Annotated[
         Path | None,
         typer.Option(metavar="FILE", help="Go on where this posterior's chains ended."),
@@ -98,7 +104,7 @@ def fit(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
             units=units, time_step=time_step,
         )  # fmt: skip
-        declared = stated_noise(declared, noise)
+        declared = with_substeps(stated_noise(declared, noise), substeps)
         progress("loading the sampler")
         os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report, sampling
@@ -109,19 +115,19 @@ def fit(
         earlier = None if resume is None else load_posterior(resume)
         progress("looking for the mode, then sampling")
         model = _declared(
-            sampling.physics_model, declared, loaded, horizon=horizon, substeps=substeps, nu=nu,
+            sampling.physics_model, declared, loaded, horizon=horizon, nu=nu,
             sigma="scalar" if scalar else "per_dimension", trajectories=trajectories,
             around=earlier if trajectories else None, seed=seed,
         )  # fmt: skip
     # the sampler has a bar of its own
-    with interruptible(), warnings.catch_warnings(record=True) as caught:
+    with interruptible() as interrupts, warnings.catch_warnings(record=True) as caught:
         with redirect_stdout(sys.stderr):
             idata = sampling.fit(
                 model, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
                 resume=earlier, progress=not quiet,
             )  # fmt: skip
         save_posterior(idata, output)
-    cut = "interrupted" in idata.attrs
+    cut = bool(interrupts) or "interrupted" in idata.attrs
     for warning in caught:
         if not (cut and "was interrupted" in str(warning.message)):
             warnings.warn(warning.message, stacklevel=1)
@@ -133,10 +139,10 @@ def fit(
         print_table(None, ["parameter", *table.columns], _rows(table))
         typer.echo(f"posterior: {output}")
     if cut:
-        kept = int(group(idata, "posterior").sizes["draw"])
+        kept = group(idata, "posterior").sizes
         typer.echo(
-            f"interrupted; {kept} draws of each chain are kept in {output}; --resume {output} goes"
-            " on",
+            f"interrupted; {kept['draw']} draws of each of {kept['chain']} chains are kept in"
+            f" {output}; --resume {output} goes on",
             err=True,
         )
         raise typer.Exit(INTERRUPTED)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -80,16 +81,19 @@ def load_own(
     units: list[str] | None = None,
     time_step: float | None = None,
 ) -> tuple[Scene, list[History]]:
-    """Read a scene, with another time step if given, and histories of it."""
+    """Read a scene, with another time step if given, and histories of it.
+
+    Warns where velocities and changes of positions differ by the factor of a unit.
+    """
     from pbrl_ppl.scene import Scene
 
     names, measures = columns_of(columns or []), units_of(units or [])
     declared = Scene.load(scene)  # its errors come before pandas is loaded
     if time_step is not None:
         declared = declared.replace(time_step=time_step)
-    from pbrl_ppl.history import History
+    from pbrl_ppl.history import History, unit_mismatches
 
-    return declared, [
+    loaded = [
         History.load(
             path,
             declared,
@@ -100,3 +104,7 @@ def load_own(
         )
         for path in histories
     ]
+    for path, history in zip(histories, loaded, strict=True):
+        for sentence in unit_mismatches(history):
+            warnings.warn(f"history {path}: {sentence}", stacklevel=2)
+    return declared, loaded

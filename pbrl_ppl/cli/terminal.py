@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import re
+import signal
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -78,6 +81,11 @@ def stated_noise(scene: Scene, given: list[str] | None) -> Scene:
     return scene.replace(noise=dict(scene.noise) | named_numbers(given, "--noise", "x=0.002"))
 
 
+def with_substeps(scene: Scene, substeps: int | None) -> Scene:
+    """The scene with engine steps from the option, if it was given."""
+    return scene if substeps is None else scene.replace(substeps=substeps)
+
+
 @contextmanager
 def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
     """Show stages on stderr with the time elapsed: on a terminal the present one runs on."""
@@ -108,12 +116,29 @@ class Stage:
 
 
 @contextmanager
-def interruptible(state: str = "nothing was written") -> Iterator[None]:
-    """Turn an interrupt into its exit code; results are renamed into place as the last thing."""
+def interruptible(state: str = "nothing was written") -> Iterator[list[int]]:
+    """Say what is left; results are renamed into place as the last thing.
+
+    Yields the interrupts so far: a sampler may end at one as if nothing had happened.
+    """
+    seen: list[int] = []
+
+    def note(number: int, frame: FrameType | None) -> None:
+        seen.append(number)
+        signal.default_int_handler(number, frame)
+
+    # in the background interrupts are ignored, and stay so
+    own = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    own = own and threading.current_thread() is threading.main_thread()
+    if own:
+        signal.signal(signal.SIGINT, note)
     try:
-        yield
+        yield seen
     except KeyboardInterrupt:
         raise typer.Exit(interrupted(state)) from None
+    finally:
+        if own:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def interrupted(state: str = "nothing was written") -> int:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -63,15 +63,23 @@ def update(
         progress("updating")
         from pbrl_ppl.sampling import updating
 
-        with warnings.catch_warnings(record=True) as caught:
+        caught: list[type[Warning]] = []
+        with warnings.catch_warnings():
+            show = warnings.showwarning
+
+            def shown(
+                message: Warning | str, category: type[Warning], *place: Any, **more: Any
+            ) -> None:
+                caught.append(category)
+                show(message, category, *place, **more)  # at once: a refit takes long
+
+            warnings.showwarning = shown
             idata = updating.update(idata, new, seed=seed, progress=False)
         if "interrupted" in idata.attrs:  # half a posterior is no ground for the next update
             raise KeyboardInterrupt
-        for warning in caught:
-            warnings.warn(warning.message, stacklevel=1)
         save_posterior(idata, output)
         (*_, last) = json.loads(idata.attrs["updates"])
-    converged = not any(issubclass(warning.category, ConvergenceWarning) for warning in caught)
+    converged = not any(issubclass(category, ConvergenceWarning) for category in caught)
     if as_json:
         print_json(last | {"posterior": output, "converged": converged})
     else:

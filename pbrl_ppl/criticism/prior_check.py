@@ -35,6 +35,10 @@ _FEWEST = 50
 #: Changes so many times the errors of measuring say something of the parameters.
 _WELL_BEYOND = 5.0
 _CHUNK = 16
+#: Factors of wrong units: m and mm or N and mN; degrees; kg for the weight of a kg.
+_UNITS = {1000.0: "1000", 180 / np.pi: "57.3", 9.81: "9.81"}
+#: How far beyond the range of the prior's factors one of these may be.
+_NEAR = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +57,8 @@ class PriorCheck:
         - ``share_inside`` (body, state): share of the measured cells inside the central 94 % of
           their own predictions;
         - ``share_beyond`` (body, state): share that lies beyond all of them;
+        - ``factor`` (body, state, quantile): how many times as large measured changes are as
+          predicted ones without noise, by least squares for each draw, over the draws;
         - ``cells`` (body, state): how many were measured.
     seconds : float
         Length of a segment (s).
@@ -80,12 +86,14 @@ class PriorCheck:
                 chance = binom.sf(round(share * cells) - 1, cells, 2 / (self.draws + 1))
                 if chance > _BY_CHANCE:
                     continue
+                # a position changes mostly by the velocity before, which is in the same units
+                factor = "" if str(state) in POSE else _unit(changes["factor"])
                 found.append(
                     f"{state} of {body} changes by up to {float(changes['measured_largest']):.3g}"
                     f" {unit} in {self.seconds:g} s; under the prior 94 % of changes are within"
                     f" {float(changes['predicted_extent']):.3g} {unit}, and {100 * share:.0f} % of"
                     f" the measured ones lie beyond all of {self.draws} draws from it: check units,"
-                    " of commands too, or the prior's hyper-parameters"
+                    f" of commands too, or the prior's hyper-parameters{factor}"
                 )
         if self.diverged > 0.1 * self.draws:
             found.append(
@@ -175,14 +183,15 @@ def prior_predictive_check(
             f"prior check: the engine diverged on {len(good) - good.sum()} of {len(good)} draws"
             " from the prior; narrow the prior's hyper-parameters, or use more substeps"
         )
-    ends = ends[good] + noise * rng.standard_normal(ends[good].shape)
-    predicted = observations.wrapped(ends - first)
+    exact = observations.wrapped(ends[good] - first)
+    predicted = ends[good] + noise * rng.standard_normal(exact.shape)
     derived = np.ones(measured.shape[1:])
     for i, d in enumerate(columns):
         rate = d if d >= len(POSE) else d + len(POSE)
         seen = np.isfinite(problem.data.history.dataset["observed"].to_numpy()[..., rate])
         derived[:, i] = ~seen.any(axis=(0, 1))
-    dataset = _compare(predicted, measured, _SLACK * derived)
+    dataset = _compare(observations.wrapped(predicted - first), measured, _SLACK * derived)
+    dataset = dataset.merge(_factors(exact, measured))
     coords = {
         "body": [body.name for body in problem.scene.moving],
         "state": list(observations.names),
@@ -193,6 +202,36 @@ def prior_predictive_check(
         problem.data.horizon * problem.scene.time_step,
         draws,
         int(draws - good.sum()),
+    )
+
+
+def _factors(exact: Array, measured: Array) -> xr.Dataset:
+    """How many times as large measured changes (transition, body, state) are as each draw's."""
+    seen = np.where(np.isfinite(measured), exact, 0.0)
+    square = (seen**2).sum(axis=1)
+    product = (seen * np.nan_to_num(measured)).sum(axis=1)
+    factor = np.divide(product, square, out=np.full_like(square, np.nan), where=square > 0)
+    some = np.isfinite(factor).any(axis=0)
+    quantiles = np.nanquantile(np.where(some, factor, 0.0), QUANTILES, axis=0)
+    quantiles = np.where(some, quantiles, np.nan)
+    return xr.Dataset({"factor": (("quantile", "body", "state"), quantiles)})
+
+
+def _unit(factor: xr.DataArray) -> str:
+    """What a factor between measured and predicted changes suggests, if it is near a unit's."""
+    low, middle, high = (float(factor[i]) for i in (0, len(QUANTILES) // 2, -1))
+    if not low > 0:  # nothing was predicted, or motion the other way
+        return ""
+    over, size = ("", middle) if middle > 1 else ("1/", 1 / middle)
+    if middle <= 1:
+        low, high = 1 / high, 1 / low
+    near = [each for each in _UNITS if low / _NEAR < each < high * _NEAR]
+    if low / _NEAR < 1 or not near:
+        return ""
+    best = min(near, key=lambda each: abs(np.log(each / size)))
+    return (
+        f" (the changes are about {middle:.2g} times those of the prior's middle, a factor near"
+        f" {over}{_UNITS[best]}: units?)"
     )
 
 

@@ -8,6 +8,7 @@ from pbrl_ppl.history.mujoco import from_mujoco
 from pbrl_ppl.history.reading import Reading, as_history
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
 from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
+from pbrl_ppl.history.unit_check import unit_mismatches
 
 __all__ = [
     "History",
@@ -24,6 +25,7 @@ __all__ = [
     "measured_alone",
     "read_table",
     "segment_rows",
+    "unit_mismatches",
     "unseen",
     "write_atomically",
 ]

@@ -48,7 +48,12 @@ _STUCK, _NEAR = 0.5, 0.01
 
 
 def complete(
-    problem: Problem, trace: Any, *, seed: int, method: str, asked: int | None = None
+    problem: Problem,
+    trace: Any,
+    *,
+    seed: int,
+    method: str,
+    asked: tuple[int, int] | None = None,
 ) -> Any:
     """Add to a trace what the posterior file must hold: likelihood, predictions, prior, origin.
 
@@ -62,8 +67,8 @@ def complete(
         Of the draws and of the predictions.
     method : str
         The sampler's name.
-    asked : int, optional
-        Draws a chain that were asked for, where an interrupt left fewer.
+    asked : tuple of int, optional
+        Draws a chain, and chains, that were asked for, where an interrupt left fewer.
 
     Returns
     -------
@@ -199,7 +204,7 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     return posterior
 
 
-def checked(problem: Problem, idata: Any, asked: int | None = None) -> Any:
+def checked(problem: Problem, idata: Any, asked: tuple[int, int] | None = None) -> Any:
     """Store a posterior's warnings, and issue them."""
     found = list(_trouble(problem, idata, asked))
     idata.attrs["warnings"] = json.dumps([message for _, message in found])
@@ -209,7 +214,7 @@ def checked(problem: Problem, idata: Any, asked: int | None = None) -> Any:
 
 
 def _trouble(
-    problem: Problem, idata: Any, asked: int | None
+    problem: Problem, idata: Any, asked: tuple[int, int] | None
 ) -> Iterator[tuple[type[Warning], str]]:
     """Category and message of each warning, with the cure."""
     on = "go on with resume= this posterior"
@@ -227,13 +232,19 @@ def _trouble(
         idata.attrs["interrupted"] = 1
         yield (
             ConvergenceWarning,
-            f"sampling was interrupted after {sizes['draw']} of {asked} draws a chain, which are"
-            f" kept; for more, {on}",
+            f"sampling was interrupted after {sizes['draw']} of {asked[0]} draws in"
+            f" {sizes['chain']} of {asked[1]} chains, which are kept; for more, {on}",
         )
     rough = doubts(idata)
     if rough is not None:
         yield ConvergenceWarning, rough
-    if sizes["draw"] < _LEAST_DRAWS:  # a mode alone
+    if sizes["draw"] < _LEAST_DRAWS:
+        if idata.attrs.get("method") != "map":  # a mode alone is one draw
+            yield (
+                ConvergenceWarning,
+                f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
+                f" {_LEAST_DRAWS}), so whether the chains have converged is not known; {more}",
+            )
         return
     r_hat, ess = convergence(idata)
     worst_hat, worst_ess = max(r_hat, key=lambda k: r_hat[k]), min(ess, key=lambda k: ess[k])

@@ -324,13 +324,17 @@ def fit(
         if joined := joined_model(problem, mode.phi[None], mode.sigma[None]):
             return again(joined)
         trace = sampled(model, mode)
-    done = group(trace, "posterior").sizes["draw"]
-    if done == draws and (joined := model_of_draws(problem, trace)):
+    # PyMC ends an interrupted run quietly, with fewer draws or with the chains that had most
+    sizes = group(trace, "posterior").sizes
+    all_chains = chains if resume is None else group(resume, "posterior").sizes["chain"]
+    cut = sizes["draw"] < draws or sizes["chain"] < all_chains
+    if not cut and (joined := model_of_draws(problem, trace)):
         return again(joined)
     if resume is not None:
+        if sizes["chain"] < all_chains:
+            raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
         trace = appended(resume, trace)
-    # PyMC ends an interrupted run quietly, with the draws so far
-    asked = draws if done < draws else None
+    asked = (draws, all_chains) if cut else None
     return complete(problem, trace, seed=seed, method=method, asked=asked)
 
 

@@ -68,9 +68,9 @@ def mix(
     for i in wanted[np.argsort(-probability[wanted])]:
         mode = found[i].mode
         traces[i] = sample(build_model(mode.problem), mode)
-        done = group(traces[i], "posterior").sizes["draw"]
-        if done < draws and len(traces) < len(wanted):
-            raise KeyboardInterrupt  # PyMC ended quietly, and others have no draws at all
+        done = group(traces[i], "posterior").sizes
+        if done["chain"] < chains or (done["draw"] < draws and len(traces) < len(wanted)):
+            raise KeyboardInterrupt  # PyMC ended quietly, and some have no draws at all
     draws = min(group(trace, "posterior").sizes["draw"] for trace in traces.values())
     fitted = np.isin(np.arange(len(found)), list(traces))
     counts = allocate(np.where(fitted, probability, 0.0), chains * draws)

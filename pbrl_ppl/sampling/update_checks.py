@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
+from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, derived_velocities, measured_alone
@@ -21,6 +22,9 @@ _LEAST_DRAWS = 100
 _SAME = 0.01
 #: Of how many transitions, one draw each.
 _CHECKED = 50
+#: Standard errors by which new transitions are less probable than the posterior's own, at least,
+#: to be predicted worse.
+_WORSE = 3.0
 _GROUPS = ("posterior_predictive", "observed_data", "constant_data")
 
 
@@ -120,3 +124,21 @@ def more_noise(problem: Problem, data: Mapping[str, xr.Dataset]) -> list[str]:
         for dimension in dimensions
         if dimension not in own.get(name, ())
     ]
+
+
+def judgement(held: NDArray[np.float64], new: NDArray[np.float64]) -> str:
+    """Say whether new transitions may be of the same bodies as those that the posterior is of.
+
+    Parameters
+    ----------
+    held, new : ndarray
+        Log-likelihoods of transitions, shape (..., transition), the draws first.
+    """
+    own, others = (each.reshape(-1, each.shape[-1]).mean(axis=0) for each in (held, new))
+    error = float(np.sqrt(own.var() / len(own) + others.var() / len(others)))
+    if not float(own.mean() - others.mean()) < _WORSE * error:
+        return "look whether they are of the same bodies, under the same conditions"
+    return (
+        "the posterior predicts them as well as its own data, so they may well be of the same"
+        " bodies: it is narrower than all of the data allow"
+    )

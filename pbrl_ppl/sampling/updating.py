@@ -6,6 +6,7 @@ import hashlib
 import json
 import warnings
 from collections.abc import Iterable, Mapping
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,7 @@ from pbrl_ppl.sampling.update_checks import (
     check_engine,
     check_history,
     checked_log,
+    judgement,
     more_noise,
 )
 
@@ -136,9 +138,13 @@ def update(
     check_history(idata, history)
     problem = problem_of(idata, effects, history)
     check_engine(idata, problem)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        result, how = _updated(idata, problem, effects, seed, progress)
+    result: Any = partial(_updated, idata, problem, effects, seed, progress)
+    while callable(result):  # a refit comes after the warning of it
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            result, how = result()
+        for warning in caught:  # they are the caller's
+            warnings.warn(warning.message, stacklevel=2)
     entry = {
         "transitions": problem.segments.n,
         "data_sha256": history.data_sha256,
@@ -149,15 +155,13 @@ def update(
     chained = f"{idata.attrs['data_sha256']}{history.data_sha256}"
     result.attrs["updates"] = json.dumps([*done, entry])
     result.attrs["data_sha256"] = hashlib.sha256(chained.encode()).hexdigest()
-    for warning in caught:  # they are the caller's
-        warnings.warn(warning.message, stacklevel=2)
     return result
 
 
 def _updated(
     idata: Any, problem: Problem, effects: tuple[Effect, ...], seed: int, progress: bool
 ) -> tuple[Any, dict[str, Any]]:
-    """The posterior with the problem's transitions, and what was done."""
+    """The posterior with the problem's transitions, or what fits it anew, and what was done."""
     rng = np.random.default_rng(seed)
     base = _base(idata, problem)
     names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
@@ -167,6 +171,7 @@ def _updated(
     together = {"together": json.dumps(list(problem.physics.together))}
     likelihood, predictive = evaluate(problem, phi, sigma, rows, rng)
     data = _with_data(idata, problem)
+    held_likelihood = base["log_likelihood"].to_numpy()
     base = _with_new(base, likelihood, predictive).assign_coords(data["observed_data"].coords)
     log_weights = base["log_weight"].to_numpy().ravel()
     weights, share, k = np.zeros(len(log_weights)), 0.0, np.inf
@@ -193,14 +198,18 @@ def _updated(
             why = f"the new data have noise that the posterior lacks ({', '.join(louder)}), so"
             whole = along_trajectories(single_transitions(whole), np.median(phi, axis=0))
         warnings.warn(
-            f"update: {why} that all of them are"
-            " fitted anew; look whether they are of the same bodies, under the same conditions",
+            f"update: {why} that all of them are fitted anew, which takes as long as a fit;"
+            f" {judgement(held_likelihood, likelihood)}",
             RefitWarning,
             stacklevel=2,
         )
-        chains = base.sizes["chain"]
-        result = fit(build_model(whole), seed=seed, chains=chains, progress=progress)
-        return placed(result, base.coords), how | {"did": "refitted"}
+
+        def refit() -> tuple[Any, dict[str, Any]]:
+            chains = base.sizes["chain"]
+            result = fit(build_model(whole), seed=seed, chains=chains, progress=progress)
+            return placed(result, base.coords), how | {"did": "refitted"}
+
+        return refit, how
     draws = min(base.sizes["draw"], -(-_WALKERS // base.sizes["chain"]))
     chosen = _systematic(weights, base.sizes["chain"] * draws, rng)
     phi, sigma, accepted = rejuvenate(whole, phi[chosen], sigma[chosen], rng)

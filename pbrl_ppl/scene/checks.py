@@ -20,6 +20,10 @@ PARAMETER_NAMES = ("mass", "r", "mu_c", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
 CONTACT_NAMES = ("r", "mu_c")
 """Those of them that a contact needs: all that a kinematic body has."""
 
+LARGEST, SMALLEST = 1e9, 1e-12
+"""No number of a scene or a recording is larger, and no positive one of a scene smaller, in SI
+units: their products, such as inertias, stay far from where floating-point numbers end."""
+
 HYPER_NAMES = ("mu", "sigma", "kappa")
 INDEX_NAMES = ("i_a", "i_b")
 """The indices of a joint of unknown bodies."""
@@ -42,7 +46,7 @@ def located(where: str) -> Iterator[None]:
 
 
 def finite(value: object, where: str) -> float:
-    """Return a finite number as a float."""
+    """Return a finite number, of at most `LARGEST`, as a float."""
     if isinstance(value, bool) or not isinstance(value, Real):
         raise SceneError(f"{where} is {value!r}, expected a number")
     try:
@@ -51,14 +55,24 @@ def finite(value: object, where: str) -> float:
         number = math.inf
     if not math.isfinite(number):
         raise SceneError(f"{where} is {number}, expected a finite number")
+    if abs(number) > LARGEST:
+        raise SceneError(
+            f"{where} is {number:g}, expected at most {LARGEST:g} in SI units; check the number and"
+            " its unit"
+        )
     return number
 
 
 def positive(value: object, where: str) -> float:
-    """Return a number above zero as a float."""
+    """Return a number above zero, of at least `SMALLEST`, as a float."""
     number = finite(value, where)
     if number <= 0:
         raise SceneError(f"{where} is {number}, expected more than 0")
+    if number < SMALLEST:
+        raise SceneError(
+            f"{where} is {number:g}, expected at least {SMALLEST:g} in SI units; check the number"
+            " and its unit"
+        )
     return number
 
 

@@ -31,8 +31,8 @@ from pbrl_ppl.scene.shape import Shape
 
 __all__ = ["PARAMETER_NAMES", "WORLD", "Body", "Joint", "Point", "Scene", "Shape", "Wall"]
 
-#: Engine steps a sample, at most: more take longer than anyone waits, for no gain.
-MOST_SUBSTEPS = 10_000
+#: Engine steps a sample, at most: twice what `close_loop` goes to where data are that exact.
+MOST_SUBSTEPS = 1280
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,8 +96,8 @@ class Scene:
             raise SceneError(f"[world]: substeps is {steps!r}, expected a whole number from 1 up")
         if steps > MOST_SUBSTEPS:
             raise SceneError(
-                f"[world]: substeps is {steps}, expected at most {MOST_SUBSTEPS}; a shorter"
-                " time_step, or fewer of them"
+                f"[world]: substeps is {steps}, expected at most {MOST_SUBSTEPS}: more change no"
+                " prediction and take long; use fewer, or record with a shorter time_step"
             )
         object.__setattr__(self, "substeps", int(steps))
         if not isinstance(self.test_is_later, bool):

@@ -163,7 +163,7 @@ def test_absurd_numbers_are_refused_at_once(capsys: pytest.CaptureFixture[str]) 
     assert "history row 4: x is 1e+300" in fails(capsys, "check", "scene.toml", "train.csv")
     Path("train.csv").write_text(text)
     argv = ("close-loop", "scene.toml", "train.csv", "-o", "out", "--substeps", "100000000")
-    assert "expected at most 10000" in fails(capsys, *argv)
+    assert "expected at most 1280" in fails(capsys, *argv)
 
 
 @pytest.mark.usefixtures("files")

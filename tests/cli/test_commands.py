@@ -1,20 +1,24 @@
 """The commands beside the loop: new, fit, criticise, simulate, doctor, and what all have alike."""
 
+import contextlib
 import json
 import os
 import shlex
+import signal
 import subprocess
 import sys
+import time
 import tomllib
 import warnings
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import typer
 
-from pbrl_ppl import report, sampling
+from pbrl_ppl import criticism, report, sampling
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import COMMANDS, _options_of, app
 from pbrl_ppl.cli.scene_text import _HEAD
@@ -22,7 +26,7 @@ from pbrl_ppl.cli.terminal import warnings_in_a_line
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.model.table1 import table1
-from pbrl_ppl.posterior import load_posterior, record
+from pbrl_ppl.posterior import group, load_posterior, record
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.places import MODELS, ROOT
@@ -162,6 +166,36 @@ def test_three_commands_from_a_recording_to_criticism(capsys: pytest.CaptureFixt
     assert found["candidates"][0]["effect"] == "linear_drag"
     assert found["candidates"][0]["estimate"]["coefficient"] == pytest.approx(2.0, rel=0.2)
     assert found["mode"]["mass[puck]"] > 0
+
+
+@pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize(
+    "command", [["check", "--no-prior"], ["criticise"], ["close-loop"], ["fit"]]
+)
+def test_a_position_in_other_units_than_its_velocity_is_named(
+    command: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Before the long work, which is not done here: it would come to an end with an error."""
+
+    def long_work(*args: Any, **options: Any) -> Any:
+        raise FitError("the long work")
+
+    for module, name in ((sampling, "fit"), (report, "close_loop"), (criticism, "criticise")):
+        monkeypatch.setattr(module, name, long_work)
+    name, *options = command
+    output = [] if name in ("check", "criticise") else ["-o", "out.nc"]
+    argv = [name, "scene.toml", "train.csv", *options, *output, "--quiet"]
+    main(argv)
+    assert "units" not in capsys.readouterr().err
+    frame = pd.read_csv("train.csv")
+    frame.assign(x=1000.0 * frame["x"]).to_csv("train.csv", index=False)
+    main(argv)
+    said = capsys.readouterr().err
+    assert said.startswith("warning: history train.csv: x of puck changes")
+    assert "x may be in mm; read it with --units x=mm\n" in said
+    if name == "check":
+        assert len(answer(capsys, *argv)["unit_mismatches"]) == 1
+        assert answer(capsys, *argv, "--units", "x=mm")["unit_mismatches"] == []
 
 
 def slowed(path: Path) -> None:
@@ -314,6 +348,91 @@ def test_an_interrupted_fit_gives_one_answer(
     said = capsys.readouterr().err
     assert said.count("interrupted") == 1 and "kept in puck.nc" in said
     assert "nothing was written" not in said and Path("puck.nc").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize("seconds", [0.5, 8.0])
+def test_an_interrupt_of_the_shell_ends_a_fit(seconds: float) -> None:
+    """Before and while chains run; the shell interrupts their processes too."""
+    code = "import sys; from pbrl_ppl.cli import main; sys.exit(main())"
+    argv = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "--transitions", "--draws", "100000"]
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *argv], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+        text=True, start_new_session=True, env=environment,
+    ) as process:  # fmt: skip
+        assert process.stderr is not None
+        assert any("then sampling" in line for line in process.stderr)
+        time.sleep(seconds)
+        os.killpg(process.pid, signal.SIGINT)
+        said = process.stderr.read()
+        assert process.wait(60) == 130
+    assert "Traceback" not in said and said.count("interrupted; ") == 1
+    assert ("kept in puck.nc" in said) == Path("puck.nc").exists()
+
+
+@pytest.mark.usefixtures("puck")
+def test_an_interrupt_that_a_sampler_swallowed_is_none_the_less_one(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It came when all chains were at their end."""
+    whole = sampling.fit
+
+    def swallowed(*args: Any, **options: Any) -> Any:
+        with contextlib.suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        return whole(*args, **options)
+
+    monkeypatch.setattr(sampling, "fit", swallowed)
+    fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "map"]
+    assert main(fit) == 130
+    assert "1 draws of each of 1 chains are kept in puck.nc" in capsys.readouterr().err
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+@pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (["--substeps", "100000"], "substeps is 100000, expected at most 1280"),
+        (["--noise", "x=1e308"], "[noise]: x is 1e+308, expected at most 1e+09"),
+        (["--noise", "x=1e-300"], "[noise]: x is 1e-300, expected at least 1e-12"),
+        (["--time-step", "1e308"], "time_step is 1e+308, expected at most 1e+09"),
+    ],
+)
+@pytest.mark.parametrize("command", ["fit", "criticise", "close-loop"])
+def test_absurd_options_are_refused(
+    command: str, options: list[str], says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = [] if command == "criticise" else ["-o", "out.nc"]
+    said = message(capsys, command, "scene.toml", "train.csv", *output, *options)
+    assert says in said and said.count("error") == 1
+
+
+@pytest.mark.usefixtures("puck")
+@pytest.mark.parametrize("options", [[], ["--transitions"]])
+def test_the_command_fits_what_python_fits(options: list[str]) -> None:
+    """The defaults are alike but for one: the command takes whole trajectories."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        fit = ["fit", "scene.toml", "train.csv", "-o", "puck.nc", "-q", "--method", "laplace"]
+        main([*fit, *options])
+        scene = Scene.load("scene.toml")
+        history = History.load("train.csv", scene)
+        model = physics_model(scene, history, trajectories=not options)
+        here = sampling.fit(model, seed=1, method="laplace", progress=False)
+    there = load_posterior("puck.nc")
+    for name, values in group(here, "posterior").items():
+        np.testing.assert_array_equal(values, group(there, "posterior")[name])
+
+
+@pytest.mark.usefixtures("puck")
+def test_a_fit_without_convergence_exits_with_3() -> None:
+    """Of one draw there is no R-hat; a mode is one draw by definition."""
+    fit = ["fit", "scene.toml", "train.csv", "-q", "--overwrite", "-o", "puck.nc"]
+    assert main([*fit, "--method", "laplace", "--draws", "1"]) == 3
+    assert main([*fit, "--method", "map"]) == 0
 
 
 def test_doctor(capsys: pytest.CaptureFixture[str]) -> None:

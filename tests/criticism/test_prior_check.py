@@ -102,6 +102,45 @@ def test_a_mass_wrong_by_a_thousand_is_named(scene, history, factor) -> None:
     assert {"vx", "vy"} <= named(check(factor * CART["mass"]))
 
 
+@pytest.mark.parametrize(
+    ("columns", "factor", "near"),
+    [
+        (["x", "y", "vx", "vy"], 1000.0, "a factor near 1000: units?"),
+        (["force_x", "force_y"], 1000.0, "a factor near 1/1000: units?"),
+        (["force_x", "force_y", "torque"], 1 / 9.81, "a factor near 9.81: units?"),
+        (["force_x", "force_y", "torque"], 9.81, "a factor near 1/9.81: units?"),
+        (["theta", "omega"], 180 / np.pi, "a factor near 57.3: units?"),
+    ],
+)
+def test_a_factor_of_units_is_named(columns, factor, near) -> None:
+    """Of a puck whose mass is about known: noise's prior, scaled by the data, hides no factor."""
+    prior = {"mass": {"mu": 0.0, "sigma": 0.3}}
+    scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1), prior=prior),))
+    truth = {"mass": 1.0, "r": 0.2, "mu_c": 0.3}
+    history = simulated_history(
+        scene, truth, seed=2, trajectories=6, intervals=12, wrench_sd=(2.0, 2.0, 0.02)
+    )
+
+    def said(history):
+        model = physics_model(scene, history, horizon=telling_horizon(history))
+        return prior_predictive_check(model, draws=100).sentences
+
+    assert said(history) == ()
+    named = [
+        sentence for sentence in said(scaled(history, scene, columns, factor)) if "?" in sentence
+    ]
+    assert named
+    assert all(near in sentence for sentence in named), named
+
+
+def test_a_prior_wrong_by_a_factor_of_no_unit_is_none_of_units(scene, history) -> None:
+    prior = {"mass": {"mu": float(np.log(CART["mass"] / 150.0)), "sigma": 0.1}}
+    body = dataclasses.replace(scene.bodies[0], prior=prior)
+    check = prior_predictive_check(physics_model(scene.replace(bodies=(body,)), history))
+    assert check.sentences
+    assert not any("factor" in sentence for sentence in check.sentences)
+
+
 def test_one_of_few_changes_may_lie_beyond_all_draws(scene, history) -> None:
     """By chance one of six does in every ninth recording; three do if the units are wrong."""
     check = prior_predictive_check(physics_model(scene, history), draws=100)

@@ -330,7 +330,9 @@ def interrupted(model, mode):
         )
         with (
             pytest.warns(ConvergenceWarning, match="have not converged"),
-            pytest.warns(ConvergenceWarning, match="after 30 of 50 draws.*resume="),
+            pytest.warns(
+                ConvergenceWarning, match="after 30 of 50 draws in 2 of 2 chains.*resume="
+            ),
         ):
             return fit(model, seed=4, start=mode, **(QUICK | {"draws": 50}))
 
@@ -340,6 +342,34 @@ def test_an_interrupt_keeps_the_draws(interrupted) -> None:
     assert interrupted.attrs["interrupted"] == 1
     assert "interrupted" in json.loads(interrupted.attrs["warnings"])[0]
     assert group(interrupted, "log_likelihood").sizes["draw"] == 30
+
+
+def test_chains_that_an_interrupt_left_out_are_missed(model, mode, interrupted, monkeypatch):
+    """PyMC keeps the chains that had most draws, all of them, and says nothing."""
+    sample = pm.sample
+
+    def two_of_three(**options):
+        return sample(**(options | {"chains": 2, "initvals": options["initvals"][:2]}))
+
+    monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", two_of_three)
+    with (
+        pytest.warns(ConvergenceWarning, match="have not converged"),
+        pytest.warns(ConvergenceWarning, match="after 30 of 30 draws in 2 of 3 chains"),
+    ):
+        cut = fit(model, seed=4, start=mode, **(QUICK | {"draws": 30, "chains": 3}))
+    assert cut.attrs["interrupted"] == 1
+    monkeypatch.setattr(
+        "pbrl_ppl.sampling.fitting.pm.sample",
+        lambda **options: sample(**(options | {"chains": 1, "initvals": options["initvals"][:1]})),
+    )
+    with pytest.raises(KeyboardInterrupt):  # the earlier draws are where they were
+        fit(model, seed=4, resume=interrupted, **(QUICK | {"draws": 30, "tune": 0}))
+
+
+def test_too_few_draws_for_r_hat_have_not_converged(model, mode) -> None:
+    with pytest.warns(ConvergenceWarning, match="1 draws a chain there is no R-hat"):
+        fit(model, seed=4, start=mode, method="laplace", draws=1)
+    fit(model, seed=4, start=mode, method="map")  # warns of nothing
 
 
 def test_an_interrupted_fit_goes_on(model, interrupted) -> None:

@@ -273,7 +273,7 @@ def test_other_data_are_fitted_anew(parts, first, monkeypatch) -> None:
     scene, _, _, _ = parts
     heavy = PUCKS | {"mass": [4.0, 6.0]}
     new = simulated_history(scene, heavy, seed=4, trajectories=40, intervals=1, substeps=8)
-    with pytest.warns(RefitWarning, match="fitted anew; look whether") as caught:
+    with pytest.warns(RefitWarning, match="fitted anew, .*; look whether") as caught:
         idata = quiet(update, first, new, seed=9, progress=False)
     assert [each.filename for each in caught if each.category is RefitWarning] == [__file__]
     assert did(idata) == ["refitted"]
@@ -281,6 +281,29 @@ def test_other_data_are_fitted_anew(parts, first, monkeypatch) -> None:
     problem = problem_of(first).with_data(history=problem_of(idata).data.history)
     assert problem.segments.n == 100
     agree(idata, quiet(fit, build_model(problem), seed=10, **QUICK | {"draws": 500}))
+
+
+@pytest.mark.parametrize(
+    ("mass", "says"), [(2.0, "predicts them as well as its own data"), (20.0, "look whether")]
+)
+def test_a_refit_says_whether_the_bodies_may_be_the_same(mass, says, monkeypatch) -> None:
+    """Twenty times the data leave few draws of the same body too."""
+    scene = pucks("a")
+    truth = {"mass": 2.0, "linear_drag_coefficient": 0.5}
+    few = simulated_history(scene, truth, seed=1, trajectories=10, intervals=6, substeps=8)
+    model = physics_model(scene, few)
+    start = quiet(fit, model, method="laplace", seed=1, draws=100, progress=False)
+    more = simulated_history(
+        scene, truth | {"mass": mass}, seed=2, trajectories=40, intervals=30, substeps=8
+    )
+
+    def long_work(*args, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pbrl_ppl.sampling.updating.fit", long_work)
+    with pytest.warns(RefitWarning, match=says) as caught, pytest.raises(KeyboardInterrupt):
+        update(start, more, seed=3, progress=False)
+    assert ("look whether" in str(caught[0].message)) == (mass != 2.0)
 
 
 @pytest.mark.parametrize(

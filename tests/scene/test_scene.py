@@ -399,3 +399,45 @@ def test_kinematic_bodies_are_moving_and_not_dynamic() -> None:
 def test_kinematic_bodies_have_nothing_that_forces_act_on(options, message) -> None:
     with pytest.raises(SceneError, match=message):
         Body("finger", Shape.circle(0.01), **{"kinematic": True} | options)
+
+
+@pytest.mark.parametrize("value", ["1e308", "-1e308", "1e10", "1e-300", "-1.0", "nan", "true"])
+@pytest.mark.parametrize(
+    ("old", "new", "where"),
+    [
+        ("[1, 0.6]", "[{0}, {0}]", "size"),
+        ("time_step = 0.1", "time_step = {0}", "time_step"),
+        ("normal_gravity = 9.81", "normal_gravity = 9.81\nsubsteps = {0}", "substeps"),
+        ("mass = 2", "mass = {0}", "known mass"),
+        ("sigma = 0.5", "sigma = {0}", "prior r sigma"),
+        ("[[wall]]", "[noise]\nx = {0}\n[[wall]]", r"\[noise\]: x"),
+    ],
+)
+def test_absurd_numbers_are_refused(old: str, new: str, where: str, value: str) -> None:
+    text = CART.replace(old, new.format(value))
+    assert text != CART
+    with pytest.raises(SceneError, match=f"{where} is .*, expected"):
+        Scene.from_toml(text)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[1, 0.6]", "[{0}, {0}]"),
+        ("normal_gravity = 9.81", "normal_gravity = 9.81\ngravity = [{0}, 0]"),
+        ("anchor_b = [0, 0]", "anchor_b = [{0}, 0]"),
+        ("from = [-1, 0]", "from = [{0}, 0]"),
+        ("mu = 2.0", "mu = {0}"),
+    ],
+)
+def test_numbers_have_a_largest(old: str, new: str) -> None:
+    Scene.from_toml(CART.replace(old, new.format("1e9")))
+    with pytest.raises(SceneError, match=r"expected at most 1e\+09 in SI units"):
+        Scene.from_toml(CART.replace(old, new.format("1.1e9")))
+
+
+@given(st.floats(1e-12, 1e9), st.floats(1e-12, 1e9))
+def test_the_moments_of_any_box_are_numbers(width: float, height: float) -> None:
+    shape = Shape.box(width, height)
+    assert 0 < shape.area < math.inf
+    assert 0 < shape.unit_moment < math.inf

@@ -1,0 +1,100 @@
+"""Comparison of measured velocities with changes of positions: wrong units show as a factor."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from pbrl_ppl.history.history import History
+from pbrl_ppl.state import STATE, THETA, wrapped
+
+Floats = npt.NDArray[np.float64]
+
+#: Factors by which a position in other units changes faster than its velocity says, and the units;
+#: where the velocity is too large by as much, it may be in these units per second.
+_LENGTHS = {1000.0: "mm", 100.0: "cm", 9.81: ""}
+_SPEEDS = {1000.0: "mm/s", 100.0: "cm/s", 9.81: ""}
+_ANGLES = {180 / np.pi: "deg", 1000.0: "mrad"}
+_RATES = {180 / np.pi: "deg/s", 1000.0: "mrad/s", 30 / np.pi: "rpm"}
+#: How far a measured factor may be from one of these, as a share of it.
+_NEAR = 0.1
+#: How far half of the single factors may be from their median, as a share of it.
+_SPREAD = 0.2
+#: Over how many intervals changes are taken: the longer, the less measurement noise counts.
+_SPANS = (1, 4, 16)
+#: Changes that a factor is computed from, at least.
+_ENOUGH = 8
+
+
+def unit_mismatches(history: History) -> tuple[str, ...]:
+    """Return a sentence for each velocity that differs from its position's changes by a unit.
+
+    Changes of a position are divided by the integral of the measured velocity. Nothing is said
+    where that factor varies (noise), where it is near one, or where no unit is near it.
+
+    Parameters
+    ----------
+    history : History
+        Positions and velocities of which both were measured are compared; an angle's turns between
+        two rows count as none.
+
+    Returns
+    -------
+    tuple of str
+        Empty where all agree.
+    """
+    observed = history.dataset["observed"].to_numpy()
+    found = []
+    for i, body in enumerate(history.bodies):
+        for d in range(3):
+            position, rate = observed[:, :, i, d], observed[:, :, i, d + 3]
+            dt = float(history.dataset.attrs["time_step"])
+            factor = _factor(position, rate, dt, angle=d == THETA)
+            if factor is not None and (words := _sentence(body, d, factor)):
+                found.append(words)
+    return tuple(found)
+
+
+def _factor(position: Floats, rate: Floats, dt: float, *, angle: bool) -> float | None:
+    """How many times as fast a position changes as its rate says; None where that varies."""
+    best, least = None, _SPREAD
+    for span in _SPANS:
+        n = (position.shape[1] - 1) // span
+        change = np.diff(position[:, : n * span + 1 : span], axis=1).ravel()
+        mean = ((rate[:, 1:] + rate[:, :-1]) / 2)[:, : n * span].reshape(len(rate), n, span)
+        told = dt * span * mean.mean(axis=2).ravel()
+        seen = np.isfinite(change) & np.isfinite(told)
+        change, told = change[seen], told[seen]
+        if len(told) < _ENOUGH:
+            continue
+        size = np.abs(told)
+        fast = (size > 0) & (size >= np.quantile(size, 0.9) / 2)  # what noise counts least for
+        change, told = change[fast], told[fast]
+        if len(told) < _ENOUGH:
+            continue
+        # angles may have been wrapped between two rows
+        off = np.median(np.abs(wrapped(change - told)))
+        if angle and off < 0.5 * min(1.0, float(np.median(np.abs(told)))):
+            return 1.0
+        factor = float(np.median(change / told))
+        spread = float(np.median(np.abs(change / told - factor))) / (abs(factor) or np.inf)
+        if factor > 0 and spread < least:
+            best, least = factor, spread
+    return best
+
+
+def _sentence(body: str, d: int, factor: float) -> str:
+    """What a factor between a position's changes and its velocity says, if it is near a unit's."""
+    place, rate = STATE[d], STATE[d + 3]
+    units, rates = (_ANGLES, _RATES) if d == THETA else (_LENGTHS, _SPEEDS)
+    faster = f"{place} of {body} changes {factor:.3g} times as fast as {rate} says"
+    larger = f"{rate} of {body} is {1 / factor:.3g} times the rate at which {place} changes"
+    for words, column, size, known in (
+        (faster, place, factor, units),
+        (larger, rate, 1 / factor, rates),
+    ):
+        for one, unit in known.items():
+            if abs(size / one - 1) < _NEAR:
+                cure = f" {column} may be in {unit}; read it with --units {column}={unit}"
+                return f"{words}: units?{cure if unit else ''}"
+    return ""
