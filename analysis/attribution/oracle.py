@@ -16,13 +16,15 @@ from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.effects import Attached, attach
-from pbrl_ppl.model import Problem
+from pbrl_ppl.model import Problem, bodies_acceleration
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.parameters import inside
+from pbrl_ppl.state import STATE
 
 #: Chance alone gives what the oracle calls detected less often than this.
 CERTAIN = 1e-4
-#: An effect matters where the oracle's model forecasts better by this share.
+#: An effect matters where the oracle's model forecasts better by this share, and where what it does
+#: to the velocities is this share of what the bodies do.
 MATTERS = 0.01
 #: The strength of the first pilot recording, how many there are at most, between which statistics
 #: one says where the limit is, and the statistic that the next one is to have.
@@ -47,12 +49,16 @@ class Oracle:
     gain : float
         By what share that model's error of forecasts is below the declared model's; errors are in
         units of the true noise, root mean square over what is measured.
+    share : float
+        What the effect changes of a step's velocities, over the bodies' acceleration; the largest of
+        the velocities'.
     """
 
     statistic: float
     p_value: float
     rollout_rmse: dict[str, float] = field(default_factory=dict)
     gain: float = 1.0
+    share: float = 1.0
 
     @property
     def detects(self) -> bool:
@@ -61,8 +67,8 @@ class Oracle:
 
     @property
     def matters(self) -> bool:
-        """Whether knowing the effect makes forecasts better."""
-        return self.gain >= MATTERS
+        """Whether the effect is no negligible one, and knowing it makes forecasts better."""
+        return min(self.gain, self.share) >= MATTERS
 
 
 def true_effect(case: Case) -> pp.Effect:
@@ -130,7 +136,23 @@ def ask(case: Case, declared: Mode, test: pp.History, seed: int) -> Oracle:
     noise = case.body.noise
     before, after = (np.hypot.reduce([e[d] / noise[d] for d in e]) for e in (plain, errors))
     p_value = float(chi2.sf(statistic, len(true_effect(case).parameters)))
-    return Oracle(statistic, p_value, errors, float(1 - after / before))
+    return Oracle(statistic, p_value, errors, float(1 - after / before), _share(best, case))
+
+
+def _share(mode: Mode, case: Case) -> float:
+    """What the effect of a mode changes of a step's velocities, over the bodies' acceleration."""
+    problem, null = mode.problem, mode.phi.copy()
+    added = true_effect(case).on(str(case.on))
+    null[[problem.layout.labels.index(label) for label in added.labels]] = added.effect.null
+    cells = problem.trajectory_noise.cells
+    change = cells.of((problem.predict(mode.phi) - problem.predict(null))[:, 0])
+    velocity = cells.places % len(STATE)
+    square = np.nanmean(change**2, axis=0) / problem.scene.time_step**2
+    sizes = bodies_acceleration(problem)
+    return max(
+        float(np.sqrt(square[velocity == d].mean())) / max(float(size), 1e-300)
+        for d, size in zip(cells.rates, sizes, strict=True)
+    )
 
 
 def _compared(case: Case, declared: Mode) -> tuple[Mode, Mode, float]:

@@ -11,10 +11,11 @@ from attribution.baselines import WAYS
 from attribution.bodies import CHAIN, PAIR, twins
 from attribution.cases import CATALOGUED, CLEAN, LEFT_OUT, METHODS, NONSENSE, OUTSIDE
 from attribution.one_case import Row
+from attribution.oracle import MATTERS
 
 #: What may come of a case in which something is hidden; each has one.
 NAMED, EXTRA, ABSTAINED, MISNAMED = "named", "extra name", "abstained", "misnamed"
-MISSED, NEGLIGIBLE = "missed", "negligible"
+MISSED, NEGLIGIBLE, EQUIVALENT = "missed", "negligible", "equivalent"
 #: What may come of the others.
 RIGHT, FALSE_ALARM, REFUSED, ACCEPTED = "right", "false alarm", "refused", "accepted"
 _NO_VERDICT = ("not-converged", "failed")
@@ -34,7 +35,14 @@ def outcome(row: Row) -> str:
     right = [_is_right(row, one) for one in row.added]
     if row.kind == CATALOGUED and any(right):
         return NAMED if all(right) else EXTRA
-    return ABSTAINED if row.open or verdict == "unexplained" else MISNAMED
+    if row.open or verdict == "unexplained":
+        return ABSTAINED
+    return EQUIVALENT if row.kind != CATALOGUED and _is_as_good(row) else MISNAMED
+
+
+def _is_as_good(row: Row) -> bool:
+    """Whether what was added forecasts the test recording as the oracle's model does."""
+    return row.excess is not None and row.excess < MATTERS
 
 
 def _is_right(row: Row, one: Mapping[str, Any]) -> bool:
@@ -51,7 +59,8 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
     -------
     dict
         Over the cases that the oracle detects, but for those that do not matter and are called
-        adequate (``negligible``, their number): ``naming``, share of catalogued ones with the right
+        adequate (``negligible``, their number), and those of an effect that is not to be had in
+        which what was added forecasts as the oracle's model does (``equivalent``): ``naming``, share of catalogued ones with the right
         effect's name and no other; ``overcautious``, share of these ones with the right name alone
         and the verdict ``unexplained``; ``extra_names``, number with a wrong name beside the right
         one; ``abstention``, share of left-out and outside ones in which the loop says that
@@ -68,7 +77,7 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         ``seconds``: sum.
     """
     detected = [row for row in rows if row.kind in (CATALOGUED, LEFT_OUT, OUTSIDE) and row.detected]
-    hidden = [row for row in detected if outcome(row) != NEGLIGIBLE]
+    hidden = [row for row in detected if outcome(row) not in (NEGLIGIBLE, EQUIVALENT)]
     catalogued = [row for row in hidden if row.kind == CATALOGUED]
     nameless = [row for row in hidden if row.kind != CATALOGUED]
     named = [row for row in catalogued if outcome(row) == NAMED]
@@ -90,7 +99,8 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         "nonsense_adequate": sum(outcome(row) == ACCEPTED for row in rows),
         "cases": len(rows),
         "detected": len(detected),
-        "negligible": len(detected) - len(hidden),
+        "negligible": sum(outcome(row) == NEGLIGIBLE for row in detected),
+        "equivalent": sum(outcome(row) == EQUIVALENT for row in detected),
         "failed": sum(row.verdict == "failed" for row in rows),
         "not_converged": sum(row.verdict == "not-converged" for row in rows),
         **{f"method_{method}": sum(row.method == method for row in rows) for method in METHODS},

@@ -124,6 +124,8 @@ def forecast(
     observed = problem.data.history.dataset["observed"].to_numpy()
     error = cells.wrapped(cells.of(observed[trajectory, step + intervals]) - ends)
     covariance = _spread(noise, sigma, at, step)
+    free, touching = cells.steps(sigma)
+    jolt = touching - free  # how bodies part is known no better
     pushes = np.zeros((len(cells.places), 0))
     if allowed is not None:
         rate = cells.pushed[cells.always] - len(cells.sensors)
@@ -132,6 +134,7 @@ def forecast(
     for i in range(intervals):
         slope = noise.slope[every[:, i]]
         covariance = slope @ covariance @ slope.transpose(0, 2, 1)
+        covariance = covariance + noise.touching[every[:, i], None, None] * jolt
         pushed = slope @ pushed + pushes
     variance = np.diagonal(covariance, axis1=1, axis2=2) + cells.errors(sigma) ** 2
     return Forecast(error, variance + (pushed**2).sum(axis=2), cells.places % len(STATE))

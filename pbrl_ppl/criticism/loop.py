@@ -14,13 +14,17 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
 from pbrl_ppl.criticism.histories import checked_histories, named
-from pbrl_ppl.criticism.misfit import PRIOR, find_misfit
+from pbrl_ppl.criticism.misfit import PRIOR, beside_names, find_misfit
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.results import ResidualTest
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection, Step
-from pbrl_ppl.criticism.unexplained import Left, unexplained_acceleration
+from pbrl_ppl.criticism.unexplained import (
+    Left,
+    unexplained_acceleration,
+    without_acceleration,
+)
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ConvergenceWarning, PriorWarning
@@ -140,6 +144,10 @@ def _revised(
     added: list[Step] = []
     while ranked and len(added) < criteria.most_added:
         step = selection.best_addition(current, ranked)
+        if step is None and unexplained_acceleration(current, criteria).remains.any():
+            alone = without_acceleration(current)
+            hidden = rank_candidates(alone, selection.missing(current))
+            step = selection.best_addition(current, hidden)
         if step is None:
             break
         say(f"added {step.signature.candidate.effect} on {step.signature.candidate.body}")
@@ -170,6 +178,8 @@ def _revised(
             selection.withdraw(added)
             added, current, left = [], declared, before
             misfit = without.with_test(prior)
+    if added:
+        misfit = beside_names(misfit, current, left)
     say("sampling the posterior of the declared model")
     posterior = _posterior(declared, method, seed, draws, criteria, say)
     revised = posterior

@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 
 #: Names of tests, of which all a model is good for depends.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
+_NOTHING_RECORDED = "nothing that was recorded"
 #: And of another.
 DEPENDENCE = "dependence on state, command and time"
 #: Lengths of forecasts that a picture shows, at most.
@@ -64,8 +65,21 @@ class Misfit:
         """The same with one test more; what it says is where the structure is if no other fails."""
         unexplained = self.unexplained
         if unexplained is None and not test.passed:
-            unexplained = Unexplained("", "", "nothing that was recorded", 0.0, 0.0, test.sentence)
+            unexplained = Unexplained("", "", _NOTHING_RECORDED, 0.0, 0.0, test.sentence)
         return replace(self, tests=(*self.tests, test), unexplained=unexplained)
+
+
+def beside_names(misfit: Misfit, mode: Mode, left: Left) -> Misfit:
+    """The misfit of a revised model, with an acceleration that remains, though negligible.
+
+    A law that is only near to the right one leaves as little as two engines differ by.
+    """
+    if misfit.unexplained is not None or not left.remains.any():
+        return misfit
+    told = _acceleration(left)
+    body, dimension = _where(mode, left, mode.problem.trajectory_noise.cells.places)
+    rest = Unexplained(body, dimension, _NOTHING_RECORDED, told.size, told.p_value, told.sentence)
+    return replace(misfit, unexplained=rest)
 
 
 def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfit:
@@ -102,7 +116,7 @@ def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfi
         where = Unexplained(
             body=body,
             dimension=dimension,
-            depends_on="nothing that was recorded",
+            depends_on=_NOTHING_RECORDED,
             share=first.size,
             p_value=first.p_value,
             sentence=first.sentence,

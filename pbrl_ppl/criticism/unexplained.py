@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +57,12 @@ class Left:
     def matters(self) -> NDArray[np.bool_]:
         """Which are significant, beyond the engine's error, and not negligible."""
         large = self.relative >= self.criteria.negligible
-        return np.asarray(self.certain & self.beyond_engine & large)
+        return np.asarray(self.remains & large)
+
+    @property
+    def remains(self) -> NDArray[np.bool_]:
+        """Which are significant and beyond the engine's error, negligible or not."""
+        return np.asarray(self.certain & self.beyond_engine)
 
     @property
     def worst(self) -> float:
@@ -92,6 +97,18 @@ def noise_alone(mode: Mode, left: Left) -> Array:
         if not certain
     }
     return profile_sigma(problem, problem.residual(mode.phi), mode.phi, held)
+
+
+def without_acceleration(mode: Mode) -> Mode:
+    """The mode with the noise parameters that it has without any unexplained acceleration.
+
+    That is a random force, and follows what is smooth: scores of such effects are small beside it.
+    """
+    problem = mode.problem
+    places = problem.trajectory_noise.cells.accelerations
+    held = {place: NOTHING * problem.noise_prior[0][place] for place in places}
+    sigma = profile_sigma(problem, problem.residual(mode.phi), mode.phi, held)
+    return replace(mode, sigma=sigma)
 
 
 def innovations_over_steps(mode: Mode) -> Array:

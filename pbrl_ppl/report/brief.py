@@ -96,7 +96,7 @@ def _next(findings: Findings, folder: Path, tried: bool) -> str:
             f"open the report, which plots the residual against {left.depends_on}; write an effect"
             f" for it{', or close the loop again with --learn-remainder' if learn else ''}."
         )
-    if left is not None:
+    if findings.verdict == UNEXPLAINED:
         return "open the report; record more quantities, or longer."
     if any(added.not_separable_from for added in findings.added):
         return (
