@@ -50,8 +50,8 @@ class Oracle:
         By what share that model's error of forecasts is below the declared model's; errors are in
         units of the true noise, root mean square over what is measured.
     share : float
-        What the effect changes of a step's velocities, over the bodies' acceleration; the largest of
-        the velocities'.
+        What the effect changes of a step's velocities, over the bodies' acceleration; the largest
+        of the velocities'.
     """
 
     statistic: float

@@ -60,8 +60,8 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
     dict
         Over the cases that the oracle detects, but for those that do not matter and are called
         adequate (``negligible``, their number), and those of an effect that is not to be had in
-        which what was added forecasts as the oracle's model does (``equivalent``): ``naming``, share of catalogued ones with the right
-        effect's name and no other; ``overcautious``, share of these ones with the right name alone
+        which what was added forecasts as the oracle's model does (``equivalent``): ``naming``,
+        share of catalogued ones with the right effect's name and no other; ``overcautious``, share of these ones with the right name alone
         and the verdict ``unexplained``; ``extra_names``, number with a wrong name beside the right
         one; ``abstention``, share of left-out and outside ones in which the loop says that
         something remains; ``misnamed`` and ``missed``, shares of all of them with wrong names alone
