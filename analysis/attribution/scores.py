@@ -61,20 +61,20 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         Over the cases that the oracle detects, but for those that do not matter and are called
         adequate (``negligible``, their number), and those of an effect that is not to be had in
         which what was added forecasts as the oracle's model does (``equivalent``): ``naming``,
-        share of catalogued ones with the right effect's name and no other; ``overcautious``, share of these ones with the right name alone
-        and the verdict ``unexplained``; ``extra_names``, number with a wrong name beside the right
-        one; ``abstention``, share of left-out and outside ones in which the loop says that
-        something remains; ``misnamed`` and ``missed``, shares of all of them with wrong names alone
-        and nothing said to remain, and called adequate; ``wrong_names_open``, number with a wrong
-        name of which something is said to remain. ``false_alarms``: share of clean cases that are
-        not adequate. ``worse_after``: number of all cases with an effect added whose held-out error
-        grew. ``coverage``: share of true values of correctly named effects inside the interval.
-        ``excess``: median, over catalogued cases, of by how much the revised model's errors of
-        forecasts exceed the oracle's, a share. ``baseline_naming``: the best of the usual ways'
-        shares of names among those of one body, each beside it; a twin is right.
-        ``nonsense_adequate``: number of nonsense cases called adequate. ``detected``, ``cases``,
-        ``failed``, ``not_converged``, ``method_laplace``, ``method_metropolis``: numbers.
-        ``seconds``: sum.
+        share of catalogued ones with the right effect's name and no other; ``overcautious``, share
+        of these ones with the right name alone and the verdict ``unexplained``; ``extra_names``,
+        number with a wrong name beside the right one; ``abstention``, share of left-out and outside
+        ones in which the loop says that something remains; ``misnamed`` and ``missed``, shares of
+        all of them with wrong names alone and nothing said to remain, and called adequate;
+        ``wrong_names_open``, number with a wrong name of which something is said to remain.
+        ``false_alarms``: share of clean cases that are not adequate. ``worse_after``: number of all
+        cases with an effect added whose held-out error grew. ``coverage``: share of true values of
+        correctly named effects inside the interval. ``excess``: median, over catalogued cases, of
+        by how much the revised model's errors of forecasts exceed the oracle's, a share.
+        ``baseline_naming``: the best of the usual ways' shares of names among those of one body,
+        each beside it; a twin is right. ``nonsense_adequate``: number of nonsense cases called
+        adequate. ``detected``, ``cases``, ``failed``, ``not_converged``, ``method_laplace``,
+        ``method_metropolis``: numbers. ``seconds``: sum.
     """
     detected = [row for row in rows if row.kind in (CATALOGUED, LEFT_OUT, OUTSIDE) and row.detected]
     hidden = [row for row in detected if outcome(row) not in (NEGLIGIBLE, EQUIVALENT)]
