@@ -46,7 +46,7 @@ def row(attribution):
 
     def make(
         kind, verdict, *added, effect="linear_drag", seen=True, gain=0.5, remains=False,
-        hdi=(0.0, 2.0), after=1.0, method="laplace",
+        hdi=(0.0, 2.0), after=1.0, method="laplace", excess=None,
     ):  # fmt: skip
         names = [name.partition("@") for name in added]
         findings = {
@@ -66,7 +66,9 @@ def row(attribution):
         }
         hidden = kind not in ("clean", "nonsense")
         p_value = 1e-9 if seen else 0.3
-        oracle = attribution.oracle.Oracle(99.0, p_value, gain=gain) if hidden else None
+        known = {} if excess is None else {"x": 1.0}
+        findings["error"]["after"]["rollout_rmse"] = {name: 1.0 + excess for name in known}
+        oracle = attribution.oracle.Oracle(99.0, p_value, known, gain) if hidden else None
         return attribution.one_case.Row(
             name="made up",
             kind=kind,
@@ -104,6 +106,7 @@ def test_scores_by_hand(attribution, row) -> None:
         row("outside", "effects-added", "quadratic_drag", remains=True),  # abstained
         row("outside", "adequate"),  # missed
         row("outside", "effects-added", "quadratic_drag", seen=False),
+        row("outside", "effects-added", "quadratic_drag", excess=0.005),  # equivalent
         row("clean", "adequate", method="metropolis"),
         row("clean", "adequate"),
         row("clean", "effects-added", "linear_drag", after=2.5),  # worse
@@ -122,19 +125,20 @@ def test_scores_by_hand(attribution, row) -> None:
         "false_alarms": 2 / 4,
         "worse_after": 2,
         "coverage": 1 / 2,  # the second named another effect of its group
-        "excess": None,  # nobody asked the oracle for forecasts
+        "excess": None,  # of catalogued ones nobody asked the oracle for forecasts
         "baseline_naming": None,
         "nonsense_adequate": 1,
-        "cases": 24,
-        "detected": 16,
+        "cases": 25,
+        "detected": 17,
         "negligible": 1,
+        "equivalent": 1,
         "failed": 1,
         "not_converged": 2,
         "method_metropolis": 1,
-        "method_laplace": 23,
-        "seconds": 240.0,
+        "method_laplace": 24,
+        "seconds": 250.0,
     }
-    assert attribution.words.table(rows).row_count == 24
+    assert attribution.words.table(rows).row_count == 25
     assert {attribution.words.plain(each)["outcome"] for each in rows[:12]} == {
         "named", "extra name", "misnamed", "abstained", "missed", "negligible", "not-converged",
         "failed",

@@ -248,7 +248,7 @@ def _height(mode: Mode, signature: Signature, floor: float) -> float:
 
 
 def _worth_it(gained: Change) -> bool:
-    return gained.total >= max(DEFAULT.min_elpd, gained.needed(DEFAULT.min_elpd_se))
+    return gained.total >= DEFAULT.min_elpd and gained.certain(DEFAULT.min_elpd_se)
 
 
 def _floored(mode: Mode, floor: float) -> Mode:

@@ -20,7 +20,8 @@ class Criteria:
         A candidate is refitted if its p-value, corrected for all candidates, is below this.
     min_elpd, min_elpd_se : float
         Gain in cross-validated log predictive density that an effect needs, in nats and in standard
-        errors; the latter are widened to Student's t for few folds.
+        errors; the latter are widened to Student's t for few folds. A signed-rank test of the folds
+        at the same level does, too.
     far_out : float
         Prior scales from the prior's centre beyond which an effect's size is not accepted.
     engines : float
@@ -45,7 +46,7 @@ class Criteria:
     try_p: float = 0.01
     min_elpd: float = 4.0
     min_elpd_se: float = 2.0
-    far_out: float = 10.0
+    far_out: float = 6.0
     engines: float = 3.0
     worse_forecast: float = 1.5
     most_added: int = 5

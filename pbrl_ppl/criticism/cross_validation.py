@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm, t
+from scipy.stats import norm, t, wilcoxon
 
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.model import robust
@@ -55,24 +55,35 @@ class Change:
         Its standard error; infinite for a single fold.
     folds : int
         Number of folds.
+    signed_rank : float
+        One-sided p-value of Wilcoxon's signed-rank test that folds gain: a fold that gains far more
+        than others makes the standard error large, and no gain less certain.
     """
 
     total: float
     error: float
     folds: int
+    signed_rank: float = 1.0
 
     @classmethod
     def of(cls, gains: Array) -> Change:
         """Sum the gains of independent folds, shape (fold,)."""
         n = len(gains)
         error = float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else np.inf
-        return cls(float(gains.sum()), error, n)
+        ranked = float(wilcoxon(gains, alternative="greater").pvalue) if gains.any() else 1.0
+        return cls(float(gains.sum()), error, n, ranked)
 
     def needed(self, errors: float) -> float:
         """Smallest sum that is as certain as so many standard errors of many folds are."""
         if self.folds < 2:
             return np.inf
         return float(t.isf(norm.sf(errors), self.folds - 1)) * self.error
+
+    def certain(self, errors: float) -> bool:
+        """Whether the gain is as certain as one of so many standard errors of many folds."""
+        if self.total <= 0:
+            return False
+        return self.total >= self.needed(errors) or self.signed_rank < norm.sf(errors)
 
 
 def folds(mode: Mode) -> Ints:

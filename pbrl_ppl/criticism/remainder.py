@@ -101,7 +101,7 @@ def learn_remainder(
         say("fitting the model with the learned remainder")
         refitted = _refitted(mode, effect, body)
         gained = gain(mode, refitted)
-        if gained.total < max(DEFAULT.min_elpd, gained.needed(DEFAULT.min_elpd_se)):
+        if gained.total < DEFAULT.min_elpd or not gained.certain(DEFAULT.min_elpd_se):
             raise FitError(
                 f"nothing to learn: a force on {body} that follows its velocity does not help on"
                 " trajectories that were left out"

@@ -149,7 +149,7 @@ class Selection:
             self._note(signature, why)
             return None
         share, negligible = _share(mode, fitted), self.criteria.negligible
-        if self._certain(forecasts):
+        if forecasts.certain(self.criteria.min_elpd_se):
             share = max(share, forecasts.total)
         if share < negligible:
             size = f"changes predictions by {100 * share:.2g} %"
@@ -179,18 +179,14 @@ class Selection:
             " the effect would allow it"
         )
 
-    def _certain(self, change: Change) -> bool:
-        return change.total >= change.needed(self.criteria.min_elpd_se)
-
     def _unsure(self, density: Change, forecasts: Change) -> str:
         """Why a gain in density, and a fall of forecasts' errors, do not do; empty if they do."""
         criteria = self.criteria
         needed = max(criteria.min_elpd, density.needed(criteria.min_elpd_se))
         if -forecasts.total > max(criteria.negligible, forecasts.needed(criteria.min_elpd_se)):
             return f"errors of cross-validated forecasts rise by {-100 * forecasts.total:.2g} %"
-        if density.total >= needed:
-            return ""
-        if density.total >= criteria.min_elpd and self._certain(forecasts):
+        either = any(each.certain(criteria.min_elpd_se) for each in (density, forecasts))
+        if density.total >= criteria.min_elpd and either:
             return ""
         gained = f"{density.total:.1f} ± {density.error:.1f} nats"
         return f"cross-validation gains {gained}, {needed:.1f} are needed"

@@ -12,6 +12,7 @@ from pbrl_ppl.model.likelihood import (
     whiten,
 )
 from pbrl_ppl.model.log_posterior import (
+    exponential,
     log_noise_prior,
     log_posterior,
     log_prior,
@@ -19,6 +20,7 @@ from pbrl_ppl.model.log_posterior import (
     noise_prior_slope,
 )
 from pbrl_ppl.model.noise import Noise, estimate_sigma, sigma_prior
+from pbrl_ppl.model.noise_scales import bodies_acceleration
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
 from pbrl_ppl.model.problem import Problem
@@ -26,7 +28,6 @@ from pbrl_ppl.model.sensitivity import Sensitivity
 from pbrl_ppl.model.simulation import simulated_trajectories, with_measurements
 from pbrl_ppl.model.smoothing import (
     along_trajectories,
-    bodies_acceleration,
     cells_of,
     linearised,
     single_transitions,
@@ -59,6 +60,7 @@ __all__ = [
     "check_moves",
     "declared_problem",
     "estimate_sigma",
+    "exponential",
     "index_priors",
     "linearised",
     "log_density",

@@ -35,6 +35,17 @@ def noise_law(problem: Problem) -> tuple[Array, float]:
     return (centre.mean(keepdims=True) if problem.noise.scalar else centre), spread
 
 
+def exponential(problem: Problem) -> NDArray[np.bool_]:
+    """Which noise parameters have an exponential prior, not a log-normal one, shape (state,).
+
+    They are the unexplained accelerations.
+    """
+    mask = np.zeros(len(problem.noise_prior[0]), dtype=bool)
+    if problem.trajectories is not None:
+        mask[list(problem.trajectories.cells.accelerations)] = True
+    return mask
+
+
 def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
     """Log-density of log sigma, shape (...), at (..., state), or (..., 1) for a scalar sigma."""
     centre, spread = noise_law(problem)
@@ -43,7 +54,7 @@ def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
         return np.asarray(normal.sum(axis=-1))
     # of sigma / scale, whose density is exp(-sigma / scale)
     u = log_sigma - centre + np.log(np.log(2.0))
-    return np.asarray(np.where(problem.exponential, u - np.exp(u), normal).sum(axis=-1))
+    return np.asarray(np.where(exponential(problem), u - np.exp(u), normal).sum(axis=-1))
 
 
 def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
@@ -53,7 +64,7 @@ def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
     if problem.trajectories is None:
         return np.asarray(normal)
     u = log_sigma - centre + np.log(np.log(2.0))
-    return np.where(problem.exponential, 1.0 - np.exp(u), normal)
+    return np.where(exponential(problem), 1.0 - np.exp(u), normal)
 
 
 def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = None) -> Array:

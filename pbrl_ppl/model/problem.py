@@ -223,17 +223,6 @@ class Problem:
         return np.array(median), spread
 
     @property
-    def exponential(self) -> NDArray[np.bool_]:
-        """Which noise parameters have an exponential prior, not a log-normal one, shape (state,).
-
-        They are the unexplained accelerations.
-        """
-        mask = np.zeros(len(self.noise_prior[0]), dtype=bool)
-        if self.trajectories is not None:
-            mask[list(self.trajectories.cells.accelerations)] = True
-        return mask
-
-    @property
     def trajectories(self) -> TrajectoryNoise | None:
         """The noise along whole trajectories, if the likelihood is of those."""
         return self.noise.trajectories

@@ -13,6 +13,7 @@ from scipy.special import wrightomega
 from pbrl_ppl.model import (
     Problem,
     TrajectoryNoise,
+    exponential,
     log_noise_prior,
     noise_law,
     noise_prior_slope,
@@ -78,7 +79,7 @@ def _of_trajectories(
     gaussian = problem.nu(phi) is None
     begin = np.log(noise.sigma)
     bounds = [(b - _FAR, b + _FAR) for b in begin]
-    for place in np.flatnonzero(problem.exponential).tolist():
+    for place in np.flatnonzero(exponential(problem)).tolist():
         least = np.log(NOTHING * problem.noise_prior[0][place])
         begin[place] = max(begin[place], least)
         bounds[place] = (least, max(bounds[place][1], least + _FAR))
@@ -174,7 +175,7 @@ def noise_gaussian(
     spread = noise_law(problem)[1]
     begin, n = np.log(sigma), len(sigma)
     floor = np.log(0.1 * problem.noise_prior[0])
-    begin = np.where(problem.exponential, np.maximum(begin, floor), begin)
+    begin = np.where(exponential(problem), np.maximum(begin, floor), begin)
 
     def cost(at: Array) -> float:
         return _cost(problem, residual, phi, at) - float(at.sum())

@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem, noise_law
+from pbrl_ppl.model import Problem, exponential, noise_law
 from pbrl_ppl.parameters import Prior, beside, prior_draws
 
 Array = NDArray[np.float64]
@@ -43,7 +43,7 @@ def prior_groups(
         return {}
     centre, spread = noise_law(problem)
     noise = [Prior("log_normal", mu=float(mu), sigma=spread) for mu in centre]
-    steps = problem.exponential[: len(centre)]
+    steps = exponential(problem)[: len(centre)]
     scale = np.exp(centre) / np.log(2.0)
     # apart from the generator of the predictions
     rng = np.random.default_rng([seed, 1])

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
-from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import (
     Mode,
     choose_from_library,
@@ -196,11 +196,10 @@ def fit(
 ) -> Any:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
-    Multi-start least squares finds the mode, from about which the chains start, if the model does
-    not hold one. Where the scene
-    does not say which bodies a joint joins, every choice is fitted by itself, and their draws are
-    mixed by their evidences; :func:`pbrl_ppl.joint_probabilities` gives those. A model with
-    a ``library`` needs no chain: all choices are summed over.
+    Multi-start least squares finds the mode, from about which the chains start, if the model holds
+    none. Where the scene does not say which bodies a joint joins, every choice is fitted by itself,
+    and their draws are mixed by their evidences (:func:`pbrl_ppl.joint_probabilities`). A model
+    with a ``library`` needs no chain: all choices are summed over.
 
     Parameters
     ----------
@@ -316,7 +315,8 @@ def fit(
         trace = sampled(model, *from_posterior(problem, resume))
     else:
         held: Mode | None = getattr(model, "mode", None)  # of physics_model
-        mode = start or held or _mode(problem, seed)
+        search = find_mode if problem.trajectories is None else find_trajectory_mode
+        mode = start or held or search(problem, seed=seed)
         if mode.problem.trajectories is not None and mode is not held:  # linearised at it by now
             mode = mode if start is None else following(start)
             problem = mode.problem
@@ -336,13 +336,6 @@ def fit(
         trace = appended(resume, trace)
     asked = (draws, all_chains) if cut else None
     return complete(problem, trace, seed=seed, method=method, asked=asked)
-
-
-def _mode(problem: Problem, seed: int) -> Mode:
-    """The mode to sample about."""
-    if problem.trajectories is None:
-        return find_mode(problem, seed=seed)
-    return find_trajectory_mode(problem, seed)
 
 
 def _summed(model: pm.Model, draws: int, chains: int, seed: int) -> Any:

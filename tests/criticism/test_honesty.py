@@ -163,7 +163,7 @@ def test_a_fit_leaves_the_hill_of_large_accelerations() -> None:
 
 
 def test_a_size_many_prior_scales_out_is_not_accepted(make_history) -> None:
-    """A drag of 3 kg/s where its prior's scale is 10: accepted at 10 scales, not at 0.1."""
+    """A drag of 3 kg/s where its prior's scale is 10: accepted at 6 scales, not at 0.1."""
     mode = fitted(BOX, box2d(make_history, 5, linear_drag=3.0)[0])
     drags = tuple(effect for effect in pp.catalogue if effect.name == "linear_drag")
 
@@ -173,7 +173,7 @@ def test_a_size_many_prior_scales_out_is_not_accepted(make_history) -> None:
         selection.best_addition(mode, ranked)
         return selection.explained(ranked)[0].why
 
-    assert why(10.0) == "added"
+    assert why(DEFAULT.far_out) == "added"
     assert "prior scales out" in why(0.1)
 
 
@@ -183,6 +183,15 @@ def test_few_folds_need_more_standard_errors() -> None:
     assert many.needed(2.0) == pytest.approx(2.0 * many.error, rel=0.01)
     assert few.needed(2.0) == pytest.approx(2.43 * few.error, rel=0.01)  # Student's t, 7 degrees
     assert Change.of(gains[:1]).needed(2.0) == np.inf
+
+
+def test_a_fold_that_gains_most_makes_no_gain_less_certain() -> None:
+    gains = np.array([9.0, 7.0, 10.0, 8.0, 9.5, 11.0, 8.5, 7.5, 190.0])
+    change = Change.of(gains)
+    assert change.total < change.needed(2.0)
+    assert change.certain(2.0)
+    assert not Change.of(gains - 40.0).certain(2.0)  # most folds lose
+    assert not Change.of(np.zeros(8)).certain(2.0)
 
 
 def test_the_fall_of_forecasts_is_a_share_of_each_quantitys_error() -> None:

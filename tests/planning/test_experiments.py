@@ -10,6 +10,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.cli import main
 from pbrl_ppl.criticism import Rival, fit_rivals, kept_groups, named_effects, rank_candidates
+from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.results import Added
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.selection import Selection, Step
@@ -31,7 +32,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarn
 def selected(frame: pd.DataFrame) -> Step:
     """What the loop adds to the model of a box without drag."""
     mode = fitted(BOX, frame)
-    selection = Selection(BOX, tuple(LOOKED), lambda stage: None)
+    selection = Selection(BOX, tuple(LOOKED), DEFAULT, lambda stage: None)
     step = selection.best_addition(mode, rank_candidates(mode, selection.missing(mode)))
     assert step is not None
     return step
