@@ -89,7 +89,8 @@ def put_together(
     # names that leave an acceleration unexplained are the nearest there are at best
     if unexplained is not None and not (steps and misfit.predicts):
         verdict = findings.UNEXPLAINED
-    if steps and after.normalised_rmse > before.normalised_rmse:
+    most = (1.0 + criteria.negligible) * before.normalised_rmse
+    if steps and after.normalised_rmse > most:
         verdict, unexplained = findings.UNEXPLAINED, unexplained or _worse(before, after)
     if not all(converged(posterior, criteria) for posterior in (models.before, models.after)):
         verdict = findings.NOT_CONVERGED
