@@ -128,6 +128,7 @@ def test_around_what_is_of_something_else(half, history) -> None:
         pp.fit(single, resume=half)
 
 
+@pytest.mark.filterwarnings("ignore:Numba will use object mode")  # PyMC 6, for random draws
 def test_pymc_s_predictions_are_of_the_filter(model, half) -> None:
     """Of one draw, repeated: 300 means of 2000 within 5 standard errors, false alarm 2e-4."""
     one = groups(half)["posterior"].isel(chain=[0], draw=[5])
