@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.stats import binom
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.history import History, longest_gap
+from pbrl_ppl.history import History, longest_gap, measurement_noise
 from pbrl_ppl.model import Problem, prior_predictive_draws
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, wrapped
@@ -117,8 +117,9 @@ def prior_predictive_check(
 ) -> PriorCheck:
     """Compare measured changes over a segment with what the prior predicts for them.
 
-    The noise added to the predictions is the median of sigma's prior. All of that prior would not
-    do: it is scaled by the data and so wide that noise could explain any change.
+    The noise added to the predictions is the median of sigma's prior, or what positions and
+    velocities show of it by themselves, if that is more. All of that prior would not do: it is
+    scaled by the data and so wide that noise could explain any change.
 
     Parameters
     ----------
@@ -184,7 +185,12 @@ def prior_predictive_check(
             " from the prior; narrow the prior's hyper-parameters, or use more substeps"
         )
     exact = observations.wrapped(ends[good] - first)
-    predicted = ends[good] + noise * rng.standard_normal(exact.shape)
+    # where sensors are worse than the prior's median, of which both ends of a change have an error
+    known = measurement_noise(problem.data.history)
+    noisy = np.sqrt(2.0) * known
+    seconds = problem.data.horizon * problem.scene.time_step
+    noisy[:, : len(POSE)] = np.hypot(noisy[:, : len(POSE)], seconds * known[:, len(POSE) :])
+    predicted = ends[good] + np.maximum(noise, noisy[:, columns]) * rng.standard_normal(exact.shape)
     derived = np.ones(measured.shape[1:])
     for i, d in enumerate(columns):
         rate = d if d >= len(POSE) else d + len(POSE)

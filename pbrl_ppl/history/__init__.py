@@ -1,6 +1,6 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
-from pbrl_ppl.history.derived import derived_velocities, measured_alone
+from pbrl_ppl.history.derived import derived_velocities, measured_alone, measurement_noise
 from pbrl_ppl.history.files import read_table, write_atomically
 from pbrl_ppl.history.gaps import longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
@@ -23,6 +23,7 @@ __all__ = [
     "lever",
     "longest_gap",
     "measured_alone",
+    "measurement_noise",
     "read_table",
     "segment_rows",
     "unit_mismatches",

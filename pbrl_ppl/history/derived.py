@@ -19,6 +19,8 @@ _REACH = 8
 _SHARE = 0.5
 #: The same where the positions have no noise: a share of the velocity's own variance.
 _EXACT = 1e-8
+#: An angle that looks noisier than this (rad) turns too far between rows to be followed.
+_WRAPPED = 0.5
 #: Windows a coefficient of the regression, at least.
 _ENOUGH = 4
 
@@ -93,12 +95,38 @@ def _is_derived(series: list[tuple[Floats, Floats]], dt: float) -> bool:
     weights = np.linalg.lstsq(x, y, rcond=None)[0]
     left = float(((y - x @ weights) ** 2).sum() / (len(x) - len(weights)))
     spread = weights @ weights + weights.sum() ** 2  # the middle position's noise is in all columns
-    noise = float(spread) * _position_noise(series, dt)
+    noise = float(spread) * _noise(series, dt)[0]
     return left < max(_SHARE * noise, _EXACT * float(y.var()))
 
 
-def _position_noise(series: list[tuple[Floats, Floats]], dt: float) -> float:
-    """Variance of positions, from what kinematics leave of measured rates.
+def measurement_noise(history: History) -> Floats:
+    """Standard deviation of measuring each state, from kinematics alone, shape (body, state).
+
+    Zero where a position or its velocity has gaps: nothing is known there. It is no more than third
+    differences show, so that a position in another unit than its velocity does not look noisy.
+    """
+    observed = history.dataset["observed"].to_numpy()
+    dt = float(history.dataset.attrs["time_step"])
+    result = np.zeros(observed.shape[2:])
+    for body in range(len(result)):
+        for d in range(3):
+            series = []
+            for own, n in zip(observed, history.dataset["n_rows"].to_numpy(), strict=True):
+                position, rate = own[:n, body, [d, d + 3]].T
+                if np.isfinite(position).all() and np.isfinite(rate).all():
+                    if d == THETA:
+                        position = unwrapped(dt * np.arange(n), position, rate)
+                    series.append((position, rate))
+            if series:
+                third = [np.concatenate([np.diff(s[i], 3) for s in series]) for i in (0, 1)]
+                least = [float(np.mean(own**2)) / 20 if len(own) else 0.0 for own in third]
+                result[body, [d, d + 3]] = np.sqrt(np.minimum(_noise(series, dt), least))
+    result[result[:, THETA] > _WRAPPED, THETA] = 0.0
+    return result
+
+
+def _noise(series: list[tuple[Floats, Floats]], dt: float) -> tuple[float, float]:
+    """Variances of positions and of rates, from what kinematics leave of measured ones.
 
     Second differences take off what a smooth acceleration leaves. Of those, independent noises of
     positions (in units of ``dt``) and rates have variance ``20 A + B`` and covariance at lag one
@@ -110,4 +138,5 @@ def _position_noise(series: list[tuple[Floats, Floats]], dt: float) -> float:
         off = np.diff(np.diff(position) / dt - (rate[1:] + rate[:-1]) / 2, 2)
         square, n = square + float(off @ off), n + len(off)
         product, m = product + float(off[1:] @ off[:-1]), m + max(len(off) - 1, 0)
-    return max(0.0, -(square / max(n, 1) + 4 * product / max(m, 1)) / 40) * dt**2
+    place = max(0.0, -(square / max(n, 1) + 4 * product / max(m, 1)) / 40)
+    return place * dt**2, max(0.0, square / max(n, 1) - 20 * place)

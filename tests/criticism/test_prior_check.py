@@ -250,3 +250,14 @@ def test_a_recording_of_three_rows_is_asked_as_it_is() -> None:
     scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.1)),))
     rows.loc[rows["step"] == 2, ["force_x", "force_y"]] = np.nan
     assert telling_horizon(History.from_dataframe(rows, scene)) == 1
+
+
+def test_worse_sensors_than_the_noise_prior_has_are_no_wrong_prior(history, scene) -> None:
+    """A clean recording at a high rate, of which a change shows hardly more than noise."""
+    rng = np.random.default_rng(4)
+    observed = history.dataset["observed"]
+    spread = observed.std(("trajectory", "time", "body")).to_numpy()
+    noisy = observed + (0, 0, 0, 0.3, 0.3, 0.3) * spread * rng.standard_normal(observed.shape)
+    start = history.dataset["start"] + (noisy - observed).fillna(0.0)
+    louder = History(history.dataset.assign(observed=noisy, start=start))
+    assert prior_predictive_check(physics_model(scene, louder), draws=100).sentences == ()

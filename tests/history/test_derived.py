@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 from scipy.signal import butter, filtfilt, savgol_filter
 
-from pbrl_ppl.history import History, derived_velocities, measured_alone
+from pbrl_ppl.history import History, derived_velocities, measured_alone, measurement_noise
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS
 
@@ -78,3 +78,23 @@ def test_what_was_computed_counts_as_missing_and_is_started_from() -> None:
     assert alone.data_sha256 == history.data_sha256
     kept = measured_alone(history, np.zeros((1, 6), dtype=bool))
     assert kept.dataset["observed"].equals(history.dataset["observed"])
+
+
+def test_noise_is_known_from_kinematics_alone() -> None:
+    """Of pushes that jump from one interval to the next, too; 2000 rows, 8 standard errors."""
+    rng, dt = np.random.default_rng(3), 0.02
+    acceleration = rng.normal(0.0, 3.0, (8, 250))
+    velocity = np.cumsum(dt * acceleration, axis=1)
+    place = np.cumsum(dt * velocity - dt**2 / 2 * acceleration, axis=1)
+    rows = []
+    for t in range(8):
+        for i in range(250):
+            x = place[t, i] + 0.002 * rng.standard_normal()
+            vx = velocity[t, i] + 0.1 * rng.standard_normal()
+            wrench = [np.nan] * 3 if i == 249 else [0.0] * 3
+            rows.append([t, i, i * dt, "puck", x, 0.0, 0.0, vx, 0.0, 0.0, *wrench])
+    scene = Scene(time_step=dt, bodies=(Body("puck", Shape.circle(0.1)),))
+    noise = measurement_noise(History.from_dataframe(pd.DataFrame(rows, columns=COLUMNS), scene))
+    assert noise[0, 0] == pytest.approx(0.002, rel=0.2)
+    assert noise[0, 3] == pytest.approx(0.1, rel=0.2)
+    assert noise[0, 1] == noise[0, 4] == 0.0
