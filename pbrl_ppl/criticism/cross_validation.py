@@ -131,7 +131,8 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
         least = np.maximum(least, np.diag(inverse) - (rows**2).sum(axis=0))
     prior = np.diag(least)
     pull = slopes * prior_residual(priors, phi)
-    residual, without = problem.residual(phi), _linearised(mode, scale)
+    residual = problem.residual(phi)
+    without = _linearised(mode, residual, scale)
     density, sigmas = np.empty(count), np.empty((count, len(mode.sigma)))
     phis = np.empty((count, len(phi)))
     for f in range(count):
@@ -193,7 +194,7 @@ def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) 
 
 
 def _linearised(
-    mode: Mode, scale: Array
+    mode: Mode, residual: Array, scale: Array
 ) -> Callable[[NDArray[np.bool_]], tuple[Array, Array, Array]]:
     """Noise parameters, whitened residual and Jacobian of all rows, fitted without some of them.
 
@@ -205,7 +206,7 @@ def _linearised(
         z = problem.robust(phi, mode.sigma)
         jacobian = mode.jacobian.reshape(*z.shape, p) * scale
         return lambda own: (mode.sigma, z, jacobian)
-    noise, residual = problem.trajectories, problem.residual(phi)
+    noise = problem.trajectories
     nu = noise.of_cells(problem.nu(phi), residual.shape)
     slopes = _residual_slopes(mode, scale)
     nothing = np.zeros_like(noise.begin)

@@ -60,21 +60,26 @@ def derived_velocities(history: History) -> Bools:
     ndarray of bool
         Shape (body, state); positions are never derived.
     """
-    observed = history.dataset["observed"].to_numpy()
-    rows = history.dataset["n_rows"].to_numpy()
     dt = float(history.dataset.attrs["time_step"])
-    result = np.zeros(observed.shape[2:], dtype=bool)
+    result = np.zeros(history.dataset["observed"].shape[2:], dtype=bool)
     for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
         for d in range(3, len(STATE)):
-            series = []
-            for trajectory, n in enumerate(rows):
-                position, rate = observed[trajectory, :n, body, [d - 3, d]]
-                if np.isfinite(position).all() and np.isfinite(rate).all():
-                    if d - 3 == THETA:
-                        position = unwrapped(dt * np.arange(n), position, rate)
-                    series.append((position, rate))
-            result[body, d] = _is_derived(series, dt)
+            result[body, d] = _is_derived(_series(history, int(body), d - 3), dt)
     return result
+
+
+def _series(history: History, body: int, d: int) -> list[tuple[Floats, Floats]]:
+    """Positions of a dimension and their rates, of trajectories in which neither has gaps."""
+    observed = history.dataset["observed"].to_numpy()[:, :, body]
+    dt = float(history.dataset.attrs["time_step"])
+    series: list[tuple[Floats, Floats]] = []
+    for own, n in zip(observed, history.dataset["n_rows"].to_numpy(), strict=True):
+        position, rate = own[:n, [d, d + 3]].T
+        if np.isfinite(position).all() and np.isfinite(rate).all():
+            if d == THETA:
+                position = unwrapped(dt * np.arange(n), position, rate)
+            series.append((position, rate))
+    return series
 
 
 def _is_derived(series: list[tuple[Floats, Floats]], dt: float) -> bool:
@@ -105,19 +110,11 @@ def measurement_noise(history: History) -> Floats:
     Zero where a position or its velocity has gaps: nothing is known there. It is no more than third
     differences show, so that a position in another unit than its velocity does not look noisy.
     """
-    observed = history.dataset["observed"].to_numpy()
     dt = float(history.dataset.attrs["time_step"])
-    result = np.zeros(observed.shape[2:])
+    result = np.zeros(history.dataset["observed"].shape[2:])
     for body in range(len(result)):
         for d in range(3):
-            series = []
-            for own, n in zip(observed, history.dataset["n_rows"].to_numpy(), strict=True):
-                position, rate = own[:n, body, [d, d + 3]].T
-                if np.isfinite(position).all() and np.isfinite(rate).all():
-                    if d == THETA:
-                        position = unwrapped(dt * np.arange(n), position, rate)
-                    series.append((position, rate))
-            if series:
+            if series := _series(history, body, d):
                 third = [np.concatenate([np.diff(s[i], 3) for s in series]) for i in (0, 1)]
                 least = [float(np.mean(own**2)) / 20 if len(own) else 0.0 for own in third]
                 result[body, [d, d + 3]] = np.sqrt(np.minimum(_noise(series, dt), least))
