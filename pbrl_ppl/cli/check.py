@@ -70,9 +70,11 @@ def check(
         if prior:
             progress("comparing with draws from the prior")
             from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
-            from pbrl_ppl.sampling import physics_model
+            from pbrl_ppl.effects import attach
+            from pbrl_ppl.model import Problem, build_model
 
-            model = physics_model(declared, loaded, horizon=telling_horizon(loaded))
+            horizon = telling_horizon(loaded)
+            model = build_model(Problem.of(declared, loaded, attach(declared, ()), horizon=horizon))
             checked = prior_predictive_check(model, draws=draws, seed=seed)
             for sentence in checked.summary:
                 console.print(f"prior: {sentence}", soft_wrap=True)

@@ -22,6 +22,9 @@ class Criteria:
         Gain in cross-validated log predictive density that an effect needs, in nats and in standard
         errors; the latter are widened to Student's t for few folds. A signed-rank test of the folds
         at the same level does, too.
+    min_evidence : float
+        Gain in log-evidence (nats) that an effect needs instead, where trajectories are too few for
+        cross-validation over them.
     far_out : float
         Prior scales from the prior's centre beyond which an effect's size is not accepted.
     engines : float
@@ -46,6 +49,7 @@ class Criteria:
     try_p: float = 0.01
     min_elpd: float = 4.0
     min_elpd_se: float = 2.0
+    min_evidence: float = 4.0
     far_out: float = 6.0
     engines: float = 3.0
     worse_forecast: float = 1.5

@@ -102,6 +102,11 @@ def folds(mode: Mode) -> Ints:
     return np.unique(trajectory * runs + run, return_inverse=True)[1].astype(np.intp)
 
 
+def few_trajectories(mode: Mode) -> bool:
+    """Whether there are too few trajectories to leave out whole ones."""
+    return len(np.unique(mode.problem.segments.trajectory)) < LEAST_FOLDS
+
+
 def leave_out(mode: Mode, fold: Ints) -> LeftOut:
     """Fit each fold's complement and judge the fold by it.
 

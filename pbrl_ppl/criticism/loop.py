@@ -169,7 +169,8 @@ def _revised(
     misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(with_added)
     remains = _remains(before, left) if added and misfit.unexplained is not None else 0.0
     small = left.worst < criteria.negligible
-    if remains > (criteria.large_if_small if small else criteria.large_remainder):
+    large = remains > (criteria.large_if_small if small else criteria.large_remainder)
+    if large and not misfit.random:
         without = find_misfit(declared, before, horizon=horizon, seed=seed)
         followed = misfit.predictable < criteria.most_predictable * without.predictable
         if remains > criteria.large_if_small or not followed:

@@ -59,6 +59,11 @@ class Misfit:
         return all(test.passed for test in self.tests if test.name in needed)
 
     @property
+    def random(self) -> bool:
+        """Whether nothing predicts what is left, however large: a random force, and no law."""
+        return all(test.passed for test in self.tests if test.name != ACCELERATION)
+
+    @property
     def predictable(self) -> float:
         """Share of the errors that recorded quantities predict; 0 where none is sure."""
         return next(test.size for test in self.tests if test.name == DEPENDENCE)

@@ -198,13 +198,14 @@ def _evidence(signature: Array, q: Array, residual: Array, sides: Ints, scales: 
     basis, direction = np.zeros((n, 0)), np.zeros(n)
     if share > ABSORBED:
         u, s, vt = np.linalg.svd(projected, full_matrices=False)
-        keep = (s > 1e-6 * s.max()) & (s >= min(_SHOWS, s.max()))
+        whole = np.linalg.norm(signature @ vt.T, axis=0)  # before the projection
+        keep = (s > 1e-6 * s.max()) & (s >= min(_SHOWS, s.max())) & (s**2 > ABSORBED * whole**2)
         basis = u[:, keep]
         unit = np.sqrt((projected**2).sum(axis=0)) / scales
         coordinates = basis.T @ residual
         size = scales * (vt[keep].T @ (coordinates / s[keep]))
         statistic = float(coordinates @ coordinates)
-        log_p = float(chi2.logsf(statistic, int(keep.sum())))
+        log_p = float(chi2.logsf(statistic, max(1, int(keep.sum()))))
         seen = int(np.argmax(np.abs(vt[0])))
         if sides[seen] and keep.sum() == 1 and np.abs(vt[0, seen]) > 1 - 1e-6:
             # it can only be on one side of nothing: half the chance, and none on the other side

@@ -7,16 +7,23 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import Criteria
-from pbrl_ppl.criticism.cross_validation import Change, folds, forecast_squares, leave_out
+from pbrl_ppl.criticism.cross_validation import (
+    Change,
+    few_trajectories,
+    folds,
+    forecast_squares,
+    leave_out,
+)
 from pbrl_ppl.criticism.forecast import longest_forecast
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, twins
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
-from pbrl_ppl.modes import Mode, trajectory_mode
+from pbrl_ppl.modes import Mode, trajectory_evidence, trajectory_mode
 from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
 
@@ -144,8 +151,8 @@ class Selection:
         if why := self._implausible(fitted, signature):
             self._note(signature, why)
             return None
-        density, forecasts = _gains(mode, fitted)
-        if why := self._unsure(density, forecasts):
+        density, forecasts = gains = _gains(mode, fitted)
+        if why := self._unsure(mode, fitted, *gains):
             self._note(signature, why)
             return None
         share, negligible = _share(mode, fitted), self.criteria.negligible
@@ -179,23 +186,44 @@ class Selection:
             " the effect would allow it"
         )
 
-    def _unsure(self, density: Change, forecasts: Change) -> str:
-        """Why a gain in density, and a fall of forecasts' errors, do not do; empty if they do."""
+    def _unsure(self, before: Mode, after: Mode, density: Change, forecasts: Change) -> str:
+        """Why a gain in density, and a fall of forecasts' errors, do not do; empty if they do.
+
+        Runs of a few trajectories are too few and too much alike for a standard error: there the
+        evidence decides.
+        """
         criteria = self.criteria
-        needed = max(criteria.min_elpd, density.needed(criteria.min_elpd_se))
         if -forecasts.total > max(criteria.negligible, forecasts.needed(criteria.min_elpd_se)):
             return f"errors of cross-validated forecasts rise by {-100 * forecasts.total:.2g} %"
+        if few_trajectories(after):
+            return self._without_evidence(before, after)
+        needed = max(criteria.min_elpd, density.needed(criteria.min_elpd_se))
         either = any(each.certain(criteria.min_elpd_se) for each in (density, forecasts))
         if density.total >= criteria.min_elpd and either:
             return ""
         gained = f"{density.total:.1f} ± {density.error:.1f} nats"
         return f"cross-validation gains {gained}, {needed:.1f} are needed"
 
+    def _without_evidence(self, before: Mode, after: Mode) -> str:
+        """Why neither evidence nor likelihood says that an effect is there; empty if both do.
+
+        The likelihood must rise, too: a declared prior that fits badly is no ground for a name.
+        """
+        likelihood = _log_likelihood(after) - _log_likelihood(before)
+        more = len(after.phi) - len(before.phi)
+        chance = float(chi2.sf(2 * max(likelihood, 0.0), max(more, 1)))
+        if chance > self.criteria.try_p:
+            return f"the likelihood rises by {likelihood:.1f} nats (p = {chance:.2g})"
+        gained = trajectory_evidence(after) - trajectory_evidence(before)
+        if gained >= self.criteria.min_evidence:
+            return ""
+        return f"the evidence rises by {gained:.1f} nats, {self.criteria.min_evidence:g} are needed"
+
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
         """Drop effects that later ones have made unnecessary; what gained most comes first."""
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
             without = self._without(mode, step.signature.attached)
-            if why := self._unsure(*_gains(without, mode)):
+            if why := self._unsure(without, mode, *_gains(without, mode)):
                 self._note(step.signature, f"needless beside later ones: {why}")
                 mode = without
                 steps = [addition for addition in steps if addition is not step]

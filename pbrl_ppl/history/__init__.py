@@ -7,7 +7,7 @@ from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.mujoco import from_mujoco
 from pbrl_ppl.history.reading import Reading, as_history
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
-from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
+from pbrl_ppl.history.start import check_start, fill_hinges, hung_bodies, lever
 from pbrl_ppl.history.unit_check import unit_mismatches
 
 __all__ = [
@@ -15,6 +15,7 @@ __all__ = [
     "Reading",
     "Segments",
     "as_history",
+    "check_start",
     "derived_velocities",
     "fill_hinges",
     "from_mujoco",

@@ -80,8 +80,10 @@ class History:
         - ``action`` (trajectory, time, body, wrench): held over the interval that starts there;
           NaN on a trajectory's last row and after, without a meaning for a kinematic body
           (N, N, N m);
-        - ``start`` (trajectory, time, body, state): the state completed through hinges and
-          estimated velocities;
+        - ``start`` (trajectory, time, body, state): the state completed: through hinges, with
+          velocities estimated from positions, and with the scene's pose for what was never measured;
+        - ``assumed`` (body, state): which columns of that neither a measurement nor a hinge gives,
+          and are not to start single transitions (Eq. 11);
         - ``clock`` (trajectory, time): time (s);
         - ``number`` (trajectory,): which trajectory of the recording it is, from 0;
         - ``before`` (trajectory, body, wrench): what acted before the first row; zero;
@@ -119,8 +121,8 @@ class History:
         scene : Scene
             The bodies, hinges and time step that are expected.
         estimate_velocities : bool
-            Whether velocities that were never measured are estimated from positions for ``start``
-            (by a local polynomial); they stay missing in ``observed``.
+            Whether single transitions (Eq. 11) may start from velocities that were never measured,
+            as estimated from positions by a local polynomial. Whole trajectories need no estimate.
         **reading
             For tables of others, as of `Reading`: ``columns={"x": "pos_x", "force_x": 0.0}`` (their
             names, or numbers), ``units={"x": "mm"}``, ``resample=True`` for uneven samples.
@@ -157,7 +159,9 @@ class History:
             raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
         frame = as_history(frame, scene, source, **reading)
         table = arrays(frame, scene, source)
-        start = complete_start(table.state, scene, estimate_velocities=estimate_velocities)
+        start, assumed = complete_start(table.state, scene)
+        if estimate_velocities:  # of positions that were measured, or that hinges give
+            assumed[:, 3:] &= assumed[:, :3]
         state_dims = ("trajectory", "time", "body", "state")
         state_units = {"units": ", ".join(STATE_UNITS)}
         wrench_units = {"units": ", ".join(WRENCH_UNITS)}
@@ -166,6 +170,7 @@ class History:
                 "observed": (state_dims, table.state, state_units),
                 "action": (("trajectory", "time", "body", "wrench"), table.action, wrench_units),
                 "start": (state_dims, start, state_units),
+                "assumed": (("body", "state"), assumed),
                 "clock": (("trajectory", "time"), table.clock, {"units": "s"}),
                 "n_rows": ("trajectory", table.n_rows),
                 "number": ("trajectory", np.arange(float(len(table.n_rows)))),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import savgol_filter
@@ -9,13 +11,20 @@ from scipy.signal import savgol_filter
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.paths import fill_path_velocities
 from pbrl_ppl.scene import WORLD, Point, Scene
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, THETA
+
+if TYPE_CHECKING:
+    from pbrl_ppl.history.history import History
 
 Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
 
 
-def complete_start(state: Floats, scene: Scene, *, estimate_velocities: bool) -> Floats:
-    """Return the states completed; measured cells are kept.
+def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
+    """Return the states completed, and which columns of them rest on no measurement.
+
+    Measured cells are kept. Hinges and paths give what follows from them; a position that was never
+    measured is that of the scene; velocities that were never measured are estimated from positions.
 
     Parameters
     ----------
@@ -24,39 +33,55 @@ def complete_start(state: Floats, scene: Scene, *, estimate_velocities: bool) ->
     scene : Scene
         Its known hinges give positions and velocities from angles; its kinematic bodies' positions
         give their velocities.
-    estimate_velocities : bool
-        Whether velocities that were never measured are estimated from positions.
+
+    Returns
+    -------
+    start : (trajectory, time, body, 6) array
+        NaN in rows that do not have what others have.
+    assumed : (body, 6) array of bool
+        Columns that are estimated, or as in the scene.
+    """
+    start = state.copy()
+    fill_path_velocities(start, scene)
+    fill_hinges(start, scene)
+    assumed = np.isnan(start).all(axis=(0, 1))
+    hung = np.array([body.name in hung_bodies(scene) for body in scene.moving])
+    for i, body in enumerate(scene.moving):
+        pose = body.pose or (0.0, 0.0, 0.0)
+        for d in np.flatnonzero(assumed[i, :3]):
+            if d == THETA or not hung[i]:
+                start[:, :, i, d] = pose[d]
+    # The angular velocity first: hinges turn it into velocities.
+    _estimate(start, (5,), scene.time_step)
+    fill_hinges(start, scene)
+    _estimate(start, (3, 4), scene.time_step)
+    fill_hinges(start, scene)
+    return start, assumed
+
+
+def check_start(history: History, scene: Scene) -> None:
+    """Refuse a history whose transitions start from states that rest on no measurement.
+
+    Transitions of Eq. 11 start from states as measured; in whole trajectories states are latent.
 
     Raises
     ------
     HistoryError
-        If no step before a trajectory's last has a complete state.
+        If a column of the states was neither measured nor allowed to be estimated.
     """
-    start = state.copy()
-    fill_path_velocities(start, scene)
-    if estimate_velocities:
-        # The angular velocity first: hinges turn it into velocities.
-        _estimate(start, state, (5,), scene.time_step)
-    fill_hinges(start, scene)
-    if estimate_velocities:
-        _estimate(start, state, (3, 4), scene.time_step)
-        fill_hinges(start, scene)
-    if not np.isfinite(start[:, :-1]).all(axis=(-1, -2)).any():
-        raise HistoryError(_incomplete(start, scene))
-    return start
-
-
-def _incomplete(start: Floats, scene: Scene) -> str:
-    parts = []
-    for i, body in enumerate(scene.moving):
-        lacking = [name for j, name in enumerate(STATE) if np.isnan(start[:, :, i, j]).all()]
-        if lacking:
-            parts.append(f'{", ".join(lacking)} of body "{body.name}"')
-    what = "; ".join(parts) or "some cells at every step"
-    return (
-        f"history: no step has a complete state to start from: missing are {what}; measure them, "
-        "declare the hinge that holds the body in the scene (it gives x, y, vx, vy from theta and "
-        "omega), or pass estimate_velocities=True (it gives vx, vy, omega from x, y, theta)"
+    assumed = history.dataset["assumed"].to_numpy()
+    if not assumed.any():
+        return
+    parts = [
+        f'{", ".join(np.array(STATE)[own])} of body "{body.name}"'
+        for body, own in zip(scene.moving, assumed, strict=True)
+        if own.any()
+    ]
+    raise HistoryError(
+        f"history: single transitions start from measured states: missing are {'; '.join(parts)};"
+        " fit whole trajectories (trajectories=True), measure them, declare the hinge that holds"
+        " the body in the scene (it gives x, y, vx, vy from theta and omega), or pass"
+        " estimate_velocities=True (it gives vx, vy, omega from x, y, theta)"
     )
 
 
@@ -121,29 +146,29 @@ def _hinge_order(scene: Scene) -> list[tuple[str, str, Point, Point]]:
     return order + [edge for _ in scene.bodies for edge in edges]
 
 
-def _estimate(start: Floats, state: Floats, columns: tuple[int, ...], dt: float) -> None:
-    """Fill velocities that were never measured, by a local polynomial of the positions."""
-    for body in range(state.shape[2]):
+def _estimate(start: Floats, columns: tuple[int, ...], dt: float) -> None:
+    """Fill velocities that no row has, by a local polynomial of the positions."""
+    for body in range(start.shape[2]):
         for column in columns:
             if not np.isnan(start[:, :, body, column]).all():
                 continue
-            for trajectory in range(state.shape[0]):
+            for trajectory in range(start.shape[0]):
                 values = start[trajectory, :, body, column - 3]
                 start[trajectory, :, body, column] = _derivative(values, dt, angle=column == 5)
 
 
 def _derivative(values: Floats, dt: float, *, angle: bool) -> Floats:
-    """Return the rate of a series, run by run of its finite values; NaN elsewhere."""
+    """Return the rate of a series where it is finite; NaN elsewhere."""
     rate = np.full(values.shape, np.nan)
     finite = np.flatnonzero(np.isfinite(values))
-    for run in np.split(finite, np.flatnonzero(np.diff(finite) > 1) + 1):
-        if len(run) < 2:
-            continue
-        part = np.unwrap(values[run]) if angle else values[run]
-        if len(run) == 2:
-            rate[run] = (part[1] - part[0]) / dt
-        else:
+    if len(finite) < 2:
+        rate[finite] = 0.0
+        return rate
+    level = np.unwrap(values[finite]) if angle else values[finite]
+    rate[finite] = np.gradient(level, dt * finite)
+    for run in np.split(np.arange(len(finite)), np.flatnonzero(np.diff(finite) > 1) + 1):
+        if len(run) > 2:
             # An even window would give the rate between samples.
             window = 5 if len(run) >= 5 else 3
-            rate[run] = savgol_filter(part, window, 2, deriv=1, delta=dt)
+            rate[finite[run]] = savgol_filter(level[run], window, 2, deriv=1, delta=dt)
     return rate

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import fill_hinges
+from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA, wrapped
 
@@ -104,7 +104,8 @@ class Cells:
             return states
         free = np.zeros((len(scene.moving), 6), dtype=bool)
         free.reshape(-1)[self.places] = True
-        hung = np.array([not body.kinematic for body in scene.moving])[:, None] & ~free
+        tied = hung_bodies(scene)
+        hung = np.array([body.name in tied for body in scene.moving])[:, None] & ~free
         if hung.any():
             states[..., hung] = np.nan
             fill_hinges(states.reshape(-1, 1, *states.shape[-2:]), scene)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History, measured_alone
+from pbrl_ppl.history import History, check_start, measured_alone
 from pbrl_ppl.model.cells import ACCELERATION, JOLT
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
@@ -71,6 +71,8 @@ def declared_problem(
         raise ValueError("sigma is 'scalar', expected 'per_dimension' with trajectories")
     if trajectories:
         history = measured_alone(history)
+    else:
+        check_start(history, scene)
     longest = int(history.dataset["n_rows"].max()) - 1
     if horizon > longest:
         raise HistoryError(

@@ -201,6 +201,9 @@ def cells_of(scene: Scene, history: History) -> Cells:
     for i, moving in enumerate(scene.moving):
         if moving.name in hung_bodies(scene) and measured[i, THETA]:
             free[i] = [d % _RATE == THETA for d in range(len(STATE))]
+    if _uncoupled(scene):  # what was not measured moves nothing that was
+        seen = measured[:, :_RATE] | measured[:, _RATE:]
+        free &= np.hstack([seen, seen])
     places = np.flatnonzero(free)
     body, dimension = np.divmod(places, len(STATE))
     stated = dict(scene.noise)
@@ -238,6 +241,11 @@ def cells_of(scene: Scene, history: History) -> Cells:
         tuple(int(d) for d in rates),
         tuple(int(d) for d in rates) if jolted else (),
     )
+
+
+def _uncoupled(scene: Scene) -> bool:
+    """Whether no coordinate of a body has to do with another, as far as is declared."""
+    return not (scene.walls or scene.joints or len(scene.bodies) > 1 or scene.bodies[0].wheel)
 
 
 def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:

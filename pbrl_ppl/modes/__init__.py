@@ -9,6 +9,7 @@ from pbrl_ppl.modes.configurations import (
     joint_probabilities,
     stored,
 )
+from pbrl_ppl.modes.evidence import trajectory_evidence
 from pbrl_ppl.modes.joint_search import weigh
 from pbrl_ppl.modes.laplace import Mode, posterior_steps
 from pbrl_ppl.modes.library_choice import choose_from_library
@@ -36,6 +37,7 @@ __all__ = [
     "posterior_steps",
     "profile_sigma",
     "stored",
+    "trajectory_evidence",
     "trajectory_mode",
     "weigh",
 ]

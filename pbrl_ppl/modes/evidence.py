@@ -10,7 +10,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln, ndtr, ndtri
 from scipy.stats import truncnorm
 
-from pbrl_ppl.model import noise_law
+from pbrl_ppl.model import log_posterior, noise_law
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior, evened
 
@@ -164,6 +164,23 @@ def laplace(mode: Mode) -> Evidence:
     centre, covariance = coordinates.gauss_newton(mode)
     log_det = np.linalg.slogdet(2 * np.pi * covariance)[1]
     return Evidence(float(coordinates.log_density(centre[None])[0] + 0.5 * log_det))
+
+
+def trajectory_evidence(mode: Mode) -> float:
+    """The Laplace approximation of the log-evidence of whole trajectories.
+
+    States are integrated out by the filter; of the noise parameters the logarithm is normal, as an
+    unexplained acceleration may well be nothing.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of whole trajectories.
+    """
+    centre, of_noise = mode.noise_gaussian()
+    value = float(log_posterior(mode.problem, mode.phi, np.exp(centre)) + centre.sum())
+    log_dets = (np.linalg.slogdet(2 * np.pi * own)[1] for own in (of_noise, mode.covariance))
+    return value + 0.5 * float(sum(log_dets))
 
 
 def importance(mode: Mode, rng: np.random.Generator) -> Evidence:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pbrl_ppl.errors import FitError, HistoryError, SimulationError
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, check_start
 from pbrl_ppl.oomdp.experience import Experience
 from pbrl_ppl.oomdp.frames import displaced, displacements, inputs
 from pbrl_ppl.scene import Scene, nearest
@@ -150,6 +150,7 @@ class Learner(ABC):
                 f"learn: the history is of {', '.join(history.bodies)}, expected"
                 f" {', '.join(names)}; load it with the learner's scene"
             )
+        check_start(history, self.scene)
         every = history.transitions(history.dataset["start"].to_numpy())
         state, action, after = every.start, every.actions[:, 0], every.observed[:, 0]
         own = list(self._own)

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
-from pbrl_ppl.history import History, derived_velocities, measured_alone
+from pbrl_ppl.history import History, check_start, derived_velocities, measured_alone
 from pbrl_ppl.model import Problem, cells_of
 from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, recorded, scene_of
 from pbrl_ppl.state import STATE
@@ -78,6 +78,8 @@ def check_history(idata: Any, history: History) -> None:
             f"update: the history has a row each {step:g} s, the posterior's each"
             f" {scene.time_step:g} s; load it with the posterior's scene"
         )
+    if "smoothed" not in group(idata, "constant_data"):
+        check_start(history, scene_of(idata))
     segments = history.segments(horizon)
     measured = [str(name) for name in group(idata, "observed_data")["state"].values]
     extra = [
