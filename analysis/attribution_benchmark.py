@@ -207,7 +207,14 @@ def parsed() -> argparse.Namespace:
     if (options.folder or options.write_page) and not options.measured:
         parser.error("--folder and --write-page are of measured recordings; add --measured")
     if options.folder and (options.write_page or options.only):
-        parser.error("--folder is one recording, and not on the page; leave out the other options")
+        parser.error(
+            "--folder is one recording, not on the page; leave out --only and --write-page"
+        )
+    if options.folder and not (options.folder / "scene.toml").is_file():
+        parser.error(
+            f"--folder {options.folder} has no scene.toml, expected scene.toml, train.csv and"
+            " test.csv; `pbrl-ppl new` makes the first"
+        )
     return options
 
 

@@ -53,7 +53,7 @@ def failures(recording: Recording, result: Result) -> list[str]:
     right = set(recording.right)
     told = []
     if right and not any(right & set(group) for group in result.names):
-        told.append(f"Not named: {' or '.join(f'`{name}`' for name in recording.right)}.")
+        told.append(f"Not named: {_listed(recording.right)}.")
     true = right | set(recording.possible)
     false = [group[0] for group in result.names if right and not true & set(group)]
     told += [f"False name: `{name}`." for name in false]
@@ -106,6 +106,10 @@ def write_page(page: Path = PAGE, recordings: Iterable[Recording] = MEASURED) ->
 def _section(recording: Recording, result: Result | None, page: Path) -> str:
     """A recording's picture, and what was declared and found."""
     lines = [f"## {recording.name}", "", recording.about, "", f"- Declared: {recording.declared}."]
+    if recording.right:
+        lines.append(f"- Physically there, by independent fits: {_listed(recording.right)}.")
+    if recording.possible:
+        lines.append(f"- May be there too: {_listed(recording.possible)}.")
     if result is None:
         return "\n".join([*lines, "- Not run yet."])
     if result.error is None:
@@ -119,7 +123,7 @@ def _section(recording: Recording, result: Result | None, page: Path) -> str:
         )
         if ahead.best is not None:
             told += (
-                f"; independent fits {number(ahead.declared)} {unit} without the effect,"
+                f"; independent fits {number(ahead.declared)} {unit} as declared,"
                 f" {number(ahead.best)} {unit} with {ahead.law}"
             )
         lines.append(f"{told}.")
@@ -147,14 +151,22 @@ def _found(result: Result) -> str:
     return "<br>".join([result.verdict, *map(_added, result.added)])
 
 
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
+
+
+def _either(names: Iterable[str]) -> str:
+    return " or ".join(f"`{name}`" for name in names)
+
+
 def _added(added: Mapping[str, Any]) -> str:
     """An effect, with means and intervals of its parameters."""
     sizes = [
         f"{name} {number(each['mean'])} ({_interval(each)}) {each['unit']}".rstrip()
         for name, each in added["parameters"].items()
     ]
-    others = "".join(f" or `{name}`" for name in added["not_separable_from"])
-    return f"`{added['effect']}`{others} of {added['body']}: {', '.join(sizes)}"
+    names = _either([added["effect"], *added["not_separable_from"]])
+    return f"{names} of {added['body']}: {', '.join(sizes)}"
 
 
 def _interval(estimate: Mapping[str, Any]) -> str:
