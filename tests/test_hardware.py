@@ -283,3 +283,16 @@ def test_recordings_load_with_the_coordinates_that_are_used(measured) -> None:
             assert round(ahead.seconds / scene.time_step) <= longest
         catalogue = {effect.name for effect in pp.catalogue}
         assert set(recording.right) | set(recording.possible) <= catalogue
+
+
+@pytest.mark.long
+def test_a_measured_recording_is_run(measured) -> None:
+    """Angle and torque alone; without friction an independent fit is off by 0.086 rad."""
+    (recording,) = (each for each in measured.MEASURED if each.name == "pendulum-torque")
+    if not recording.folder.is_dir():
+        pytest.skip(f"no recording at {recording.folder}")
+    result, picture = measured.run(recording)
+    assert result.error is None and picture is not None
+    (row,) = result.errors
+    assert 0.05 < row["before"] < 0.2
+    assert row["after"] <= row["before"]

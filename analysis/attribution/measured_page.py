@@ -129,7 +129,9 @@ def _section(recording: Recording, result: Result | None, page: Path) -> str:
         lines.append(f"{told}.")
     bad = failures(recording, result)
     lines.append(f"- **{' '.join(bad)}**" if bad else "- As good as the independent fit.")
-    lines.append(f"- {result.seconds:.0f} s, `{result.method}`, seed {result.seed}.")
+    lines.append(
+        f"- {result.seconds:.0f} s, `{result.method}`, seed {result.seed}, code {result.sources}."
+    )
     if (page.with_suffix("") / f"{recording.name}.png").is_file():
         seen = f"{recording.name}: a held-out trajectory, measured and forecast from its start"
         lines += ["", f"![{seen}]({page.stem}/{recording.name}.png)"]
