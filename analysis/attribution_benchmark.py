@@ -5,16 +5,19 @@
     python analysis/attribution_benchmark.py --quick --method laplace    # a tenth of the cases
     python analysis/attribution_benchmark.py --only cart-linear_drag --verbose
     python analysis/attribution_benchmark.py --seed 1 --list             # another board
-    python analysis/attribution_benchmark.py --measured double_pendulum push    # no cases: minutes
+    python analysis/attribution_benchmark.py --measured --only pendulum-torque   # no cases
+    python analysis/attribution_benchmark.py --measured --folder runs/arm        # your recording
+    python analysis/attribution_benchmark.py --measured --write-page             # On hardware
 
 Box2D and MuJoCo make the data. A seed draws the cases: bodies (carts on a wheel, free boxes,
 pendulums, pairs, double pendulums), recordings, noises, and what is hidden: an effect of the
 catalogue; one that is left out of it; one that is not in it; nothing; and logs that are nonsense.
 An oracle that knows what is hidden says which cases can be told at all: scores are over those. Each
-tenth case has the loop's own sampler, the others Laplace's approximation. Where the measured
-pendulum lies beside the project, the loop's forecasts of it are told too (``--only`` leaves them
-out, and all but the last part do); those of the other measured recordings take minutes each, and
-are told where ``--measured`` names them.
+tenth case has the loop's own sampler, the others Laplace's approximation.
+
+``--measured`` runs the loop on the measured recordings beside the project, minutes each, and prints
+a Markdown table of errors on held-out data beside those of independent fits. Each result is a JSON
+file and a picture in the ``--cache`` (out/measured by default); those of the same code are kept.
 """
 
 from __future__ import annotations
@@ -29,12 +32,14 @@ import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 from attribution.cases import METHODS, Case, a_tenth, all_cases
-from attribution.measured import MEASURED, SHARED, SWING, pendulum_errors
+from attribution.measured import MEASURED, Recording, Result, run
+from attribution.measured_page import PAGE, RESULTS, kept_results, markdown_table, write_page
 from attribution.one_case import Row, about, cache_path, load, run_case, save, sources
 from attribution.scores import score
 from attribution.words import plain, score_table, table, told
@@ -167,9 +172,15 @@ def parsed() -> argparse.Namespace:
     )
     parser.add_argument("--quick", action="store_true", help="a tenth of the cases")
     parser.add_argument("--only", nargs="+", metavar="NAME", help="cases with this in their name")
+    parser.add_argument("--measured", action="store_true", help="measured recordings, and no cases")
     parser.add_argument(
-        "--measured", nargs="+", choices=MEASURED, help="measured recordings, and no cases"
-    )
+        "--folder", type=Path, metavar="PATH",
+        help="with --measured: a recording of your own, scene.toml, train.csv and test.csv",
+    )  # fmt: skip
+    parser.add_argument(
+        "--write-page", action="store_true",
+        help="with --measured: keep results in the docs, and write their page On hardware",
+    )  # fmt: skip
     parser.add_argument("--list", action="store_true", help="print the cases' names and stop")
     parser.add_argument("--seed", type=int, default=0, help="another seed draws other cases")
     parser.add_argument("--draws", type=int, help="posterior draws a chain; the loop's by default")
@@ -193,6 +204,17 @@ def parsed() -> argparse.Namespace:
     for name, least in (("workers", 1), ("limit", 0), ("seed", 0)):
         if getattr(options, name) < least:
             parser.error(f"--{name} is {getattr(options, name)}, expected {least} or more")
+    if (options.folder or options.write_page) and not options.measured:
+        parser.error("--folder and --write-page are of measured recordings; add --measured")
+    if options.folder and (options.write_page or options.only):
+        parser.error(
+            "--folder is one recording, not on the page; leave out --only and --write-page"
+        )
+    if options.folder and not (options.folder / "scene.toml").is_file():
+        parser.error(
+            f"--folder {options.folder} has no scene.toml, expected scene.toml, train.csv and"
+            " test.csv; `pbrl-ppl new` makes the first"
+        )
     return options
 
 
@@ -216,19 +238,61 @@ def write(name: str | None, found: Mapping[str, object]) -> None:
         Path(name).write_text(text + "\n")
 
 
+def recordings(options: argparse.Namespace) -> list[Recording]:
+    """The measured recordings asked for."""
+    if options.folder:
+        return [Recording(options.folder.resolve().name, options.folder)]
+    only = options.only or [""]
+    return [each for each in MEASURED if any(part in each.name for part in only)]
+
+
+def measure(options: argparse.Namespace) -> None:
+    """Run the loop on measured recordings, keep each result, and print their table."""
+    chosen = recordings(options)
+    if not chosen:
+        sys.exit(f"no recording has {' or '.join(options.only)} in its name; --list prints them")
+    if options.list:
+        print("\n".join(each.name for each in chosen))
+        return
+    folder = RESULTS if options.write_page else options.cache or Path("out/measured")
+    for recording in chosen:
+        path = folder / f"{recording.name}.json"
+        if not recording.folder.is_dir():
+            say(f"{recording.name}: no recording at {recording.folder}")
+        elif is_fresh(Result.load(path), options):
+            say(f"{recording.name}: kept in {path}; delete it to run the loop anew")
+        else:
+            say(f"{recording.name}: running")
+            result, picture = run(
+                recording, seed=options.seed, method=options.method or "laplace",
+                progress=say if options.verbose else None,
+            )  # fmt: skip
+            result.save(path)
+            if picture is not None:
+                path.with_suffix(".png").write_bytes(picture)
+            say(f"{recording.name}: {result.error or result.verdict}, {result.seconds:.0f} s")
+    shown = chosen if options.folder else list(MEASURED)
+    found = kept_results(folder, shown)
+    if options.json != "-":
+        print(markdown_table(shown, found))
+    write(options.json, {name: asdict(result) for name, result in found.items()})
+    if options.write_page:
+        write_page()
+        say(f"wrote {PAGE}")
+
+
+def is_fresh(kept: Result | None, options: argparse.Namespace) -> bool:
+    """Whether a kept result is of this code and these settings."""
+    now = (options.seed, options.method or "laplace", sources())
+    return kept is not None and kept.error is None and (kept.seed, kept.method, kept.sources) == now
+
+
 def main() -> None:
     """Run the cases and print their table and scores."""
     options = parsed()
     console = Console(stderr=options.json == "-", width=None if sys.stdout.isatty() else _WIDTH)
     if options.measured:
-        scores: dict[str, float | int | None] = {}
-        for name in options.measured:
-            say(f"the measured {name.replace('_', ' ')}")
-            scores |= MEASURED[name](seed=options.seed)
-        if None in scores.values():
-            say(f"not all recordings are there, in {SHARED}")
-        console.print(score_table(scores))
-        write(options.json, scores)
+        measure(options)
         return
     cases = chosen(options)
     if not cases:
@@ -251,9 +315,6 @@ def main() -> None:
     others = (kept(case, options) for case in cases if case.name not in names)
     rows += [row for row in others if row is not None]
     scores = score(rows) | {"cases_not_run": len(cases) - len(rows)}
-    if not options.only and i == n:
-        say("the measured pendulum" + ("" if SWING.is_dir() else f": none at {SWING}"))
-        scores |= pendulum_errors(seed=options.seed)
     console.print(table(rows), score_table(scores))
     ordered = sorted(rows, key=lambda row: row.name)
     write(options.json, scores | {"rows": [plain(row) for row in ordered]})

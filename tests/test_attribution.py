@@ -9,7 +9,6 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
-import pandas as pd
 import pytest
 
 import pbrl_ppl as pp
@@ -29,7 +28,6 @@ def attribution(monkeypatch):
     import attribution.baselines
     import attribution.bodies
     import attribution.cases
-    import attribution.measured
     import attribution.one_case
     import attribution.oracle
     import attribution.scores
@@ -418,7 +416,7 @@ def test_a_case_that_takes_too_long_is_a_failure(attribution, monkeypatch) -> No
 def settings(cache=None, **changed):
     """The command line's options."""
     usual = {"seed": 0, "draws": None, "limit": 0, "cache": cache, "workers": 1, "method": None}
-    usual |= {"part": (1, 1), "quick": False, "only": None, "measured": None, "list": False}
+    usual |= {"part": (1, 1), "quick": False, "only": None, "measured": False, "list": False}
     return SimpleNamespace(**usual | {"json": None, "verbose": False} | changed)
 
 
@@ -459,7 +457,6 @@ def test_parts_add_up_in_one_cache(attribution, row, monkeypatch, tmp_path) -> N
             yield done
 
     monkeypatch.setattr(benchmark, "in_batches", batches)
-    monkeypatch.setattr(benchmark, "pendulum_errors", lambda seed: {"pendulum_1s": 0.1})
     cases = attribution.cases.all_cases()
     for i in (1, 2, 3):
         out = settings(tmp_path, part=(i, 3), json=str(tmp_path / "board.json"))
@@ -468,7 +465,6 @@ def test_parts_add_up_in_one_cache(attribution, row, monkeypatch, tmp_path) -> N
         found = json.loads((tmp_path / "board.json").read_text())
         assert found["cases"] == len(made) == len(found["rows"])
         assert found["cases_not_run"] == len(cases) - len(made)
-        assert ("pendulum_1s" in found) == (i == 3)
     assert sorted(made) == sorted(case.name for case in cases)
     assert {each["method"] for each in found["rows"]} == {"laplace"}
     assert benchmark.part("2/3") == (2, 3)
@@ -505,46 +501,3 @@ def test_a_dead_worker_is_a_row(attribution, monkeypatch) -> None:
     assert only.verdict == "failed"
     assert "gone" in only.error
     assert "--workers" in only.error
-
-
-def test_the_measured_pendulum_is_left_out_where_it_is_not(attribution, tmp_path) -> None:
-    none = attribution.measured.pendulum_errors(tmp_path / "nowhere")
-    assert {"pendulum_1s", "pendulum_2s", "pendulum_angle_only_1s"} < set(none)
-    assert set(none.values()) == {None}
-
-
-def test_other_measured_recordings_are_left_out_where_they_are_not(attribution, tmp_path) -> None:
-    measured = attribution.measured
-    none = measured.double_pendulum_errors(tmp_path / "nowhere")
-    none |= measured.push_errors(tmp_path / "nowhere")
-    assert none == {"double_pendulum_01s": None, "push_mm": None, "push_deg": None}
-
-
-def test_the_pushed_blocks_error_is_in_the_plane(attribution, shared_data, monkeypatch) -> None:
-    folder = shared_data.parent / "contact" / "planar-push"
-    if not folder.is_dir():
-        pytest.skip(f"no recorded pushes at {folder}")
-    error = {"x": 3e-3, "y": 4e-3, "theta": np.radians(2.0)}
-    found = SimpleNamespace(after=SimpleNamespace(rollout_rmse=error))
-    monkeypatch.setattr(attribution.measured, "revise", lambda *args, **settings: found)
-    told = attribution.measured.push_errors(folder)
-    assert told == pytest.approx({"push_mm": 5.0, "push_deg": 2.0})
-
-
-@pytest.mark.slow
-def test_the_double_pendulums_error_is_of_a_tenth_of_a_second(
-    attribution, shared_data, monkeypatch, tmp_path
-) -> None:
-    """Three trajectories, and nothing added: as far off as without friction."""
-    folder = shared_data / "real" / "double-pendulum-driven"
-    if not folder.is_dir():
-        pytest.skip(f"no recorded double pendulum at {folder}")
-    (tmp_path / "scene.toml").write_text((folder / "scene.toml").read_text())
-    for name in ("train", "test"):
-        rows = pd.read_csv(folder / f"{name}.csv")
-        first = rows["trajectory"].isin(rows["trajectory"].unique()[:3])
-        rows[first].to_csv(tmp_path / f"{name}.csv", index=False)
-    found = SimpleNamespace(added=(), numerical=SimpleNamespace(substeps_used=20))
-    monkeypatch.setattr(attribution.measured, "revise", lambda *args, **settings: found)
-    told = attribution.measured.double_pendulum_errors(tmp_path)
-    assert 0.01 < told["double_pendulum_01s"] < 0.2

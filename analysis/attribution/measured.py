@@ -1,95 +1,336 @@
-"""What the loop makes of measured bodies: errors of forecasts on recordings it never saw."""
+"""Measured recordings, what independent fits reach on them, and results of the loop on them."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import revise
+from attribution.one_case import sources
+from pbrl_ppl.criticism import Findings, revise
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
+from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.effects import attach
 from pbrl_ppl.model import Problem
-from pbrl_ppl.modes import find_mode, trajectory_mode
+from pbrl_ppl.modes import trajectory_mode
+from pbrl_ppl.posterior import draws
+from pbrl_ppl.report import plot_rollout, png
+from pbrl_ppl.report.words import verdict_in_words
+from pbrl_ppl.state import STATE
 
 #: The recordings lie beside the project, which holds no copy.
 SHARED = Path(__file__).parents[3] / "shared"
-SWING = SHARED / "data" / "real" / "pendulum-swing"
-ARMS = SHARED / "data" / "real" / "double-pendulum-driven"
-PUSHED = SHARED / "contact" / "planar-push"
+#: State dimensions whose errors are told together, and their unit.
+QUANTITIES = {"angle": (("theta",), "rad"), "position": (("x", "y"), "m")}
+_VELOCITIES = list(STATE[3:])
 
 
-def pendulum_errors(folder: Path = SWING, seed: int = 0) -> dict[str, float | None]:
-    """Root mean square errors of the angle (rad) at the end of 1 s and 2 s; None without the data.
+@dataclass(frozen=True)
+class Ahead:
+    """A forecast, and the held-out errors of independent fits at its end.
 
-    ``pendulum``: angle and angular velocity as recorded; ``pendulum_angle_only``: the angle alone,
-    velocities estimated from it.
+    Parameters
+    ----------
+    seconds : float
+        Length of the forecast (s).
+    quantity : str
+        ``angle`` (rad) or ``position`` (m, in the plane).
+    declared, best : float, optional
+        Root mean square errors of independent fits of the declared physics and of the best law.
+    law : str
+        What the best law is.
     """
-    errors: dict[str, float | None] = {}
-    for key, angle_only in (("pendulum", False), ("pendulum_angle_only", True)):
-        told = _errors(folder, (1, 2), seed, angle_only) if folder.is_dir() else {}
-        errors |= {f"{key}_{seconds}s": told.get(seconds) for seconds in (1, 2)}
-    return errors
+
+    seconds: float
+    quantity: str
+    declared: float | None = None
+    best: float | None = None
+    law: str = ""
 
 
-def double_pendulum_errors(folder: Path = ARMS, seed: int = 0) -> dict[str, float | None]:
-    """Root mean square error of both arms' angles (rad) at the end of 0.1 s; None without data."""
-    told = _errors(folder, (0.1,), seed) if folder.is_dir() else {}
-    return {"double_pendulum_01s": told.get(0.1)}
+@dataclass(frozen=True)
+class Recording:
+    """A folder with scene.toml, train.csv and test.csv, and what is known of it.
 
-
-def push_errors(folder: Path = PUSHED, seed: int = 0) -> dict[str, float | None]:
-    """Root mean square errors of a pushed block's last pose: mm in the plane, and degrees.
-
-    A push lasts many intervals and is seen at its end alone: forecasts of held-out data end there.
+    Parameters
+    ----------
+    name : str
+        Names the result's files.
+    folder : Path
+        Where it is.
+    about, declared : str
+        What was measured, and what the scene declares, one line each.
+    coordinates : tuple of str, optional
+        State dimensions that are used; all that were recorded by default.
+    ahead : tuple of Ahead
+        Forecasts to judge by; without them as far as the loop's own.
+    right : tuple of str
+        Effects that are physically there, of which at least one should be named.
+    possible : tuple of str
+        Effects that may be there too, which no independent fit is sure of; other names are false.
+    sizes : dict of (str, str) to float
+        Independent estimates by effect and parameter, in the catalogue's units.
     """
-    if not folder.is_dir():
-        return {"push_mm": None, "push_deg": None}
-    scene = pp.Scene.load(folder / "scene.toml")
-    train, test = (pp.History.load(folder / f"{name}.csv", scene) for name in ("train", "test"))
-    error = revise(scene, train, test, seed=seed, method="laplace").after.rollout_rmse
-    return {
-        "push_mm": 1e3 * float(np.hypot(error["x"], error["y"])),
-        "push_deg": float(np.degrees(error["theta"])),
-    }
+
+    name: str
+    folder: Path
+    about: str = ""
+    declared: str = ""
+    coordinates: tuple[str, ...] | None = None
+    ahead: tuple[Ahead, ...] = ()
+    right: tuple[str, ...] = ()
+    possible: tuple[str, ...] = ()
+    sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
 
-#: What can be asked for. Each takes minutes, the loop on its recording (twice for the pendulum).
-MEASURED: dict[str, Callable[..., dict[str, float | None]]] = {
-    "pendulum": pendulum_errors,
-    "double_pendulum": double_pendulum_errors,
-    "push": push_errors,
-}
+_SWING = Recording(
+    name="pendulum-swing-velocities",
+    folder=SHARED / "data" / "real" / "pendulum-swing",
+    about="One arm of a multi-arm pendulum on a bearing, swinging freely (Kaheman et al., arXiv"
+    " 2205.06231): encoder angle and the angular velocity by a local polynomial, 50 Hz.",
+    declared="a hinge and a weighed arm, moment of inertia free; no friction",
+    ahead=(
+        Ahead(1.0, "angle", 0.0130, 0.0025, "viscous, dry and quadratic friction"),
+        Ahead(2.0, "angle", 0.0354, 0.0037, "viscous, dry and quadratic friction"),
+    ),
+    right=("pivot_damping", "pivot_friction", "quadratic_drag"),
+    possible=("sensor_bias",),  # an encoder's zero is set by hand
+)
+#: The measured recordings, the quick ones first.
+MEASURED = (
+    _SWING,
+    replace(
+        _SWING,
+        name="pendulum-swing-angle",
+        about="The same recording, the angle alone.",
+        coordinates=("theta",),
+    ),
+    Recording(
+        name="pendulum-torque",
+        folder=SHARED / "measured" / "pendulum-torque",
+        about="An arm with a weight at its end, swung up by a motor in its hinge (DFKI"
+        " torque-limited simple pendulum): encoder angle, and the torque from the motor's current,"
+        " 50 Hz. Train and test are of two controllers.",
+        declared="a hinge and an arm, mass and moment of inertia free; no friction",
+        coordinates=("theta",),
+        ahead=(
+            Ahead(0.2, "angle", 0.086, 0.035, "dry friction (0.029 rad with a late command too)"),
+        ),
+        right=("pivot_friction",),
+        possible=("actuator_delay", "sensor_bias"),
+        sizes={("pivot_friction", "torque"): 0.143},
+    ),
+    Recording(
+        name="double-pendulum",
+        folder=SHARED / "data" / "real" / "double-pendulum-driven",
+        about="Two arms with a motor in each hinge (DFKI double pendulum, design C.1; Wiebe et al.,"
+        " doi 10.1109/MRA.2023.3341257): angles, velocities by a local polynomial, torques from"
+        " the motors' currents, 100 Hz.",
+        declared="two hinges, two arms with free mass, moment of inertia and centre of mass; no"
+        " friction",
+        ahead=(Ahead(0.1, "angle", 0.0641, 0.0095, "dry friction in both hinges"),),
+        right=("pivot_friction",),
+        possible=("sensor_bias",),
+    ),
+    Recording(
+        name="planar-push",
+        folder=SHARED / "contact" / "planar-push",
+        about="A steel block pushed over a table by a robot's finger (Zhou et al., arXiv"
+        " 1602.06056): motion capture of the block before and after each push, of the finger all"
+        " the way.",
+        declared="a weighed block and the finger's path; nothing of the table",
+        ahead=(
+            Ahead(6.7, "position", 0.0050, 0.00149, "quasi-static ellipsoidal limit surface"),
+            Ahead(6.7, "angle", 0.0419, 0.0241, "quasi-static ellipsoidal limit surface"),
+        ),
+        right=("sliding_friction",),
+    ),
+)
 
 
-def _errors(
-    folder: Path, ahead: tuple[float, ...], seed: int, angle_only: bool = False
-) -> dict[float, float]:
-    """Errors of angles after so many seconds with the effects that the loop adds."""
-    scene = pp.Scene.load(folder / "scene.toml")
+@dataclass(frozen=True)
+class Result:
+    """Findings of the loop on a recording.
 
-    def recording(name: str) -> pp.History:
-        frame = pd.read_csv(folder / f"{name}.csv")
-        if angle_only:
-            frame = frame.assign(omega=float("nan"))
-        return pp.History.from_dataframe(frame, scene, estimate_velocities=angle_only)
+    Parameters
+    ----------
+    name : str
+        Of the recording.
+    method, sources, version : str
+        Of the posteriors, hash of the package's files, and the package's version.
+    seed : int
+        Of the loop.
+    verdict, sentence : str
+        The loop's verdict in a word and in a sentence.
+    added : tuple of dict
+        As in ``report.json``: effect, body, parameters with mean, interval and unit, and effects
+        that are not separable from it.
+    errors : tuple of dict
+        Of each forecast: seconds, quantity, unit, before and after (root mean square).
+    error : str, optional
+        Why the loop failed.
+    seconds : float
+        What the loop took (s).
+    """
 
-    train, test = recording("train"), recording("test")
-    found = revise(scene, train, test, seed=seed, method="laplace")
+    name: str
+    method: str
+    seed: int
+    sources: str
+    version: str
+    verdict: str = "failed"
+    sentence: str = ""
+    added: tuple[dict[str, Any], ...] = ()
+    errors: tuple[dict[str, Any], ...] = ()
+    error: str | None = None
+    seconds: float = 0.0
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(asdict(self), indent=1) + "\n")
+
+    @classmethod
+    def load(cls, path: Path) -> Result | None:
+        """Read one, if it is there."""
+        if not path.is_file():
+            return None
+        kept = json.loads(path.read_text())
+        return cls(**kept | {key: tuple(kept[key]) for key in ("added", "errors")})
+
+    @property
+    def names(self) -> tuple[tuple[str, ...], ...]:
+        """Each added effect, with those that are not separable from it."""
+        return tuple((each["effect"], *each["not_separable_from"]) for each in self.added)
+
+
+def load_recording(recording: Recording) -> tuple[pp.Scene, pp.History, pp.History]:
+    """Scene, train and test; velocities are estimated where none were recorded or none are used."""
+    scene = pp.Scene.load(recording.folder / "scene.toml")
+
+    def history(name: str) -> pp.History:
+        frame = pd.read_csv(recording.folder / f"{name}.csv")
+        if recording.coordinates is not None:
+            unused = [key for key in STATE if key not in recording.coordinates]
+            frame = frame.assign(**dict.fromkeys(unused, np.nan))
+        estimate = not frame[[key for key in _VELOCITIES if key in frame]].notna().any(axis=None)
+        return pp.History.from_dataframe(frame, scene, estimate_velocities=bool(estimate))
+
+    return scene, history("train"), history("test")
+
+
+def run(
+    recording: Recording,
+    *,
+    seed: int = 0,
+    method: str = "laplace",
+    progress: Callable[[str], None] | None = None,
+) -> tuple[Result, bytes | None]:
+    """Run the loop on a recording.
+
+    Parameters
+    ----------
+    recording : Recording
+        Its folder exists.
+    seed : int
+        The same seed gives the same result.
+    method : str
+        Of the posteriors, as of ``close_loop``.
+    progress : callable, optional
+        Called with the name of each stage.
+
+    Returns
+    -------
+    result : Result
+        A failure too is a result.
+    picture : bytes or None
+        PNG of a held-out trajectory, measured and forecast; None of a failure.
+    """
+    result = Result(recording.name, method, seed, sources(), pp.__version__)
+    begin = time.perf_counter()
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the result says what matters of them
+            scene, train, test = load_recording(recording)
+            found = revise(scene, train, test, seed=seed, method=method, progress=progress)
+            seconds = time.perf_counter() - begin
+            errors = errors_ahead(recording, found, train, test, seed)
+    except Exception as error:  # the other recordings are run all the same
+        why = f"{type(error).__name__}: {error}"
+        return replace(result, error=why, seconds=time.perf_counter() - begin), None
+    done = replace(
+        result,
+        verdict=found.verdict,
+        sentence=verdict_in_words(found),
+        added=tuple(found.to_dict()["added"]),
+        errors=errors,
+        seconds=seconds,
+    )
+    return done, picture(found)
+
+
+def errors_ahead(
+    recording: Recording, found: Findings, train: pp.History, test: pp.History, seed: int
+) -> tuple[dict[str, Any], ...]:
+    """Held-out errors of each forecast, before and after; None where no trajectory is as long."""
+    scene = found.scene
+    train, test, _ = checked_histories(scene, train, test)
+    judged = HeldOut(test, seed)
     by_name = {effect.name: effect for effect in pp.catalogue}
     added = [by_name[each.effect].on(each.body) for each in found.added]
-    problem = Problem.of(
-        scene, train, attach(scene, added), substeps=found.numerical.substeps_used, threads=2
+    models = [(found.posterior_before, ())]
+    if added:
+        models.append((found.posterior_after, added))
+    fitted = []
+    for posterior, effects in models:
+        problem = Problem.of(
+            scene, train, attach(scene, effects), substeps=found.numerical.substeps_used, threads=2
+        )
+        vectors = problem.layout.to_vectors(draws(posterior), len(draws(posterior)["sigma"]))
+        mode = trajectory_mode(problem, vectors.mean(axis=0))
+        fitted.append((judged.problem(mode), mode))
+    own = found.rollout_horizon * scene.time_step
+    asked = recording.ahead or tuple(Ahead(own, quantity) for quantity in QUANTITIES)
+    rows = []
+    for each in asked:
+        dimensions, unit = QUANTITIES[each.quantity]
+        intervals = round(each.seconds / scene.time_step)
+        errors = []
+        for problem, mode in fitted:
+            rmse = forecast(problem, mode.phi, mode.sigma, intervals).rmse()
+            square = [rmse[name] ** 2 for name in dimensions if name in rmse]
+            errors.append(float(np.sqrt(sum(square))) if square else None)
+        row = {"seconds": each.seconds, "quantity": each.quantity, "unit": unit}
+        rows.append(row | {"before": errors[0], "after": errors[-1]})
+    if recording.ahead:
+        return tuple(rows)
+    return tuple(row for row in rows if row["before"] is not None)
+
+
+def picture(found: Findings) -> bytes:
+    """PNG of positions and angle of a held-out trajectory, measured and forecast from its start."""
+    shown = found.rollout
+    columns = [place for place, name in enumerate(shown.names) if name not in _VELOCITIES]
+
+    def of(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        return values[:, columns]
+
+    places = replace(
+        shown,
+        names=tuple(shown.names[place] for place in columns),
+        units=tuple(shown.units[place] for place in columns),
+        measured=of(shown.measured),
+        before=of(shown.before),
+        after=of(shown.after),
     )
-    mode = trajectory_mode(problem, find_mode(problem, seed=seed).phi)
-    held_out = HeldOut(test, seed).problem(mode)
-    return {
-        seconds: forecast(held_out, mode.phi, mode.sigma, round(seconds / scene.time_step)).rmse()[
-            "theta"
-        ]
-        for seconds in ahead
-    }
+    return png(plot_rollout(replace(found, rollout=places)))

@@ -1,0 +1,298 @@
+"""Measured recordings: the script that runs the loop on them, and the page On hardware."""
+
+import json
+import shutil
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+import pbrl_ppl as pp
+from pbrl_ppl.state import STATE
+from tests.helpers.places import ROOT
+
+for engine in ("Box2D", "mujoco"):
+    pytest.importorskip(engine, reason=f"{engine} makes cases; install the extra `test`")
+
+#: Drag over mass (1/s), and its mass (kg), of a sliding disc.
+RATE, MASS = 0.8, 2.0
+
+
+@pytest.fixture
+def measured(monkeypatch):
+    """Modules of analysis/attribution can be imported, as the script imports them."""
+    monkeypatch.syspath_prepend(str(ROOT / "analysis"))
+    import attribution.measured
+
+    return attribution.measured
+
+
+@pytest.fixture
+def page(measured):
+    import attribution.measured_page
+
+    return attribution.measured_page
+
+
+@pytest.fixture
+def benchmark(measured):
+    import attribution_benchmark
+
+    return attribution_benchmark
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A disc that slides with linear drag, in closed form: 8 trajectories of 2 s, and 4 to test."""
+    folder = tmp_path / "disc"
+    folder.mkdir()
+    disc = pp.Body("disc", pp.Shape.circle(0.1), known={"mass": MASS}, wheel=False)
+    scene = pp.Scene(time_step=0.1, bodies=(disc,), gravity=(0.0, 0.0))
+    (folder / "scene.toml").write_text(scene.to_toml())
+    rng = np.random.default_rng(5)
+    time = 0.1 * np.arange(21)
+    for name, n in (("train", 8), ("test", 4)):
+        rows = []
+        for trajectory in range(n):
+            velocity, spin = rng.uniform(-2.0, 2.0, 2), rng.uniform(-1.0, 1.0)
+            slowed = np.exp(-RATE * time)
+            way = velocity * ((1.0 - slowed) / RATE)[:, None]
+            motion = np.column_stack(
+                [way, spin * time, velocity * slowed[:, None], np.full_like(time, spin)]
+            )
+            noisy = motion + rng.normal(0.0, [1e-3] * 3 + [5e-3] * 3, motion.shape)
+            rows.append(
+                pd.DataFrame(noisy, columns=list(STATE)).assign(
+                    trajectory=trajectory, step=range(21), time=time, body="disc",
+                    force_x=0.0, force_y=0.0, torque=0.0,
+                )
+            )  # fmt: skip
+        pd.concat(rows).to_csv(folder / f"{name}.csv", index=False)
+    return folder
+
+
+def settings(**changed):
+    """The command line's options."""
+    usual = {"folder": None, "only": None, "list": False, "write_page": False, "cache": None}
+    usual |= {"seed": 0, "method": None, "verbose": False, "json": None}
+    return SimpleNamespace(**usual | changed)
+
+
+@pytest.fixture
+def result(measured):
+    """A made-up result of a made-up recording, which names dry friction and a false torque."""
+    recording = measured.Recording(
+        name="arm",
+        folder=ROOT / "nowhere",
+        about="An arm.",
+        declared="a hinge; no friction",
+        ahead=(measured.Ahead(0.2, "angle", 0.09, 0.03, "dry friction"),),
+        right=("pivot_friction",),
+        possible=("sensor_bias",),
+        sizes={("pivot_friction", "torque"): 0.14},
+    )
+    friction, torque, bias = (
+        {
+            "effect": effect, "body": "arm", "not_separable_from": [],
+            "parameters": {name: {"mean": 0.15, "sd": 0.01, "hdi": [0.13, 0.17], "unit": unit}},
+        }
+        for effect, name, unit in (
+            ("pivot_friction", "torque", "N m"),
+            ("constant_torque", "torque", "N m"),
+            ("sensor_bias", "theta", "rad"),
+        )
+    )  # fmt: skip
+    errors = {"seconds": 0.2, "quantity": "angle", "unit": "rad", "before": 0.09, "after": 0.036}
+    made = measured.Result(
+        "arm", "laplace", 0, "abc", "0", "effects-added", "Something was missing.",
+        (friction, torque, bias), (errors,), seconds=12.0,
+    )  # fmt: skip
+    return recording, made
+
+
+def test_a_result_is_the_same_from_its_file(measured, result, tmp_path) -> None:
+    _, made = result
+    made.save(tmp_path / "some" / "arm.json")
+    assert measured.Result.load(tmp_path / "some" / "arm.json") == made
+    assert measured.Result.load(tmp_path / "other.json") is None
+
+
+def test_failures_by_hand(page, result) -> None:
+    recording, made = result
+    friction, torque, bias = made.added
+    assert page.failures(recording, made) == ["False name: `constant_torque`."]
+    assert page.failures(recording, replace(made, added=(friction, bias))) == []
+    (none,) = page.failures(recording, replace(made, added=()))
+    assert none == "Not named: `pivot_friction`."
+    grouped = torque | {"not_separable_from": ["pivot_friction"]}
+    assert page.failures(recording, replace(made, added=(grouped,))) == []
+    (far,) = page.failures(
+        recording, replace(made, added=(friction,), errors=({**made.errors[0], "after": 0.06},))
+    )
+    assert far == "The error of the angle at 0.2 s is 2.0 times that of the independent fit."
+    (off,) = page.failures(
+        replace(recording, sizes={("pivot_friction", "torque"): 0.2}),
+        replace(made, added=(friction,)),
+    )
+    assert off.endswith("0.130 to 0.170, does not hold the 0.200 of the independent fit.")
+    (broken,) = page.failures(recording, replace(made, error="PbrlError: no way"))
+    assert broken == "The loop failed: PbrlError: no way."
+    # a recording of a user's own: nothing is known of what is there
+    assert page.failures(replace(recording, right=(), ahead=(), sizes={}), made) == []
+
+
+def test_a_table_has_a_row_a_recording(page, result) -> None:
+    recording, made = result
+    other = replace(recording, name="leg")
+    table = page.markdown_table([recording, other], {"arm": made}).splitlines()
+    assert len(table) == 4
+    assert {line.count("|") for line in table} == {7}
+    assert "`pivot_friction` of arm: torque 0.150 (0.130 to 0.170) N m" in table[2]
+    assert "0.0900 rad at 0.2 s | 0.0360 rad at 0.2 s | 0.0300 rad at 0.2 s |" in table[2]
+    assert "not run | – | – | 0.0300 rad at 0.2 s" in table[3]
+
+
+def test_a_page_is_written_between_its_markers_again_and_again(page, result, tmp_path) -> None:
+    recording, made = result
+    path = tmp_path / "hardware.md"
+    path.write_text(f"# Title\n\n{page.BEGIN}\nold\n{page.END}\n\nThe end.\n")
+    made.save(tmp_path / "hardware" / "arm.json")
+    (tmp_path / "hardware" / "arm.png").write_bytes(b"")
+    page.write_page(path, [recording])
+    text = path.read_text()
+    assert text.startswith("# Title\n") and text.endswith("\n\nThe end.\n")
+    assert "old" not in text
+    assert "**False name: `constant_torque`.**" in text
+    assert "(hardware/arm.png)" in text
+    page.write_page(path, [recording])
+    assert path.read_text() == text
+    path.write_text("# Title\n")
+    with pytest.raises(ValueError, match="expected one line"):
+        page.write_page(path, [recording])
+
+
+def test_the_page_shows_the_results_beside_it(page, tmp_path) -> None:
+    """Made anew of the same results it is the same: `--write-page` was run on what is there."""
+    shutil.copytree(page.RESULTS, tmp_path / "hardware")
+    shutil.copy(page.PAGE, tmp_path)
+    page.write_page(tmp_path / "hardware.md")
+    assert (tmp_path / "hardware.md").read_text() == page.PAGE.read_text()
+    for picture in page.RESULTS.glob("*.png"):
+        assert picture.stat().st_size <= 60_000
+
+
+def test_a_folder_is_run_once(benchmark, measured, result, folder, tmp_path, monkeypatch) -> None:
+    """Until the code, the seed or the method is another; a failure is tried again."""
+    _, made = result
+    runs = []
+
+    def quick(recording, *, seed, method, progress):
+        runs.append((recording.name, seed, method))
+        now = {"sources": benchmark.sources(), "seed": seed, "method": method}
+        return replace(made, name=recording.name, **now), b"picture"
+
+    monkeypatch.setattr(benchmark, "run", quick)
+    given = settings(folder=folder, cache=tmp_path / "kept", json=str(tmp_path / "all.json"))
+    for _ in range(2):
+        benchmark.measure(given)
+    assert runs == [("disc", 0, "laplace")]
+    assert (tmp_path / "kept" / "disc.png").read_bytes() == b"picture"
+    assert json.loads((tmp_path / "all.json").read_text())["disc"]["verdict"] == "effects-added"
+    benchmark.measure(SimpleNamespace(**vars(given) | {"seed": 1}))
+    broken = replace(measured.Result.load(tmp_path / "kept" / "disc.json"), error="why")
+    broken.save(tmp_path / "kept" / "disc.json")
+    benchmark.measure(SimpleNamespace(**vars(given) | {"seed": 1}))
+    assert runs[1:] == [("disc", 1, "laplace")] * 2
+
+
+def test_recordings_that_are_not_there_are_left_out(
+    benchmark, result, tmp_path, monkeypatch, capsys
+) -> None:
+    recording, _ = result
+    monkeypatch.setattr(benchmark, "MEASURED", (recording, replace(recording, name="leg")))
+    said = []
+    monkeypatch.setattr(benchmark, "say", said.append)
+    benchmark.measure(settings(only=["ar"], cache=tmp_path))
+    assert [each.partition(" at ")[0] for each in said] == ["arm: no recording"]
+    assert capsys.readouterr().out.count("not run") == 2
+    with pytest.raises(SystemExit, match="no recording has tail in its name"):
+        benchmark.measure(settings(only=["tail"]))
+
+
+def test_a_failure_is_a_result(measured, folder) -> None:
+    (folder / "test.csv").unlink()
+    result, picture = measured.run(measured.Recording("disc", folder))
+    assert (result.verdict, picture) == ("failed", None)
+    assert result.error.startswith("FileNotFoundError")
+
+
+@pytest.mark.slow
+def test_a_simulated_folder_is_run_as_a_measured_one(measured, folder, monkeypatch) -> None:
+    """Errors told are those of the loop's own models; its drag is 1.6 kg/s."""
+    loops = []
+
+    def kept(*given, **options):
+        loops.append(measured_revise(*given, **options))
+        return loops[-1]
+
+    measured_revise = measured.revise
+    monkeypatch.setattr(measured, "revise", kept)
+    own = measured.Recording("disc", folder)
+    result, picture = measured.run(own)
+    assert (result.error, result.verdict) == (None, "effects-added")
+    (drag,) = result.added
+    assert drag["effect"] == "linear_drag"
+    size = drag["parameters"]["coefficient"]
+    # a false alarm in 6e-5
+    assert abs(size["mean"] - RATE * MASS) < 4.0 * size["sd"]
+    assert picture.startswith(b"\x89PNG")
+    assert len(picture) <= 60_000
+    (found,) = loops
+    angle, place = result.errors
+    for row, names in ((angle, ["theta"]), (place, ["x", "y"])):
+        assert row["seconds"] == pytest.approx(0.1 * found.rollout_horizon)
+        for key in ("before", "after"):
+            told = getattr(found, key).rollout_rmse
+            assert row[key] == pytest.approx(np.hypot.reduce([told[n] for n in names]), rel=0.02)
+    assert place["after"] < 0.1 * place["before"]
+    # none of the held-out trajectories is as long as 3 s
+    asked = replace(own, ahead=(measured.Ahead(0.5, "position"), measured.Ahead(3.0, "angle")))
+    train, test = measured.load_recording(own)[1:]
+    half, long = measured.errors_ahead(asked, found, train, test, seed=0)
+    assert half["after"] < place["after"] * 3
+    assert long["before"] is None and long["after"] is None
+
+
+def test_recordings_load_with_the_coordinates_that_are_used(measured) -> None:
+    there = [each for each in measured.MEASURED if each.folder.is_dir()]
+    if not there:
+        pytest.skip(f"no recordings at {measured.SHARED}")
+    assert len({each.name for each in measured.MEASURED}) == len(measured.MEASURED)
+    for recording in there:
+        scene, train, test = measured.load_recording(recording)
+        for history in (train, test):
+            observed = np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1, 2))
+            names = {name for name, seen in zip(STATE, observed, strict=True) if seen}
+            assert {"theta"} <= names
+            if recording.coordinates == ("theta",):
+                assert names <= {"theta", "omega"}  # x, y, vx and vy follow from the hinge
+        longest = int(test.dataset["n_rows"].min()) - 1
+        for ahead in recording.ahead:
+            assert round(ahead.seconds / scene.time_step) <= longest
+        catalogue = {effect.name for effect in pp.catalogue}
+        assert set(recording.right) | set(recording.possible) <= catalogue
+
+
+@pytest.mark.long
+def test_a_measured_recording_is_run(measured) -> None:
+    """Angle and torque alone; without friction an independent fit is off by 0.086 rad."""
+    (recording,) = (each for each in measured.MEASURED if each.name == "pendulum-torque")
+    if not recording.folder.is_dir():
+        pytest.skip(f"no recording at {recording.folder}")
+    result, picture = measured.run(recording)
+    assert result.error is None and picture is not None
+    (row,) = result.errors
+    assert 0.05 < row["before"] < 0.2
+    assert row["after"] <= row["before"]
