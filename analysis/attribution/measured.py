@@ -215,7 +215,7 @@ class Result:
 
 
 def load_recording(recording: Recording) -> tuple[pp.Scene, pp.History, pp.History]:
-    """Scene, train and test; velocities are estimated where none were recorded or none are used."""
+    """Scene, train and test, with the velocities empty where none are used."""
     scene = pp.Scene.load(recording.folder / "scene.toml")
 
     def history(name: str) -> pp.History:
@@ -223,8 +223,7 @@ def load_recording(recording: Recording) -> tuple[pp.Scene, pp.History, pp.Histo
         if recording.coordinates is not None:
             unused = [key for key in STATE if key not in recording.coordinates]
             frame = frame.assign(**dict.fromkeys(unused, np.nan))
-        estimate = not frame[[key for key in _VELOCITIES if key in frame]].notna().any(axis=None)
-        return pp.History.from_dataframe(frame, scene, estimate_velocities=bool(estimate))
+        return pp.History.from_dataframe(frame, scene)
 
     return scene, history("train"), history("test")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,10 +67,10 @@ def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
     flat[segments.trajectory[:, None], segments.step[:, None] + 1, cells.places] += deviation
-    # nothing comes before a trajectory's first row: it is as measured, or as estimated there
-    start = problem.data.history.dataset["start"].to_numpy()[:, 0].reshape(len(flat), -1)
-    first = start[:, cells.places]
-    flat[:, 0, cells.places] = np.where(np.isfinite(first), first, flat[:, 0, cells.places])
+    # nothing comes before a trajectory's first row: it is as measured, or as the next rows have it
+    few = replace(noise, seen=noise.seen & (segments.step < _SETTLED)[:, None])
+    first = np.where(noise.wide > 0, few.smoothed(residual, sigma)[0], noise.begin)[noise.first]
+    flat[segments.trajectory[noise.first, None], 0, cells.places] += first
     return cells.completed(problem.scene, states)
 
 
