@@ -142,7 +142,7 @@ def forecast(
 
 def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array:
     """Covariance of the filtered states before these transitions, shape (start, cell, cell)."""
-    after = noise.gains(sigma)[2][at - 1]
+    after = noise.covariance(sigma)[at - 1]
     variance = np.where(noise.wide[at] > 0, noise.wide[at], noise.cells.errors(sigma) ** 2)
     # an estimate of what was not measured is no better than the filter's, soon after
     later = np.diagonal(after, axis1=1, axis2=2)

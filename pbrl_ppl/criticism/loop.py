@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.assembly import Models, converged, put_together
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.drift import same_noise, with_correlated_errors
 from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
 from pbrl_ppl.criticism.histories import checked_histories, named
@@ -18,7 +19,7 @@ from pbrl_ppl.criticism.misfit import PRIOR, beside_names, find_misfit
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.results import ResidualTest
-from pbrl_ppl.criticism.score import rank_candidates
+from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.criticism.unexplained import (
     Left,
@@ -138,25 +139,13 @@ def _revised(
         warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
     say("fitting the declared model")
     declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
-    say("scoring what the model might lack")
-    first = rank_candidates(declared, selection.missing(declared))
-    current, ranked = declared, first
-    added: list[Step] = []
-    while ranked and len(added) < criteria.most_added:
-        step = selection.best_addition(current, ranked)
-        if step is None and unexplained_acceleration(current, criteria).remains.any():
-            alone = without_acceleration(current)
-            hidden = rank_candidates(alone, selection.missing(current))
-            step = selection.best_addition(current, hidden)
-        if step is None:
-            break
-        say(f"added {step.signature.candidate.effect} on {step.signature.candidate.body}")
-        added.append(step)
-        current = step.after
-        ranked = rank_candidates(current, selection.missing(current))
-    if len(added) > 1:
-        say("checking that each added effect is still needed")
-        current, added = selection.prune(current, added)
+    first, current, added = _with_effects(declared, selection, criteria, say)
+    if unexplained_acceleration(current, criteria).matters.any():
+        tracked = with_correlated_errors(current, criteria)
+        if tracked is not None:  # under the right noise effects may show that were hidden before
+            say("errors of measuring are correlated: looking again")
+            declared = same_noise(declared, tracked)
+            first, current, added = _with_effects(declared, selection, criteria, say)
     say("testing what is left")
     before, left = (unexplained_acceleration(mode, criteria) for mode in (declared, current))
     horizon = rollout_horizon(train, scene.time_step)
@@ -191,6 +180,32 @@ def _revised(
     models = Models(declared, current, posterior, revised, before, left)
     told = selection.explained(first), tuple(selection.small)
     return put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
+
+
+def _with_effects(
+    declared: Mode, selection: Selection, criteria: Criteria, say: Callable[[str], None]
+) -> tuple[list[Signature], Mode, list[Step]]:
+    """The ranking of the declared model, the model with effects added one by one, and those."""
+    say("scoring what the model might lack")
+    first = rank_candidates(declared, selection.missing(declared))
+    current, ranked = declared, first
+    added: list[Step] = []
+    while ranked and len(added) < criteria.most_added:
+        step = selection.best_addition(current, ranked)
+        if step is None and unexplained_acceleration(current, criteria).remains.any():
+            alone = without_acceleration(current)
+            hidden = rank_candidates(alone, selection.missing(current))
+            step = selection.best_addition(current, hidden)
+        if step is None:
+            break
+        say(f"added {step.signature.candidate.effect} on {step.signature.candidate.body}")
+        added.append(step)
+        current = step.after
+        ranked = rank_candidates(current, selection.missing(current))
+    if len(added) > 1:
+        say("checking that each added effect is still needed")
+        current, added = selection.prune(current, added)
+    return first, current, added
 
 
 def _prior_test(

@@ -120,7 +120,7 @@ def innovations_over_steps(mode: Mode) -> Array:
     velocity = np.where(dimension < 3, dimension + 3, dimension)
     typical = np.sqrt(np.mean(change[:, body, velocity] ** 2, axis=0))
     step = np.where(dimension < 3, dt * typical, typical)
-    return np.asarray(np.median(noise.gains(mode.sigma)[1], axis=0) / np.maximum(step, 1e-300))
+    return np.asarray(np.median(noise.scale(mode.sigma), axis=0) / np.maximum(step, 1e-300))
 
 
 def _numerical(mode: Mode) -> Array:

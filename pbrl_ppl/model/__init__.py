@@ -1,6 +1,6 @@
 """Table 1, Eqs. 11 and 12, the engine as a pytensor Op, and the `pm.Model` made of them."""
 
-from pbrl_ppl.model.cells import ACCELERATION, JOLT, Cells, check_moves
+from pbrl_ppl.model.cells import ACCELERATION, DRIFT, JOLT, Cells, check_moves
 from pbrl_ppl.model.data import Data
 from pbrl_ppl.model.declaration import build_model, declared_problem, prior_predictive_draws
 from pbrl_ppl.model.library import ParameterLibrary
@@ -20,7 +20,7 @@ from pbrl_ppl.model.log_posterior import (
     noise_prior_slope,
 )
 from pbrl_ppl.model.noise import Noise, estimate_sigma, sigma_prior
-from pbrl_ppl.model.noise_scales import bodies_acceleration
+from pbrl_ppl.model.noise_scales import bodies_acceleration, noise_medians, ranges
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
 from pbrl_ppl.model.problem import Problem
@@ -40,6 +40,7 @@ from pbrl_ppl.model.transition import Transition
 
 __all__ = [
     "ACCELERATION",
+    "DRIFT",
     "JOLT",
     "Cells",
     "Data",
@@ -69,8 +70,10 @@ __all__ = [
     "log_prior",
     "next_state_random",
     "noise_law",
+    "noise_medians",
     "noise_prior_slope",
     "prior_predictive_draws",
+    "ranges",
     "robust",
     "sigma_prior",
     "simulated_trajectories",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +17,8 @@ from pbrl_ppl.state import STATE, THETA, wrapped
 ACCELERATION = "unexplained_acceleration"
 #: And the one of what comes on top of it where bodies touch.
 JOLT = "contact_acceleration"
+#: Errors of measuring that last: those of a tracker, say, beside errors of single rows.
+DRIFT = "correlated_error"
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -42,9 +44,11 @@ class Cells:
         velocity, shape (push, cell).
     pushed : ndarray of int
         Which noise parameter is the acceleration of each row, shape (push,).
-    sensors, rates, jolts : tuple of int
+    sensors, rates, jolts, drifts : tuple of int
         State dimensions that the noise parameters are about: of measurements, of accelerations, of
-        what bodies that touch add to those.
+        what bodies that touch add to those, of errors of measuring that are correlated.
+    memory : float
+        Correlation of the latter from one row to the next.
     """
 
     places: Ints
@@ -56,17 +60,39 @@ class Cells:
     sensors: tuple[int, ...]
     rates: tuple[int, ...]
     jolts: tuple[int, ...] = ()
+    drifts: tuple[int, ...] = ()
+    memory: float = 0.0
 
     @property
     def variables(self) -> dict[str, tuple[str, ...]]:
         """Variables of the noise, and the state dimensions of each, in the order of sigma."""
-        own = {"sigma": self.sensors, ACCELERATION: self.rates, JOLT: self.jolts}
+        own = {
+            "sigma": self.sensors, ACCELERATION: self.rates, JOLT: self.jolts, DRIFT: self.drifts,
+        }  # fmt: skip
         return {name: tuple(STATE[d] for d in about) for name, about in own.items() if about}
 
     @property
     def accelerations(self) -> range:
         """Places of the noise parameters that are unexplained accelerations."""
         return range(len(self.sensors), len(self.sensors) + len(self.rates))
+
+    @property
+    def drift_parameters(self) -> range:
+        """Places of the noise parameters that are correlated errors of measuring."""
+        first = len(self.sensors) + len(self.rates) + len(self.jolts)
+        return range(first, first + len(self.drifts))
+
+    def drifting(self, memory: float) -> Cells:
+        """The same with correlated errors of measuring positions."""
+        return replace(self, drifts=tuple(d for d in self.sensors if d <= THETA), memory=memory)
+
+    @cached_property
+    def drifted(self) -> tuple[Ints, Ints]:
+        """Cells with correlated errors, and which noise parameter each one's is."""
+        dimension = self.places % len(STATE)
+        cells = np.flatnonzero(np.isin(dimension, self.drifts) & (self.sensor >= 0))
+        order = np.searchsorted(self.drifts, dimension[cells])
+        return cells, self.drift_parameters.start + order
 
     @cached_property
     def always(self) -> Bools:
@@ -90,9 +116,16 @@ class Cells:
         drawn = sigma[..., self.pushed] * rng.standard_normal((*touching.shape, len(self.pushed)))
         return np.where(self.always | touching[..., None], drawn, 0.0) @ self.push
 
-    def errors(self, sigma: Array) -> Array:
-        """Standard deviation of measuring each cell, shape (cell,)."""
+    def white(self, sigma: Array) -> Array:
+        """Standard deviation of a row's own error of measuring each cell, shape (cell,)."""
         return np.where(self.sensor >= 0, sigma[self.sensor], self.fixed)
+
+    def errors(self, sigma: Array) -> Array:
+        """Standard deviation of measuring each cell, correlated or not, shape (cell,)."""
+        square = self.white(sigma) ** 2
+        cells, parameters = self.drifted
+        square[cells] += sigma[parameters] ** 2
+        return np.sqrt(square)
 
     def of(self, values: Array) -> Array:
         """The cells of values of shape (..., body, 6), shape (..., cell)."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, check_start, measured_alone
-from pbrl_ppl.model.cells import ACCELERATION, JOLT
+from pbrl_ppl.model.cells import ACCELERATION, DRIFT, JOLT
 from pbrl_ppl.model.library import ParameterLibrary
 from pbrl_ppl.model.likelihood import (
     Observations,
@@ -34,8 +34,10 @@ from pbrl_ppl.parameters import Block, Layout
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE
 
-#: Dimensions of the two noises along trajectories.
-_NOISE_DIMS = {"sigma": "sensor", ACCELERATION: "velocity", JOLT: "velocity"}
+#: Dimensions of the noises along trajectories.
+_NOISE_DIMS = {
+    "sigma": "sensor", ACCELERATION: "velocity", JOLT: "velocity", DRIFT: "position",
+}  # fmt: skip
 
 
 def declared_problem(
@@ -198,7 +200,7 @@ def _noise(problem: Problem) -> Any:
     parts, mu = [pt.zeros(0)], np.log(median)
     for name, own in problem.noise_variables.items():
         centre, dims = mu[: len(own)], _NOISE_DIMS[name]
-        if name == ACCELERATION:
+        if name in (ACCELERATION, DRIFT):
             variable = pm.Exponential(name, scale=np.exp(centre) / np.log(2.0), dims=dims)
         else:
             variable = pm.LogNormal(name, mu=centre, sigma=spread, dims=dims)

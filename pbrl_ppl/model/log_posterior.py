@@ -14,9 +14,9 @@ Ints = NDArray[np.intp]
 def noise_law(problem: Problem) -> tuple[Array, float]:
     """P(sigma): log of each sigma's median, and the standard deviation of log sigma.
 
-    Errors of measuring are log-normal. An unexplained acceleration is exponential, whatever the
-    spread says: a penalised-complexity prior (Simpson et al., Statistical Science 32, 2017), under
-    which motion follows the physics unless the data say otherwise.
+    Errors of measuring are log-normal. An unexplained acceleration and a correlated error are
+    exponential, whatever the spread says: penalised-complexity priors (Simpson et al., Statistical
+    Science 32, 2017), under which motion follows the physics unless the data say otherwise.
 
     Parameters
     ----------
@@ -38,11 +38,12 @@ def noise_law(problem: Problem) -> tuple[Array, float]:
 def exponential(problem: Problem) -> NDArray[np.bool_]:
     """Which noise parameters have an exponential prior, not a log-normal one, shape (state,).
 
-    They are the unexplained accelerations.
+    They are the unexplained accelerations, and correlated errors of measuring.
     """
     mask = np.zeros(len(problem.noise_prior[0]), dtype=bool)
     if problem.trajectories is not None:
-        mask[list(problem.trajectories.cells.accelerations)] = True
+        cells = problem.trajectories.cells
+        mask[[*cells.accelerations, *cells.drift_parameters]] = True
     return mask
 
 

@@ -18,6 +18,9 @@ SENSOR_SHARE, JOLT_SHARE, SPREAD = 0.1, 0.1, 2.0
 #: An unexplained acceleration is larger than this share of the bodies' acceleration with so much
 #: probability: physics is nearly deterministic, and a random force follows whatever is smooth.
 ACCELERATION_SHARE, ACCELERATION_CHANCE = 0.1, 0.01
+#: A correlated error of measuring is larger than this share of the range of what it measures with
+#: the same probability: an error that lasts follows whatever is smooth, too.
+DRIFT_SHARE = 0.01
 #: A position's velocity is so many places on.
 _RATE = 3
 
@@ -38,7 +41,29 @@ def noise_medians(cells: Cells, history: History, states: Array) -> Array:
     share = ACCELERATION_SHARE * np.log(2.0) / -np.log(ACCELERATION_CHANCE)
     steps = share * _vectors(each, cells.rates) / dt
     jolts = JOLT_SHARE * each[list(cells.jolts)] / dt
-    return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts]), 1e-9))
+    drifts = (
+        DRIFT_SHARE * np.log(2.0) / -np.log(ACCELERATION_CHANCE) * ranges(cells, history, states)
+    )
+    return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts, drifts]), 1e-9))
+
+
+def ranges(cells: Cells, history: History, states: Array) -> Array:
+    """Largest distance between values of each dimension that has correlated errors, shape (drift,).
+
+    Parameters
+    ----------
+    cells : Cells
+        Says which dimensions those are.
+    history : History
+        Says which rows there are.
+    states : ndarray
+        Shape (trajectory, time, body, 6), SI units.
+    """
+    real = np.isfinite(history.dataset["clock"].to_numpy())
+    values = states[real].reshape(-1, states.shape[2] * len(STATE))[:, cells.places]
+    extent = np.ptp(values, axis=0)
+    dimension = cells.places % len(STATE)
+    return np.array([extent[dimension == d].max() for d in cells.drifts])
 
 
 def _typical(cells: Cells, changes: list[Array]) -> Array:

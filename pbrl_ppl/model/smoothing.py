@@ -99,7 +99,7 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
         cells = noise.cells
         residual = cells.of_residual(problem.residual(phi))
         before, after = noise.smoothed(residual, sigma)
-        spread = np.sqrt(np.median(np.diagonal(noise.gains(sigma)[2], axis1=1, axis2=2), axis=0))
+        spread = np.sqrt(np.median(np.diagonal(noise.covariance(sigma), axis1=1, axis2=2), axis=0))
         states = _moved(problem, cells, noise.first, before, after)
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # no motion fits such data: stay where it was linearised last
@@ -258,6 +258,7 @@ def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
     dt = problem.scene.time_step
     guess = [by_dimension[d] / np.sqrt(2) for d in cells.sensors]
     guess += [by_dimension[d] / np.sqrt(2) / dt for d in (*cells.rates, *cells.jolts)]
+    guess += [by_dimension[d] / np.sqrt(2) for d in cells.drifts]
     return np.maximum(guess, problem.noise_prior[0] * 0.01)
 
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.model.cells import Cells
+from pbrl_ppl.model.extended import Extended
 from pbrl_ppl.model.kalman import adjoint, gains, innovations, score
 from pbrl_ppl.model.sensitivity import Sensitivity
 
@@ -23,8 +25,12 @@ class TrajectoryNoise:
     Neighbouring transitions share a measured state, so their residuals are correlated. Whitened
     along the trajectory they are the innovations of a Kalman filter. The noise parameters are the
     standard deviations of a measurement, R, one a measured state dimension, followed by those of an
-    unexplained acceleration, held over an interval, Q, one a velocity, and of what comes on top of
-    it where bodies touch: how they part hangs on more than any engine knows.
+    unexplained acceleration, held over an interval, Q, one a velocity, of what comes on top of it
+    where bodies touch: how they part depends on more than any engine knows; and of errors of
+    measuring that are correlated from row to row.
+
+    The filter's state is the cells as measured without a row's own error, which is the state plus
+    the correlated errors, followed by those errors: each measurement then is of one coordinate.
 
     Parameters
     ----------
@@ -64,8 +70,13 @@ class TrajectoryNoise:
         default_factory=dict, init=False, repr=False
     )
 
-    def gains(self, sigma: Array) -> tuple[Array, Array, Array, Array]:
-        """Gain, scale and covariance of a filter at noise parameters, and the log of the scale.
+    @cached_property
+    def _extended(self) -> Extended:
+        """The filter's linear model."""
+        return Extended.of(self.cells, self.slope, self.seen)
+
+    def _gains(self, sigma: Array) -> tuple[Array, Array, Array, Array]:
+        """Gain, scale and covariance of the filter at noise parameters, and the log of the scale.
 
         The first three are as of :func:`kalman.gains`; the last is summed, shape (transition,).
         """
@@ -74,13 +85,21 @@ class TrajectoryNoise:
         if known is None:
             if len(self._known) > 3:
                 self._known.clear()
-            sensor = self.cells.errors(sigma) ** 2
+            own = self._extended
             gain, scale, after = gains(
-                self.slope, self.first, self.seen, self._begin(sigma), sensor,
-                self.cells.steps(sigma), self.kind,
+                own.slope, self.first, own.seen, self._begin(sigma),
+                own.padded(self.cells.white(sigma) ** 2), own.steps(sigma), self.kind,
             )  # fmt: skip
             known = self._known[key] = gain, scale, after, np.log(scale).sum(axis=1)
         return known
+
+    def scale(self, sigma: Array) -> Array:
+        """Standard deviation of each innovation, shape (transition, cell); 1 where not seen."""
+        return self._gains(sigma)[1][:, : len(self.cells.places)]
+
+    def covariance(self, sigma: Array) -> Array:
+        """Covariance of filtered states, shape (transition, cell, cell)."""
+        return self._extended.covariance(self.cells, self._gains(sigma)[2])
 
     @property
     def last(self) -> Bools:
@@ -118,22 +137,29 @@ class TrajectoryNoise:
         lead = cells.shape[:-2]
         rows = cells.reshape(-1, *cells.shape[-2:])
         if sigma.ndim == 1:
-            return self.filtered(rows, sigma)[0].reshape(cells.shape), self.gains(sigma)[3]
+            return self.filtered(rows, sigma)[0].reshape(cells.shape), self._gains(sigma)[3]
         sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
         own, which = np.unique(sigmas, axis=0, return_inverse=True)
         white, log_scale = np.empty_like(rows), np.empty(rows.shape[:-1])
         for i, row in enumerate(own):
             mine = which.ravel() == i
-            white[mine], log_scale[mine] = self.filtered(rows[mine], row)[0], self.gains(row)[3]
+            white[mine], log_scale[mine] = self.filtered(rows[mine], row)[0], self._gains(row)[3]
         return white.reshape(cells.shape), log_scale.reshape(cells.shape[:-1])
 
     def filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
         """White innovations and filtered deviations of cells' residuals (set, transition, cell)."""
-        gain, scale, *_ = self.gains(sigma)
-        rows = np.ascontiguousarray(residual)  # another layout would be compiled for, too
+        white, state = self._filtered(residual, sigma)
+        cells = self.cells
+        return white[..., : len(cells.places)], self._extended.states(cells, state)
+
+    def _filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """As :meth:`filtered`, of the filter's coordinates."""
+        own, (gain, scale, *_) = self._extended, self._gains(sigma)
+        rows = np.ascontiguousarray(own.padded(residual))  # another layout would be compiled, too
         white, state = innovations(
-            self.slope, self.first, self.seen, gain, scale, rows, self.begin, self.measured
-        )
+            own.slope, self.first, own.seen, gain, scale, rows,
+            own.padded(self.begin), own.padded(self.measured),
+        )  # fmt: skip
         return white, state
 
     def of_cells(self, nu: float | Array | None, shape: tuple[int, ...]) -> float | Array | None:
@@ -144,22 +170,27 @@ class TrajectoryNoise:
 
     def log_scale(self, sigma: Array) -> Array:
         """Logarithm of the innovations' standard deviations, summed, shape (transition,)."""
-        return self.gains(sigma)[3]
+        return self._gains(sigma)[3]
 
     def smoothed(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
         """Smoothed deviations before and after each transition, shape (transition, cell) each."""
-        white, filtered = self.filtered(residual[None], sigma)
-        before, _, after = self.pulled(white[0], sigma)
-        return (
-            self.begin - self._begin(sigma) * before,
-            filtered[0] - np.einsum("kab,kb->ka", self.gains(sigma)[2], after),
-        )
+        own, cells = self._extended, self.cells
+        white, filtered = self._filtered(residual[None], sigma)
+        before, _, after = self._pulled(white[0], sigma)
+        begin = own.padded(self.begin) - self._begin(sigma) * before
+        end = filtered[0] - np.einsum("kab,kb->ka", self._gains(sigma)[2], after)
+        return own.states(cells, begin), own.states(cells, end)
 
-    def pulled(self, weighted: Array, sigma: Array) -> tuple[Array, Array, Array]:
-        """Derivatives of a sum of white innovations, see :func:`kalman.adjoint`."""
-        gain, scale, *_ = self.gains(sigma)
+    def pulled(self, weighted: Array, sigma: Array) -> Array:
+        """Derivative of a sum of white innovations by the predictions, shape (transition, cell)."""
+        padded = self._extended.padded(weighted)
+        return self._pulled(padded, sigma)[1][:, : weighted.shape[1]]
+
+    def _pulled(self, weighted: Array, sigma: Array) -> tuple[Array, Array, Array]:
+        """As of :func:`kalman.adjoint`."""
+        own, (gain, scale, *_) = self._extended, self._gains(sigma)
         pulled: tuple[Array, Array, Array] = adjoint(
-            self.slope, self.last, self.seen, gain, scale, weighted
+            own.slope, self.last, own.seen, gain, scale, weighted
         )
         return pulled
 
@@ -173,16 +204,19 @@ class TrajectoryNoise:
         sigma : ndarray
             Shape (parameter,).
         """
-        white = self.filtered(self.cells.of_residual(residual)[None], sigma)[0][0]
-        gain, scale, _, log_scale = self.gains(sigma)
-        sensor, step, begin = score(self.slope, self.last, self.seen, gain, scale, white, self.kind)
+        own, cells, d = self._extended, self.cells, len(self.cells.places)
+        white = self._filtered(cells.of_residual(residual)[None], sigma)[0][0]
+        gain, scale, _, log_scale = self._gains(sigma)
+        sensor, step, begin = score(own.slope, self.last, own.seen, gain, scale, white, self.kind)
         # measured states begin a trajectory: their error is that of measuring
-        begun = np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0).sum(axis=0)
-        cells, slope = self.cells, np.zeros(len(sigma))
+        began = np.where(self.first[:, None], begin, 0.0)
+        measured = np.where(self.wide > 0, 0.0, began[:, :d]).sum(axis=0)
+        slope = np.zeros(len(sigma))
         free = cells.sensor >= 0
-        np.add.at(slope, cells.sensor[free], (sensor + begun)[free])
-        steps = np.where(cells.always[:, None, None], step.sum(axis=0), step[1])
-        np.add.at(slope, cells.pushed, np.einsum("ja,jab,jb->j", cells.push, steps, cells.push))
+        np.add.at(slope, cells.sensor[free], (sensor[:d] + measured)[free])
+        np.add.at(slope, cells.drifted[1], began[:, d:].sum(axis=0))
+        steps = np.where(own.always[:, None, None], step.sum(axis=0), step[1])
+        np.add.at(slope, own.pushed, np.einsum("ja,jab,jb->j", own.push, steps, own.push))
         norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
         value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
         return value, sigma**2 * slope
@@ -202,16 +236,15 @@ class TrajectoryNoise:
         mean, covariance : ndarray
             Shapes (transition, cell) and (transition, cell, cell).
         """
-        after, filtered = self.gains(sigma)[2], self.filtered(residual[None], sigma)[1][0]
-        first = self.first[:, None]
-        state = np.where(first, self.begin, np.roll(filtered, 1, axis=0))
-        begin = self._begin(sigma)[:, :, None] * np.eye(len(self.cells.places))
+        own, d, first = self._extended, len(self.cells.places), self.first[:, None]
+        after, filtered = self._gains(sigma)[2], self._filtered(residual[None], sigma)[1][0]
+        state = np.where(first, own.padded(self.begin), np.roll(filtered, 1, axis=0))
+        begin = self._begin(sigma)[:, :, None] * np.eye(own.slope.shape[1])
         known = np.where(first[..., None], begin, np.roll(after, 1, axis=0))
-        step = self.cells.steps(sigma)[self.kind]
-        covariance = self.slope @ known @ self.slope.transpose(0, 2, 1) + step
+        covariance = own.slope @ known @ own.slope.transpose(0, 2, 1) + own.steps(sigma)[self.kind]
         return (
-            np.einsum("kab,kb->ka", self.slope, state) - residual,
-            covariance + np.diag(self.cells.errors(sigma) ** 2),
+            np.einsum("kab,kb->ka", own.slope, state)[:, :d] - residual,
+            covariance[:, :d, :d] + np.diag(self.cells.white(sigma) ** 2),
         )
 
     def random(
@@ -235,5 +268,9 @@ class TrajectoryNoise:
         return result
 
     def _begin(self, sigma: Array) -> Array:
-        """Variance of the state before each transition that is its trajectory's first."""
-        return np.where(self.wide > 0, self.wide, self.cells.errors(sigma) ** 2)
+        """Variance of the filter's state before each transition that is its trajectory's first."""
+        state = np.where(self.wide > 0, self.wide, self.cells.white(sigma) ** 2)
+        error = np.broadcast_to(
+            sigma[self.cells.drifted[1]] ** 2, (len(state), len(self.cells.drifted[1]))
+        )
+        return np.hstack([state, error])

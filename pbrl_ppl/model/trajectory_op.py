@@ -118,7 +118,7 @@ class _DerivativeOp(_DensityOp):
             heavy = np.isfinite(nus)
             nus = np.where(heavy, nus, 1.0)
             pull = np.where(heavy, (nus + 1) * white / (nus + white**2), white)
-        by_cell = noise.pulled(pull * weights[:, None], sigma)[1]
+        by_cell = noise.pulled(pull * weights[:, None], sigma)
         by_residual = np.zeros_like(residual)
         body, place = noise.cells.in_residual
         by_residual[:, 0, body, place] = by_cell

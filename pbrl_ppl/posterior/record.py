@@ -17,7 +17,7 @@ from pbrl_ppl.errors import (
     LinearisationWarning,
     UninformedWarning,
 )
-from pbrl_ppl.model import ACCELERATION, JOLT, Problem
+from pbrl_ppl.model import ACCELERATION, DRIFT, JOLT, Problem
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
@@ -201,6 +201,8 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     if problem.trajectories is not None:
         for name in {ACCELERATION, JOLT} & set(problem.noise_variables):
             posterior[name].attrs["units"] = "m/s^2, of omega rad/s^2"
+        if DRIFT in problem.noise_variables:
+            posterior[DRIFT].attrs["units"] = "the unit of each position"
     return posterior
 
 

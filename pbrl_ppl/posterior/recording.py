@@ -18,6 +18,8 @@ Array = NDArray[np.float64]
 SMOOTHED = "smoothed"
 #: Names of how the smoothed states follow the parameters.
 _ORIGIN, _SENSITIVITY = "smoothed_at", "sensitivity"
+#: Name of the correlation of lasting errors from row to row.
+_MEMORY = "memory"
 #: Variables of the recording have these before their names, and before their dimensions'.
 _PREFIX = "recorded_"
 
@@ -35,6 +37,8 @@ def recording(problem: Problem) -> xr.Dataset:
     dims = (f"{_PREFIX}trajectory", f"{_PREFIX}time", f"{_PREFIX}body", f"{_PREFIX}state")
     kept[SMOOTHED] = (dims, problem.data.smoothed_states)
     kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
+    if noise.cells.drifts:
+        kept[_MEMORY] = noise.cells.memory
     kept["linearised_at"] = (("noise_parameter",), noise.sigma)
     if noise.sensitivity is not None:
         follow = noise.sensitivity
@@ -49,6 +53,8 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
         return problem
     history = recorded(problem.scene, given, data_sha256)
     cells = cells_of(problem.scene, history)
+    if _MEMORY in given:
+        cells = cells.drifting(float(given[_MEMORY]))
     states = given[SMOOTHED].to_numpy()
     data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
     noise: TrajectoryNoise = linearised(

@@ -146,7 +146,7 @@ def _log_density(problem: Problem, posterior: Any) -> Array:
     """Log-likelihood of each measured number given those before it, shape (transition, cell)."""
     phi, sigma = likeliest(problem, posterior)
     noise = problem.trajectory_noise
-    cells = -0.5 * problem.robust(phi, sigma) ** 2 - np.log(noise.gains(sigma)[1])
+    cells = -0.5 * problem.robust(phi, sigma) ** 2 - np.log(noise.scale(sigma))
     whole = problem.log_density(problem.residual(phi), sigma, phi)
     # the norm of the density, which is the same for all
     rest = (whole - np.where(noise.seen, cells, 0.0).sum(axis=1))[:, None]
