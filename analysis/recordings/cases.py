@@ -131,7 +131,7 @@ class Case:
 
     @property
     def scene(self) -> pp.Scene:
-        """The declared scene: the body's outline and mass, gravity and a hinge."""
+        """The declared scene: the body's outline and mass, gravity, and the rod's hinge."""
         known = {"mass": self.body.mass}
         dt = 1.0 / self.rate
         if self.world == FALL:
@@ -144,7 +144,7 @@ class Case:
             )
             return pp.Scene(time_step=dt, gravity=(0.0, -G), bodies=(body,), joints=(hinge,))
         body = pp.Body("block", pp.Shape.box(*self.body.size), known=known)
-        return pp.Scene(time_step=dt, bodies=(body,))
+        return pp.Scene(time_step=dt, normal_gravity=G, bodies=(body,))  # a top view
 
     def recordings(self) -> tuple[Recording, Recording]:
         """Make the recording to fit and the held-out one, which have the same law and noise."""

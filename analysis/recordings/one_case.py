@@ -127,14 +127,20 @@ def run_case(case: Case, seed: int, bare: bool, limit: int) -> Row:
             found = revise(case.scene, train, test, method="laplace", seed=seed)
             known["findings"] = found.to_dict()
     except Exception as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        where = f"{Path(place.filename).name}:{place.lineno}"
-        known["error"] = f"{type(error).__name__}: {error} ({where})"
+        known["error"] = f"{type(error).__name__}: {error} ({_where(error)})"
     about = {name: getattr(case, name) for name in _ABOUT}
     return Row(**about, **known, seconds=time.perf_counter() - begin, sources=sources())
 
 
 _ABOUT = ("name", "world", "rate", "shape", "noise", "effect", "clean", "answers")
+
+
+def _where(error: Exception) -> str:
+    """Return the line at which an error left the package, or was raised outside of it."""
+    places = traceback.extract_tb(error.__traceback__)
+    own = [each for each in places if Path(pp.__file__).parent in Path(each.filename).parents]
+    place = (own or places)[-1]
+    return f"{Path(place.filename).name}:{place.lineno}"
 
 
 @contextmanager

@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from pbrl_ppl.criticism import UNEXPLAINED
 from recordings.cases import NOISES, RATES, SHAPES, WORLDS
 from recordings.one_case import Row
 
@@ -50,7 +51,8 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
     -------
     dict
         ``naming``: share of detectable cases with the right name and no other; ``extra_names``:
-        number of detectable cases with a wrong name beside the right one; ``wrong_names``: number
+        number of detectable cases with a wrong name beside the right one; ``overcautious``: number
+        of named ones whose verdict is that something remains unexplained; ``wrong_names``: number
         with wrong names alone; ``missed``: number without a name. ``clean``: share of clean cases
         called adequate, without a name. ``undetectable_named``: number of cases with an effect that
         the oracle does not detect in which something was named. ``coverage``: share of true
@@ -66,6 +68,7 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
     return {
         "naming": _share([row.named for row in detectable]),
         "extra_names": sum(row.extra for row in detectable),
+        "overcautious": sum(row.named and row.verdict == UNEXPLAINED for row in detectable),
         "wrong_names": sum(
             bool(row.added) and not row.named and not row.extra for row in detectable
         ),
@@ -118,9 +121,11 @@ def told(row: Row) -> str:
             lines.append(
                 f"    added {one['effect']}: {name} {each['mean']:.4g} [{low:.4g}, {high:.4g}]"
             )
-    for one in row.findings["candidates"][:_CANDIDATES]:
+    for rank, one in enumerate(row.findings["candidates"]):
+        if rank >= _CANDIDATES and one["effect"] not in row.answers:
+            continue
         lines.append(
-            f"    candidate {one['effect']}: S = {one['statistic']:.1f}, p = {one['p_value']:.0e},"
+            f"    candidate {rank + 1} {one['effect']}: S = {one['statistic']:.1f}, p = {one['p_value']:.0e},"
             f" {one['estimate']}: {one['why']}"
         )
     for test in row.findings["tests"]:
