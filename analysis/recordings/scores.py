@@ -125,8 +125,8 @@ def told(row: Row) -> str:
         if rank >= _CANDIDATES and one["effect"] not in row.answers:
             continue
         lines.append(
-            f"    candidate {rank + 1} {one['effect']}: S = {one['statistic']:.1f}, p = {one['p_value']:.0e},"
-            f" {one['estimate']}: {one['why']}"
+            f"    candidate {rank + 1} {one['effect']}: S = {one['statistic']:.1f},"
+            f" p = {one['p_value']:.0e}, {one['estimate']}: {one['why']}"
         )
     for test in row.findings["tests"]:
         if not test["passed"]:
