@@ -32,24 +32,23 @@ from pathlib import Path
 
 import numpy as np
 from recordings.cases import Case, all_cases
-from recordings.one_case import Row, cache_path, load, run_case, save
+from recordings.one_case import Row, cache_path, load, run_case, save, sources
 from recordings.scores import brief, score, table, told
 
 say = partial(print, file=sys.stderr, flush=True)
 
 
 def kept(case: Case, options: argparse.Namespace) -> Row | None:
-    """Return the row of a case from the cache, if it is there and no failure."""
+    """Return the row of a case from the cache, if it is there."""
     if options.cache is None:
         return None
-    row = load(cache_path(options.cache, case, options.seed, options.bare))
-    return None if row is None or row.error is not None else row
+    return load(cache_path(options.cache, case, options.seed, options.bare))
 
 
 def made(case: Case, options: argparse.Namespace) -> Row:
-    """Return the row of a case, from the cache or made anew."""
+    """Return the row of a case, from the cache or made anew; failures are made anew."""
     row = kept(case, options)
-    if row is None:
+    if row is None or row.error is not None:
         row = run_case(case, options.seed, options.bare, options.limit)
         if options.cache is not None:
             save(row, cache_path(options.cache, case, options.seed, options.bare))
@@ -123,8 +122,11 @@ def main() -> None:
     except KeyboardInterrupt:
         say(f"interrupted: {len(rows)} of {len(mine)} cases are done")
     names = {row.name for row in rows}
-    others = (kept(case, options) for case in cases if case.name not in names)
+    others = (kept(case, options) for case in cases if case.name not in names)  # other parts'
     rows += [row for row in others if row is not None]
+    stale = sum(row.sources != sources() for row in rows)
+    if stale:
+        say(f"{stale} rows are of other files of pbrl_ppl; name another --cache to make them again")
     scores = score(rows) | {"cases_not_run": len(cases) - len(rows)}
     print(table(rows), "", sep="\n")
     print("\n".join(f"- `{name}`: {_shown(value)}" for name, value in scores.items()))

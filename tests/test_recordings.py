@@ -234,6 +234,7 @@ def test_scores_by_hand(bench) -> None:
         "naming": 4 / 8,
         "extra_names": 1,
         "overcautious": 1,
+        "in_group": 1,
         "wrong_names": 1,
         "missed": 2,
         "clean": 1 / 3,

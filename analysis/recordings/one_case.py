@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -163,6 +164,7 @@ def _limited(limit: int) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
+@cache
 def sources() -> str:
     """Return a hash of the package's files, which may change within a version."""
     digest = hashlib.sha256()

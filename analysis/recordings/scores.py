@@ -52,7 +52,9 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
     dict
         ``naming``: share of detectable cases with the right name and no other; ``extra_names``:
         number of detectable cases with a wrong name beside the right one; ``overcautious``: number
-        of named ones whose verdict is that something remains unexplained; ``wrong_names``: number
+        of named ones whose verdict is that something remains unexplained; ``in_group``: number of
+        named ones in which the right name is only among those that the data cannot separate from
+        the one added; ``wrong_names``: number
         with wrong names alone; ``missed``: number without a name. ``clean``: share of clean cases
         called adequate, without a name. ``undetectable_named``: number of cases with an effect that
         the oracle does not detect in which something was named. ``coverage``: share of true
@@ -69,6 +71,10 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
         "naming": _share([row.named for row in detectable]),
         "extra_names": sum(row.extra for row in detectable),
         "overcautious": sum(row.named and row.verdict == UNEXPLAINED for row in detectable),
+        "in_group": sum(
+            row.named and any(one["effect"] not in row.answers for one in row.added)
+            for row in detectable
+        ),
         "wrong_names": sum(
             bool(row.added) and not row.named and not row.extra for row in detectable
         ),
