@@ -51,21 +51,18 @@ def check(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
             units=units, time_step=time_step,
         )  # fmt: skip
-        import numpy as np
-
-        from pbrl_ppl.history import derived_velocities, unit_mismatches
+        from pbrl_ppl.history import unit_mismatches, unused_velocities
         from pbrl_ppl.physics import check_history
 
         check_history(declared, loaded, loaded.segments(1))
         contents = _contents(declared, loaded)
         missing = _missing(loaded)
-        derived = derived_velocities(loaded)
-        names = [STATE[d] for d in np.flatnonzero(derived.any(axis=0))]
+        unused = unused_velocities(loaded)
         console = Console(highlight=False, quiet=as_json)
         console.print(_listed(contents))
         console.print(_cells(loaded, missing))
-        if names:
-            console.print(f"{', '.join(names)}: computed from positions, no measurements")
+        for velocity in unused:
+            console.print(velocity.sentence, soft_wrap=True)
         checked = None
         if prior:
             progress("comparing with draws from the prior")
@@ -81,7 +78,7 @@ def check(
     if as_json:
         found = checked and {"passed": not checked.sentences, "sentences": checked.summary}
         numbers = {"trajectories": loaded.n_trajectories, "transitions": loaded.n_transitions}
-        cells = {"missing": missing, "computed": names}
+        cells = {"missing": missing, "velocities_not_used": [vars(each) for each in unused]}
         units_differ = {"unit_mismatches": unit_mismatches(loaded)}
         print_json(contents | numbers | cells | units_differ | {"prior": found})
 

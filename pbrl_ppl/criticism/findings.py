@@ -21,6 +21,7 @@ from pbrl_ppl.criticism.results import (
     Rollout,
     Unexplained,
 )
+from pbrl_ppl.history import UnusedVelocity
 from pbrl_ppl.posterior import Comparison, Identifiability
 from pbrl_ppl.scene import Scene
 
@@ -75,6 +76,8 @@ class Findings:
         Which parameters of the model after revision the data inform.
     loo : Comparison or None
         Leave-one-out cross-validation of both models on the data they were fitted to.
+    velocities_not_used : tuple of UnusedVelocity
+        Velocity columns that were computed from positions or lag them.
     """
 
     scene: Scene
@@ -100,6 +103,7 @@ class Findings:
     small: tuple[Candidate, ...] = ()
     identifiability: Identifiability | None = None
     loo: Comparison | None = None
+    velocities_not_used: tuple[UnusedVelocity, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of ``report.json``; numbers that are not finite become null."""
@@ -147,6 +151,7 @@ class Findings:
                 },
                 "identifiability": self.identifiability and self.identifiability.to_dict(),
                 "loo": self.loo and self.loo.to_dict(),
+                "velocities_not_used": [vars(each) for each in self.velocities_not_used],
                 "provenance": self.provenance,
             }
         )

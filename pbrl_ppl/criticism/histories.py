@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History, derived_velocities, measured_alone
+from pbrl_ppl.history import History, UnusedVelocity, measured_alone, unused_velocities
 from pbrl_ppl.model import cells_of, check_moves
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE
@@ -14,8 +14,8 @@ from pbrl_ppl.state import STATE
 
 def checked_histories(
     scene: Scene, train: History, test: History
-) -> tuple[History, History, NDArray[np.bool_]]:
-    """Both histories without velocities that were computed from positions, and which those are.
+) -> tuple[History, History, tuple[UnusedVelocity, ...]]:
+    """Both histories without velocities that were computed from positions or lag them, and which.
 
     Parameters
     ----------
@@ -28,8 +28,8 @@ def checked_histories(
     -------
     train, test : History
         With what was measured alone.
-    derived : ndarray of bool
-        What counts as computed, shape (body, state).
+    unused : tuple of UnusedVelocity
+        Velocity columns of the training history that are not used, in either.
 
     Raises
     ------
@@ -50,8 +50,8 @@ def checked_histories(
                 f"{which} history: it has a row each {step:g} s, the scene each"
                 f" {scene.time_step:g} s; load it with this scene"
             )
-    derived = derived_velocities(train)
-    train, test = measured_alone(train, derived), measured_alone(test, derived)
+    unused = unused_velocities(train)
+    train, test = measured_alone(train, unused), measured_alone(test, unused)
     check_moves(cells_of(scene, train), scene)
     known, asked = (
         np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
@@ -62,7 +62,7 @@ def checked_histories(
             f"test history measures {named(scene, asked & ~known)}, which the training history does"
             " not; leave those columns empty, or measure them in both"
         )
-    return train, test, derived
+    return train, test, unused
 
 
 def named(scene: Scene, columns: NDArray[np.bool_]) -> str:

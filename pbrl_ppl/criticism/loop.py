@@ -14,7 +14,7 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.drift import same_noise, with_correlated_errors
 from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
-from pbrl_ppl.criticism.histories import checked_histories, named
+from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.misfit import PRIOR, beside_names, find_misfit
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import declared_mode
@@ -123,9 +123,9 @@ def _revised(
         test = test.numbered(float(train.dataset["number"].max()) + 1.0)
     if substeps is not None:
         scene.replace(substeps=substeps)  # it is checked there
-    train, test, derived = checked_histories(scene, train, test)
-    if derived.any():
-        say(f"taking {named(scene, derived)} for computed from positions, which count alone")
+    train, test, unused = checked_histories(scene, train, test)
+    for velocity in unused:
+        say(velocity.sentence)
     held_out = HeldOut(test, seed)
     for effect in catalogue:
         if effect not in full_catalogue:
@@ -179,7 +179,8 @@ def _revised(
     say("comparing errors on held-out data")
     models = Models(declared, current, posterior, revised, before, left)
     told = selection.explained(first), tuple(selection.small)
-    return put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
+    findings = put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
+    return replace(findings, velocities_not_used=unused)
 
 
 def _with_effects(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.histories import checked_histories, named
+from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import rank_candidates
@@ -93,9 +93,9 @@ def criticise(
         scene.replace(substeps=substeps)  # it is checked there
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
-        history, _, derived = checked_histories(scene, history, history)
-        if derived.any():
-            say(f"taking {named(scene, derived)} for computed from positions, which count alone")
+        history, _, unused = checked_histories(scene, history, history)
+        for velocity in unused:
+            say(velocity.sentence)
         effects = attach(scene, (), catalogue)
         say("fitting the declared model")
         mode = declared_mode(scene, history, effects, seed, substeps, say, criteria)

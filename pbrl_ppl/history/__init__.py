@@ -1,6 +1,11 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
-from pbrl_ppl.history.derived import derived_velocities, measured_alone, measurement_noise
+from pbrl_ppl.history.derived import (
+    UnusedVelocity,
+    measured_alone,
+    measurement_noise,
+    unused_velocities,
+)
 from pbrl_ppl.history.files import read_table, write_atomically
 from pbrl_ppl.history.gaps import longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
@@ -14,9 +19,9 @@ __all__ = [
     "History",
     "Reading",
     "Segments",
+    "UnusedVelocity",
     "as_history",
     "check_start",
-    "derived_velocities",
     "fill_hinges",
     "from_mujoco",
     "from_segments",
@@ -29,5 +34,6 @@ __all__ = [
     "segment_rows",
     "unit_mismatches",
     "unseen",
+    "unused_velocities",
     "write_atomically",
 ]

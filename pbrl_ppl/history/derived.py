@@ -1,107 +1,209 @@
-"""Recognition of velocity columns that were computed from the positions of the same log."""
+"""Velocity columns that are no measurements of their row: computed from positions, or late."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
+from scipy.stats import t as t_distribution
 
 from pbrl_ppl.history.angles import unwrapped
+from pbrl_ppl.history.filters import Runs, computed_by, position_noise
 from pbrl_ppl.history.history import History
 from pbrl_ppl.state import STATE, THETA
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
 
-#: Samples on either side that a smoother may have looked at.
-_REACH = 8
-#: A velocity is computed if positions predict it better than their noise would let them, were it
-#: measured by itself: this share of that noise's variance, or less, is left over.
-_SHARE = 0.5
-#: The same where the positions have no noise: a share of the velocity's own variance.
-_EXACT = 1e-8
 #: An angle that looks noisier than this (rad) turns too far between rows to be followed.
 _WRAPPED = 0.5
-#: Windows a coefficient of the regression, at least.
-_ENOUGH = 4
+#: Rows without gaps of which a velocity is judged, at least.
+_SHORTEST = 5
+#: A lag matters from this share of the time step on, and is told if significant at this p.
+_MATERIAL, _ALARM = 0.05, 1e-4
+#: Steps to a lag of several rows, at most.
+_STEPS = 20
+#: A lag of this share of a time step more than what matters is seen without any noise, too.
+_TINY = 1e-6
+#: Intervals that a lag is estimated from, at least.
+_ENOUGH = 12
 
 
-def measured_alone(history: History, columns: Bools | None = None) -> History:
-    """Return the history without derived velocities: they stay as states to start from.
+@dataclass(frozen=True)
+class UnusedVelocity:
+    """A velocity column that does not count as measured, and why.
+
+    Attributes
+    ----------
+    body : str
+        Name of the body.
+    state : str
+        Name of the velocity: "vx", "vy" or "omega".
+    position : str
+        Name of its position: "x", "y" or "theta".
+    computed_by : str or None
+        The filter that gives it from the position; None if it lags the position only.
+    lag : float
+        By how much it is late (s); negative if early.
+
+    Examples
+    --------
+    >>> UnusedVelocity("ball", "vy", "y", "central differences", 0.0).sentence
+    'vy of ball was computed from y (central differences) and is not used'
+    >>> UnusedVelocity("arm", "omega", "theta", None, 0.012).sentence
+    'omega of arm lags theta by 12 ms and is not used'
+    """
+
+    body: str
+    state: str
+    position: str
+    computed_by: str | None
+    lag: float
+
+    @property
+    def sentence(self) -> str:
+        """The column, how it was computed or by how much it lags, and that it is not used."""
+        name, late = f"{self.state} of {self.body}", f"{1e3 * abs(self.lag):.3g} ms"
+        if self.computed_by is None:
+            verb = "lags" if self.lag > 0 else "leads"
+            return f"{name} {verb} {self.position} by {late} and is not used"
+        lag = f", {late} {'late' if self.lag > 0 else 'early'}" if self.lag else ""
+        return f"{name} was computed from {self.position} ({self.computed_by}{lag}) and is not used"
+
+
+def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
+    """Return the velocity columns that were computed from positions of the log, or lag them.
+
+    Tests are made so that fewer than one in a hundred logs with independently measured velocities
+    loses one; it then costs information, as positions are enough for a fit.
+
+    Parameters
+    ----------
+    history : History
+        What was measured. Rows with gaps are left out.
+
+    Returns
+    -------
+    tuple of UnusedVelocity
+        By body and state.
+
+    Examples
+    --------
+    >>> import pandas as pd
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> from pbrl_ppl.state import STATE, WRENCH
+    >>> scene = Scene(time_step=0.05, bodies=(Body("puck", Shape.circle(0.2)),))
+    >>> table = pd.DataFrame(0.0, range(50), [*STATE, *WRENCH]).assign(trajectory=0, body="puck")
+    >>> table["step"] = np.arange(50)
+    >>> table["time"] = 0.05 * table["step"]
+    >>> table["x"] = np.cumsum(np.random.default_rng(1).normal(0.0, 0.02, 50))
+    >>> table["vx"] = np.gradient(table["x"], 0.05)
+    >>> print(unused_velocities(History.from_dataframe(table, scene))[0].sentence)
+    vx of puck was computed from x (central differences) and is not used
+    """
+    dt = float(history.dataset.attrs["time_step"])
+    found: list[UnusedVelocity] = []
+    for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
+        for d in range(3):
+            runs = _runs(history, int(body), d)
+            names = (history.bodies[body], STATE[d + 3], STATE[d])
+            if match := computed_by(runs, dt):
+                late = match.lag if abs(match.lag) > _MATERIAL * dt else 0.0
+                found.append(UnusedVelocity(*names, match.name, late))
+            elif lag := velocity_lag(runs, dt):
+                found.append(UnusedVelocity(*names, None, lag))
+    return tuple(found)
+
+
+def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = None) -> History:
+    """Return the history without unused velocities: they stay as states to start from.
 
     Parameters
     ----------
     history : History
         What was recorded.
-    columns : ndarray of bool, optional
-        Which not to count as measured, shape (body, state); :func:`derived_velocities` by default.
+    unused : sequence of UnusedVelocity, optional
+        Which columns not to count as measured; :func:`unused_velocities` by default.
     """
-    columns = derived_velocities(history) if columns is None else columns
-    if not columns.any():
+    unused = unused_velocities(history) if unused is None else unused
+    if not unused:
         return history
+    columns = np.zeros((len(history.bodies), len(STATE)), dtype=bool)
+    for each in unused:
+        columns[history.bodies.index(each.body), STATE.index(each.state)] = True
     observed = history.dataset["observed"]
     return History(history.dataset.assign(observed=observed.where(~columns)))
 
 
-def derived_velocities(history: History) -> Bools:
-    """Which velocities are linear in the positions around them, and so no measurements.
+def velocity_lag(runs: Runs, dt: float) -> float:
+    """Return by how much (s) velocities are late; 0 where that is negligible or not significant.
 
-    A velocity with a noise of its own cannot be predicted from noisy positions with weights w more
-    closely than ``|w|^2 s^2``, s being the positions' noise; a difference quotient or a smoother
-    can. That noise is known without a model: the mean of two neighbouring velocities differs from
-    the difference quotient between them by noise alone.
+    The position's change in an interval is its mean velocity; of a velocity that is late by ``tau``
+    it differs by ``tau`` times the acceleration. Of differences of velocities that bracket the
+    interval as instruments the estimate is consistent whatever the noise of both. A constant
+    offset, a scale and the curvature within an interval are fitted alongside. Residuals of
+    neighbouring intervals share a velocity, for which the standard error is multiplied by sqrt(2).
 
     Parameters
     ----------
-    history : History
-        What was measured.
+    runs : list of (ndarray, ndarray)
+        Positions and velocities of rows without gaps, shape (n,) each.
+    dt : float
+        Time step (s).
 
-    Returns
-    -------
-    ndarray of bool
-        Shape (body, state); positions are never derived.
+    Examples
+    --------
+    >>> t = np.arange(200) * 0.02
+    >>> round(velocity_lag([(np.sin(5 * t), 5 * np.cos(5 * (t - 0.012)))], 0.02), 4)
+    0.012
+    >>> velocity_lag([(np.sin(5 * t), 5 * np.cos(5 * t))], 0.02)
+    0.0
     """
-    dt = float(history.dataset.attrs["time_step"])
-    result = np.zeros(history.dataset["observed"].shape[2:], dtype=bool)
-    for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
-        for d in range(3, len(STATE)):
-            result[body, d] = _is_derived(_series(history, int(body), d - 3), dt)
-    return result
+    lag, found = _shifted(runs, dt, 0)
+    if not found:
+        return 0.0
+    shift = 0
+    for _ in range(_STEPS):  # it is linear in the lag only near it
+        if not np.isfinite(lag) or abs(lag - shift) <= 0.5:
+            break
+        shift = int(np.clip(round(lag), shift - 1, shift + 1))
+        lag = _shifted(runs, dt, shift)[0]
+    return float(lag) * dt if np.isfinite(lag) else 0.0
 
 
-def _series(history: History, body: int, d: int) -> list[tuple[Floats, Floats]]:
-    """Positions of a dimension and their rates, of trajectories in which neither has gaps."""
-    observed = history.dataset["observed"].to_numpy()[:, :, body]
-    dt = float(history.dataset.attrs["time_step"])
-    series: list[tuple[Floats, Floats]] = []
-    for own, n in zip(observed, history.dataset["n_rows"].to_numpy(), strict=True):
-        position, rate = own[:n, [d, d + 3]].T
-        if np.isfinite(position).all() and np.isfinite(rate).all():
-            if d == THETA:
-                position = unwrapped(dt * np.arange(n), position, rate)
-            series.append((position, rate))
-    return series
+def _shifted(runs: Runs, dt: float, shift: int) -> tuple[float, bool]:
+    """Lag (rows) linearised about ``shift`` rows; whether it is materially other than that.
 
-
-def _is_derived(series: list[tuple[Floats, Floats]], dt: float) -> bool:
-    """Whether rates follow from positions, of trajectories without gaps."""
-    width = 2 * _REACH + 1
-    windows, middle = [], []
-    for position, rate in series:
-        if len(position) < width:
-            continue
-        own = np.lib.stride_tricks.sliding_window_view(position, width)
-        windows.append(np.delete(own - own[:, [_REACH]], _REACH, axis=1))
-        middle.append(rate[_REACH:-_REACH])
-    if not windows:
-        return False
-    x, y = np.concatenate(windows), np.concatenate(middle)
-    if len(x) < _ENOUGH * width or not np.any(y):
-        return False
-    weights = np.linalg.lstsq(x, y, rcond=None)[0]
-    left = float(((y - x @ weights) ** 2).sum() / (len(x) - len(weights)))
-    spread = weights @ weights + weights.sum() ** 2  # the middle position's noise is in all columns
-    noise = float(spread) * _noise(series, dt)[0]
-    return left < max(_SHARE * noise, _EXACT * float(y.var()))
+    The instrument's covariance with what is left at the least lag that matters is tested, which
+    needs no lag that is known well (Anderson and Rubin's test).
+    """
+    columns: list[list[Floats]] = [[], [], [], [], []]
+    for position, rate in runs:
+        k = np.arange(max(0, 1 - shift), len(position) - max(1, 2 + shift))
+        if len(k):
+            before, one, two, after = (rate[k + shift + i] for i in (-1, 0, 1, 2))
+            mean, off = (one + two) / 2, (position[k + 1] - position[k]) / dt
+            own = (off - mean, mean, before - one - two + after, two - one, after - before)
+            for column, values in zip(columns, own, strict=True):
+                column.append(values)
+    if sum(map(len, columns[0])) < _ENOUGH:
+        return np.nan, False
+    y, mean, curve, x, z = (np.concatenate(each) for each in columns)
+    beside = np.linalg.svd(np.stack([np.ones(len(y)), mean, curve], axis=1), full_matrices=False)[0]
+    y, x, z = (each - beside @ (beside.T @ each) for each in (y, x, z))
+    slope, square, dof = float(z @ x), float(z @ z), len(y) - 4
+    if not slope > 0 or not square > 0:
+        return np.nan, False
+    lag = float(z @ y) / slope
+    rest = y - np.copysign(_MATERIAL, lag) * x
+    left = rest - float(z @ rest) / square * z
+    spread = max(float(left @ left) / dof * square, float((z * left) @ (z * left)))  # in collisions
+    error = np.sqrt(2 * spread)
+    bound = float(t_distribution.isf(_ALARM / 2, dof)) * error
+    found = abs(lag) > _MATERIAL and abs(float(z @ rest)) > max(bound, _TINY * slope)
+    return lag + shift, bool(found)
 
 
 def measurement_noise(history: History) -> Floats:
@@ -114,26 +216,27 @@ def measurement_noise(history: History) -> Floats:
     result = np.zeros(history.dataset["observed"].shape[2:])
     for body in range(len(result)):
         for d in range(3):
-            if series := _series(history, body, d):
-                third = [np.concatenate([np.diff(s[i], 3) for s in series]) for i in (0, 1)]
+            if runs := _runs(history, body, d):
+                third = [np.concatenate([np.diff(s[i], 3) for s in runs]) for i in (0, 1)]
                 least = [float(np.mean(own**2)) / 20 if len(own) else 0.0 for own in third]
-                result[body, [d, d + 3]] = np.sqrt(np.minimum(_noise(series, dt), least))
+                result[body, [d, d + 3]] = np.sqrt(np.minimum(position_noise(runs, dt), least))
     result[result[:, THETA] > _WRAPPED, THETA] = 0.0
     return result
 
 
-def _noise(series: list[tuple[Floats, Floats]], dt: float) -> tuple[float, float]:
-    """Variances of positions and of rates, from what kinematics leave of measured ones.
-
-    Second differences take off what a smooth acceleration leaves. Of those, independent noises of
-    positions (in units of ``dt``) and rates have variance ``20 A + B`` and covariance at lag one
-    ``-15 A - B / 4``.
-    """
-    square = product = 0.0
-    n = m = 0
-    for position, rate in series:
-        off = np.diff(np.diff(position) / dt - (rate[1:] + rate[:-1]) / 2, 2)
-        square, n = square + float(off @ off), n + len(off)
-        product, m = product + float(off[1:] @ off[:-1]), m + max(len(off) - 1, 0)
-    place = max(0.0, -(square / max(n, 1) + 4 * product / max(m, 1)) / 40)
-    return place * dt**2, max(0.0, square / max(n, 1) - 20 * place)
+def _runs(history: History, body: int, d: int) -> Runs:
+    """Positions of a dimension and their rates, in rows between gaps of either."""
+    observed = history.dataset["observed"].to_numpy()[:, :, body]
+    dt = float(history.dataset.attrs["time_step"])
+    runs: Runs = []
+    for own, n in zip(observed, history.dataset["n_rows"].to_numpy(), strict=True):
+        both = own[:n, [d, d + 3]]
+        seen = np.flatnonzero(np.isfinite(both).all(axis=1))
+        for rows in np.split(seen, np.flatnonzero(np.diff(seen) > 1) + 1):
+            if len(rows) < _SHORTEST:
+                continue
+            position, rate = np.asarray(both[rows].T, dtype=np.float64)
+            if d == THETA:
+                position = unwrapped(dt * np.arange(float(len(rows))), position, rate)
+            runs.append((position, rate))
+    return runs

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
-from pbrl_ppl.history import History, check_start, derived_velocities, measured_alone
+from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
 from pbrl_ppl.model import Problem, cells_of
 from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, recorded, scene_of
 from pbrl_ppl.state import STATE
@@ -54,13 +54,18 @@ def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
 
 
 def as_recorded(idata: Any, history: History) -> History:
-    """The history without velocities that were left out of the posterior's as computed."""
+    """The history without unused velocities that the posterior's is without as well."""
     given = group(idata, "constant_data")
     if "recorded_observed" not in given:
         return history
     held = given["recorded_observed"].to_numpy()
     left_out = ~np.isfinite(held).any(axis=(0, 1))
-    return measured_alone(history, left_out & derived_velocities(history))
+    unused = [
+        each
+        for each in unused_velocities(history)
+        if left_out[history.bodies.index(each.body), STATE.index(each.state)]
+    ]
+    return measured_alone(history, unused)
 
 
 def check_history(idata: Any, history: History) -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from pbrl_ppl.criticism.results import Errors
 from pbrl_ppl.errors import OutputError
+from pbrl_ppl.history import UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.posterior.comparison import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
@@ -468,3 +469,11 @@ def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(OutputError, match="cannot be written"):
             Loop(made_up()).report(place)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_velocities_that_are_not_used_are_named() -> None:
+    unused = (UnusedVelocity("cart", "vy", "y", "backward differences", 0.05),)
+    findings = replace(made_up(), velocities_not_used=unused)
+    said = "vy of cart was computed from y (backward differences, 50 ms late) and is not used."
+    assert said in " ".join(Page(render(findings)).text.split())
+    assert findings.to_dict()["velocities_not_used"][0]["lag"] == 0.05
