@@ -132,7 +132,7 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
     rows = mode.jacobian * scale
     least = slopes**2
     if len(phi):
-        inverse = np.linalg.inv(mode.covariance / np.outer(scale, scale))
+        inverse = np.linalg.pinv(mode.covariance / np.outer(scale, scale), hermitian=True)
         least = np.maximum(least, np.diag(inverse) - (rows**2).sum(axis=0))
     prior = np.diag(least)
     pull = slopes * prior_residual(priors, phi)

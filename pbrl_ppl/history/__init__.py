@@ -7,12 +7,12 @@ from pbrl_ppl.history.derived import (
     unused_velocities,
 )
 from pbrl_ppl.history.files import read_table, write_atomically
-from pbrl_ppl.history.gaps import longest_gap, unseen
+from pbrl_ppl.history.gaps import check_start, longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.mujoco import from_mujoco
 from pbrl_ppl.history.reading import Reading, as_history
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
-from pbrl_ppl.history.start import check_start, fill_hinges, hung_bodies, lever
+from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
 from pbrl_ppl.history.unit_check import unit_mismatches
 
 __all__ = [

@@ -12,7 +12,7 @@ from scipy.stats import t as t_distribution
 from pbrl_ppl.history.angles import unwrapped
 from pbrl_ppl.history.filters import Runs, computed_by, position_noise
 from pbrl_ppl.history.history import History
-from pbrl_ppl.state import STATE, THETA
+from pbrl_ppl.state import STATE, THETA, wrapped
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -21,6 +21,8 @@ Bools = npt.NDArray[np.bool_]
 _WRAPPED = 0.5
 #: Rows without gaps of which a velocity is judged, at least.
 _SHORTEST = 5
+#: Error of a velocity at the end of a quadratic of five positions, in their errors a time step.
+_AT_AN_END = 1.1
 #: A lag matters from this share of the time step on, and is told if significant at this p.
 _MATERIAL, _ALARM = 0.05, 1e-4
 #: Steps to a lag of several rows, at most.
@@ -209,17 +211,24 @@ def _shifted(runs: Runs, dt: float, shift: int) -> tuple[float, bool]:
 def measurement_noise(history: History) -> Floats:
     """Standard deviation of measuring each state, from kinematics alone, shape (body, state).
 
-    Zero where a position or its velocity has gaps: nothing is known there. It is no more than third
-    differences show, so that a position in another unit than its velocity does not look noisy.
+    Zero where nothing is known. It is no more than third differences show, so that a position in
+    another unit than its velocity does not look noisy; and what they show where no velocity was
+    measured, which a local polynomial then knows that much less at a trajectory's end.
     """
     dt = float(history.dataset.attrs["time_step"])
-    result = np.zeros(history.dataset["observed"].shape[2:])
+    observed = history.dataset["observed"].to_numpy()
+    result = np.zeros(observed.shape[2:])
     for body in range(len(result)):
         for d in range(3):
             if runs := _runs(history, body, d):
                 third = [np.concatenate([np.diff(s[i], 3) for s in runs]) for i in (0, 1)]
                 least = [float(np.mean(own**2)) / 20 if len(own) else 0.0 for own in third]
                 result[body, [d, d + 3]] = np.sqrt(np.minimum(position_noise(runs, dt), least))
+            elif np.isnan(observed[:, :, body, d + 3]).all():
+                change = np.diff(observed[:, :, body, d])
+                third = np.diff(wrapped(change) if d == THETA else change, 2)
+                size = float(np.sqrt(np.nanmean(third**2) / 20)) if np.isfinite(third).any() else 0.0
+                result[body, [d, d + 3]] = size, _AT_AN_END * size / dt
     result[result[:, THETA] > _WRAPPED, THETA] = 0.0
     return result
 

@@ -80,10 +80,9 @@ class History:
         - ``action`` (trajectory, time, body, wrench): held over the interval that starts there;
           NaN on a trajectory's last row and after, without a meaning for a kinematic body
           (N, N, N m);
-        - ``start`` (trajectory, time, body, state): the state completed: through hinges, with
-          velocities estimated from positions, and with the scene's pose for what was never measured;
-        - ``assumed`` (body, state): which columns of that neither a measurement nor a hinge gives,
-          and are not to start single transitions (Eq. 11);
+        - ``start`` (trajectory, time, body, state): the state completed through hinges, estimated
+          velocities and the scene's pose;
+        - ``assumed`` (body, state): columns of it that may not start single transitions (Eq. 11);
         - ``clock`` (trajectory, time): time (s);
         - ``number`` (trajectory,): which trajectory of the recording it is, from 0;
         - ``before`` (trajectory, body, wrench): what acted before the first row; zero;

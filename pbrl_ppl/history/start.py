@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 import numpy.typing as npt
 from scipy.signal import savgol_filter
 
-from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.paths import fill_path_velocities
 from pbrl_ppl.scene import WORLD, Point, Scene
 from pbrl_ppl.state import STATE, THETA
-
-if TYPE_CHECKING:
-    from pbrl_ppl.history.history import History
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
@@ -44,7 +38,7 @@ def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
     start = state.copy()
     fill_path_velocities(start, scene)
     fill_hinges(start, scene)
-    assumed = np.isnan(start).all(axis=(0, 1))
+    assumed: Bools = np.asarray(np.isnan(start).all(axis=(0, 1)))
     hung = np.array([body.name in hung_bodies(scene) for body in scene.moving])
     for i, body in enumerate(scene.moving):
         pose = body.pose or (0.0, 0.0, 0.0)
@@ -57,32 +51,6 @@ def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
     _estimate(start, (3, 4), scene.time_step)
     fill_hinges(start, scene)
     return start, assumed
-
-
-def check_start(history: History, scene: Scene) -> None:
-    """Refuse a history whose transitions start from states that rest on no measurement.
-
-    Transitions of Eq. 11 start from states as measured; in whole trajectories states are latent.
-
-    Raises
-    ------
-    HistoryError
-        If a column of the states was neither measured nor allowed to be estimated.
-    """
-    assumed = history.dataset["assumed"].to_numpy()
-    if not assumed.any():
-        return
-    parts = [
-        f'{", ".join(np.array(STATE)[own])} of body "{body.name}"'
-        for body, own in zip(scene.moving, assumed, strict=True)
-        if own.any()
-    ]
-    raise HistoryError(
-        f"history: single transitions start from measured states: missing are {'; '.join(parts)};"
-        " fit whole trajectories (trajectories=True), measure them, declare the hinge that holds"
-        " the body in the scene (it gives x, y, vx, vy from theta and omega), or pass"
-        " estimate_velocities=True (it gives vx, vy, omega from x, y, theta)"
-    )
 
 
 def fill_hinges(start: Floats, scene: Scene) -> None:
