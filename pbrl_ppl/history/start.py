@@ -8,7 +8,7 @@ from scipy.signal import savgol_filter
 
 from pbrl_ppl.history.paths import fill_path_velocities
 from pbrl_ppl.scene import WORLD, Point, Scene
-from pbrl_ppl.state import STATE, THETA
+from pbrl_ppl.state import THETA
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
