@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from scipy.ndimage import maximum_filter1d
 
 from pbrl_ppl.history.history import History
 from pbrl_ppl.state import STATE, STATE_UNITS, THETA, wrapped
@@ -27,6 +28,8 @@ _ONE_SIDE, _BOTH_SIDES = 2, 3
 _FAR, _FAR_OF_SIDE = 8.0, 5.0
 #: The curves must agree on how far the row is off, to this share of it.
 _AGREE = 0.5
+#: A velocity is off its curve in truth if its position moves on by this share of that.
+_CONFIRMED = 0.25
 #: Rounding of numbers, as a share of a column's range.
 _ROUNDING = 1e-9
 #: Standard deviation of a Gaussian over the median of its absolute values.
@@ -57,6 +60,11 @@ class BadFrame:
         Of the measurement.
     rows : int
         Rows of the history, all trajectories together.
+
+    Examples
+    --------
+    >>> print(BadFrame(2, 7, 0.35, "puck", "x", 0.31, "m", 400))
+    x of puck at t = 0.35 s of trajectory 2 is off by 0.31 m and left out (1 of 400 rows)
     """
 
     trajectory: Any
@@ -82,9 +90,10 @@ def bad_frames(history: History) -> Bools:
     A row, or two neighbouring rows, are bad if they are far off the curve through the rows before,
     far off the one through the rows after, and far off the one through both, which must fit its own
     rows. After an impact a row is on one of the first two curves, so it is never called bad; nor is
-    it where the body's other positions (or velocities) are not smooth, as in a contact. The scale is the median absolute deviation of the whole column, in all trajectories; nothing nearer
-    than eight steps of a quantised column is bad. At a trajectory's ends, and beside gaps, three
-    rows on either side are needed.
+    it where the body's other positions (or velocities) are not smooth, as in a contact, or where
+    positions confirm a velocity. The scale is the median absolute deviation of the whole column, in
+    all trajectories; nothing nearer than eight steps of a quantised column is bad. Three measured
+    rows are needed on either side.
 
     Parameters
     ----------
@@ -135,11 +144,11 @@ def without_bad_frames(history: History) -> tuple[History, list[BadFrame]]:
     ::
 
         clean, frames = without_bad_frames(history)
-        print(*frames, sep="\\n")
+        print(frames[0])
     x of puck at t = 0.35 s of trajectory 2 is off by 0.31 m and left out (1 of 400 rows)
     """
     off, dataset = _deviations(history), history.dataset
-    bad = np.isfinite(off)
+    bad: Bools = np.isfinite(off)
     count = bad.sum(axis=(0, 1))
     rows = int(dataset["n_rows"].sum())
     many = (count > 1) & (count > _MOST * rows)
@@ -173,13 +182,10 @@ def without_bad_frames(history: History) -> tuple[History, list[BadFrame]]:
 
 def _start(start: Floats, observed: Floats, bad: Bools) -> Floats:
     """States to start from, without what was computed from bad frames."""
-    computed = ~np.isfinite(observed)
-    lost = computed & bad.any(axis=(2, 3), keepdims=True)
-    near = bad.any(axis=-1)
-    for shift in range(1, _REACH + 1):
-        near[:, shift:] |= bad.any(axis=-1)[:, :-shift]
-        near[:, :-shift] |= bad.any(axis=-1)[:, shift:]
-    never = computed.all(axis=(0, 1))
+    computed: Bools = ~np.isfinite(observed)
+    lost: Bools = computed & bad.any(axis=(2, 3), keepdims=True)
+    near = maximum_filter1d(bad.any(axis=-1).astype(np.uint8), 2 * _REACH + 1, axis=1) > 0
+    never: Bools = computed.all(axis=(0, 1))
     never[:, :3] = False
     lost |= near[..., None] & never
     return np.where(lost, np.nan, start)
@@ -188,6 +194,7 @@ def _start(start: Floats, observed: Floats, bad: Bools) -> Floats:
 def _deviations(history: History) -> Floats:
     """How far bad frames are off; NaN elsewhere, shape (trajectory, time, body, state)."""
     observed = history.dataset["observed"].to_numpy()
+    dt = float(history.dataset.attrs["time_step"])
     result = np.full(observed.shape, np.nan)
     for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
         for kind in (slice(0, 3), slice(3, 6)):
@@ -200,6 +207,8 @@ def _deviations(history: History) -> Floats:
                 off, rough = (np.stack(each, axis=-1) for each in zip(*columns, strict=True))
                 # a contact changes several coordinates at once
                 off[rough.any(axis=-1)] = np.nan
+                if kind.start:
+                    off[_happened(kept, off, dt)] = np.nan
                 own = result[:, :, body, kind]
                 own[...] = np.where(np.isfinite(own), own, off)
     return result
@@ -265,6 +274,27 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
         result[trajectory[good], first[good] + width + k] = off[good, k]
         rough[trajectory[ragged], first[ragged] + width + k] = True
     return result, rough
+
+
+def _happened(state: Floats, off: Floats, dt: float) -> Bools:
+    """Return which deviations of velocities the positions confirm, as between two impacts.
+
+    Parameters
+    ----------
+    state : ndarray
+        Measured, shape (trajectory, time, 6), SI units.
+    off : ndarray
+        Velocities less their curve, shape (trajectory, time, 3); NaN where they are on it.
+    dt : float
+        Time step (s).
+    """
+    more = np.nan_to_num(off)
+    curve = state[..., 3:] - more
+    change = np.diff(state[..., :3], axis=1) - dt / 2 * (curve[:, 1:] + curve[:, :-1])
+    change[..., THETA] = wrapped(change[..., THETA])
+    change = np.pad(change, ((0, 0), (1, 1), (0, 0)))
+    beside = change[:, :-1] + change[:, 1:]
+    return np.asarray(beside * more > _CONFIRMED * dt * more**2)
 
 
 def _finest(column: Floats) -> float:
