@@ -75,6 +75,8 @@ class Findings:
         Which parameters of the model after revision the data inform.
     loo : Comparison or None
         Leave-one-out cross-validation of both models on the data they were fitted to.
+    bad_frames : tuple of str
+        A sentence for each single bad frame that was left out, of either history.
     """
 
     scene: Scene
@@ -100,6 +102,7 @@ class Findings:
     small: tuple[Candidate, ...] = ()
     identifiability: Identifiability | None = None
     loo: Comparison | None = None
+    bad_frames: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of ``report.json``; numbers that are not finite become null."""
@@ -147,6 +150,7 @@ class Findings:
                 },
                 "identifiability": self.identifiability and self.identifiability.to_dict(),
                 "loo": self.loo and self.loo.to_dict(),
+                "bad_frames": self.bad_frames,
                 "provenance": self.provenance,
             }
         )

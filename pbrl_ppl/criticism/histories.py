@@ -6,7 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History, derived_velocities, measured_alone
+from pbrl_ppl.history import (
+    History,
+    derived_velocities,
+    measured_alone,
+    without_bad_frames,
+)
 from pbrl_ppl.model import cells_of, check_moves
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE
@@ -14,8 +19,8 @@ from pbrl_ppl.state import STATE
 
 def checked_histories(
     scene: Scene, train: History, test: History
-) -> tuple[History, History, NDArray[np.bool_]]:
-    """Both histories without velocities that were computed from positions, and which those are.
+) -> tuple[History, History, NDArray[np.bool_], tuple[str, ...]]:
+    """Both histories without computed velocities and single bad frames, and which those are.
 
     Parameters
     ----------
@@ -30,6 +35,8 @@ def checked_histories(
         With what was measured alone.
     derived : ndarray of bool
         What counts as computed, shape (body, state).
+    bad : tuple of str
+        A sentence for each single bad frame that is left out.
 
     Raises
     ------
@@ -50,8 +57,10 @@ def checked_histories(
                 f"{which} history: it has a row each {step:g} s, the scene each"
                 f" {scene.time_step:g} s; load it with this scene"
             )
-    derived = derived_velocities(train)
+    same, derived = test is train, derived_velocities(train)
     train, test = measured_alone(train, derived), measured_alone(test, derived)
+    train, bad = without_bad_frames(train)
+    test, more = without_bad_frames(test)
     check_moves(cells_of(scene, train), scene)
     known, asked = (
         np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
@@ -62,7 +71,8 @@ def checked_histories(
             f"test history measures {named(scene, asked & ~known)}, which the training history does"
             " not; leave those columns empty, or measure them in both"
         )
-    return train, test, derived
+    held_out = [] if same else [f"held out: {frame}" for frame in more]
+    return train, test, derived, (*map(str, bad), *held_out)
 
 
 def named(scene: Scene, columns: NDArray[np.bool_]) -> str:

@@ -122,9 +122,11 @@ def _revised(
         test = test.numbered(float(train.dataset["number"].max()) + 1.0)
     if substeps is not None:
         scene.replace(substeps=substeps)  # it is checked there
-    train, test, derived = checked_histories(scene, train, test)
+    train, test, derived, bad = checked_histories(scene, train, test)
     if derived.any():
         say(f"taking {named(scene, derived)} for computed from positions, which count alone")
+    for sentence in bad:
+        say(sentence)
     held_out = HeldOut(test, seed)
     for effect in catalogue:
         if effect not in full_catalogue:
@@ -189,7 +191,8 @@ def _revised(
     say("comparing errors on held-out data")
     models = Models(declared, current, posterior, revised, before, left)
     told = selection.explained(first), tuple(selection.small)
-    return put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
+    found = put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
+    return replace(found, bad_frames=bad)
 
 
 def _prior_test(

@@ -93,9 +93,11 @@ def criticise(
         scene.replace(substeps=substeps)  # it is checked there
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
-        history, _, derived = checked_histories(scene, history, history)
+        history, _, derived, bad = checked_histories(scene, history, history)
         if derived.any():
             say(f"taking {named(scene, derived)} for computed from positions, which count alone")
+        for sentence in bad:
+            say(sentence)
         effects = attach(scene, (), catalogue)
         say("fitting the declared model")
         mode = declared_mode(scene, history, effects, seed, substeps, say, criteria)

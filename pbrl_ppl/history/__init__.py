@@ -1,5 +1,6 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
+from pbrl_ppl.history.bad_frames import BadFrame, bad_frames, without_bad_frames
 from pbrl_ppl.history.derived import derived_velocities, measured_alone, measurement_noise
 from pbrl_ppl.history.files import read_table, write_atomically
 from pbrl_ppl.history.gaps import longest_gap, unseen
@@ -11,10 +12,12 @@ from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
 from pbrl_ppl.history.unit_check import unit_mismatches
 
 __all__ = [
+    "BadFrame",
     "History",
     "Reading",
     "Segments",
     "as_history",
+    "bad_frames",
     "derived_velocities",
     "fill_hinges",
     "from_mujoco",
@@ -28,5 +31,6 @@ __all__ = [
     "segment_rows",
     "unit_mismatches",
     "unseen",
+    "without_bad_frames",
     "write_atomically",
 ]

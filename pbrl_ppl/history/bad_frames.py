@@ -185,8 +185,7 @@ def _start(start: Floats, observed: Floats, bad: Bools) -> Floats:
     computed: Bools = ~np.isfinite(observed)
     lost: Bools = computed & bad.any(axis=(2, 3), keepdims=True)
     near = maximum_filter1d(bad.any(axis=-1).astype(np.uint8), 2 * _REACH + 1, axis=1) > 0
-    never: Bools = computed.all(axis=(0, 1))
-    never[:, :3] = False
+    never = computed.all(axis=(0, 1)) & (np.arange(len(STATE)) >= len(STATE) // 2)
     lost |= near[..., None] & never
     return np.where(lost, np.nan, start)
 
