@@ -1,0 +1,381 @@
+"""Rows at a trajectory's ends that belong to no model: a body still held, an abrupt stop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.digest import hashed
+from pbrl_ppl.history.history import History
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import THETA
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+HELD, STOPPED = "held", "stopped"
+#: Rows at rest, at least, and rows of motion beside them that are looked at, at least and at most.
+_LEAST, _BESIDE, _MOST = 3, 6, 200
+#: Rows of motion that are looked at, over those at rest: each is tried.
+_LENGTHS = (1, 2, 4)
+#: Measurement noises within which a body is at rest.
+_STILL = 4.0
+#: A bend is one if it takes this much off the sum of squares of a cubic, in variances of the noise,
+#: and this share of it.
+_CERTAIN, _SHARE = 100.0, 0.9
+#: A cubic must fit the end this many times worse than it fits the median window of all rows.
+_OUTSIDE = 4.0
+#: A change of velocity in standard errors, and over the 90th percentile of all rows' changes.
+_ABRUPT, _LARGE = 8.0, 4.0
+#: Places of a bend that are tried, at most.
+_PLACES = 60
+#: A moment of release may fit worse than the best by so much (in variances): its upper limit.
+_LIMIT = 4.0
+#: Reach of a contact beyond the shapes' radii, as a share of them.
+_REACH = 0.25
+
+
+@dataclass(frozen=True)
+class End:
+    """Rows at one end of a trajectory that belong to no model.
+
+    Parameters
+    ----------
+    trajectory : int or str
+        Label of the trajectory.
+    first : bool
+        Whether these are its first rows; else its last.
+    rows : int
+        How many.
+    begin, end : float
+        Times of the first and the last of them (s).
+    body : str
+        Which body.
+    what : str
+        ``held`` (at rest, then moving off without a command) or ``stopped`` (after an abrupt change
+        of velocity).
+
+    Examples
+    --------
+    >>> print(End(2, True, 6, 0.0, 0.167, "ball", "held"))
+    ball is held in the first 6 rows of trajectory 2 (t = 0 to 0.167 s)
+    """
+
+    trajectory: Any
+    first: bool
+    rows: int
+    begin: float
+    end: float
+    body: str
+    what: str
+
+    def __str__(self) -> str:
+        """Say which rows, and why."""
+        where = f"{'first' if self.first else 'last'} {self.rows} rows of trajectory"
+        said = f"is held in the {where}" if self.first else f"stops abruptly before the {where}"
+        return f"{self.body} {said} {self.trajectory} (t = {self.begin:.4g} to {self.end:.4g} s)"
+
+
+def strange_ends(history: History, scene: Scene) -> list[End]:
+    """Return the ends of trajectories that neither a command nor the scene explains.
+
+    A body is held if it is at rest for three rows or more and then moves off while no command acts
+    on any body. It was stopped if its velocity changes abruptly near the end, where the commands
+    do not change and nothing in the scene is near enough to be met. Either must be far outside of
+    what all trajectories show elsewhere. Only positions and angles are looked at.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+    scene : Scene
+        Says what a body may meet.
+
+    Returns
+    -------
+    list of End
+        By trajectory, first rows before last ones; of several bodies the one with the most rows.
+
+    Examples
+    --------
+    ::
+
+        print(*strange_ends(history, scene))
+    ball is held in the first 6 rows of trajectory 2 (t = 0 to 0.167 s)
+    """
+    dataset = history.dataset
+    observed, clock = dataset["observed"].to_numpy(), dataset["clock"].to_numpy()
+    action = np.nan_to_num(dataset["action"].to_numpy())
+    dt = float(dataset.attrs["time_step"])
+    follows = dataset["kinematic"].to_numpy()
+    labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
+    found: dict[tuple[int, bool], End] = {}
+    for body in np.flatnonzero(~follows):
+        for d in range(3):
+            series = [_filled(observed[t, :n, body, d], angle=d == THETA)
+                      for t, n in enumerate(n_rows)]  # fmt: skip
+            column = _Column.of([each for each in series if each is not None])
+            if column is None:
+                continue
+            for t, own in enumerate(series):
+                if own is None:
+                    continue
+                n = len(own)
+                push = action[t, :n][:, ~follows].reshape(n, -1)
+                for first in (True, False):
+                    rows = column.held(own, push) if first else column.stopped(own, push)
+                    others = np.delete(observed[t, :n], body, axis=1)[..., :3]
+                    if rows and (
+                        _moves(others[: 2 * rows + _BESIDE])
+                        if first
+                        else _near(scene, int(body), observed[t, :n], n - rows, dt)
+                    ):
+                        rows = 0
+                    if rows > (found[t, first].rows if (t, first) in found else 0):
+                        times = clock[t, :rows] if first else clock[t, n - rows : n]
+                        found[t, first] = End(
+                            labels[t], first, rows, float(times[0]), float(times[-1]),
+                            history.bodies[body], HELD if first else STOPPED,
+                        )  # fmt: skip
+    return [found[key] for key in sorted(found, key=lambda key: (key[0], not key[1]))]
+
+
+def trimmed(history: History, ends: Iterable[End]) -> History:
+    """Return the history without the rows of these ends.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+    ends : iterable of End
+        As of :func:`strange_ends`.
+
+    Raises
+    ------
+    HistoryError
+        If less than three rows of a trajectory would be left.
+
+    Examples
+    --------
+    ::
+
+        trimmed(history, strange_ends(history, scene)).n_transitions
+    38
+    """
+    dataset = history.dataset
+    labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
+    begin, end = np.zeros(len(labels), dtype=np.int64), n_rows.astype(np.int64)
+    for each in ends:
+        t = labels.index(each.trajectory)
+        if each.first:
+            begin[t] = max(begin[t], each.rows)
+        else:
+            end[t] = min(end[t], n_rows[t] - each.rows)
+    for t in np.flatnonzero(end - begin < _LEAST):
+        raise HistoryError(
+            f"history: trajectory {labels[t]} has {max(end[t] - begin[t], 0)} rows without its"
+            f" first {begin[t]} and last {n_rows[t] - end[t]}; expected at least {_LEAST}; drop the"
+            " trajectory"
+        )
+    if (begin == 0).all() and (end == n_rows).all():
+        return history
+    length = int((end - begin).max())
+    rows = begin[:, None] + np.arange(length)
+    outside = rows >= end[:, None]
+    rows = np.where(outside, 0, rows)
+    result = dataset.isel(time=slice(length)).copy()
+    for name in ("observed", "action", "start", "clock"):
+        values = dataset[name].to_numpy()
+        kept = values[np.arange(len(labels))[:, None], rows]
+        kept[outside] = np.nan
+        result[name] = result[name].copy(data=kept)
+    action, before = dataset["action"].to_numpy(), dataset["before"].to_numpy().copy()
+    late = np.flatnonzero(begin)
+    before[late] = np.nan_to_num(action[late, begin[late] - 1])
+    last = result["action"].to_numpy()
+    last[np.arange(len(labels)), end - begin - 1] = np.nan
+    result = result.assign(
+        action=result["action"].copy(data=last),
+        before=dataset["before"].copy(data=before),
+        n_rows=dataset["n_rows"].copy(data=end - begin),
+    )
+    return History(hashed(result))
+
+
+@dataclass(frozen=True, eq=False)
+class _Column:
+    """Positions of a dimension in all trajectories: their noise, and their changes of velocity."""
+
+    series: list[Floats]
+    noise: float
+    change: float
+
+    @classmethod
+    def of(cls, series: list[Floats]) -> _Column | None:
+        """From fourth and second differences; None where nothing moves or rows are too few."""
+        fourth = np.concatenate([np.diff(own, 4) for own in series if len(own) > 4] or [[]])
+        if not len(fourth) or not any(np.ptp(own) > 0 for own in series):
+            return None
+        every = np.concatenate(series)
+        steps = np.diff(np.unique(every))
+        rounding = 1e-9 * float(np.abs(every).max())
+        finest = float(steps[steps > rounding].min()) if (steps > rounding).any() else 0.0
+        noise = 1.4826 * float(np.median(np.abs(fourth))) / np.sqrt(70.0)
+        second = np.concatenate([np.diff(own, 2) for own in series])
+        noise = max(noise, finest / np.sqrt(12), rounding)
+        # of independent errors the second differences have six times the variance
+        change = float(np.quantile(np.abs(second), 0.9)) ** 2 - 6 * (1.8 * noise) ** 2
+        return cls(series, noise, float(np.sqrt(max(change, 0.0))))
+
+    def held(self, own: Floats, push: Floats) -> int:
+        """Rows at the beginning at rest, then moving off with no command."""
+        still = self._still(own)
+        if not _LEAST <= still < len(own) - _BESIDE:
+            return 0
+        for window in _windows(own, still):
+            if push[: len(window)].any():
+                break
+            bend = self._bend(
+                window, np.linspace(2, still, min(2 * still - 3, _PLACES)), 3, rest=True
+            )
+            if bend is not None and bend.place >= _LEAST - 1:
+                return int(np.ceil(bend.latest))
+        return 0
+
+    def stopped(self, own: Floats, push: Floats) -> int:
+        """Rows at the end after an abrupt change of velocity while no command changes."""
+        back = own[::-1]
+        still = self._still(back)
+        n = len(own)
+        tries = [(max(_LEAST, n // 4), False)]
+        if _LEAST <= still < n - _BESIDE:
+            tries.append((still, True))
+        best = None
+        for (longest, rest), window in (
+            (each, w) for each in tries for w in _windows(back, each[0])
+        ):
+            if np.ptp(push[n - len(window) : -1], axis=0).any():
+                continue
+            places = np.linspace(1.5, longest, min(2 * longest - 2, _PLACES))
+            bend = self._bend(window, places, 2, rest=rest)
+            if bend is None or bend.certainty < _ABRUPT or abs(bend.jump) < _LARGE * self.change:
+                continue
+            if best is None or bend.certainty > best.certainty:
+                best = bend
+        # rows after the moment of the stop: in reversed time those before it
+        return 0 if best is None else int(np.floor(best.latest)) + 1
+
+    def _still(self, own: Floats) -> int:
+        """Rows at the beginning that stay within the noise of where they begin."""
+        mean = np.cumsum(own) / np.arange(1, len(own) + 1)
+        off = np.abs(own - mean) > _STILL * self.noise
+        return int(np.argmax(off)) if off.any() else len(own)
+
+    def _bend(self, window: Floats, places: Floats, degree: int, *, rest: bool) -> _Bend | None:
+        """Return the best place of a bend, if a cubic does not do as well and fits elsewhere."""
+        n = len(window)
+        time = np.arange(n, dtype=float)
+        cubic = np.vander(time / n, 4)
+        smooth = np.eye(n) - cubic @ np.linalg.pinv(cubic)
+        without = float(((smooth @ window) ** 2).sum())
+        bends, powers = [], range(2 if rest else 1, degree + 1)
+        for place in places:
+            after = np.maximum(time - place, 0.0)
+            design = np.stack(
+                [np.ones(n), after, *((after if rest else time) ** k for k in powers)], axis=1
+            )
+            inverse = np.linalg.pinv(design)
+            size = inverse @ window
+            left = float(((window - design @ size) ** 2).sum())
+            spread = max(self.noise, float(np.sqrt(left / max(n - design.shape[1] - 1, 1))))
+            error = spread * float(np.sqrt((inverse[1] ** 2).sum()))
+            bends.append(_Bend(float(place), float(place), float(size[1]), error, left))
+        best = min(bends, key=lambda bend: bend.left)
+        variance = max(self.noise**2, best.left / max(n - 5, 1))
+        gain = without - best.left
+        if gain < _CERTAIN * variance or best.left > (1 - _SHARE) * without:
+            return None
+        elsewhere = [
+            ((np.lib.stride_tricks.sliding_window_view(own, n) @ smooth) ** 2).sum(axis=1)
+            for own in self.series
+            if len(own) >= n
+        ]
+        if without < _OUTSIDE**2 * float(np.median(np.concatenate(elsewhere))):
+            return None
+        near = [bend.place for bend in bends if bend.left < best.left + _LIMIT * variance]
+        return _Bend(best.place, max(near), best.jump, best.error, best.left)
+
+
+@dataclass(frozen=True)
+class _Bend:
+    """A bend at a row (a fraction): its latest place, its jump of velocity with standard error."""
+
+    place: float
+    latest: float
+    jump: float
+    error: float
+    left: float
+
+    @property
+    def certainty(self) -> float:
+        """Jump over its standard error."""
+        return abs(self.jump) / self.error
+
+
+def _windows(own: Floats, still: int) -> list[Floats]:
+    """Beginnings of a series: the rows at rest, and more and more beside them."""
+    beside = (int(np.clip(times * still, _BESIDE, _MOST)) for times in _LENGTHS)
+    return [own[: still + each] for each in beside if still + each <= len(own)]
+
+
+def _filled(values: Floats, *, angle: bool) -> Floats | None:
+    """Values with gaps interpolated, an angle without jumps; None with gaps at an end, or many."""
+    known = np.flatnonzero(np.isfinite(values))
+    if (
+        len(known) < max(2 * _BESIDE, 0.8 * len(values))
+        or len(values) - len(known)
+        and (known[0] > 0 or known[-1] < len(values) - 1)
+    ):
+        return None
+    level = np.unwrap(values[known]) if angle else values[known]
+    return np.interp(np.arange(len(values)), known, level)
+
+
+def _moves(states: Floats) -> bool:
+    """Whether any body of shape (time, body, 3) moves: it may be what sets others moving."""
+    with np.errstate(invalid="ignore"):
+        spread = np.fmax.reduce(states, axis=0) - np.fmin.reduce(states, axis=0)
+    return bool((np.nan_to_num(spread) > 0).any())
+
+
+def _near(scene: Scene, body: int, states: Floats, row: int, dt: float) -> bool:
+    """Whether something is near enough at a row to be met: a wall, or another body."""
+    bodies = scene.moving
+    own = states[max(row - 2, 0) : row + 2, body, :2]
+    if not np.isfinite(own).all():
+        return False  # a hinged body, of which the angle was measured
+    speed = np.abs(np.diff(own, axis=0)).max() if len(own) > 1 else 0.0
+    reach = (1 + _REACH) * bodies[body].shape.bounding_radius + 2 * float(speed)
+    for wall in scene.walls:
+        start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
+        along = np.clip((own - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        if (np.linalg.norm(own - start - along[:, None] * way, axis=1) < reach).any():
+            return True
+    for other, shape in enumerate(bodies):
+        if other != body:
+            place = states[max(row - 2, 0) : row + 2, other, :2]
+            far = np.linalg.norm(own - place, axis=1)
+            if not (far > reach + (1 + _REACH) * shape.shape.bounding_radius).all():
+                return True
+    for static in (each for each in scene.bodies if each.static and each.pose is not None):
+        far = np.linalg.norm(own - np.array(static.pose or ())[:2], axis=1)
+        if (far < reach + (1 + _REACH) * static.shape.bounding_radius).any():
+            return True
+    return any(
+        joint.kind == "distance" and bodies[body].name in joint.bodies for joint in scene.joints
+    )
