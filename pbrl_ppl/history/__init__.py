@@ -2,6 +2,7 @@
 
 from pbrl_ppl.history.bad_frames import BadFrame, bad_frames, without_bad_frames
 from pbrl_ppl.history.derived import derived_velocities, measured_alone, measurement_noise
+from pbrl_ppl.history.ends import End, strange_ends, trimmed
 from pbrl_ppl.history.files import read_table, write_atomically
 from pbrl_ppl.history.gaps import longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
@@ -13,6 +14,7 @@ from pbrl_ppl.history.unit_check import unit_mismatches
 
 __all__ = [
     "BadFrame",
+    "End",
     "History",
     "Reading",
     "Segments",
@@ -29,6 +31,8 @@ __all__ = [
     "measurement_noise",
     "read_table",
     "segment_rows",
+    "strange_ends",
+    "trimmed",
     "unit_mismatches",
     "unseen",
     "without_bad_frames",

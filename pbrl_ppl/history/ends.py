@@ -10,32 +10,17 @@ import numpy as np
 import numpy.typing as npt
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.bends import BESIDE, LEAST, Column
 from pbrl_ppl.history.digest import hashed
 from pbrl_ppl.history.history import History
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA
 
 Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
 
 HELD, STOPPED = "held", "stopped"
-#: Rows at rest, at least, and rows of motion beside them that are looked at, at least and at most.
-_LEAST, _BESIDE, _MOST = 3, 6, 200
-#: Rows of motion that are looked at, over those at rest: each is tried.
-_LENGTHS = (1, 2, 4)
-#: Measurement noises within which a body is at rest.
-_STILL = 4.0
-#: A bend is one if it takes this much off the sum of squares of a cubic, in variances of the noise,
-#: and this share of it.
-_CERTAIN, _SHARE = 100.0, 0.9
-#: A cubic must fit the end this many times worse than it fits the median window of all rows.
-_OUTSIDE = 4.0
-#: A change of velocity in standard errors, and over the 90th percentile of all rows' changes.
-_ABRUPT, _LARGE = 8.0, 4.0
-#: Places of a bend that are tried, at most.
-_PLACES = 60
-#: A moment of release may fit worse than the best by so much (in variances): its upper limit.
-_LIMIT = 4.0
+#: Rows on either side that a velocity estimated for ``start`` looks at.
+_ESTIMATED = 2
 #: Reach of a contact beyond the shapes' radii, as a share of them.
 _REACH = 0.25
 
@@ -119,7 +104,7 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
         for d in range(3):
             series = [_filled(observed[t, :n, body, d], angle=d == THETA)
                       for t, n in enumerate(n_rows)]  # fmt: skip
-            column = _Column.of([each for each in series if each is not None])
+            column = Column.of([each for each in series if each is not None])
             if column is None:
                 continue
             for t, own in enumerate(series):
@@ -131,7 +116,7 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
                     rows = column.held(own, push) if first else column.stopped(own, push)
                     others = np.delete(observed[t, :n], body, axis=1)[..., :3]
                     if rows and (
-                        _moves(others[: 2 * rows + _BESIDE])
+                        _moves(others[: 2 * rows + BESIDE])
                         if first
                         else _near(scene, int(body), observed[t, :n], n - rows, dt)
                     ):
@@ -176,10 +161,10 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
             begin[t] = max(begin[t], each.rows)
         else:
             end[t] = min(end[t], n_rows[t] - each.rows)
-    for t in np.flatnonzero(end - begin < _LEAST):
+    for t in np.flatnonzero(end - begin < LEAST):
         raise HistoryError(
             f"history: trajectory {labels[t]} has {max(end[t] - begin[t], 0)} rows without its"
-            f" first {begin[t]} and last {n_rows[t] - end[t]}; expected at least {_LEAST}; drop the"
+            f" first {begin[t]} and last {n_rows[t] - end[t]}; expected at least {LEAST}; drop the"
             " trajectory"
         )
     if (begin == 0).all() and (end == n_rows).all():
@@ -194,6 +179,12 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
         kept = values[np.arange(len(labels))[:, None], rows]
         kept[outside] = np.nan
         result[name] = result[name].copy(data=kept)
+    # velocities estimated from positions across a stop
+    never = ~np.isfinite(dataset["observed"].to_numpy()[..., 3:]).any(axis=(0, 1))
+    start = result["start"].to_numpy().copy()
+    for t in np.flatnonzero(end < n_rows):
+        kept = end[t] - begin[t]
+        start[t, max(kept - _ESTIMATED, 1) : kept, :, 3:][:, never] = np.nan
     action, before = dataset["action"].to_numpy(), dataset["before"].to_numpy().copy()
     late = np.flatnonzero(begin)
     before[late] = np.nan_to_num(action[late, begin[late] - 1])
@@ -201,146 +192,19 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     last[np.arange(len(labels)), end - begin - 1] = np.nan
     result = result.assign(
         action=result["action"].copy(data=last),
+        start=result["start"].copy(data=start),
         before=dataset["before"].copy(data=before),
         n_rows=dataset["n_rows"].copy(data=end - begin),
     )
     return History(hashed(result))
 
 
-@dataclass(frozen=True, eq=False)
-class _Column:
-    """Positions of a dimension in all trajectories: their noise, and their changes of velocity."""
-
-    series: list[Floats]
-    noise: float
-    change: float
-
-    @classmethod
-    def of(cls, series: list[Floats]) -> _Column | None:
-        """From fourth and second differences; None where nothing moves or rows are too few."""
-        fourth = np.concatenate([np.diff(own, 4) for own in series if len(own) > 4] or [[]])
-        if not len(fourth) or not any(np.ptp(own) > 0 for own in series):
-            return None
-        every = np.concatenate(series)
-        steps = np.diff(np.unique(every))
-        rounding = 1e-9 * float(np.abs(every).max())
-        finest = float(steps[steps > rounding].min()) if (steps > rounding).any() else 0.0
-        noise = 1.4826 * float(np.median(np.abs(fourth))) / np.sqrt(70.0)
-        second = np.concatenate([np.diff(own, 2) for own in series])
-        noise = max(noise, finest / np.sqrt(12), rounding)
-        # of independent errors the second differences have six times the variance
-        change = float(np.quantile(np.abs(second), 0.9)) ** 2 - 6 * (1.8 * noise) ** 2
-        return cls(series, noise, float(np.sqrt(max(change, 0.0))))
-
-    def held(self, own: Floats, push: Floats) -> int:
-        """Rows at the beginning at rest, then moving off with no command."""
-        still = self._still(own)
-        if not _LEAST <= still < len(own) - _BESIDE:
-            return 0
-        for window in _windows(own, still):
-            if push[: len(window)].any():
-                break
-            bend = self._bend(
-                window, np.linspace(2, still, min(2 * still - 3, _PLACES)), 3, rest=True
-            )
-            if bend is not None and bend.place >= _LEAST - 1:
-                return int(np.ceil(bend.latest))
-        return 0
-
-    def stopped(self, own: Floats, push: Floats) -> int:
-        """Rows at the end after an abrupt change of velocity while no command changes."""
-        back = own[::-1]
-        still = self._still(back)
-        n = len(own)
-        tries = [(max(_LEAST, n // 4), False)]
-        if _LEAST <= still < n - _BESIDE:
-            tries.append((still, True))
-        best = None
-        for (longest, rest), window in (
-            (each, w) for each in tries for w in _windows(back, each[0])
-        ):
-            if np.ptp(push[n - len(window) : -1], axis=0).any():
-                continue
-            places = np.linspace(1.5, longest, min(2 * longest - 2, _PLACES))
-            bend = self._bend(window, places, 2, rest=rest)
-            if bend is None or bend.certainty < _ABRUPT or abs(bend.jump) < _LARGE * self.change:
-                continue
-            if best is None or bend.certainty > best.certainty:
-                best = bend
-        # rows after the moment of the stop: in reversed time those before it
-        return 0 if best is None else int(np.floor(best.latest)) + 1
-
-    def _still(self, own: Floats) -> int:
-        """Rows at the beginning that stay within the noise of where they begin."""
-        mean = np.cumsum(own) / np.arange(1, len(own) + 1)
-        off = np.abs(own - mean) > _STILL * self.noise
-        return int(np.argmax(off)) if off.any() else len(own)
-
-    def _bend(self, window: Floats, places: Floats, degree: int, *, rest: bool) -> _Bend | None:
-        """Return the best place of a bend, if a cubic does not do as well and fits elsewhere."""
-        n = len(window)
-        time = np.arange(n, dtype=float)
-        cubic = np.vander(time / n, 4)
-        smooth = np.eye(n) - cubic @ np.linalg.pinv(cubic)
-        without = float(((smooth @ window) ** 2).sum())
-        bends, powers = [], range(2 if rest else 1, degree + 1)
-        for place in places:
-            after = np.maximum(time - place, 0.0)
-            design = np.stack(
-                [np.ones(n), after, *((after if rest else time) ** k for k in powers)], axis=1
-            )
-            inverse = np.linalg.pinv(design)
-            size = inverse @ window
-            left = float(((window - design @ size) ** 2).sum())
-            spread = max(self.noise, float(np.sqrt(left / max(n - design.shape[1] - 1, 1))))
-            error = spread * float(np.sqrt((inverse[1] ** 2).sum()))
-            bends.append(_Bend(float(place), float(place), float(size[1]), error, left))
-        best = min(bends, key=lambda bend: bend.left)
-        variance = max(self.noise**2, best.left / max(n - 5, 1))
-        gain = without - best.left
-        if gain < _CERTAIN * variance or best.left > (1 - _SHARE) * without:
-            return None
-        elsewhere = [
-            ((np.lib.stride_tricks.sliding_window_view(own, n) @ smooth) ** 2).sum(axis=1)
-            for own in self.series
-            if len(own) >= n
-        ]
-        if without < _OUTSIDE**2 * float(np.median(np.concatenate(elsewhere))):
-            return None
-        near = [bend.place for bend in bends if bend.left < best.left + _LIMIT * variance]
-        return _Bend(best.place, max(near), best.jump, best.error, best.left)
-
-
-@dataclass(frozen=True)
-class _Bend:
-    """A bend at a row (a fraction): its latest place, its jump of velocity with standard error."""
-
-    place: float
-    latest: float
-    jump: float
-    error: float
-    left: float
-
-    @property
-    def certainty(self) -> float:
-        """Jump over its standard error."""
-        return abs(self.jump) / self.error
-
-
-def _windows(own: Floats, still: int) -> list[Floats]:
-    """Beginnings of a series: the rows at rest, and more and more beside them."""
-    beside = (int(np.clip(times * still, _BESIDE, _MOST)) for times in _LENGTHS)
-    return [own[: still + each] for each in beside if still + each <= len(own)]
-
-
 def _filled(values: Floats, *, angle: bool) -> Floats | None:
     """Values with gaps interpolated, an angle without jumps; None with gaps at an end, or many."""
     known = np.flatnonzero(np.isfinite(values))
-    if (
-        len(known) < max(2 * _BESIDE, 0.8 * len(values))
-        or len(values) - len(known)
-        and (known[0] > 0 or known[-1] < len(values) - 1)
-    ):
+    if len(known) < max(2 * BESIDE, 0.8 * len(values)):
+        return None
+    if known[0] > 0 or known[-1] < len(values) - 1:
         return None
     level = np.unwrap(values[known]) if angle else values[known]
     return np.interp(np.arange(len(values)), known, level)
@@ -377,5 +241,6 @@ def _near(scene: Scene, body: int, states: Floats, row: int, dt: float) -> bool:
         if (far < reach + (1 + _REACH) * static.shape.bounding_radius).any():
             return True
     return any(
-        joint.kind == "distance" and bodies[body].name in joint.bodies for joint in scene.joints
+        joint.kind == "distance" and bodies[body].name in (joint.bodies or ())
+        for joint in scene.joints
     )
