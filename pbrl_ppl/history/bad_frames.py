@@ -266,7 +266,8 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
     good = ((far > _FAR) & (size > _FAR * misfit[:, None])).all(axis=1)
     for own in (left, right):
         off_side, _, far = off_curve(own, _ONE_SIDE)
-        agree = np.abs(off_side - off) <= _AGREE * np.abs(off)
+        apart = wrapped(off_side - off) if angle else off_side - off
+        agree = np.abs(apart) <= _AGREE * np.abs(off)
         good &= ((far > _FAR_OF_SIDE) & agree).all(axis=1)
     ragged = misfit > _FAR * max(float(np.median(misfit)), least)
     for k in range(gap):

@@ -109,11 +109,12 @@ class Column:
         cubic = np.vander(time / n, 4)
         smooth = np.eye(n) - cubic @ np.linalg.pinv(cubic)
         without = float(((smooth @ window) ** 2).sum())
+        for place in np.linspace(1, n - 2, min(2 * n, _PLACES)) if abrupt else ():
+            parts = [time, time**2, np.maximum(time - place, 0.0) ** 2]
+            without = min(without, _fitted(window, parts)[2])
         bends, powers = [], range(2 if rest else 1, degree + 1)
         for place in places:
             after = np.maximum(time - place, 0.0)
-            if abrupt:
-                without = min(without, _fitted(window, [time, time**2, after**2])[2])
             more = [(after if rest else time) ** k for k in powers]
             jump, error, left = _fitted(window, [after, *more])
             free = max(n - len(more) - 3, 1)
