@@ -203,9 +203,13 @@ def _deviations(history: History) -> Floats:
                     _off(kept[..., d], width, gap, angle=d == THETA)
                     for d in range(len(STATE))[kind]
                 ]
-                off, rough = (np.stack(each, axis=-1) for each in zip(*columns, strict=True))
+                first, rough = (np.stack(each, axis=2) for each in zip(*columns, strict=True))
                 # a contact changes several coordinates at once
-                off[rough.any(axis=-1)] = np.nan
+                first[rough.sum(axis=2, keepdims=True) > rough] = np.nan
+                off = first[..., 0]
+                for k in range(1, gap):
+                    late = np.roll(first[..., k], k, axis=1)
+                    off = np.where(np.isfinite(off), off, late)
                 if kind.start:
                     off[_happened(kept, off, dt)] = np.nan
                 own = result[:, :, body, kind]
@@ -214,7 +218,7 @@ def _deviations(history: History) -> Floats:
 
 
 def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, Bools]:
-    """How far bad rows are off, and around which rows the neighbours are not smooth.
+    """How far neighbouring rows are off, and where the rows around them are not smooth.
 
     Parameters
     ----------
@@ -230,11 +234,11 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
     Returns
     -------
     off : ndarray
-        Shape (trajectory, time); NaN where a row is not bad.
+        Of each row and those after it, shape (trajectory, time, gap); NaN if one is not bad.
     rough : ndarray of bool
         Shape (trajectory, time).
     """
-    result, rough = np.full(column.shape, np.nan), np.zeros(column.shape, dtype=bool)
+    result, rough = np.full((*column.shape, gap), np.nan), np.zeros(column.shape, dtype=bool)
     span = 2 * width + gap
     if column.shape[1] < span:
         return result, rough
@@ -270,9 +274,8 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
         agree = np.abs(apart) <= _AGREE * np.abs(off)
         good &= ((far > _FAR_OF_SIDE) & agree).all(axis=1)
     ragged = misfit > _FAR * max(float(np.median(misfit)), least)
-    for k in range(gap):
-        result[trajectory[good], first[good] + width + k] = off[good, k]
-        rough[trajectory[ragged], first[ragged] + width + k] = True
+    result[trajectory[good], first[good] + width] = off[good]
+    rough[trajectory[ragged], first[ragged] + width] = True
     return result, rough
 
 
