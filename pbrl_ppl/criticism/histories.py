@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import (
     History,
+    bad_frames,
     derived_velocities,
     measured_alone,
     without_bad_frames,
@@ -57,7 +58,7 @@ def checked_histories(
                 f"{which} history: it has a row each {step:g} s, the scene each"
                 f" {scene.time_step:g} s; load it with this scene"
             )
-    same, derived = test is train, derived_velocities(train)
+    same, derived = test is train, _computed(train)
     train, test = measured_alone(train, derived), measured_alone(test, derived)
     train, bad = without_bad_frames(train)
     test, more = without_bad_frames(test)
@@ -73,6 +74,16 @@ def checked_histories(
         )
     held_out = [] if same else [f"held out: {frame}" for frame in more]
     return train, test, derived, (*map(str, bad), *held_out)
+
+
+def _computed(history: History) -> NDArray[np.bool_]:
+    """Which velocities are computed, by trajectories without bad frames if most are.
+
+    A bad frame makes positions look noisy, and a measured velocity as if they predicted it.
+    """
+    clear = np.flatnonzero(~bad_frames(history).any(axis=(1, 2, 3)))
+    most = 2 * len(clear) >= history.n_trajectories
+    return derived_velocities(history.select(clear) if most else history)
 
 
 def named(scene: Scene, columns: NDArray[np.bool_]) -> str:

@@ -14,6 +14,7 @@ from pbrl_ppl.report.report import render
 from tests.helpers.free_puck import DISC, fitted
 from tests.helpers.histories import simulated_history
 from tests.helpers.made_up import made_up
+from tests.helpers.places import MODELS, load
 
 
 def puck(seed: int, row: int) -> History:
@@ -39,6 +40,16 @@ def test_both_histories_are_without_them_and_each_is_named_once() -> None:
     assert said[0].endswith(" m and left out (1 of 105 rows)")
     assert said[1].startswith("held out: x of puck at t = 1.1 s")
     assert len(checked_histories(DISC, train, train)[3]) == 1
+
+
+def test_a_measured_velocity_is_not_called_computed_for_a_bad_frame() -> None:
+    scene, train, test = load(MODELS / "shopping_cart", MODELS / "shopping_cart" / "recorded")
+    observed = train.dataset["observed"].to_numpy().copy()
+    observed[1, 19, 0, 0] += 0.4
+    data = train.dataset.assign(observed=train.dataset["observed"].copy(data=observed))
+    _, _, derived, said = checked_histories(scene, History(data), test)
+    assert not derived.any()
+    assert len(said) == 1
 
 
 def test_a_file_holds_them_as_missing() -> None:
