@@ -58,13 +58,15 @@ class Column:
         still = self._still(own)
         if not LEAST <= still < len(own) - BESIDE:
             return 0
-        for window in _windows(own, still):
-            if push[: len(window)].any():
+        skip = max(0, still - _MOST)  # of a long rest its last rows are enough
+        still -= skip
+        for window in _windows(own[skip:], still):
+            if push[: skip + len(window)].any():
                 break
             places = np.linspace(2, still, min(2 * still - 3, _PLACES))
             bend = self._bend(window, places, 3, rest=True, abrupt=False)
             if bend is not None and bend.place >= LEAST - 1:
-                return int(np.ceil(bend.latest))
+                return skip + int(np.ceil(bend.latest))
         return 0
 
     def stopped(self, own: Floats, push: Floats) -> int:
@@ -72,23 +74,24 @@ class Column:
         back = own[::-1]
         still = self._still(back)
         n = len(own)
-        tries = [(max(LEAST, n // 4), False)]
+        tries = [(min(max(LEAST, n // 4), _MOST), 0, False)]
         if LEAST <= still < n - BESIDE:
-            tries.append((still, True))
-        best = None
-        for (longest, rest), window in (
-            (each, w) for each in tries for w in _windows(back, each[0])
+            skip = max(0, still - _MOST)
+            tries.append((still - skip, skip, True))
+        best, rows = None, 0
+        for longest, skip, rest, window in (
+            (*each, w) for each in tries for w in _windows(back[each[1] :], each[0])
         ):
-            if np.ptp(push[n - len(window) : -1], axis=0).any():
+            if np.ptp(push[n - skip - len(window) : -1], axis=0).any():
                 continue
             places = np.linspace(1.5, longest, min(2 * longest - 2, _PLACES))
             bend = self._bend(window, places, 2, rest=rest, abrupt=True)
             if bend is None or bend.certainty < _ABRUPT or abs(bend.jump) < _LARGE * self.change:
                 continue
             if best is None or bend.certainty > best.certainty:
-                best = bend
-        # rows after the moment of the stop: in reversed time those before it
-        return 0 if best is None else int(np.floor(best.latest)) + 1
+                # rows after the moment of the stop: in reversed time those before it
+                best, rows = bend, skip + int(np.floor(bend.latest)) + 1
+        return rows
 
     def _still(self, own: Floats) -> int:
         """Rows at the beginning that stay within the noise of where they begin."""
