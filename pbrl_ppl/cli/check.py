@@ -16,6 +16,7 @@ from pbrl_ppl.cli.terminal import (
     Quiet,
     SceneFile,
     Seed,
+    Trim,
     Velocities,
     interruptible,
     stages,
@@ -34,6 +35,7 @@ def check(
     columns: Columns = None,
     units: Units = None,
     time_step: TimeStep = None,
+    trim: Trim = False,
     prior: Annotated[
         bool, typer.Option(help="Whether to compare the data with draws from the prior.")
     ] = True,
@@ -49,7 +51,7 @@ def check(
     with interruptible(), stages(quiet) as progress:
         declared, (loaded,) = load_own(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
-            units=units, time_step=time_step,
+            units=units, time_step=time_step, trim=trim,
         )  # fmt: skip
         from pbrl_ppl.history import unit_mismatches, unused_velocities
         from pbrl_ppl.physics import check_history

@@ -23,6 +23,7 @@ from pbrl_ppl.cli.terminal import (
     Quiet,
     Seed,
     Substeps,
+    Trim,
     Velocities,
     interruptible,
     named_numbers,
@@ -84,6 +85,7 @@ def close_loop(
     columns: Columns = None,
     units: Units = None,
     time_step: TimeStep = None,
+    trim: Trim = False,
     many: Annotated[
         Path | None,
         typer.Option(
@@ -116,6 +118,8 @@ def close_loop(
     if many is not None:
         if not (scene is train is test is None):
             raise typer.BadParameter("SCENE, TRAIN and --test are in the manifest, with --many")
+        if trim:
+            raise typer.BadParameter("--trim is for one log; leave it, or --many")
         if learn_remainder:
             raise typer.BadParameter("--learn-remainder is for one log; leave it, or --many")
         close_loop_many(
@@ -136,7 +140,7 @@ def close_loop(
         declared, histories = load_own(
             scene, train, *([] if test is None else [test]),
             estimate_velocities=estimate_velocities, columns=columns, units=units,
-            time_step=time_step,
+            time_step=time_step, trim=trim,
         )  # fmt: skip
         declared = stated_noise(declared, noise)
         if substeps is not None:

@@ -16,6 +16,7 @@ from pbrl_ppl.cli.terminal import (
     SceneFile,
     Seed,
     Substeps,
+    Trim,
     Velocities,
     interruptible,
     stages,
@@ -37,6 +38,7 @@ def criticise(
     columns: Columns = None,
     units: Units = None,
     time_step: TimeStep = None,
+    trim: Trim = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
 ) -> None:
@@ -49,7 +51,7 @@ def criticise(
         progress("reading the scene and the history")
         declared, (loaded,) = load_own(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
-            units=units, time_step=time_step,
+            units=units, time_step=time_step, trim=trim,
         )  # fmt: skip
         declared = with_substeps(stated_noise(declared, noise), substeps)
         progress("loading the model")

@@ -27,6 +27,7 @@ from pbrl_ppl.cli.terminal import (
     SceneFile,
     Seed,
     Substeps,
+    Trim,
     Velocities,
     interruptible,
     stages,
@@ -86,6 +87,7 @@ def fit(
     columns: Columns = None,
     units: Units = None,
     time_step: TimeStep = None,
+    trim: Trim = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -102,7 +104,7 @@ def fit(
         progress("reading the scene and the history")
         declared, (loaded,) = load_own(
             scene, history, estimate_velocities=estimate_velocities, columns=columns,
-            units=units, time_step=time_step,
+            units=units, time_step=time_step, trim=trim,
         )  # fmt: skip
         declared = with_substeps(stated_noise(declared, noise), substeps)
         progress("loading the sampler")

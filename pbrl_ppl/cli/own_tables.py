@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
 
+#: Ends of trajectories that a message names, at most.
+_NAMED = 4
+
 Columns = Annotated[
     list[str] | None,
     typer.Option(
@@ -80,10 +83,13 @@ def load_own(
     columns: list[str] | None = None,
     units: list[str] | None = None,
     time_step: float | None = None,
+    trim: bool | None = None,
 ) -> tuple[Scene, list[History]]:
     """Read a scene, with another time step if given, and histories of it.
 
-    Warns where velocities and changes of positions differ by the factor of a unit.
+    Warns where velocities and changes of positions differ by the factor of a unit, and of rows at
+    a trajectory's ends that belong to no model; with ``trim`` those are left out, with None they
+    are not looked for.
     """
     from pbrl_ppl.scene import Scene
 
@@ -107,4 +113,35 @@ def load_own(
     for path, history in zip(histories, loaded, strict=True):
         for sentence in unit_mismatches(history):
             warnings.warn(f"history {path}: {sentence}", stacklevel=2)
+    if trim is not None:
+        loaded = [
+            without_ends(history, declared, f"history {path}", trim=trim)
+            for path, history in zip(histories, loaded, strict=True)
+        ]
     return declared, loaded
+
+
+def without_ends(history: History, scene: Scene, source: str, *, trim: bool) -> History:
+    """The history without the rows at its ends that belong to no model, or with a warning of them.
+
+    Parameters
+    ----------
+    history : History
+        As read.
+    scene : Scene
+        The declared scene.
+    source : str
+        What to call the history.
+    trim : bool
+        Whether the rows are left out.
+    """
+    from pbrl_ppl.history import strange_ends, trimmed
+
+    ends = strange_ends(history, scene)
+    if not ends:
+        return history
+    named = "; ".join(str(end) for end in ends[:_NAMED])
+    more = f"; and {len(ends) - _NAMED} more" if len(ends) > _NAMED else ""
+    cure = "left out" if trim else "no command or contact explains it: --trim leaves the rows out"
+    warnings.warn(f"{source}: {named}{more}: {cure}", stacklevel=2)
+    return trimmed(history, ends) if trim else history

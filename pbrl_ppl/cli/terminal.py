@@ -53,6 +53,15 @@ Velocities = Annotated[
     ),
 ]
 
+Trim = Annotated[
+    bool,
+    typer.Option(
+        "--trim",
+        help="Leave out rows at a trajectory's ends that belong to no model: a body still held, an"
+        " abrupt stop.",
+    ),
+]
+
 #: What messages for Python advise besides, by the argument that it takes: left out of a command's
 #: messages if it has no such option.
 _ADVICE = {"thin": " or thin=", "resume": ", or go on with resume= this posterior"}

@@ -11,13 +11,14 @@ import typer
 
 from pbrl_ppl.cli.answers import print_json
 from pbrl_ppl.cli.outputs import check_file
-from pbrl_ppl.cli.own_tables import Columns, Resample, Units, columns_of, units_of
+from pbrl_ppl.cli.own_tables import Columns, Resample, Units, columns_of, units_of, without_ends
 from pbrl_ppl.cli.terminal import (
     UNDECIDED,
     AsJson,
     Overwrite,
     Quiet,
     Seed,
+    Trim,
     Velocities,
     interruptible,
     stages,
@@ -40,6 +41,7 @@ def update(
     columns: Columns = None,
     units: Units = None,
     resample: Resample = False,
+    trim: Trim = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
     quiet: Quiet = False,
@@ -56,10 +58,12 @@ def update(
         from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
 
         idata = load_posterior(posterior)
+        scene = scene_of(idata)
         new = History.load(
-            history, scene_of(idata), estimate_velocities=estimate_velocities, columns=names,
+            history, scene, estimate_velocities=estimate_velocities, columns=names,
             units=measures, resample=resample,
         )  # fmt: skip
+        new = without_ends(new, scene, f"history {history}", trim=trim)
         progress("updating")
         from pbrl_ppl.sampling import updating
 

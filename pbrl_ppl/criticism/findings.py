@@ -78,6 +78,8 @@ class Findings:
         Leave-one-out cross-validation of both models on the data they were fitted to.
     velocities_not_used : tuple of UnusedVelocity
         Velocity columns that were computed from positions or lag them.
+    bad_frames : tuple of str
+        A sentence for each single bad frame that was left out, of either history.
     """
 
     scene: Scene
@@ -104,6 +106,7 @@ class Findings:
     identifiability: Identifiability | None = None
     loo: Comparison | None = None
     velocities_not_used: tuple[UnusedVelocity, ...] = ()
+    bad_frames: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of ``report.json``; numbers that are not finite become null."""
@@ -152,6 +155,7 @@ class Findings:
                 "identifiability": self.identifiability and self.identifiability.to_dict(),
                 "loo": self.loo and self.loo.to_dict(),
                 "velocities_not_used": [vars(each) for each in self.velocities_not_used],
+                "bad_frames": self.bad_frames,
                 "provenance": self.provenance,
             }
         )

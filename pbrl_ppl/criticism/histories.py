@@ -6,7 +6,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History, UnusedVelocity, measured_alone, unused_velocities
+from pbrl_ppl.history import (
+    History,
+    UnusedVelocity,
+    bad_frames,
+    measured_alone,
+    unused_velocities,
+    without_bad_frames,
+)
 from pbrl_ppl.model import cells_of, check_moves
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE
@@ -14,8 +21,8 @@ from pbrl_ppl.state import STATE
 
 def checked_histories(
     scene: Scene, train: History, test: History
-) -> tuple[History, History, tuple[UnusedVelocity, ...]]:
-    """Both histories without velocities that were computed from positions or lag them, and which.
+) -> tuple[History, History, tuple[UnusedVelocity, ...], tuple[str, ...]]:
+    """Both histories without unused velocities and single bad frames, and which those are.
 
     Parameters
     ----------
@@ -30,6 +37,8 @@ def checked_histories(
         With what was measured alone.
     unused : tuple of UnusedVelocity
         Velocity columns of the training history that are not used, in either.
+    bad : tuple of str
+        A sentence for each single bad frame that is left out.
 
     Raises
     ------
@@ -50,8 +59,10 @@ def checked_histories(
                 f"{which} history: it has a row each {step:g} s, the scene each"
                 f" {scene.time_step:g} s; load it with this scene"
             )
-    unused = unused_velocities(train)
+    same, unused = test is train, _unused(train)
     train, test = measured_alone(train, unused), measured_alone(test, unused)
+    train, bad = without_bad_frames(train)
+    test, more = without_bad_frames(test)
     check_moves(cells_of(scene, train), scene)
     known, asked = (
         np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
@@ -62,7 +73,18 @@ def checked_histories(
             f"test history measures {named(scene, asked & ~known)}, which the training history does"
             " not; leave those columns empty, or measure them in both"
         )
-    return train, test, unused
+    held_out = [] if same else [f"held out: {frame}" for frame in more]
+    return train, test, unused, (*map(str, bad), *held_out)
+
+
+def _unused(history: History) -> tuple[UnusedVelocity, ...]:
+    """Which velocities are not used, by trajectories without bad frames if most are.
+
+    A bad frame makes positions look noisy, and a measured velocity as if they predicted it.
+    """
+    clear = np.flatnonzero(~bad_frames(history).any(axis=(1, 2, 3)))
+    most = 2 * len(clear) >= history.n_trajectories
+    return unused_velocities(history.select(clear) if most else history)
 
 
 def named(scene: Scene, columns: NDArray[np.bool_]) -> str:

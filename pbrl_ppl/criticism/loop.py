@@ -123,9 +123,9 @@ def _revised(
         test = test.numbered(float(train.dataset["number"].max()) + 1.0)
     if substeps is not None:
         scene.replace(substeps=substeps)  # it is checked there
-    train, test, unused = checked_histories(scene, train, test)
-    for velocity in unused:
-        say(velocity.sentence)
+    train, test, unused, bad = checked_histories(scene, train, test)
+    for sentence in (*(velocity.sentence for velocity in unused), *bad):
+        say(sentence)
     held_out = HeldOut(test, seed)
     for effect in catalogue:
         if effect not in full_catalogue:
@@ -180,7 +180,7 @@ def _revised(
     models = Models(declared, current, posterior, revised, before, left)
     told = selection.explained(first), tuple(selection.small)
     findings = put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
-    return replace(findings, velocities_not_used=unused)
+    return replace(findings, velocities_not_used=unused, bad_frames=bad)
 
 
 def _with_effects(

@@ -93,9 +93,9 @@ def criticise(
         scene.replace(substeps=substeps)  # it is checked there
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
-        history, _, unused = checked_histories(scene, history, history)
-        for velocity in unused:
-            say(velocity.sentence)
+        history, _, unused, bad = checked_histories(scene, history, history)
+        for sentence in (*(velocity.sentence for velocity in unused), *bad):
+            say(sentence)
         effects = attach(scene, (), catalogue)
         say("fitting the declared model")
         mode = declared_mode(scene, history, effects, seed, substeps, say, criteria)

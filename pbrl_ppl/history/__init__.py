@@ -1,11 +1,13 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
+from pbrl_ppl.history.bad_frames import BadFrame, bad_frames, without_bad_frames
 from pbrl_ppl.history.derived import (
     UnusedVelocity,
     measured_alone,
     measurement_noise,
     unused_velocities,
 )
+from pbrl_ppl.history.ends import End, strange_ends, trimmed
 from pbrl_ppl.history.files import read_table, write_atomically
 from pbrl_ppl.history.gaps import check_start, longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
@@ -16,11 +18,14 @@ from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
 from pbrl_ppl.history.unit_check import unit_mismatches
 
 __all__ = [
+    "BadFrame",
+    "End",
     "History",
     "Reading",
     "Segments",
     "UnusedVelocity",
     "as_history",
+    "bad_frames",
     "check_start",
     "fill_hinges",
     "from_mujoco",
@@ -32,8 +37,11 @@ __all__ = [
     "measurement_noise",
     "read_table",
     "segment_rows",
+    "strange_ends",
+    "trimmed",
     "unit_mismatches",
     "unseen",
     "unused_velocities",
+    "without_bad_frames",
     "write_atomically",
 ]

@@ -14,6 +14,7 @@ from pbrl_ppl.report.words import (
     digits_of,
     error_in_words,
     joined,
+    left_out_in_words,
     number,
     plain,
     quantity,
@@ -39,6 +40,7 @@ def in_brief(findings: Findings, folder: str | Path, remainder: str = "") -> lis
     lines += _errors(findings)
     if left is not None and left.body:
         lines.append(f"Where: {left.dimension} of the {plain(left.body)}.")
+    lines += [f"Left out: {words}"] if (words := left_out_in_words(findings)) else []
     lines += [f"Remainder: {remainder}"] if remainder else []
     lines.append(f"Next: {_next(findings, folder, bool(remainder))}")
     lines.append(f"Report: {folder / 'report.html'}; posteriors before.nc and after.nc beside it.")

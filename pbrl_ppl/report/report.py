@@ -46,6 +46,7 @@ from pbrl_ppl.report.words import (
     depends_on_records,
     error_in_words,
     gains_in_words,
+    left_out_in_words,
     rejected_in_words,
     verdict_in_words,
 )
@@ -121,6 +122,7 @@ def render(
         accepted=accepted(findings),
         note=error_in_words(findings),
         rejected=rejected_in_words(findings),
+        left_out=left_out_in_words(findings),
         depends=depends_on_records(findings),
         remainder=remainder,
         gains=gains_in_words(findings.before.rollout_rmse, findings.after.rollout_rmse, UNITS),

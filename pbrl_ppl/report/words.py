@@ -138,6 +138,13 @@ def rejected_in_words(findings: Findings) -> str:
     return f"Not added: {'; '.join(told[:TRIED])}." if told else ""
 
 
+def left_out_in_words(findings: Findings) -> str:
+    """Say which single bad frames were left out of the histories, the first few one by one."""
+    first, more = findings.bad_frames[:TRIED], len(findings.bad_frames) - TRIED
+    rest = f"; and {more} more (report.json lists them)" if more > 0 else ""
+    return f"{'; '.join(first)}{rest}." if first else ""
+
+
 def plain(name: str) -> str:
     """Write a catalogue name as words."""
     return name.replace("_", " ")

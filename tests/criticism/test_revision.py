@@ -281,7 +281,7 @@ def test_computed_velocities_are_recognised_and_the_effect_is_found(make_history
                 lambda values: np.gradient(values, 0.1)
             )
         computed.append(frame)
-    train, test, unused = checked_histories(BOX, *histories(computed))
+    train, test, unused, _ = checked_histories(BOX, *histories(computed))
     assert [each.state for each in unused] == ["vx", "vy", "omega"]
     for history in (train, test):
         observed = history.dataset["observed"].to_numpy()[..., 3:]

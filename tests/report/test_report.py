@@ -368,6 +368,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "error",
         "identifiability",
         "loo",
+        "bad_frames",
         "provenance",
     ]
     assert list(got["added"][0]) == [

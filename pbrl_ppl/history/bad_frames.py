@@ -1,0 +1,311 @@
+"""Single bad frames of a recording: rows off the smooth curve through their neighbours."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from scipy.ndimage import maximum_filter1d
+
+from pbrl_ppl.history.history import History
+from pbrl_ppl.state import STATE, STATE_UNITS, THETA, wrapped
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+#: Rows on either side that a curve is fitted to: each width is tried.
+_WIDTHS = (3, 4, 5)
+#: Neighbouring bad rows, at most.
+_LONGEST = 2
+#: Degree of the curve through the rows of one side, and of both.
+_ONE_SIDE, _BOTH_SIDES = 2, 3
+#: Robust standard deviations that a bad row is off the curve through both sides, and off those
+#: through either side. Under Gaussian noise a row is beyond the first with a probability of 1e-15.
+_FAR, _FAR_OF_SIDE = 8.0, 5.0
+#: The curves must agree on how far the row is off, to this share of it.
+_AGREE = 0.5
+#: A velocity is off its curve in truth if its position moves on by this share of that.
+_CONFIRMED = 0.25
+#: Rounding of numbers, as a share of a column's range.
+_ROUNDING = 1e-9
+#: Standard deviation of a Gaussian over the median of its absolute values.
+_GAUSSIAN = 1.4826
+#: Share of a column's rows that may be left out, at most.
+_MOST = 0.05
+#: Rows on either side that a velocity estimated for ``start`` looks at.
+_REACH = 2
+
+
+@dataclass(frozen=True)
+class BadFrame:
+    """A measurement that is off the smooth curve through its neighbours.
+
+    Parameters
+    ----------
+    trajectory : int or str
+        Label of the trajectory.
+    row : int
+        Row of the trajectory, from 0.
+    time : float
+        When (s).
+    body, state : str
+        What was measured.
+    off : float
+        Measured less the curve's value, in ``unit``.
+    unit : str
+        Of the measurement.
+    rows : int
+        Rows of the history, all trajectories together.
+
+    Examples
+    --------
+    >>> print(BadFrame(2, 7, 0.35, "puck", "x", 0.31, "m", 400))
+    x of puck at t = 0.35 s of trajectory 2 is off by 0.31 m and left out (1 of 400 rows)
+    """
+
+    trajectory: Any
+    row: int
+    time: float
+    body: str
+    state: str
+    off: float
+    unit: str
+    rows: int
+
+    def __str__(self) -> str:
+        """Say which measurement is left out, and why."""
+        return (
+            f"{self.state} of {self.body} at t = {self.time:.4g} s of trajectory {self.trajectory}"
+            f" is off by {abs(self.off):.2g} {self.unit} and left out (1 of {self.rows} rows)"
+        )
+
+
+def bad_frames(history: History) -> Bools:
+    """Return which measurements are single bad frames.
+
+    A row, or two neighbouring rows, are bad if they are far off the curve through the rows before,
+    far off the one through the rows after, and far off the one through both, which must fit its own
+    rows. After an impact a row is on one of the first two curves, so it is never called bad; nor is
+    it where the body's other positions (or velocities) are not smooth, as in a contact, or where
+    positions confirm a velocity. The scale is the median absolute deviation of the whole column, in
+    all trajectories; nothing nearer than eight steps of a quantised column is bad. Three measured
+    rows are needed on either side.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+
+    Returns
+    -------
+    ndarray of bool
+        Shape (trajectory, time, body, state). Under Gaussian noise a row is marked with a
+        probability of less than 1e-14.
+
+    Examples
+    --------
+    ::
+
+        bad_frames(history).sum()
+    1
+    """
+    return np.asarray(np.isfinite(_deviations(history)))
+
+
+def without_bad_frames(history: History) -> tuple[History, list[BadFrame]]:
+    """Return the history with its bad frames missing, and the list of them.
+
+    They become NaN in ``observed``, so that they take no part in a likelihood, and what was
+    computed from them becomes NaN in ``start``. The hash stays that of the recording.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+
+    Returns
+    -------
+    history : History
+        The same object if nothing is left out.
+    frames : list of BadFrame
+        By trajectory, row, body and state.
+
+    Warns
+    -----
+    UserWarning
+        If more than 5 % of a column's rows are off: that is heavy-tailed noise, and all are kept.
+
+    Examples
+    --------
+    ::
+
+        clean, frames = without_bad_frames(history)
+        print(frames[0])
+    x of puck at t = 0.35 s of trajectory 2 is off by 0.31 m and left out (1 of 400 rows)
+    """
+    off, dataset = _deviations(history), history.dataset
+    bad: Bools = np.isfinite(off)
+    count = bad.sum(axis=(0, 1))
+    rows = int(dataset["n_rows"].sum())
+    many = (count > 1) & (count > _MOST * rows)
+    for body, d in np.argwhere(many):
+        warnings.warn(
+            f"{STATE[d]} of {history.bodies[body]}: {100 * count[body, d] / rows:.2g} % of the rows"
+            f" are far off their neighbours, more than {100 * _MOST:g} %: heavy-tailed noise rather"
+            " than single bad frames, so all rows are kept",
+            stacklevel=2,
+        )
+    bad &= ~many
+    if not bad.any():
+        return history, []
+    labels, clock = dataset["trajectory"].to_numpy().tolist(), dataset["clock"].to_numpy()
+    found = [
+        BadFrame(
+            labels[t], int(i), float(clock[t, i]), history.bodies[body], STATE[d],
+            float(off[t, i, body, d]), STATE_UNITS[d], rows,
+        )
+        for t, i, body, d in np.argwhere(bad)
+    ]  # fmt: skip
+    observed = np.where(bad, np.nan, dataset["observed"].to_numpy())
+    start = _start(dataset["start"].to_numpy(), observed, bad)
+    return History(
+        dataset.assign(
+            observed=dataset["observed"].copy(data=observed),
+            start=dataset["start"].copy(data=start),
+        )
+    ), found
+
+
+def _start(start: Floats, observed: Floats, bad: Bools) -> Floats:
+    """States to start from, without what was computed from bad frames."""
+    computed: Bools = ~np.isfinite(observed)
+    lost: Bools = computed & bad.any(axis=(2, 3), keepdims=True)
+    near = maximum_filter1d(bad.any(axis=-1).astype(np.uint8), 2 * _REACH + 1, axis=1) > 0
+    never = computed.all(axis=(0, 1)) & (np.arange(len(STATE)) >= len(STATE) // 2)
+    lost |= near[..., None] & never
+    return np.where(lost, np.nan, start)
+
+
+def _deviations(history: History) -> Floats:
+    """How far bad frames are off; NaN elsewhere, shape (trajectory, time, body, state)."""
+    observed = history.dataset["observed"].to_numpy()
+    dt = float(history.dataset.attrs["time_step"])
+    result = np.full(observed.shape, np.nan)
+    for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
+        for kind in (slice(0, 3), slice(3, 6)):
+            for gap, width in product(range(1, _LONGEST + 1), _WIDTHS):
+                kept = np.where(np.isfinite(result[:, :, body]), np.nan, observed[:, :, body])
+                columns = [
+                    _off(kept[..., d], width, gap, angle=d == THETA)
+                    for d in range(len(STATE))[kind]
+                ]
+                first, rough = (np.stack(each, axis=2) for each in zip(*columns, strict=True))
+                # a contact changes several coordinates at once
+                first[rough.sum(axis=2, keepdims=True) > rough] = np.nan
+                off = first[..., 0]
+                for k in range(1, gap):
+                    late = np.roll(first[..., k], k, axis=1)
+                    off = np.where(np.isfinite(off), off, late)
+                if kind.start:
+                    off[_happened(kept, off, dt)] = np.nan
+                own = result[:, :, body, kind]
+                own[...] = np.where(np.isfinite(own), own, off)
+    return result
+
+
+def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, Bools]:
+    """How far neighbouring rows are off, and where the rows around them are not smooth.
+
+    Parameters
+    ----------
+    column : ndarray
+        Shape (trajectory, time), NaN where missing.
+    width : int
+        Rows on either side.
+    gap : int
+        Neighbouring rows that are left out together.
+    angle : bool
+        Whether the column wraps (rad).
+
+    Returns
+    -------
+    off : ndarray
+        Of each row and those after it, shape (trajectory, time, gap); NaN if one is not bad.
+    rough : ndarray of bool
+        Shape (trajectory, time).
+    """
+    result, rough = np.full((*column.shape, gap), np.nan), np.zeros(column.shape, dtype=bool)
+    span = 2 * width + gap
+    if column.shape[1] < span:
+        return result, rough
+    windows = np.lib.stride_tricks.sliding_window_view(column, span, axis=1)
+    trajectory, first = np.nonzero(np.isfinite(windows).all(axis=-1))
+    rows = windows[trajectory, first]
+    if not len(rows):
+        return result, rough
+    middle, left, right = slice(width, width + gap), slice(width), slice(width, None)
+    place = np.arange(span) - width - (gap - 1) / 2
+    there, other = place[middle], np.delete(place, middle)
+    sides = np.delete(rows, middle, axis=1)
+    sides = np.unwrap(sides, axis=1) if angle else sides
+    least = _finest(column)
+
+    def off_curve(own: slice, degree: int) -> tuple[Floats, Floats, Floats]:
+        """Rows less the curve through the others; the same in standard deviations; the scale."""
+        predict = np.vander(there, degree + 1) @ np.linalg.pinv(np.vander(other[own], degree + 1))
+        off = rows[:, middle] - sides[:, own] @ predict.T
+        off = wrapped(off) if angle else off
+        size = np.abs(off) / np.sqrt(1.0 + (predict**2).sum(axis=1))
+        scale = max(_GAUSSIAN * float(np.median(size)), least)
+        return off, size, size / scale
+
+    off, size, far = off_curve(slice(None), _BOTH_SIDES)
+    powers = np.vander(other, _BOTH_SIDES + 1)
+    left_over = sides - sides @ (powers @ np.linalg.pinv(powers)).T
+    misfit = np.sqrt((left_over**2).sum(axis=1) / (len(other) - _BOTH_SIDES - 1))
+    good = ((far > _FAR) & (size > _FAR * misfit[:, None])).all(axis=1)
+    for own in (left, right):
+        off_side, _, far = off_curve(own, _ONE_SIDE)
+        apart = wrapped(off_side - off) if angle else off_side - off
+        agree = np.abs(apart) <= _AGREE * np.abs(off)
+        good &= ((far > _FAR_OF_SIDE) & agree).all(axis=1)
+    ragged = misfit > _FAR * max(float(np.median(misfit)), least)
+    result[trajectory[good], first[good] + width] = off[good]
+    rough[trajectory[ragged], first[ragged] + width] = True
+    return result, rough
+
+
+def _happened(state: Floats, off: Floats, dt: float) -> Bools:
+    """Return which deviations of velocities the positions confirm, as between two impacts.
+
+    Parameters
+    ----------
+    state : ndarray
+        Measured, shape (trajectory, time, 6), SI units.
+    off : ndarray
+        Velocities less their curve, shape (trajectory, time, 3); NaN where they are on it.
+    dt : float
+        Time step (s).
+    """
+    more = np.nan_to_num(off)
+    curve = state[..., 3:] - more
+    change = np.diff(state[..., :3], axis=1) - dt / 2 * (curve[:, 1:] + curve[:, :-1])
+    change[..., THETA] = wrapped(change[..., THETA])
+    change = np.pad(change, ((0, 0), (1, 1), (0, 0)))
+    beside = change[:, :-1] + change[:, 1:]
+    return np.asarray(beside * more > _CONFIRMED * dt * more**2)
+
+
+def _finest(column: Floats) -> float:
+    """Finest step between a column's values: what quantisation or rounding may be off by."""
+    values = np.unique(column[np.isfinite(column)])
+    if len(values) < 2:
+        return np.inf
+    least = _ROUNDING * float(max(np.abs(values).max(), values[-1] - values[0]))
+    steps = np.diff(values)
+    steps = steps[steps > least]
+    return max(least, float(steps.min()) if len(steps) else 0.0)

@@ -1,0 +1,246 @@
+"""Rows at a trajectory's ends that belong to no model: a body still held, an abrupt stop."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.bends import BESIDE, LEAST, Column
+from pbrl_ppl.history.digest import hashed
+from pbrl_ppl.history.history import History
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import THETA
+
+Floats = npt.NDArray[np.float64]
+
+HELD, STOPPED = "held", "stopped"
+#: Rows on either side that a velocity estimated for ``start`` looks at.
+_ESTIMATED = 2
+#: Reach of a contact beyond the shapes' radii, as a share of them.
+_REACH = 0.25
+
+
+@dataclass(frozen=True)
+class End:
+    """Rows at one end of a trajectory that belong to no model.
+
+    Parameters
+    ----------
+    trajectory : int or str
+        Label of the trajectory.
+    first : bool
+        Whether these are its first rows; else its last.
+    rows : int
+        How many.
+    begin, end : float
+        Times of the first and the last of them (s).
+    body : str
+        Which body.
+    what : str
+        ``held`` (at rest, then moving off without a command) or ``stopped`` (after an abrupt change
+        of velocity).
+
+    Examples
+    --------
+    >>> print(End(2, True, 6, 0.0, 0.167, "ball", "held"))
+    ball is held in the first 6 rows of trajectory 2 (t = 0 to 0.167 s)
+    """
+
+    trajectory: Any
+    first: bool
+    rows: int
+    begin: float
+    end: float
+    body: str
+    what: str
+
+    def __str__(self) -> str:
+        """Say which rows, and why."""
+        where = f"{'first' if self.first else 'last'} {self.rows} rows of trajectory"
+        said = f"is held in the {where}" if self.first else f"stops abruptly before the {where}"
+        return f"{self.body} {said} {self.trajectory} (t = {self.begin:.4g} to {self.end:.4g} s)"
+
+
+def strange_ends(history: History, scene: Scene) -> list[End]:
+    """Return the ends of trajectories that neither a command nor the scene explains.
+
+    A body is held if it is at rest for three rows or more and then moves off while no command acts
+    on any body. It was stopped if its velocity changes abruptly near the end, where the commands
+    do not change and nothing in the scene is near enough to be met. Either must be far outside of
+    what all trajectories show elsewhere. Only positions and angles are looked at.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+    scene : Scene
+        Says what a body may meet.
+
+    Returns
+    -------
+    list of End
+        By trajectory, first rows before last ones; of several bodies the one with the most rows.
+
+    Examples
+    --------
+    ::
+
+        print(*strange_ends(history, scene))
+    ball is held in the first 6 rows of trajectory 2 (t = 0 to 0.167 s)
+    """
+    dataset = history.dataset
+    observed, clock = dataset["observed"].to_numpy(), dataset["clock"].to_numpy()
+    action = np.nan_to_num(dataset["action"].to_numpy())
+    dt = float(dataset.attrs["time_step"])
+    follows = dataset["kinematic"].to_numpy()
+    labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
+    found: dict[tuple[int, bool], End] = {}
+    for body in np.flatnonzero(~follows):
+        for d in range(3):
+            series = [_filled(observed[t, :n, body, d], angle=d == THETA)
+                      for t, n in enumerate(n_rows)]  # fmt: skip
+            column = Column.of([each for each in series if each is not None])
+            if column is None:
+                continue
+            for t, own in enumerate(series):
+                if own is None:
+                    continue
+                n = len(own)
+                push = action[t, :n][:, ~follows].reshape(n, -1)
+                for first in (True, False):
+                    rows = column.held(own, push) if first else column.stopped(own, push)
+                    others = np.delete(observed[t, :n], body, axis=1)[..., :3]
+                    if rows and (
+                        _moves(others[: 2 * rows + BESIDE])
+                        if first
+                        else _near(scene, int(body), observed[t, :n], n - rows, dt)
+                    ):
+                        rows = 0
+                    if rows > (found[t, first].rows if (t, first) in found else 0):
+                        times = clock[t, :rows] if first else clock[t, n - rows : n]
+                        found[t, first] = End(
+                            labels[t], first, rows, float(times[0]), float(times[-1]),
+                            history.bodies[body], HELD if first else STOPPED,
+                        )  # fmt: skip
+    return [found[key] for key in sorted(found, key=lambda key: (key[0], not key[1]))]
+
+
+def trimmed(history: History, ends: Iterable[End]) -> History:
+    """Return the history without the rows of these ends.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+    ends : iterable of End
+        As of :func:`strange_ends`.
+
+    Raises
+    ------
+    HistoryError
+        If less than three rows of a trajectory would be left.
+
+    Examples
+    --------
+    ::
+
+        trimmed(history, strange_ends(history, scene)).n_transitions
+    38
+    """
+    dataset = history.dataset
+    labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
+    begin, end = np.zeros(len(labels), dtype=np.int64), n_rows.astype(np.int64)
+    for each in ends:
+        t = labels.index(each.trajectory)
+        if each.first:
+            begin[t] = max(begin[t], each.rows)
+        else:
+            end[t] = min(end[t], n_rows[t] - each.rows)
+    for t in np.flatnonzero(end - begin < LEAST):
+        raise HistoryError(
+            f"history: trajectory {labels[t]} has {max(end[t] - begin[t], 0)} rows without its"
+            f" first {begin[t]} and last {n_rows[t] - end[t]}; expected at least {LEAST}; drop the"
+            " trajectory"
+        )
+    if (begin == 0).all() and (end == n_rows).all():
+        return history
+    length = int((end - begin).max())
+    rows = begin[:, None] + np.arange(length)
+    outside = rows >= end[:, None]
+    rows = np.where(outside, 0, rows)
+    result = dataset.isel(time=slice(length)).copy()
+    for name in ("observed", "action", "start", "clock"):
+        values = dataset[name].to_numpy()
+        kept = values[np.arange(len(labels))[:, None], rows]
+        kept[outside] = np.nan
+        result[name] = result[name].copy(data=kept)
+    # velocities estimated from positions across a stop
+    never = ~np.isfinite(dataset["observed"].to_numpy()[..., 3:]).any(axis=(0, 1))
+    start = result["start"].to_numpy().copy()
+    for t in np.flatnonzero(end < n_rows):
+        kept = end[t] - begin[t]
+        start[t, max(kept - _ESTIMATED, 1) : kept, :, 3:][:, never] = np.nan
+    action, before = dataset["action"].to_numpy(), dataset["before"].to_numpy().copy()
+    late = np.flatnonzero(begin)
+    before[late] = np.nan_to_num(action[late, begin[late] - 1])
+    last = result["action"].to_numpy()
+    last[np.arange(len(labels)), end - begin - 1] = np.nan
+    result = result.assign(
+        action=result["action"].copy(data=last),
+        start=result["start"].copy(data=start),
+        before=dataset["before"].copy(data=before),
+        n_rows=dataset["n_rows"].copy(data=end - begin),
+    )
+    return History(hashed(result))
+
+
+def _filled(values: Floats, *, angle: bool) -> Floats | None:
+    """Values with gaps interpolated, an angle without jumps; None with gaps at an end, or many."""
+    known = np.flatnonzero(np.isfinite(values))
+    if len(known) < max(2 * BESIDE, 0.8 * len(values)):
+        return None
+    if known[0] > 0 or known[-1] < len(values) - 1:
+        return None
+    level = np.unwrap(values[known]) if angle else values[known]
+    return np.interp(np.arange(len(values)), known, level)
+
+
+def _moves(states: Floats) -> bool:
+    """Whether any body of shape (time, body, 3) moves: it may be what sets others moving."""
+    with np.errstate(invalid="ignore"):
+        spread = np.fmax.reduce(states, axis=0) - np.fmin.reduce(states, axis=0)
+    return bool((np.nan_to_num(spread) > 0).any())
+
+
+def _near(scene: Scene, body: int, states: Floats, row: int, dt: float) -> bool:
+    """Whether something is near enough at a row to be met: a wall, or another body."""
+    bodies = scene.moving
+    own = states[max(row - 2, 0) : row + 2, body, :2]
+    if not np.isfinite(own).all():
+        return False  # a hinged body, of which the angle was measured
+    speed = np.abs(np.diff(own, axis=0)).max() if len(own) > 1 else 0.0
+    reach = (1 + _REACH) * bodies[body].shape.bounding_radius + 2 * float(speed)
+    for wall in scene.walls:
+        start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
+        along = np.clip((own - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        if (np.linalg.norm(own - start - along[:, None] * way, axis=1) < reach).any():
+            return True
+    for other, shape in enumerate(bodies):
+        if other != body:
+            place = states[max(row - 2, 0) : row + 2, other, :2]
+            far = np.linalg.norm(own - place, axis=1)
+            if not (far > reach + (1 + _REACH) * shape.shape.bounding_radius).all():
+                return True
+    for static in (each for each in scene.bodies if each.static and each.pose is not None):
+        far = np.linalg.norm(own - np.array(static.pose or ())[:2], axis=1)
+        if (far < reach + (1 + _REACH) * static.shape.bounding_radius).any():
+            return True
+    return any(
+        joint.kind == "distance" and bodies[body].name in (joint.bodies or ())
+        for joint in scene.joints
+    )
