@@ -283,7 +283,7 @@ def errors_ahead(
 ) -> tuple[dict[str, Any], ...]:
     """Held-out errors of each forecast, before and after; None where no trajectory is as long."""
     scene = found.scene
-    train, test, _ = checked_histories(scene, train, test)
+    train, test, *_ = checked_histories(scene, train, test)
     judged = HeldOut(test, seed)
     by_name = {effect.name: effect for effect in pp.catalogue}
     added = [by_name[each.effect].on(each.body) for each in found.added]

@@ -226,8 +226,8 @@ def measurement_noise(history: History) -> Floats:
                 result[body, [d, d + 3]] = np.sqrt(np.minimum(position_noise(runs, dt), least))
             elif np.isnan(observed[:, :, body, d + 3]).all():
                 change = np.diff(observed[:, :, body, d])
-                third = np.diff(wrapped(change) if d == THETA else change, 2)
-                some = third[np.isfinite(third)]
+                noisy = np.diff(wrapped(change) if d == THETA else change, 2)
+                some = noisy[np.isfinite(noisy)]
                 size = float(np.sqrt(np.mean(some**2) / 20)) if some.size else 0.0
                 result[body, [d, d + 3]] = size, _AT_AN_END * size / dt
     result[result[:, THETA] > _WRAPPED, THETA] = 0.0

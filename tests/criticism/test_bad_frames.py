@@ -30,8 +30,8 @@ def puck(seed: int, row: int) -> History:
 
 def test_both_histories_are_without_them_and_each_is_named_once() -> None:
     train, test = puck(1, 8), puck(2, 11)
-    kept, held_out, derived, said = checked_histories(DISC, train, test)
-    assert not derived.any()
+    kept, held_out, unused, said = checked_histories(DISC, train, test)
+    assert not unused
     for history, row in ((kept, 8), (held_out, 11)):
         missing = np.argwhere(~np.isfinite(history.dataset["observed"].to_numpy()))
         assert missing.tolist() == [[1, row, 0, 0]]
@@ -47,8 +47,8 @@ def test_a_measured_velocity_is_not_called_computed_for_a_bad_frame() -> None:
     observed = train.dataset["observed"].to_numpy().copy()
     observed[1, 19, 0, 0] += 0.4
     data = train.dataset.assign(observed=train.dataset["observed"].copy(data=observed))
-    _, _, derived, said = checked_histories(scene, History(data), test)
-    assert not derived.any()
+    _, _, unused, said = checked_histories(scene, History(data), test)
+    assert not unused
     assert len(said) == 1
 
 
