@@ -7,7 +7,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.model import Problem, noise_medians, ranges
 from pbrl_ppl.modes import Mode, profile_sigma, trajectory_evidence, trajectory_mode
 
@@ -36,7 +38,7 @@ def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | N
     Mode or None
         None where they do not explain the data better, or are too large.
     """
-    if mode.problem.trajectory_noise.cells.drifts:
+    if mode.problem.trajectory_noise.cells.drifts or not _asked_for(mode, criteria):
         return None
     residual = mode.problem.residual(mode.phi)
     tried = []
@@ -50,10 +52,20 @@ def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | N
     cells = found.problem.trajectory_noise.cells
     data = found.problem.data
     extent = ranges(cells, data.history, data.smoothed_states)
-    if (found.sigma[cells.drift_parameters] > criteria.negligible * extent).any():
+    white = mode.sigma[: len(cells.drifts)]  # as large as what passed for a row's own errors
+    most = np.maximum(criteria.negligible * extent, white)
+    if (found.sigma[cells.drift_parameters] > most).any():
         return None
     gained = trajectory_evidence(found) - trajectory_evidence(mode)
     return found if gained >= criteria.min_evidence else None
+
+
+def _asked_for(mode: Mode, criteria: Criteria) -> bool:
+    """Whether an acceleration is unexplained, or an innovation says something of the next."""
+    if unexplained_acceleration(mode, criteria).matters.any():
+        return True
+    whiteness, _ = correlation_tests(mode, criteria)[0]
+    return not whiteness.passed
 
 
 def same_noise(mode: Mode, other: Mode) -> Mode:

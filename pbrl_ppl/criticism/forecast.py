@@ -69,7 +69,8 @@ def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
     flat[segments.trajectory[:, None], segments.step[:, None] + 1, cells.places] += deviation
     # nothing comes before a trajectory's first row: it is as measured, or as the next rows have it
     few = replace(noise, seen=noise.seen & (segments.step < _SETTLED)[:, None])
-    first = np.where(noise.wide > 0, few.smoothed(residual, sigma)[0], noise.begin)[noise.first]
+    hidden = (noise.wide > 0).any(axis=1, keepdims=True)
+    first = np.where(hidden, few.smoothed(residual, sigma)[0], noise.begin)[noise.first]
     flat[segments.trajectory[noise.first, None], 0, cells.places] += first
     return cells.completed(problem.scene, states)
 
@@ -143,9 +144,24 @@ def forecast(
 def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array:
     """Covariance of the filtered states before these transitions, shape (start, cell, cell)."""
     after = noise.covariance(sigma)[at - 1]
-    variance = np.where(noise.wide[at] > 0, noise.wide[at], noise.cells.errors(sigma) ** 2)
-    # an estimate of what was not measured is no better than the filter's, soon after
-    later = np.diagonal(after, axis1=1, axis2=2)
-    variance = np.where(noise.wide[at] > 0, later, variance)
-    first = variance[:, :, None] * np.eye(variance.shape[1])
-    return np.where((step == 0)[:, None, None], first, after)
+    for i in np.flatnonzero(step == 0):
+        after[i] = _first_spread(noise, sigma, int(at[i]))
+    return after
+
+
+def _first_spread(noise: TrajectoryNoise, sigma: Array, first: int) -> Array:
+    """Covariance of a trajectory's first state as `filtered_states` has it, shape (cell, cell)."""
+    error = noise.cells.errors(sigma)
+    wide = noise.wide[first]
+    if not wide.any():
+        return np.diag(error**2)
+    # what the first rows tell of it, with no process noise between them
+    scale = np.where(wide > 0, np.sqrt(wide), error)
+    information, way = np.eye(len(scale)), np.diag(scale)
+    for k in range(first, min(first + _SETTLED, len(noise.first))):
+        if k > first and noise.first[k]:
+            break
+        way = noise.slope[k] @ way
+        seen = way[noise.seen[k]] / error[noise.seen[k], None]
+        information += seen.T @ seen
+    return np.asarray(scale[:, None] * np.linalg.inv(information) * scale)

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.assembly import Models, converged, put_together
@@ -16,6 +17,7 @@ from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
 from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.misfit import PRIOR, beside_names, find_misfit
+from pbrl_ppl.criticism.outliers import outliers
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.results import ResidualTest
@@ -29,7 +31,7 @@ from pbrl_ppl.criticism.unexplained import (
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ConvergenceWarning, PriorWarning
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, without_measurements
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import try_effect
@@ -38,6 +40,8 @@ from pbrl_ppl.scene import Scene
 
 #: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
 DRAWS, INDEPENDENT, LEAST_TUNE = (300, 1000), (125,), 100
+#: Times that the noise is mended and the search for effects begun again, at most.
+_NOISES = 4
 #: Draws from the prior, of which some must reach what was measured.
 PRIOR_DRAWS = 100
 
@@ -140,12 +144,20 @@ def _revised(
     say("fitting the declared model")
     declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
     first, current, added = _with_effects(declared, selection, criteria, say)
-    if unexplained_acceleration(current, criteria).matters.any():
-        tracked = with_correlated_errors(current, criteria)
-        if tracked is not None:  # under the right noise effects may show that were hidden before
+    for _ in range(_NOISES):  # under the right noise effects may show that were hidden before
+        train, frames = without_measurements(train, outliers(current))
+        if frames:
+            for sentence in map(str, frames):
+                say(sentence)
+            bad += tuple(map(str, frames))
+            declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
+        else:
+            tracked = with_correlated_errors(current, criteria)
+            if tracked is None:
+                break
             say("errors of measuring are correlated: looking again")
             declared = same_noise(declared, tracked)
-            first, current, added = _with_effects(declared, selection, criteria, say)
+        first, current, added = _with_effects(declared, selection, criteria, say)
     say("testing what is left")
     before, left = (unexplained_acceleration(mode, criteria) for mode in (declared, current))
     horizon = rollout_horizon(train, scene.time_step)
@@ -192,6 +204,8 @@ def _with_effects(
     current, ranked = declared, first
     added: list[Step] = []
     while ranked and len(added) < criteria.most_added:
+        if np.isfinite(outliers(current)).any():
+            return first, current, added
         step = selection.best_addition(current, ranked)
         if step is None and unexplained_acceleration(current, criteria).remains.any():
             alone = without_acceleration(current)

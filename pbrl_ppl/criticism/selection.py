@@ -103,6 +103,7 @@ class Selection:
             waiting = [signature for signature in waiting if signature.candidate.statistic < enough]
             fits = [(signature, refitted(mode, signature)) for signature in leading]
             ranks = {item: rank(item) for item in fits}
+            ranks = {item: value for item, value in ranks.items() if np.isfinite(value)}
             while ranks:
                 best = max(ranks.values())
                 tied = [item for item, value in ranks.items() if value > best - TIE]
@@ -214,7 +215,10 @@ class Selection:
         chance = float(chi2.sf(2 * max(likelihood, 0.0), max(more, 1)))
         if chance > self.criteria.try_p:
             return f"the likelihood rises by {likelihood:.1f} nats (p = {chance:.2g})"
-        gained = trajectory_evidence(after) - trajectory_evidence(before)
+        labels = before.problem.layout.labels
+        added = [i for i, label in enumerate(after.problem.layout.labels) if label not in labels]
+        told = [i for i in added if _left_of_prior(after)[i] < TOLD]
+        gained = trajectory_evidence(after, told) - trajectory_evidence(before)
         if gained >= self.criteria.min_evidence:
             return ""
         return f"the evidence rises by {gained:.1f} nats, {self.criteria.min_evidence:g} are needed"
@@ -327,11 +331,15 @@ def _told(mode: Mode, attached: Attached) -> int:
     """
     if attached.effect.scan is not None:
         return len(attached.variables)
-    layout = mode.problem.layout
-    # posterior standard deviations in units of the prior's
-    left = np.sqrt(np.diag(mode.covariance)) * np.abs(prior_slopes(layout.priors, mode.phi))
-    places = [layout.labels.index(label) for label in attached.labels]
-    return int((left[places] < TOLD).sum())
+    labels = mode.problem.layout.labels
+    places = [labels.index(label) for label in attached.labels]
+    return int((_left_of_prior(mode)[places] < TOLD).sum())
+
+
+def _left_of_prior(mode: Mode) -> Array:
+    """Posterior standard deviations in units of the prior's, shape (p,)."""
+    slopes = prior_slopes(mode.problem.layout.priors, mode.phi)
+    return np.asarray(np.sqrt(np.diag(mode.covariance)) * np.abs(slopes))
 
 
 def _log_likelihood(mode: Mode) -> float:

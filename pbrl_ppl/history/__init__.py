@@ -1,6 +1,11 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
-from pbrl_ppl.history.bad_frames import BadFrame, bad_frames, without_bad_frames
+from pbrl_ppl.history.bad_frames import (
+    BadFrame,
+    bad_frames,
+    without_bad_frames,
+    without_measurements,
+)
 from pbrl_ppl.history.derived import (
     UnusedVelocity,
     measured_alone,
@@ -43,5 +48,6 @@ __all__ = [
     "unseen",
     "unused_velocities",
     "without_bad_frames",
+    "without_measurements",
     "write_atomically",
 ]

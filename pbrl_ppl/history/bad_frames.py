@@ -159,9 +159,23 @@ def without_bad_frames(history: History) -> tuple[History, list[BadFrame]]:
             " than single bad frames, so all rows are kept",
             stacklevel=2,
         )
-    bad &= ~many
+    return without_measurements(history, np.where(many, np.nan, off))
+
+
+def without_measurements(history: History, off: Floats) -> tuple[History, list[BadFrame]]:
+    """Return the history with some measurements missing, and the list of them.
+
+    Parameters
+    ----------
+    history : History
+        What was measured.
+    off : ndarray
+        How far they are off, NaN elsewhere, shape (trajectory, time, body, 6), SI units.
+    """
+    bad, dataset = np.isfinite(off), history.dataset
     if not bad.any():
         return history, []
+    rows = int(dataset["n_rows"].sum())
     labels, clock = dataset["trajectory"].to_numpy().tolist(), dataset["clock"].to_numpy()
     found = [
         BadFrame(

@@ -207,7 +207,7 @@ def score(
     scale: Array,
     white: Array,
     kind: Ints,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, Array, Array, Array]:
     """Derivative of the log-likelihood by the variances, half the expectation of a quadratic form.
 
     Parameters
@@ -227,8 +227,14 @@ def score(
         Twice that by the covariance of what a step of each kind adds, shape (2, cell, cell).
     begin : ndarray
         Twice that by the variance of the state before each transition, shape (transition, cell).
+    auxiliary : ndarray
+        Residual of each measurement given all others, over its standard deviation (auxiliary
+        residuals: A. C. Harvey and S. J. Koopman, Journal of Business & Economic Statistics 10,
+        1992), shape (2, transition, cell): at the transition's end, and of the state before it as
+        if measured there; 0 where not seen.
     """
     n, d = seen.shape
+    auxiliary = np.zeros((2, n, d))
     sensor, step, begin = np.zeros(d), np.zeros((2, d, d)), np.zeros((n, d))
     state, moved = np.zeros(d), np.zeros(d)
     known, pulled = np.zeros((d, d)), np.zeros((d, d))
@@ -248,6 +254,7 @@ def score(
                 total += own[a] * state[a]
                 spread += own[a] * moved[a]
             sensor[i] += total * total - spread
+            auxiliary[0, k, i] = total / np.sqrt(spread)
             state[i] -= total
             for a in range(d):
                 known[i, a] -= moved[a]
@@ -274,4 +281,6 @@ def score(
         state[:] = moved
         for a in range(d):
             begin[k, a] = state[a] * state[a] - known[a, a]
-    return sensor, step, begin
+            if known[a, a] > 0.0:
+                auxiliary[1, k, a] = state[a] / np.sqrt(known[a, a])
+    return sensor, step, begin, auxiliary

@@ -50,6 +50,8 @@ def noise_medians(cells: Cells, history: History, states: Array) -> Array:
 def ranges(cells: Cells, history: History, states: Array) -> Array:
     """Largest distance between values of each dimension that has correlated errors, shape (drift,).
 
+    Of x and y the larger one: a sensor of places is as far off in both.
+
     Parameters
     ----------
     cells : Cells
@@ -63,7 +65,9 @@ def ranges(cells: Cells, history: History, states: Array) -> Array:
     values = states[real].reshape(-1, states.shape[2] * len(STATE))[:, cells.places]
     extent = np.ptp(values, axis=0)
     dimension = cells.places % len(STATE)
-    return np.array([extent[dimension == d].max() for d in cells.drifts])
+    turns = dimension % _RATE == THETA
+    place = dimension < _RATE
+    return np.array([extent[place & (turns == (d == THETA))].max() for d in cells.drifts])
 
 
 def _typical(cells: Cells, changes: list[Array]) -> Array:

@@ -207,7 +207,9 @@ class TrajectoryNoise:
         own, cells, d = self._extended, self.cells, len(self.cells.places)
         white = self._filtered(cells.of_residual(residual)[None], sigma)[0][0]
         gain, scale, _, log_scale = self._gains(sigma)
-        sensor, step, begin = score(own.slope, self.last, own.seen, gain, scale, white, self.kind)
+        sensor, step, begin, _ = score(
+            own.slope, self.last, own.seen, gain, scale, white, self.kind
+        )
         # measured states begin a trajectory: their error is that of measuring
         began = np.where(self.first[:, None], begin, 0.0)
         measured = np.where(self.wide > 0, 0.0, began[:, :d]).sum(axis=0)
@@ -220,6 +222,28 @@ class TrajectoryNoise:
         norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
         value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
         return value, sigma**2 * slope
+
+    def auxiliary(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """Residual of each measurement given all others, in standard deviations.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Of cells, shape (transition, cell).
+        sigma : ndarray
+            Shape (parameter,).
+
+        Returns
+        -------
+        end, begin : ndarray
+            At a transition's end, and before the first of a trajectory, shape (transition, cell)
+            each; 0 where nothing was measured.
+        """
+        own, (gain, scale, *_) = self._extended, self._gains(sigma)
+        white = self._filtered(residual[None], sigma)[0][0]
+        every = score(own.slope, self.last, own.seen, gain, scale, white, self.kind)[3]
+        end, begin = every[..., : residual.shape[1]]
+        return end, np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0)
 
     def foreseen(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
         """Mean and covariance of each measurement, as deviations, given those before it.

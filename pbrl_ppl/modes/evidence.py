@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -166,7 +167,7 @@ def laplace(mode: Mode) -> Evidence:
     return Evidence(float(coordinates.log_density(centre[None])[0] + 0.5 * log_det))
 
 
-def trajectory_evidence(mode: Mode) -> float:
+def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
     """The Laplace approximation of the log-evidence of whole trajectories.
 
     States are integrated out by the filter; of the noise parameters the logarithm is normal, as an
@@ -176,11 +177,21 @@ def trajectory_evidence(mode: Mode) -> float:
     ----------
     mode : Mode
         Of whole trajectories.
+    unit : sequence of int, optional
+        Places of parameters whose prior counts as worth one measured row, whatever its scale (R. E.
+        Kass and L. Wasserman, Journal of the American Statistical Association 90, 1995): effects
+        are of bodies of any size.
     """
     centre, of_noise = mode.noise_gaussian()
     value = float(log_posterior(mode.problem, mode.phi, np.exp(centre)) + centre.sum())
     log_dets = (np.linalg.slogdet(2 * np.pi * own)[1] for own in (of_noise, mode.covariance))
-    return value + 0.5 * float(sum(log_dets))
+    value += 0.5 * float(sum(log_dets))
+    if not len(unit):
+        return value
+    places, shown = list(unit), mode.problem.trajectory_noise.seen.any(axis=1).sum()
+    own = np.linalg.slogdet(2 * np.pi * mode.covariance[np.ix_(places, places)])[1]
+    prior = mode.problem.layout.log_prior(mode.phi)[places].sum()
+    return value - float(prior) - 0.5 * float(own + len(places) * np.log(shown))
 
 
 def importance(mode: Mode, rng: np.random.Generator) -> Evidence:

@@ -1,0 +1,54 @@
+"""Single measurements that a fitted model and all other measurements contradict."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from pbrl_ppl.criticism.unexplained import without_acceleration
+from pbrl_ppl.modes import Mode
+
+Array = NDArray[np.float64]
+
+#: Robust standard deviations beyond which a measurement is left out: one of 10^14 of Gaussian noise.
+_FAR = 8.0
+#: Largest share of a cell's measurements that single frames are.
+_FEW = 0.05
+#: Measurements of a cell, at least, of which one may be called far off.
+_ENOUGH = 12
+
+
+def outliers(mode: Mode) -> Array:
+    """How far single measurements are off, NaN elsewhere, shape (trajectory, time, body, 6).
+
+    They are judged by the residual given all others (auxiliary residuals), without any unexplained
+    acceleration, which would follow them, and in units of the median residual: where physics is
+    missing most residuals are large, and none is far off.
+
+    Parameters
+    ----------
+    mode : Mode
+        Of whole trajectories.
+    """
+    problem = mode.problem
+    noise, segments = problem.trajectory_noise, problem.segments
+    residual = noise.cells.of_residual(problem.residual(mode.phi))
+    both = noise.auxiliary(residual, without_acceleration(mode).sigma)
+    size = np.abs(np.concatenate(both))  # of rows that transitions end at, then of first rows
+    size[size == 0.0] = np.nan
+    off = np.concatenate([noise.measured, noise.begin])
+    trajectory = np.tile(segments.trajectory, 2)
+    row = np.concatenate([segments.step + 1, segments.step])
+    observed = problem.data.history.dataset["observed"]
+    found = np.full(observed.shape, np.nan)
+    flat = found.reshape(*found.shape[:2], -1)
+    for cell, place in enumerate(noise.cells.places):
+        own = size[:, cell]
+        count = np.isfinite(own).sum()
+        if noise.cells.sensor[cell] < 0 or count < _ENOUGH:
+            continue
+        far = own > _FAR * np.nanmedian(own) / norm.isf(0.25)
+        if 0 < far.sum() <= max(_FEW * count, 1):
+            flat[trajectory[far], row[far], place] = off[far, cell]
+    return found
