@@ -158,6 +158,10 @@ def _revised(
             say("errors of measuring are correlated: looking again")
             declared = same_noise(declared, tracked)
         first, current, added = _with_effects(declared, selection, criteria, say)
+    as_tested = replace(current, problem=held_out.problem(current))
+    test, frames = without_measurements(test, outliers(as_tested))
+    if frames:
+        held_out, bad = HeldOut(test, seed), (*bad, *(f"held out: {frame}" for frame in frames))
     say("testing what is left")
     before, left = (unexplained_acceleration(mode, criteria) for mode in (declared, current))
     horizon = rollout_horizon(train, scene.time_step)

@@ -11,7 +11,7 @@ from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
 
-#: Robust standard deviations beyond which a measurement is left out: one of 10^14 of Gaussian noise.
+#: Robust standard deviations beyond which a measurement is left out: 1 of 10^14 of Gaussian noise.
 _FAR = 8.0
 #: Largest share of a cell's measurements that single frames are.
 _FEW = 0.05

@@ -266,7 +266,7 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
     there, other = place[middle], np.delete(place, middle)
     sides = np.delete(rows, middle, axis=1)
     sides = np.unwrap(sides, axis=1) if angle else sides
-    least = _finest(column)
+    least = finest_step(column)
 
     def off_curve(own: slice, degree: int) -> tuple[Floats, Floats, Floats]:
         """Rows less the curve through the others; the same in standard deviations; the scale."""
@@ -314,7 +314,7 @@ def _happened(state: Floats, off: Floats, dt: float) -> Bools:
     return np.asarray(beside * more > _CONFIRMED * dt * more**2)
 
 
-def _finest(column: Floats) -> float:
+def finest_step(column: Floats) -> float:
     """Finest step between a column's values: what quantisation or rounding may be off by."""
     values = np.unique(column[np.isfinite(column)])
     if len(values) < 2:

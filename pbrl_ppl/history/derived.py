@@ -10,6 +10,7 @@ import numpy.typing as npt
 from scipy.stats import t as t_distribution
 
 from pbrl_ppl.history.angles import unwrapped
+from pbrl_ppl.history.bad_frames import finest_step
 from pbrl_ppl.history.filters import Runs, computed_by, position_noise
 from pbrl_ppl.history.history import History
 from pbrl_ppl.state import STATE, THETA, wrapped
@@ -229,6 +230,9 @@ def measurement_noise(history: History) -> Floats:
                 noisy = np.diff(wrapped(change) if d == THETA else change, 2)
                 some = noisy[np.isfinite(noisy)]
                 size = float(np.sqrt(np.mean(some**2) / 20)) if some.size else 0.0
+                coarse = finest_step(observed[:, :, body, d])
+                if coarse < np.inf:  # rounding looks like no noise where hardly anything moves
+                    size = max(size, coarse / np.sqrt(12.0))
                 result[body, [d, d + 3]] = size, _AT_AN_END * size / dt
     result[result[:, THETA] > _WRAPPED, THETA] = 0.0
     return result
