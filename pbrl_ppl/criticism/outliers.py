@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 
 #: Robust standard deviations beyond which a measurement is left out: 1 of 10^14 of Gaussian noise.
 _FAR = 8.0
+#: ... and times as far as its neighbours are: an event that lasts moves those, too.
+_ALONE = 2.0
 #: Largest share of a cell's measurements that single frames are.
 _FEW = 0.05
 #: Measurements of a cell, at least, of which one may be called far off.
@@ -49,6 +51,15 @@ def outliers(mode: Mode) -> Array:
         if noise.cells.sensor[cell] < 0 or count < _ENOUGH:
             continue
         far = own > _FAR * np.nanmedian(own) / norm.isf(0.25)
+        far &= own > _ALONE * np.nan_to_num(_beside(own, trajectory, row))
         if 0 < far.sum() <= max(_FEW * count, 1):
             flat[trajectory[far], row[far], place] = off[far, cell]
     return found
+
+
+def _beside(size: Array, trajectory: NDArray[np.intp], row: NDArray[np.intp]) -> Array:
+    """The larger residual of the rows before and after, shape of ``size``; NaN without any."""
+    table = np.full((trajectory.max() + 1, row.max() + 3), np.nan)
+    some = np.isfinite(size)
+    table[trajectory[some], row[some] + 1] = size[some]
+    return np.fmax(table[trajectory, row], table[trajectory, row + 2])

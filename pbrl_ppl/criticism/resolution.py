@@ -8,7 +8,7 @@ import numpy as np
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
-from pbrl_ppl.modes import Mode, trajectory_mode
+from pbrl_ppl.modes import Mode, nearby_mode, trajectory_mode
 
 #: A doubling of the substeps may move innovations by this share of their noise.
 SMALL_SHIFT = 0.1
@@ -31,6 +31,7 @@ def with_enough_substeps(
     model was fitted with fewer. At the end smoothing begins anew: where a climb took up too large a
     noise, states smoothed with that noise confirm it.
     """
+    confirmed = 0  # substeps with which smoothing began anew
     while True:  # a better engine leaves less noise, against which its own error shows again
         begin = substeps = mode.problem.physics.substeps
         while shift(mode, substeps) > SMALL_SHIFT and substeps < MOST_SUBSTEPS:
@@ -38,10 +39,11 @@ def with_enough_substeps(
         if substeps > begin:
             mode = _refined(mode, substeps, say)
             continue
-        fresh = trajectory_mode(mode.problem, mode.phi)
-        if fresh.log_posterior > mode.log_posterior + _BETTER:
-            mode = fresh
-            continue
+        if confirmed < substeps:
+            fresh, confirmed = trajectory_mode(mode.problem, mode.phi), substeps
+            if fresh.log_posterior > mode.log_posterior + _BETTER:
+                mode = fresh
+                continue
         left = unexplained_acceleration(mode, criteria)
         if not left.matters.any() or left.worst > _LARGE or substeps >= MOST_SUBSTEPS:
             return mode
@@ -54,7 +56,7 @@ def with_enough_substeps(
 
 def _refined(mode: Mode, substeps: int, say: Callable[[str], None]) -> Mode:
     say(f"using {substeps} engine steps an interval")
-    return trajectory_mode(mode.problem.with_physics(substeps=substeps), mode.phi, mode.sigma)
+    return nearby_mode(mode.problem.with_physics(substeps=substeps), mode.phi, mode.sigma)
 
 
 def shift(mode: Mode, substeps: int | None = None) -> float:

@@ -18,6 +18,7 @@ from pbrl_ppl.criticism.cross_validation import (
     leave_out,
 )
 from pbrl_ppl.criticism.forecast import longest_forecast
+from pbrl_ppl.criticism.outliers import outliers
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, twins
@@ -147,7 +148,12 @@ class Selection:
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
-        """Accept an improvement that cross-validation is sure of and that is not negligible."""
+        """Accept an improvement that cross-validation is sure of and that is not negligible.
+
+        One that shows outliers is accepted for now: the search begins again without them.
+        """
+        if np.isfinite(outliers(fitted)).any():
+            return Step(signature, (), fitted, np.nan, np.nan)
         fitted = with_enough_substeps(fitted, self.say, self.criteria)
         if why := self._implausible(fitted, signature):
             self._note(signature, why)

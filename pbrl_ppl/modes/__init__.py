@@ -18,6 +18,7 @@ from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.modes.trajectories import (
     find_trajectory_mode,
     following,
+    nearby_mode,
     trajectory_mode,
 )
 
@@ -34,6 +35,7 @@ __all__ = [
     "following",
     "index_law",
     "joint_probabilities",
+    "nearby_mode",
     "posterior_steps",
     "profile_sigma",
     "stored",

@@ -81,16 +81,24 @@ def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) ->
         sigma = None
     if sigma is None:
         sigma = problem.trajectory_noise.sigma
-    mode = _climbed(problem, phi, sigma)
+    mode = nearby_mode(problem, phi, sigma)
     quiet = mode.problem.quiet(mode.sigma, _QUIET)
     if not np.array_equal(quiet, mode.sigma):
         problem = smoothed(mode.problem, mode.phi, quiet)
-        mode = max(mode, _climbed(problem, mode.phi, quiet), key=lambda own: own.log_posterior)
+        mode = max(mode, nearby_mode(problem, mode.phi, quiet), key=lambda own: own.log_posterior)
     return mode
 
 
-def _climbed(problem: Problem, phi: Array, sigma: Array) -> Mode:
-    """Mode from states smoothed with these noise parameters, by climbs and smoothing in turn."""
+def nearby_mode(problem: Problem, phi: Array, sigma: Array) -> Mode:
+    """Mode from states smoothed with these noise parameters, by climbs and smoothing in turn.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories.
+    phi, sigma : ndarray
+        Where to begin, shapes (p,) and (parameter,).
+    """
     for i in range(_ROUNDS):
         if i:
             problem = smoothed(problem, phi, sigma)
