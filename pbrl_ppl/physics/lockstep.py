@@ -114,6 +114,7 @@ def _set_properties(z, links, free, i, row, joints, normal_gravity, step):  # ty
 def _substep(z, links, points, free, slowing, patch_radius, step):  # type: ignore[no-untyped-def]
     """One step of the engine."""
     sliding = len(free.ring) > 0
+    patch_alone = not (free.wheel or free.pivot or len(links))
     solver.turn(z, step)
     if sliding:  # by the velocities before, at the heading after
         solver.place_patch(z, points, free.ring, slowing, patch_radius, step)
@@ -135,8 +136,8 @@ def _substep(z, links, points, free, slowing, patch_radius, step):  # type: igno
             solver.solve_link(z, links[j], free.link_rod[j])
         if free.pivot:
             solver.solve_pivot(z)
-        if sliding:
-            solver.solve_patch(z, points)
+        if sliding and not solver.solve_patch(z, points) and patch_alone:
+            break
 
 
 @numba.njit(nogil=True, cache=True)

@@ -249,7 +249,11 @@ def begin_patch(z, points):  # type: ignore[no-untyped-def]
 
 @numba.njit(nogil=True, cache=True)
 def solve_patch(z, points):  # type: ignore[no-untyped-def]
-    """What holds the points, then their rods."""
+    """What holds the points, then their rods; how many impulses changed.
+
+    With none, a further iteration repeats this one.
+    """
+    changed = 0
     for own in points:
         for i in range(LANES):
             v_x = z[VX + i] - own[RY + i] * z[W + i]
@@ -260,6 +264,7 @@ def solve_patch(z, points):  # type: ignore[no-untyped-def]
             size = new_x * new_x + new_y * new_y
             scale = most / math.sqrt(size) if size > most * most else 1.0
             own[HX + i], own[HY + i] = new_x * scale, new_y * scale
+            changed += own[HX + i] != old_x or own[HY + i] != old_y
             _push(z, own, i, own[HX + i] - old_x, own[HY + i] - old_y)
     for own in points:
         for i in range(LANES):
@@ -267,4 +272,6 @@ def solve_patch(z, points):  # type: ignore[no-untyped-def]
             v = n_x * z[VX + i] + n_y * z[VY + i] + own[CROSS + i] * z[W + i]
             new = limited(old - v * own[RM + i], most)
             own[RJ + i] = new
+            changed += new != old
             _push(z, own, i, n_x * (new - old), n_y * (new - old))
+    return changed

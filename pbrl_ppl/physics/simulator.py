@@ -332,12 +332,18 @@ class Simulator:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
                 engines.append(Engine(partial(self._new_world, choice)))
+            found = out
+            if engines[0].slides and len(out):
+                found, (batch, order) = np.empty_like(out), batch.by_speed()
             alone = batch.alone() if engines[0].free else ()
 
             def run(engine: Engine, first: int, last: int) -> None:
-                engine.rollout(batch, alone, first, last, out)
+                engine.rollout(batch, alone, first, last, found)
 
             share_out(run, engines[:workers], len(out))
+        if found is not out:
+            shape = (-1, len(order), *out.shape[1:])
+            out.reshape(shape)[:, order] = found.reshape(shape)
 
 
 def _each(states: Array, proposals: int) -> Array:
