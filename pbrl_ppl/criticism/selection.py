@@ -333,13 +333,18 @@ def _share(before: Mode, after: Mode) -> float:
 def _told(mode: Mode, attached: Attached) -> int:
     """How many of an effect's parameters the data say something of: others fit nothing.
 
-    Where the derivative vanishes, as at a threshold, the posterior cannot tell: all count.
+    Where the derivative vanishes, as at a threshold, the posterior cannot tell: what is scanned
+    counts.
     """
-    if attached.effect.scan is not None:
-        return len(attached.variables)
-    labels = mode.problem.layout.labels
+    problem = mode.problem
+    labels = problem.layout.labels
     places = [labels.index(label) for label in attached.labels]
-    return int((_left_of_prior(mode)[places] < TOLD).sum())
+    told = _left_of_prior(mode)[places] < TOLD
+    if attached.effect.scan is not None:
+        body = problem.scene.body(attached.body)
+        looks = np.nan_to_num(attached.effect.scan(problem.scene, problem.data.history, body))
+        told |= np.ptp(looks, axis=0) > 0
+    return int(told.sum())
 
 
 def _left_of_prior(mode: Mode) -> Array:

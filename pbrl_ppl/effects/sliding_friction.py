@@ -2,8 +2,11 @@
 
 from typing import Any
 
+import numpy as np
+
 from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.stages import Properties
+from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
@@ -12,6 +15,14 @@ def _modify(properties: Any, parameters: Any, clock: Any) -> None:
     # the engine solves it together with contacts, so sticking is exact
     properties["patch_mu"] = properties["patch_mu"] + parameters["mu"]
     properties["patch_radius"] = properties["patch_radius"] + parameters["radius"]
+
+
+def _scan(scene: Scene, history: History, body: Body) -> Any:
+    """One radius, of half the body's; friction is differentiated where there is next to none.
+
+    More of it would hold the body still now and then, which is no derivative of anything.
+    """
+    return np.array([[np.nan, 0.5 * body.shape.bounding_radius]])
 
 
 def _is_pressed(scene: Scene, body: Body) -> bool:
@@ -29,4 +40,5 @@ sliding_friction = Effect(
     "Coulomb's law on a ring of contact (Goyal, Ruina and Papadopoulos, Wear 143, 1991)",
     Properties(_modify),
     applies=_is_pressed,
+    scan=_scan,
 )

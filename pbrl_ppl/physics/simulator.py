@@ -332,8 +332,8 @@ class Simulator:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
                 engines.append(Engine(partial(self._new_world, choice)))
-            found = out
-            if engines[0].slides and len(out):
+            found, slides = out, engines[0].slides and len(out) > 0
+            if slides:
                 found, (batch, order) = np.empty_like(out), batch.by_speed()
             alone = batch.alone() if engines[0].free else ()
 
@@ -341,7 +341,7 @@ class Simulator:
                 engine.rollout(batch, alone, first, last, found)
 
             share_out(run, engines[:workers], len(out))
-        if found is not out:
+        if slides:
             shape = (-1, len(order), *out.shape[1:])
             out.reshape(shape)[:, order] = found.reshape(shape)
 
