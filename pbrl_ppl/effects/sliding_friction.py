@@ -10,6 +10,9 @@ from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
+#: Radii that are tried, as shares of the body's: of even pressure under a disc, and others.
+_RADII = (2.0 / 3.0, 0.2, 0.4, 1.0)
+
 
 def _modify(properties: Any, parameters: Any, clock: Any) -> None:
     # the engine solves it together with contacts, so sticking is exact
@@ -18,11 +21,13 @@ def _modify(properties: Any, parameters: Any, clock: Any) -> None:
 
 
 def _scan(scene: Scene, history: History, body: Body) -> Any:
-    """One radius, of half the body's; friction is differentiated where there is next to none.
+    """Radii, of a body that turns; friction is differentiated where there is next to none.
 
     More of it would hold the body still now and then, which is no derivative of anything.
     """
-    return np.array([[np.nan, 0.5 * body.shape.bounding_radius]])
+    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy()
+    shares = _RADII if np.nanmax(theta) > np.nanmin(theta) else _RADII[:1]
+    return np.array([(np.nan, share * body.shape.bounding_radius) for share in shares])
 
 
 def _is_pressed(scene: Scene, body: Body) -> bool:

@@ -326,8 +326,7 @@ class Simulator:
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
         workers = max(1, min(self.threads, len(out), steps // _A_THREAD))
         with self._lock:
-            engines = self._worlds.setdefault(choice, [])
-            self._worlds.move_to_end(choice)
+            self._worlds[choice] = engines = self._worlds.pop(choice, [])
             while len(self._worlds) > _KEPT:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:

@@ -55,6 +55,7 @@ def test_a_gain_that_is_not_sure_is_told(weak, monkeypatch) -> None:
     ranked = rank_candidates(weak, chosen.missing(weak))
     gains = Change(3.1, 2.4, 100_000), Change(0.0, np.inf, 0)
     monkeypatch.setattr(module, "_gains", lambda before, after: gains)
+    monkeypatch.setattr(module, "few_trajectories", lambda mode: False)
     assert chosen.best_addition(weak, ranked) is None
     (only,) = chosen.explained(ranked)
     assert only.why == "cross-validation gains 3.1 ± 2.4 nats, 4.8 are needed"
