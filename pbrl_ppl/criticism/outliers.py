@@ -13,6 +13,8 @@ Array = NDArray[np.float64]
 
 #: Robust standard deviations beyond which a measurement is left out: 1 of 10^14 of Gaussian noise.
 _FAR = 8.0
+#: ... errors of measuring that it is off the smoothed state, to which it belongs itself,
+_OFF = 4.0
 #: ... and times as far as its neighbours are: an event that lasts moves those, too.
 _ALONE = 2.0
 #: Largest share of a cell's measurements that single frames are.
@@ -36,7 +38,8 @@ def outliers(mode: Mode) -> Array:
     problem = mode.problem
     noise, segments = problem.trajectory_noise, problem.segments
     residual = noise.cells.of_residual(problem.residual(mode.phi))
-    both = noise.auxiliary(residual, without_acceleration(mode).sigma)
+    sigma = without_acceleration(mode).sigma
+    both, error = noise.auxiliary(residual, sigma), noise.cells.white(sigma)
     size = np.abs(np.concatenate(both))  # of rows that transitions end at, then of first rows
     size[size == 0.0] = np.nan
     off = np.concatenate([noise.measured, noise.begin])
@@ -51,6 +54,7 @@ def outliers(mode: Mode) -> Array:
         if noise.cells.sensor[cell] < 0 or count < _ENOUGH:
             continue
         far = own > _FAR * np.nanmedian(own) / norm.isf(0.25)
+        far &= np.abs(off[:, cell]) > _OFF * error[cell]
         far &= own > _ALONE * np.nan_to_num(_beside(own, trajectory, row))
         if 0 < far.sum() <= max(_FEW * count, 1):
             flat[trajectory[far], row[far], place] = off[far, cell]

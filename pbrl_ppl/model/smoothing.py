@@ -30,6 +30,9 @@ _FAR = 10.0
 _EXACT = 1e-6
 #: Smoothing ends with a round that moves no state by more than this, in standard deviations.
 _SETTLED, _ROUNDS = 0.05, 4
+#: States are smoothed with unexplained accelerations that fall to those given by so much, one after
+#: the other.
+_SHARES = (0.5, 1.0)
 #: A position's velocity is so many places on.
 _RATE = 3
 
@@ -72,10 +75,13 @@ def along_trajectories(
         problem = problem.with_noise(prior=(medians, SPREAD), scalar=False, trajectories=None)
     data = replace(problem.data, horizon=1, states=states, columns=cells.columns)
     problem = problem.on(data)
-    if sigma is None:
-        sigma = _guess(problem, cells, phi)
-    noise = _sloped(problem, cells, phi, sigma, cells.errors(sigma))
-    problem = smoothed(problem.with_noise(trajectories=noise), phi, sigma)
+    begin = _guess(problem, cells, phi)
+    sigma = begin if sigma is None else sigma
+    noise = _sloped(problem, cells, phi, begin, cells.errors(begin))
+    problem = smoothed(problem.with_noise(trajectories=noise), phi, begin)
+    if sigma is not begin:  # what the physics alone make of far-off states may be far off, too
+        for share in _SHARES:
+            problem = smoothed(problem, phi, _between(begin, sigma, share, cells))
     if not given:  # the noise of measurements adds to the changes of states as measured
         moved = noise_medians(cells, history, problem.data.smoothed_states)
         steps = list(cells.accelerations)
@@ -246,6 +252,14 @@ def cells_of(scene: Scene, history: History) -> Cells:
 def _uncoupled(scene: Scene) -> bool:
     """Whether no coordinate of a body has to do with another, as far as is declared."""
     return not (scene.walls or scene.joints or len(scene.bodies) > 1 or scene.bodies[0].wheel)
+
+
+def _between(begin: Array, end: Array, share: float, cells: Cells) -> Array:
+    """Noise parameters, the accelerations on their way from one to the other, by factors."""
+    sigma, steps = end.copy(), list(cells.accelerations)
+    larger = np.maximum(begin, end)[steps]
+    sigma[steps] = larger ** (1.0 - share) * end[steps] ** share
+    return sigma
 
 
 def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
