@@ -46,9 +46,9 @@ def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
             if d == THETA or not hung[i]:
                 start[:, :, i, d] = pose[d]
     # The angular velocity first: hinges turn it into velocities.
-    _estimate(start, (5,), scene.time_step)
+    estimate_rates(start, scene.time_step, (5,))
     fill_hinges(start, scene)
-    _estimate(start, (3, 4), scene.time_step)
+    estimate_rates(start, scene.time_step)
     fill_hinges(start, scene)
     return start, assumed
 
@@ -114,8 +114,18 @@ def _hinge_order(scene: Scene) -> list[tuple[str, str, Point, Point]]:
     return order + [edge for _ in scene.bodies for edge in edges]
 
 
-def _estimate(start: Floats, columns: tuple[int, ...], dt: float) -> None:
-    """Fill velocities that no row has, by a local polynomial of the positions."""
+def estimate_rates(start: Floats, dt: float, columns: tuple[int, ...] = (3, 4, 5)) -> None:
+    """Fill velocities that no row has, by a local polynomial of the positions, in place.
+
+    Parameters
+    ----------
+    start : ndarray
+        States, shape (trajectory, time, body, 6), SI units; changed.
+    dt : float
+        Time step (s).
+    columns : tuple of int
+        Velocities to fill.
+    """
     for body in range(start.shape[2]):
         for column in columns:
             if not np.isnan(start[:, :, body, column]).all():

@@ -30,6 +30,8 @@ _FAR = 10.0
 _EXACT = 1e-6
 #: Smoothing ends with a round that moves no state by more than this, in standard deviations.
 _SETTLED, _ROUNDS = 0.05, 4
+#: Share of the median of an unexplained acceleration's prior that is a little.
+_LITTLE = 0.1
 #: States are smoothed with unexplained accelerations that fall to those given by so much, one after
 #: the other.
 _SHARES = (0.5, 1.0)
@@ -77,7 +79,7 @@ def along_trajectories(
     problem = problem.on(data)
     begin = _guess(problem, cells, phi)
     sigma = begin if sigma is None else sigma
-    noise = _sloped(problem, cells, phi, begin, cells.errors(begin))
+    noise = _sloped(problem, cells, phi, begin, _steps(problem, cells, begin))
     problem = smoothed(problem.with_noise(trajectories=noise), phi, begin)
     if sigma is not begin:  # what the physics alone make of far-off states may be far off, too
         for share in _SHARES:
@@ -99,7 +101,14 @@ def single_transitions(problem: Problem) -> Problem:
 
 
 def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
-    """The same problem, linearised anew about the states smoothed at phi and sigma."""
+    """The same problem, linearised anew about the states smoothed at phi and sigma.
+
+    With next to no unexplained acceleration states are smoothed as if there were a little: where
+    bodies stick and slip, no start leads to what physics alone make of it.
+    """
+    steps = list(problem.trajectory_noise.cells.accelerations)
+    sigma = sigma.copy()
+    sigma[steps] = np.maximum(sigma[steps], _LITTLE * problem.noise_prior[0][steps])
     for _ in range(_ROUNDS):
         noise = problem.trajectory_noise
         cells = noise.cells
@@ -252,6 +261,15 @@ def cells_of(scene: Scene, history: History) -> Cells:
 def _uncoupled(scene: Scene) -> bool:
     """Whether no coordinate of a body has to do with another, as far as is declared."""
     return not (scene.walls or scene.joints or len(scene.bodies) > 1 or scene.bodies[0].wheel)
+
+
+def _steps(problem: Problem, cells: Cells, sigma: Array) -> Array:
+    """How well cells are known from a row and the next, shape (cell,): steps of slopes."""
+    error = cells.errors(sigma)
+    known = {place: error[i] / problem.scene.time_step for i, place in enumerate(cells.places)}
+    below = np.array([known.get(place - _RATE, 0.0) for place in cells.places])
+    rate = (cells.places % len(STATE) >= _RATE) & (cells.sensor < 0)
+    return np.where(rate, np.maximum(error, below), error)
 
 
 def _between(begin: Array, end: Array, share: float, cells: Cells) -> Array:
