@@ -24,11 +24,11 @@ from pbrl_ppl.model.noise_scales import bodies_acceleration, noise_medians, rang
 from pbrl_ppl.model.op import SimulatorOp
 from pbrl_ppl.model.physics import Physics
 from pbrl_ppl.model.problem import Problem
+from pbrl_ppl.model.recorded_cells import cells_of
 from pbrl_ppl.model.sensitivity import Sensitivity
 from pbrl_ppl.model.simulation import simulated_trajectories, with_measurements
 from pbrl_ppl.model.smoothing import (
     along_trajectories,
-    cells_of,
     linearised,
     single_transitions,
     smoothed,
