@@ -121,5 +121,8 @@ def declared_mode(
 ) -> Mode:
     """Mode of the declared model along trajectories, the engine's error small."""
     problem = Problem.of(scene, history, effects, substeps=substeps, threads=2)
+    if substeps is None:
+        physics = problem.physics
+        problem = problem.with_physics(substeps=max(physics.substeps, physics.fine_enough))
     mode = find_mode(single_transitions(problem), seed=seed)
     return with_enough_substeps(trajectory_mode(problem, mode.phi), say, criteria)

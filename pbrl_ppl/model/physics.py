@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TypeVar
@@ -12,10 +13,11 @@ from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Parts
 from pbrl_ppl.scene import Scene
 
-#: Engine steps an interval where a rough answer will do.
-COARSE = 4
-#: Substeps at most for what an effect changes, and for slopes, which need no more.
-ROUGH = 10
+#: Engine steps an interval where a rough answer will do, and how long they are at most (s).
+COARSE, LONGEST_COARSE = 4, 0.02
+#: Substeps for what an effect changes, and for slopes, which need no more; and how long they are at
+#: most (s): where rows are far apart, dry friction at a turning point shows with short steps alone.
+ROUGH, LONGEST = 10, 0.005
 
 
 _Engine = TypeVar("_Engine", PartedSimulator, OneWorld)
@@ -83,12 +85,18 @@ class Physics:
     @cached_property
     def coarse(self) -> Physics:
         """The same with few substeps: it costs little, and its derivative is nearly right."""
-        return self.changed(substeps=min(COARSE, self.substeps), extrapolate=False)
+        enough = max(COARSE, math.ceil(self.scene.time_step / LONGEST_COARSE))
+        return self.changed(substeps=min(enough, self.substeps), extrapolate=False)
 
     @property
     def rough(self) -> Physics:
         """The same with few substeps where it has more."""
-        return self.changed(substeps=min(ROUGH, self.substeps))
+        return self.changed(substeps=min(max(ROUGH, self.fine_enough), self.substeps))
+
+    @property
+    def fine_enough(self) -> int:
+        """Substeps that are short enough to begin with."""
+        return math.ceil(self.scene.time_step / LONGEST)
 
     def changed(self, **fields: object) -> Physics:
         """The same with other fields; itself, with its worlds, where they are equal."""
