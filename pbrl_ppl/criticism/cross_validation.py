@@ -198,6 +198,21 @@ def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) 
     return squares
 
 
+def relative_fall(before: Array, after: Array) -> Change:
+    """Share by which errors fall, from sums of squares of folds and cells, shape (fold, cell).
+
+    A fold or cell without forecasts is NaN. To first order, half of what the squares fall by.
+    """
+    some = np.isfinite(before).any(axis=1)
+    before, after = before[some], after[some]
+    if not len(before):
+        return Change(0.0, np.inf, 0)
+    unit = np.nansum(before, axis=0)
+    cells = unit > 0
+    falls = np.nan_to_num((before - after)[:, cells] / unit[cells]).mean(axis=1) / 2
+    return Change.of(falls)
+
+
 def _linearised(
     mode: Mode, residual: Array, scale: Array
 ) -> Callable[[NDArray[np.bool_]], tuple[Array, Array, Array]]:

@@ -16,6 +16,7 @@ from pbrl_ppl.criticism.cross_validation import (
     folds,
     forecast_squares,
     leave_out,
+    relative_fall,
 )
 from pbrl_ppl.criticism.forecast import longest_forecast
 from pbrl_ppl.criticism.outliers import outliers
@@ -305,21 +306,6 @@ def _gains(before: Mode, after: Mode) -> tuple[Change, Change]:
         for mode, left_out in zip((before, after), models, strict=True)
     )
     return Change.of(models[1].density - models[0].density), relative_fall(worse, better)
-
-
-def relative_fall(before: Array, after: Array) -> Change:
-    """Share by which errors fall, from sums of squares of folds and cells, shape (fold, cell).
-
-    A fold or cell without forecasts is NaN. To first order, half of what the squares fall by.
-    """
-    some = np.isfinite(before).any(axis=1)
-    before, after = before[some], after[some]
-    if not len(before):
-        return Change(0.0, np.inf, 0)
-    unit = np.nansum(before, axis=0)
-    cells = unit > 0
-    falls = np.nan_to_num((before - after)[:, cells] / unit[cells]).mean(axis=1) / 2
-    return Change.of(falls)
 
 
 def _share(before: Mode, after: Mode) -> float:

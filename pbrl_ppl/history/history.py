@@ -85,7 +85,7 @@ class History:
         - ``assumed`` (body, state): columns of it that may not start single transitions (Eq. 11);
         - ``clock`` (trajectory, time): time (s);
         - ``number`` (trajectory,): which trajectory of the recording it is, from 0;
-        - ``before`` (trajectory, body, wrench): what acted before the first row; zero;
+        - ``before`` (trajectory, body, wrench): what acted before; zero;
         - ``n_rows`` (trajectory,): number of steps;
 
         and the coordinate ``kinematic`` (body,): whether a body follows its recorded path.
@@ -150,10 +150,7 @@ class History:
         source: str = "history",
         **reading: Unpack[Reading],
     ) -> History:
-        """Build a history from a table; arguments and errors as `load`.
-
-        Rows are numbered in messages as in a file, with the header as row 1.
-        """
+        """Build a history from a table; arguments, errors and row numbers as `load` of a file."""
         if not isinstance(frame, pd.DataFrame):
             raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
         frame = as_history(frame, scene, source, **reading)

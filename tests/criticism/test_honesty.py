@@ -12,12 +12,12 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import revise
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.cross_validation import Change
+from pbrl_ppl.criticism.cross_validation import Change, relative_fall
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.misfit import ACCELERATION, find_misfit
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.criticism.score import rank_candidates
-from pbrl_ppl.criticism.selection import Selection, relative_fall
+from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import attach
 from pbrl_ppl.model import Problem, bodies_acceleration, smoothed

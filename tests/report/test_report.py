@@ -368,6 +368,7 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "error",
         "identifiability",
         "loo",
+        "velocities_not_used",
         "bad_frames",
         "provenance",
     ]
