@@ -40,10 +40,11 @@ import numpy as np
 from attribution.cases import METHODS, Case, a_tenth, all_cases
 from attribution.measured import MEASURED, Recording, Result, run
 from attribution.measured_page import PAGE, RESULTS, kept_results, markdown_table, write_page
-from attribution.one_case import Row, about, cache_path, load, run_case, save, sources
+from attribution.one_case import Row, about, cache_path, load, run_case
 from attribution.scores import score
 from attribution.words import plain, score_table, table, told
 from rich.console import Console
+from running import part, save, sources
 
 #: Seconds that a case takes a worker, before any has been timed.
 SECONDS_A_CASE = 25.0
@@ -216,17 +217,6 @@ def parsed() -> argparse.Namespace:
             " test.csv; `pbrl-ppl new` makes the first"
         )
     return options
-
-
-def part(text: str) -> tuple[int, int]:
-    """Which of how many parts."""
-    try:
-        i, n = (int(number) for number in text.split("/"))
-    except ValueError:
-        i, n = 0, 0
-    if not 1 <= i <= n:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected I/N with I from 1 to N: 1/3")
-    return i, n
 
 
 def write(name: str | None, found: Mapping[str, object]) -> None:

@@ -32,8 +32,9 @@ from pathlib import Path
 
 import numpy as np
 from recordings.cases import Case, all_cases
-from recordings.one_case import Row, cache_path, load, run_case, save, sources
+from recordings.one_case import Row, cache_path, load, run_case
 from recordings.scores import brief, score, table, told
+from running import part, save, sources
 
 say = partial(print, file=sys.stderr, flush=True)
 
@@ -62,17 +63,6 @@ def chosen(options: argparse.Namespace) -> list[Case]:
         cases = [case for case in cases if any(part in case.name for part in options.only)]
     order = np.random.default_rng(options.seed).permutation(len(cases))
     return [cases[i] for i in order]
-
-
-def part(text: str) -> tuple[int, int]:
-    """Return which of how many parts."""
-    try:
-        i, n = (int(number) for number in text.split("/"))
-    except ValueError:
-        i, n = 0, 0
-    if not 1 <= i <= n:
-        raise argparse.ArgumentTypeError(f"got {text!r}, expected I/N with I from 1 to N: 1/3")
-    return i, n
 
 
 def parsed() -> argparse.Namespace:

@@ -25,8 +25,11 @@ def bench(monkeypatch):
     import recordings.one_case as one_case
     import recordings.oracle as oracle
     import recordings.scores as scores
+    import running
 
-    return SimpleNamespace(cases=cases, laws=laws, one_case=one_case, oracle=oracle, scores=scores)
+    return SimpleNamespace(
+        cases=cases, laws=laws, one_case=one_case, oracle=oracle, scores=scores, running=running
+    )
 
 
 def path(rate, start, time):
@@ -257,7 +260,7 @@ def test_rows_are_kept(bench, tmp_path) -> None:
     where = bench.one_case.cache_path(tmp_path, case, seed=0, bare=False)
     assert bench.one_case.load(where) is None
     made = row(bench, "adequate", clean=True)
-    bench.one_case.save(made, where)
+    bench.running.save(made, where)
     kept = bench.one_case.load(where)
     assert (kept.name, kept.oracle, kept.verdict) == (made.name, made.oracle, "adequate")
     assert where != bench.one_case.cache_path(tmp_path, case, seed=0, bare=True)

@@ -13,9 +13,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from running import sources
 
 import pbrl_ppl as pp
-from attribution.one_case import sources
 from pbrl_ppl.criticism import Findings, revise
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import signal
-import threading
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from running import cache_file, limited, sources
 
 import pbrl_ppl as pp
 from attribution.baselines import ask_baselines
@@ -135,8 +131,9 @@ def run_case(case: Case, seed: int, draws: int | None = None, limit: int = 0) ->
     """
     begin = time.perf_counter()
     known: dict[str, Any] = about(case)
+    cure = f"see where with --only {case.name} --workers 1 --verbose --limit 0"
     try:
-        with warnings.catch_warnings(), _limited(case.name, limit):
+        with warnings.catch_warnings(), limited(limit, cure):
             warnings.simplefilter("ignore")
             case = sized(case, seed)
             known |= {"strength": case.strength, "truth": true_parameters(case)}
@@ -160,27 +157,6 @@ def about(case: Case) -> dict[str, Any]:
     return known | {"body": case.body.sort, "sources": sources()}
 
 
-@contextmanager
-def _limited(name: str, limit: int) -> Iterator[None]:
-    """Stop what takes too long, where the system lets us: in a process's main thread."""
-    if threading.current_thread() is not threading.main_thread() or not hasattr(signal, "SIGALRM"):
-        yield
-        return
-
-    def stop(number: int, frame: object) -> None:
-        raise TimeoutError(
-            f"no end after {limit} s; see where with --only {name} --workers 1 --verbose --limit 0"
-        )
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(limit)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
-
-
 def _loop(
     case: Case, train: pp.History, test: pp.History, seed: int, draws: int | None
 ) -> dict[str, Any]:
@@ -200,29 +176,11 @@ def _loop(
     return found.to_dict() | {"stages": stages, "loop_seconds": time.perf_counter() - begin}
 
 
-def sources() -> str:
-    """Hash of the package's files: the loop may change between two runs of one version."""
-    digest = hashlib.sha256()
-    folder = Path(pp.__file__).parent
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
 def cache_path(folder: Path, case: Case, seed: int, draws: int | None) -> Path:
     """Where the row of a case is kept: its name, and a hash of version and settings."""
     catalogue = [effect.name for effect in case.catalogue]
-    scene = case.body.scene.to_toml()
-    settings = (_FORMAT, pp.__version__, case, scene, catalogue, seed, draws)
-    return folder / f"{case.name}-{hashlib.sha256(repr(settings).encode()).hexdigest()[:12]}.json"
-
-
-def save(row: Row, path: Path) -> None:
-    """Write a row."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(asdict(row)))
-    partial.replace(path)
+    settings = (_FORMAT, case, case.body.scene.to_toml(), catalogue, seed, draws)
+    return cache_file(folder, case.name, settings)
 
 
 def load(path: Path) -> Row | None:

@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
-import signal
-import threading
 import time
 import traceback
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from functools import cache
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+from running import cache_file, limited, sources
 
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import ADEQUATE, revise
@@ -119,7 +115,7 @@ def run_case(case: Case, seed: int, bare: bool, limit: int) -> Row:
     known: dict[str, Any] = {}
     begin = time.perf_counter()
     try:
-        with warnings.catch_warnings(), _limited(limit):
+        with warnings.catch_warnings(), limited(limit, "allow more with --limit"):
             warnings.simplefilter("ignore")
             recordings = case.recordings()
             known["oracle"] = ask(case, recordings[0])
@@ -144,48 +140,9 @@ def _where(error: Exception) -> str:
     return f"{Path(place.filename).name}:{place.lineno}"
 
 
-@contextmanager
-def _limited(limit: int) -> Iterator[None]:
-    """Stop what takes too long, where the system can: in a process's main thread."""
-    main = threading.current_thread() is threading.main_thread()
-    if not limit or not main or not hasattr(signal, "SIGALRM"):
-        yield
-        return
-
-    def stop(number: int, frame: object) -> None:
-        raise TimeoutError(f"no end after {limit} s; allow more with --limit")
-
-    before = signal.signal(signal.SIGALRM, stop)
-    signal.alarm(limit)
-    try:
-        yield
-    finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, before)
-
-
-@cache
-def sources() -> str:
-    """Return a hash of the package's files, which may change within a version."""
-    digest = hashlib.sha256()
-    folder = Path(pp.__file__).parent
-    for path in sorted(folder.rglob("*.py")):
-        digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
-    return digest.hexdigest()[:12]
-
-
 def cache_path(folder: Path, case: Case, seed: int, bare: bool) -> Path:
     """Return where the row of a case is kept: its name, and a hash of the settings."""
-    settings = repr((_FORMAT, pp.__version__, case, case.scene.to_toml(), seed, bare))
-    return folder / f"{case.name}-{hashlib.sha256(settings.encode()).hexdigest()[:12]}.json"
-
-
-def save(row: Row, path: Path) -> None:
-    """Write a row."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(".partial")
-    partial.write_text(json.dumps(asdict(row)))
-    partial.replace(path)
+    return cache_file(folder, case.name, (_FORMAT, case, case.scene.to_toml(), seed, bare))
 
 
 def load(path: Path) -> Row | None:

@@ -1,0 +1,75 @@
+"""What benchmarks of many cases share: a time limit, the code's hash, parts, and kept rows."""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pbrl_ppl as pp
+
+
+@contextmanager
+def limited(limit: int, cure: str) -> Iterator[None]:
+    """Stop what takes longer than so many seconds, where the system can: in a main thread.
+
+    0 is no limit. The message says what to do: ``cure``.
+    """
+    main = threading.current_thread() is threading.main_thread()
+    if not limit or not main or not hasattr(signal, "SIGALRM"):
+        yield
+        return
+
+    def stop(number: int, frame: object) -> None:
+        raise TimeoutError(f"no end after {limit} s; {cure}")
+
+    before = signal.signal(signal.SIGALRM, stop)
+    signal.alarm(limit)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, before)
+
+
+@cache
+def sources() -> str:
+    """Return a hash of the package's files, which may change within a version."""
+    digest = hashlib.sha256()
+    folder = Path(pp.__file__).parent
+    for path in sorted(folder.rglob("*.py")):
+        digest.update(path.relative_to(folder).as_posix().encode() + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def cache_file(folder: Path, name: str, settings: tuple[Any, ...]) -> Path:
+    """Return where the row of a case is kept: its name, and a hash of version and settings."""
+    text = repr((pp.__version__, *settings))
+    return folder / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.json"
+
+
+def save(row: Any, path: Path) -> None:
+    """Write a row, a dataclass, whole or not at all."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(".partial")
+    partial.write_text(json.dumps(asdict(row)))
+    partial.replace(path)
+
+
+def part(text: str) -> tuple[int, int]:
+    """Return which of how many parts."""
+    try:
+        i, n = (int(number) for number in text.split("/"))
+    except ValueError:
+        i, n = 0, 0
+    if not 1 <= i <= n:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected I/N with I from 1 to N: 1/3")
+    return i, n
