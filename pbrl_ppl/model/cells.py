@@ -104,9 +104,7 @@ class Cells:
 
         Shape (2, cell, cell).
         """
-        size = sigma[self.pushed] ** 2
-        free = np.where(self.always, size, 0.0)
-        return np.stack([(self.push.T * own) @ self.push for own in (free, size)])
+        return step_covariances(self.push, sigma[self.pushed], self.always)
 
     def pushes(self, sigma: Array, touching: Bools, rng: np.random.Generator) -> Array:
         """Draw what steps add to the cells, shape (..., cell), as ``touching`` has its axes.
@@ -159,6 +157,28 @@ class Cells:
         """Body and place among the columns of each cell."""
         body, dimension = np.divmod(self.places, 6)
         return body, np.searchsorted(self.columns, dimension)
+
+
+def step_covariances(push: Array, size: Array, always: Bools) -> Array:
+    """Covariance of what a step adds where no bodies touch, and where some do.
+
+    Parameters
+    ----------
+    push : ndarray
+        What a unit of each row adds, shape (push, coordinate).
+    size : ndarray
+        Standard deviation of each row, shape (push,).
+    always : ndarray of bool
+        Which rows act in every step, shape (push,).
+
+    Returns
+    -------
+    ndarray
+        Shape (2, coordinate, coordinate).
+    """
+    square = size**2
+    free = np.where(always, square, 0.0)
+    return np.stack([(push.T * own) @ push for own in (free, square)])
 
 
 def check_moves(cells: Cells, scene: Scene) -> None:

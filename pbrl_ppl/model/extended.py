@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model.cells import Cells
+from pbrl_ppl.model.cells import Cells, step_covariances
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -71,9 +71,7 @@ class Extended:
 
         Shape (2, coordinate, coordinate).
         """
-        size = sigma[self.pushed] ** 2
-        free = np.where(self.always, size, 0.0)
-        return np.stack([(self.push.T * own) @ self.push for own in (free, size)])
+        return step_covariances(self.push, sigma[self.pushed], self.always)
 
     def padded(self, values: Array) -> Array:
         """Values of cells, shape (..., cell), with zeros for the errors."""

@@ -21,6 +21,8 @@ ACCELERATION_SHARE, ACCELERATION_CHANCE = 0.1, 0.01
 #: A correlated error of measuring is larger than this share of the range of what it measures with
 #: the same probability: an error that lasts follows whatever is smooth, too.
 DRIFT_SHARE = 0.01
+#: Median of an exponential law, as a share of what it exceeds with that probability.
+_MEDIAN = np.log(2.0) / -np.log(ACCELERATION_CHANCE)
 #: A position's velocity is so many places on.
 _RATE = 3
 
@@ -38,12 +40,9 @@ def noise_medians(cells: Cells, history: History, states: Array) -> Array:
     )
     dt = float(history.dataset.attrs["time_step"])
     sensors = SENSOR_SHARE * seen[list(cells.sensors)]
-    share = ACCELERATION_SHARE * np.log(2.0) / -np.log(ACCELERATION_CHANCE)
-    steps = share * _vectors(each, cells.rates) / dt
+    steps = ACCELERATION_SHARE * _MEDIAN * _vectors(each, cells.rates) / dt
     jolts = JOLT_SHARE * each[list(cells.jolts)] / dt
-    drifts = (
-        DRIFT_SHARE * np.log(2.0) / -np.log(ACCELERATION_CHANCE) * ranges(cells, history, states)
-    )
+    drifts = DRIFT_SHARE * _MEDIAN * ranges(cells, history, states)
     return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts, drifts]), 1e-9))
 
 
