@@ -143,8 +143,9 @@ def _revised(
         warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
     say("fitting the declared model")
     declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
-    first, current, added = _with_effects(declared, selection, criteria, say)
-    for _ in range(_NOISES):  # under the right noise effects may show that were hidden before
+    first, current, added = _with_effects(declared, selection, criteria, say, mendable=True)
+    # under the right noise effects may show that were hidden before
+    for again in reversed(range(_NOISES)):
         train, frames = without_measurements(train, outliers(current))
         if frames:
             for sentence in map(str, frames):
@@ -157,7 +158,9 @@ def _revised(
                 break
             say("errors of measuring are correlated: looking again")
             declared = same_noise(declared, tracked)
-        first, current, added = _with_effects(declared, selection, criteria, say)
+        first, current, added = _with_effects(
+            declared, selection, criteria, say, mendable=again > 0
+        )
     as_tested = replace(current, problem=held_out.problem(current))
     test, frames = without_measurements(test, outliers(as_tested))
     if frames:
@@ -200,17 +203,25 @@ def _revised(
 
 
 def _with_effects(
-    declared: Mode, selection: Selection, criteria: Criteria, say: Callable[[str], None]
+    declared: Mode,
+    selection: Selection,
+    criteria: Criteria,
+    say: Callable[[str], None],
+    *,
+    mendable: bool,
 ) -> tuple[list[Signature], Mode, list[Step]]:
-    """The ranking of the declared model, the model with effects added one by one, and those."""
+    """The ranking of the declared model, the model with effects added one by one, and those.
+
+    If the noise is ``mendable`` it ends where outliers show, the last effect unconfirmed.
+    """
     say("scoring what the model might lack")
     first = rank_candidates(declared, selection.missing(declared))
     current, ranked = declared, first
     added: list[Step] = []
     while ranked and len(added) < criteria.most_added:
-        if np.isfinite(outliers(current)).any():
+        if mendable and np.isfinite(outliers(current)).any():
             return first, current, added
-        step = selection.best_addition(current, ranked)
+        step = selection.best_addition(current, ranked, provisional=mendable)
         if step is None and unexplained_acceleration(current, criteria).remains.any():
             alone = without_acceleration(current)
             hidden = rank_candidates(alone, selection.missing(current))

@@ -83,8 +83,13 @@ class Selection:
         """Candidate effects for a model."""
         return candidates(self.scene, mode.problem.physics.effects, self.catalogue)
 
-    def best_addition(self, mode: Mode, ranked: list[Signature]) -> Step | None:
-        """Refit with the leading candidates; the best that held-out data confirm, or None."""
+    def best_addition(
+        self, mode: Mode, ranked: list[Signature], *, provisional: bool = False
+    ) -> Step | None:
+        """Refit with the leading candidates; the best that held-out data confirm, or None.
+
+        If ``provisional``, one whose fit shows outliers is returned without being confirmed.
+        """
         order = [attached.effect.name for attached in self.missing(mode)]
         self.small.clear()
 
@@ -111,6 +116,8 @@ class Selection:
                 tied = [item for item, value in ranks.items() if value > best - TIE]
                 item = min(tied, key=lambda pair: order.index(pair[0].attached.effect.name))
                 own = ranks.pop(item)
+                if provisional and np.isfinite(outliers(item[1])).any():
+                    return Step(item[0], (), item[1], np.nan, np.nan)
                 step = self._confirm(mode, *item, ranked)
                 if step is None:
                     continue
@@ -149,12 +156,7 @@ class Selection:
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
-        """Accept an improvement that cross-validation is sure of and that is not negligible.
-
-        One that shows outliers is accepted for now: the search begins again without them.
-        """
-        if np.isfinite(outliers(fitted)).any():
-            return Step(signature, (), fitted, np.nan, np.nan)
+        """Accept an improvement that cross-validation is sure of and that is not negligible."""
         fitted = with_enough_substeps(fitted, self.say, self.criteria)
         if why := self._implausible(fitted, signature):
             self._note(signature, why)
