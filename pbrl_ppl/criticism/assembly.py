@@ -86,8 +86,8 @@ def put_together(
         after = held_out.errors(revised, revised, models.after, rollout)
     verdict = findings.EFFECTS_ADDED if steps else findings.ADEQUATE
     unexplained = misfit.unexplained
-    # names that leave structure unexplained are the nearest there are at best
-    if unexplained is not None and not (steps and (misfit.predicts or misfit.random)):
+    # names that leave an acceleration unexplained are the nearest there are at best
+    if unexplained is not None and not (steps and misfit.predicts):
         verdict = findings.UNEXPLAINED
     most = (1.0 + criteria.negligible) * before.normalised_rmse
     if steps and after.normalised_rmse > most:

@@ -19,7 +19,7 @@ from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.mujoco import from_mujoco
 from pbrl_ppl.history.reading import Reading, as_history
 from pbrl_ppl.history.rebuild import from_segments, segment_rows
-from pbrl_ppl.history.start import fill_hinges, hung_bodies, lever
+from pbrl_ppl.history.start import estimate_rates, fill_hinges, hung_bodies, lever
 from pbrl_ppl.history.unit_check import unit_mismatches
 
 __all__ = [
@@ -32,6 +32,7 @@ __all__ = [
     "as_history",
     "bad_frames",
     "check_start",
+    "estimate_rates",
     "fill_hinges",
     "from_mujoco",
     "from_segments",

@@ -13,7 +13,6 @@ from pbrl_ppl.history.angles import unwrapped
 from pbrl_ppl.history.bad_frames import finest_step
 from pbrl_ppl.history.filters import Runs, computed_by, position_noise
 from pbrl_ppl.history.history import History
-from pbrl_ppl.history.start import estimate_rates
 from pbrl_ppl.state import STATE, THETA, wrapped
 
 Floats = npt.NDArray[np.float64]
@@ -122,7 +121,7 @@ def unused_velocities(history: History) -> tuple[UnusedVelocity, ...]:
 
 
 def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = None) -> History:
-    """Return the history without unused velocities; states to start from have estimates of them.
+    """Return the history without unused velocities: they stay as states to start from.
 
     Parameters
     ----------
@@ -137,10 +136,8 @@ def measured_alone(history: History, unused: Sequence[UnusedVelocity] | None = N
     columns = np.zeros((len(history.bodies), len(STATE)), dtype=bool)
     for each in unused:
         columns[history.bodies.index(each.body), STATE.index(each.state)] = True
-    observed, start = history.dataset["observed"], history.dataset["start"]
-    start = start.copy(data=np.where(columns, np.nan, start.to_numpy()))
-    estimate_rates(start.to_numpy(), float(history.dataset.attrs["time_step"]))
-    return History(history.dataset.assign(observed=observed.where(~columns), start=start))
+    observed = history.dataset["observed"]
+    return History(history.dataset.assign(observed=observed.where(~columns)))
 
 
 def velocity_lag(runs: Runs, dt: float) -> float:

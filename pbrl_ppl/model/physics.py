@@ -14,7 +14,7 @@ from pbrl_ppl.physics import OneWorld, PartedSimulator, Parts
 from pbrl_ppl.scene import Scene
 
 #: Engine steps an interval where a rough answer will do, and how long they are at most (s).
-COARSE, LONGEST_COARSE = 4, 0.02
+COARSE, LONGEST_COARSE = 4, 0.025
 #: Substeps for what an effect changes, and for slopes, which need no more; and how long they are at
 #: most (s): where rows are far apart, dry friction at a turning point shows with short steps alone.
 ROUGH, LONGEST = 10, 0.005

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.history import History, hung_bodies
+from pbrl_ppl.history import History, estimate_rates, hung_bodies
 from pbrl_ppl.model.cells import Cells
 from pbrl_ppl.physics import touching
 from pbrl_ppl.scene import Scene
@@ -83,9 +83,18 @@ def _uncoupled(scene: Scene) -> bool:
 
 
 def first_states(history: History) -> Array:
-    """States as measured, gaps interpolated, shape (trajectory, time, body, 6); no angle jumps."""
-    states: Array = history.dataset["start"].to_numpy().copy()
-    rows = history.dataset["n_rows"].to_numpy()
+    """States as measured, gaps interpolated, shape (trajectory, time, body, 6); no angle jumps.
+
+    Velocities that do not count as measured are estimated from measured positions.
+    """
+    dataset = history.dataset
+    states: Array = dataset["start"].to_numpy().copy()
+    seen = np.isfinite(dataset["observed"].to_numpy()).any(axis=(0, 1))
+    free = ~dataset["kinematic"].to_numpy()[:, None]
+    rates = np.hstack([np.zeros_like(seen[:, :_RATE]), free & seen[:, :_RATE] & ~seen[:, _RATE:]])
+    states[:, :, rates] = np.nan
+    estimate_rates(states, float(dataset.attrs["time_step"]))
+    rows = dataset["n_rows"].to_numpy()
     for trajectory, n in enumerate(rows):
         for body in range(states.shape[2]):
             for d in range(len(STATE)):
