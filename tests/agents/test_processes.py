@@ -23,7 +23,9 @@ def test_an_interrupt_ends_them_at_once() -> None:
         raise KeyboardInterrupt
     for child in set(active_children()) - before:
         child.join(10.0)
-    assert time.monotonic() - begin < 30.0 and all(future.done() for future in waiting[2:])
+    while not all(future.done() for future in waiting) and time.monotonic() - begin < 30.0:
+        time.sleep(0.01)  # the executor's own thread cancels what waits
+    assert all(future.done() for future in waiting) and time.monotonic() - begin < 30.0
     assert os.getpid() not in {each.result() for each in pids}
 
 
