@@ -105,7 +105,7 @@ class Box2DWorld(World):
         given = dict(zip(layout.labels, phi.tolist(), strict=True))
         self._values = [
             {
-                name: float(given.get(f"{name}[{body.name}]", dict(body.known).get(name, 0.0)))
+                name: float(given.get(f"{name}[{body.owner}]", dict(body.known).get(name, 0.0)))
                 for name in ("mass", "r", "mu_c", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
             }
             for body in scene.moving

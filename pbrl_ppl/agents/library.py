@@ -34,7 +34,8 @@ class LibraryAgent(Agent):
     """PBRL agent of the paper's apartment (section 5.2): a choice among parameter sets a body.
 
     A body is judged by the transitions in which it moves or is pushed and touches no other moving
-    one, each by itself with a noise of its own: given the noise, bodies apart are independent. The
+    one, each by itself with a noise of its own: given the noise, bodies apart are independent.
+    Bodies of one class with equal attributes share parameters, and so one choice and noise. The
     paper walks among the choices; here the sum over them is exact, and as many draws are kept. The
     most frequent choice (MAP) is planned with; a body of which nothing was seen is like a set drawn
     from the prior.
@@ -51,7 +52,7 @@ class LibraryAgent(Agent):
     Attributes
     ----------
     fits : int
-        How often a body was looked at.
+        How often a body, or those of a class, were looked at.
 
     Raises
     ------
@@ -77,16 +78,16 @@ class LibraryAgent(Agent):
         self._table = library.table(self._layout, scene)
         rng = np.random.default_rng([self.seed, 2])
         names = [body.name for body in scene.moving]
-        self._probability = {name: library.prior(name) for name in names}
+        self._probability = {owner: library.prior(owner) for owner in scene.owners}
         self._choice = {name: int(rng.choice(len(p), p=p)) for name, p in self._probability.items()}
-        self._own = {name: scene.subset([name]) for name in names}
+        self._own = {owner: scene.subset(own) for owner, own in scene.owners.items()}
         self._pairs = {
             (a, b): scene.subset([a, b]).replace(walls=())
             for i, a in enumerate(names)
             for b in names[i + 1 :]
         }
-        self._seen: dict[str, list[tuple[Array, Array, Array]]] = {name: [] for name in names}
-        self._fitted = dict.fromkeys(names, 0)
+        self._seen: dict[str, list[tuple[Array, Array, Array]]] = {name: [] for name in self._own}
+        self._fitted = dict.fromkeys(self._own, 0)
         self._dynamics: Dynamics | None = None
 
     @property
@@ -103,26 +104,30 @@ class LibraryAgent(Agent):
 
     @property
     def probabilities(self) -> pd.DataFrame:
-        """Posterior probability of every set: one row a body, one column a set."""
+        """Posterior probability of every set: one row a body or class, one column a set."""
         return pd.DataFrame(self._probability, index=list(self.library.names)).T
 
     def observe(self, state: Array, action: Array, next_state: Array) -> None:
         """Keep what a transition says of each body; arguments as of :meth:`Agent.observe`."""
         moved = action.any(axis=1) | state[:, 3:].any(axis=1) | (next_state != state).any(axis=1)
-        names = list(self._seen)
-        met = set()
+        names = [body.name for body in self.task.scene.moving]
+        alone = moved.copy()
         for pair, scene in self._pairs.items():
             i, j = (names.index(name) for name in pair)
             if moved[i] or moved[j]:
                 both = [i, j]
                 if touching(scene, state[None, both], next_state[None, both])[0]:
-                    met |= {i, j}
-        for i in np.flatnonzero(moved).tolist():
-            if i not in met:
-                self._seen[names[i]].append((state[i], action[i], next_state[i]))
+                    alone[both] = False
+        for owner, own in self.task.scene.owners.items():
+            of = [names.index(name) for name in own]
+            judged = alone[of, None]
+            if judged.any():  # the others of its class stand still, and were not measured
+                begin = np.where(judged | (np.arange(state.shape[1]) < 3), state[of], 0.0)
+                push, after = judged * action[of], np.where(judged, next_state[of], np.nan)
+                self._seen[owner].append((begin, push, after))
 
     def update(self) -> None:
-        """Choose anew for each body whose data have grown by a fifth and were not foretold."""
+        """Choose anew for each body or class whose data grew by a fifth and were not foretold."""
         before = self.fits
         for name, seen in self._seen.items():
             fitted = self._fitted[name]
@@ -136,7 +141,7 @@ class LibraryAgent(Agent):
         state, action, after = (np.array(each) for each in zip(*self._seen[name], strict=True))
         scene = self._own[name]
         own = Dynamics(scene, self._phi(build_layout(scene)), threads=1)
-        error = abs(after - own.step(state[None, :, None], action[:, None])[0, :, 0])
+        error = abs(after - own.step(state[None], action)[0])
         error[..., THETA] = abs(wrapped(error[..., THETA]))
         return bool((error > _FORETOLD).any())
 
@@ -154,7 +159,7 @@ class LibraryAgent(Agent):
 
     def _choose(self, name: str) -> None:
         scene, seen = self._own[name], self._seen[name]
-        state, action, after = (np.array(each)[:, None] for each in zip(*seen, strict=True))
+        state, action, after = (np.array(each) for each in zip(*seen, strict=True))
         history = from_segments(scene, state, action[:, None], after[:, None])
         among = _of_one(self.library, scene, name)
         problem = Problem.of(scene, history, noise=Noise(scalar=True), library=among)
@@ -167,7 +172,7 @@ class LibraryAgent(Agent):
 
 
 def _of_one(library: ParameterLibrary, scene: Scene, name: str) -> ParameterLibrary:
-    """The sets that are possible for one body, with the parameters that it has."""
+    """The sets that are possible for one body or class, with the parameters that it has."""
     wanted = {block.name for block in build_layout(scene).blocks}
     prior = dict(zip(library.names, library.prior(name).tolist(), strict=True))
     sets = {

@@ -228,7 +228,8 @@ def residual_forces(mode: Mode, body: str) -> tuple[Array, dict[int, Array]]:
 
 
 def _mass(problem: Problem, phi: Array, body: str) -> float:
-    known = dict(problem.scene.body(body).known)
+    own = problem.scene.body(body)
+    known = dict(own.known)
     if "mass" in known:
         return float(known["mass"])
-    return float(phi[problem.layout.index("mass", body)])
+    return float(phi[problem.layout.index("mass", own.owner)])

@@ -176,11 +176,11 @@ def prior_predictive_draws(
 
 
 def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
-    """Which parameter set each body has, and the parameters that follow from that."""
-    names = [body.name for body in problem.scene.moving]
+    """Which parameter set each body or class has, and the parameters that follow from that."""
+    names = tuple(problem.scene.owners)
     table = library.table(problem.layout, problem.scene)
     p = np.stack([library.prior(name) for name in names])
-    index = pm.Categorical("library_index", p=p, dims="body")
+    index = pm.Categorical("library_index", p=p, dims=_owner_dim(problem, names, "library"))
     result = {}
     for block, place in problem.layout.slices():
         own = index[[names.index(owner) for owner in block.owners]]
@@ -282,6 +282,8 @@ def _coords(problem: Problem) -> dict[str, Any]:
         "transition": np.arange(segments.n),
         "step": np.arange(1, problem.data.horizon + 1),
     }
+    owners = tuple(problem.scene.owners)
+    coords.setdefault(_owner_dim(problem, owners, ""), list(owners))
     for block in problem.layout.blocks:
         coords.setdefault(_dim(problem, block), list(block.owners))
     return coords
@@ -294,9 +296,14 @@ def _noise_coords(problem: Problem) -> dict[str, Any]:
 
 
 def _dim(problem: Problem, block: Block) -> str:
-    """``body`` where all moving bodies have the parameter, else a dimension of its own."""
+    """Dimension of a parameter: of joints, or of the bodies or classes that have it."""
     if block.of == "joint":
         return "joint" if not block.name.startswith("i_") else "free_joint"
-    if len(block.owners) == len(problem.scene.moving):
+    return _owner_dim(problem, block.owners, block.effect or block.name)
+
+
+def _owner_dim(problem: Problem, owners: tuple[str, ...], name: str) -> str:
+    """``body`` for all moving bodies, ``owner`` for all that own parameters, else one by name."""
+    if set(owners) == {body.name for body in problem.scene.moving}:
         return "body"
-    return f"{block.effect or block.name}_body"
+    return "owner" if owners == tuple(problem.scene.owners) else f"{name}_body"

@@ -30,7 +30,8 @@ class ParameterLibrary:
     probabilities : mapping, optional
         Of the sets by name, ``{"cart": 0.7, "table": 0.3}``, or for each body its own,
         ``{"sofa": {"table": 1.0}}``; sets left out have none, bodies left out and all bodies
-        without it take every set as likely. They are scaled to add up to one.
+        without it take every set as likely. They are scaled to add up to one. Bodies of one class
+        with equal attributes have one choice, under the class's name (`Body.owner`).
 
     Raises
     ------
@@ -100,7 +101,7 @@ class ParameterLibrary:
         return tuple(name for name, _ in self.sets)
 
     def prior(self, body: str) -> Array:
-        """Probability of each set for a body, shape (set,)."""
+        """Probability of each set for a body or class, shape (set,)."""
         given: dict[str, Any] = dict(self.probabilities or {})
         if any(isinstance(value, tuple) for value in given.values()):
             given = dict(given.get(body, ()))
@@ -116,11 +117,11 @@ class ParameterLibrary:
             If a joint is to be inferred, a set lacks a parameter, has one that no body has, or has
             a value that a body cannot have while the set is possible for it.
         """
-        bodies = [body.name for body in scene.moving]
+        bodies = tuple(scene.owners)
         for name, _ in self.probabilities or ():
             if name not in (*bodies, *self.names):
                 raise ParameterError(
-                    f"probabilities: {name!r} is neither a parameter set nor a moving body"
+                    f"probabilities: {name!r} is neither a parameter set nor a moving body or class"
                     f"{nearest(name, (*bodies, *self.names))}"
                 )
         wanted = [block.name for block in layout.blocks]

@@ -80,8 +80,8 @@ def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = 
     sigma : ndarray
         Shape (..., state), all the same for a scalar sigma.
     choice : ndarray of int, optional
-        Which parameter set each body has, shape (..., body), where the problem has such sets:
-        then the parameters follow from it, and its probability counts.
+        Which parameter set each owner has, shape (..., owner), as in `Scene.owners`, where the
+        problem has such sets: then the parameters follow from it, and its probability counts.
 
     Returns
     -------
@@ -94,7 +94,7 @@ def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = 
         return np.asarray(of_noise + problem.layout.log_prior(phi).sum(axis=-1))
     if choice is None:
         raise ValueError("choice is missing: the parameters follow from which set each body has")
-    names = [body.name for body in problem.scene.moving]
+    names = list(problem.scene.owners)
     with np.errstate(divide="ignore"):  # a set that a body cannot have
         table = np.log([problem.library.prior(name) for name in names])
     return np.asarray(of_noise + table[np.arange(len(names)), choice].sum(axis=-1))

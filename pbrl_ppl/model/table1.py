@@ -204,7 +204,8 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
     Parameters
     ----------
     scene : Scene
-        Parameters that it names as known are left out, and a wheel's where there is none.
+        Parameters that it names as known are left out, and a wheel's where there is none. Bodies
+        that share parameters (`Scene.owners`) have one entry of each.
     effects : tuple of Attached
         All effects of the model.
 
@@ -226,13 +227,12 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
                     f" effects{nearest(name, names)}"
                 )
     blocks = []
+    owning = [scene.body(names[0]) for names in scene.owners.values()]  # those that share agree
     for name, unit in BODY_PARAMETERS.items():
-        bodies = [
-            body for body in scene.moving if name not in dict(body.known) and _has(body, name)
-        ]
+        bodies = [body for body in owning if name not in dict(body.known) and _has(body, name)]
         if bodies:
             priors = tuple(table1(body)[name] for body in bodies)
-            blocks.append(Block(name, tuple(body.name for body in bodies), unit, priors))
+            blocks.append(Block(name, tuple(body.owner for body in bodies), unit, priors))
     blocks += _joint_blocks(scene)
     for effect in dict.fromkeys(attached.effect for attached in effects):
         on = tuple(attached.body for attached in effects if attached.effect == effect)

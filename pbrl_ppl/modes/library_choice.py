@@ -30,8 +30,7 @@ class _Combinations:
     """Every combination of parameter sets of one part's bodies: its prior and its residuals."""
 
     def __init__(self, problem: Problem, part: Part, table: Array) -> None:
-        names = [body.name for body in problem.scene.moving]
-        bodies = [names[i] for i in part.bodies]
+        bodies = list(part.simulator.scene.owners)
         library = problem.library
         if library is None:
             raise FitError("fit: the model has no library to choose from")
@@ -50,8 +49,8 @@ class _Combinations:
         self.log_prior = np.sum(
             [np.log(p[self.indices[:, i]]) for i, p in enumerate(priors)], axis=0
         )
-        owners = [owner for block in problem.layout.blocks for owner in block.owners]
-        whose = [bodies.index(owners[place]) for place in part.places]
+        owners = [owner for block in part.simulator.layout.blocks for owner in block.owners]
+        whose = [bodies.index(owner) for owner in owners]
         phi = table[part.places, self.indices[:, whose]].reshape(count, -1)
         segments = problem.segments
         states = part.simulator(
@@ -96,7 +95,7 @@ def choose_from_library(
     sigma : ndarray
         Shape (chain, draw, state), or (chain, draw, 1) for a scalar sigma.
     index : ndarray of int
-        Of the parameter set in the library, shape (chain, draw, body).
+        Of the parameter set in the library, shape (chain, draw, owner), as in `Scene.owners`.
     accepted : ndarray
         Share of the proposals of sigma that were, shape (chain, draw).
 
@@ -108,6 +107,7 @@ def choose_from_library(
     if problem.library is None:
         raise FitError("fit: the model has no library to choose from")
     rng = np.random.default_rng(seed)
+    names = list(problem.scene.owners)
     table = problem.library.table(problem.layout, problem.scene)
     parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
     median, spread = problem.noise_prior
@@ -142,14 +142,14 @@ def choose_from_library(
         accepted.append(moved.reshape(draws, _THIN).mean(axis=1))
         log_sigma = x[kept[drawn]]
         sigmas.append(np.exp(log_sigma))
-        index = np.zeros((draws, len(problem.scene.moving)), dtype=np.intp)
+        index = np.zeros((draws, len(names)), dtype=np.intp)
         for own, part in zip(parts, problem.simulator.parts, strict=True):
             joint = own.log_joint(np.exp(log_sigma) * ones, problem.nu())
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
-            index[:, part.bodies] = own.indices[which]
+            columns = [names.index(owner) for owner in part.simulator.scene.owners]
+            index[:, columns] = own.indices[which]
         chosen.append(index)
-    names = [body.name for body in problem.scene.moving]
     owners = [owner for block in problem.layout.blocks for owner in block.owners]
     indices = np.stack(chosen)
     of = indices[..., [names.index(owner) for owner in owners]]

@@ -40,7 +40,8 @@ class Block:
     name : str
         Variable name, e.g. ``mass`` or ``linear_drag_coefficient``.
     owners : tuple of str
-        The bodies in the scene's order, or the joints; the length of the variable.
+        The bodies in the scene's order, or the joints; the length of the variable. Bodies that
+        share Table 1's parameters are one owner, under the name of their class.
     unit : str
         SI unit.
     priors : tuple of Prior

@@ -1,4 +1,4 @@
-"""Independent parts of a scene: bodies that come near in a history or share a joint, together."""
+"""Independent parts of a scene: bodies that come near, share a joint or parameters, together."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def joined_parts(parts: Parts, together: Collection[str]) -> Parts:
 
 
 def independent_parts(scene: Scene, history: History) -> Parts:
-    """Moving bodies in parts that never come near each other and share no joint.
+    """Moving bodies in parts that never come near each other and share no joint or parameters.
 
     A kinematic body counts as any other: bodies that it meets are in one part, for it is in one.
 
@@ -50,7 +50,7 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     Parameters
     ----------
     scene : Scene
-        Shapes and joints. A joint of unknown bodies may join any two.
+        Shapes, joints and classes. A joint of unknown bodies may join any two.
     history : History
         Where the bodies were; one whose place is not known at some time may have been anywhere.
 
@@ -82,6 +82,9 @@ def independent_parts(scene: Scene, history: History) -> Parts:
         if all(name in names for name in joint.bodies) and WORLD not in joint.bodies:
             i, j = (names.index(name) for name in joint.bodies)
             together[i, j] = True
+    for sharing in scene.owners.values():
+        for name in sharing[1:]:
+            together[names.index(name), names.index(sharing[0])] = True
     place = history.dataset["start"].to_numpy()[..., :2]
     intervals = history.dataset["n_rows"].to_numpy() - 1
     inside = np.arange(place.shape[1] - 1) < intervals[:, None]

@@ -76,7 +76,8 @@ class PartedSimulator:
         self.parts = []
         for part in parts:
             own = scene if len(parts) == 1 else scene.subset(part)
-            chosen = layout if len(parts) == 1 else layout.subset((*part, *own.joint_names))
+            kept = (*part, *own.owners, *own.joint_names)
+            chosen = layout if len(parts) == 1 else layout.subset(kept)
             simulator = Simulator(
                 own,
                 chosen,

@@ -123,7 +123,7 @@ class EngineProperties:
             known = dict(body.known) | ({"mass": 1.0} if body.kinematic else {})  # not used
             for name in BODY_PARAMETERS:
                 self._known[i, COLUMN[name]] = known.get(name, 0.0)
-                place = places.get(f"{name}[{body.name}]")
+                place = places.get(f"{name}[{body.owner}]")
                 if place is not None:
                     moved.append((place, i, COLUMN[name]))
         self._moved = np.array(moved, dtype=int).reshape(-1, 3).T

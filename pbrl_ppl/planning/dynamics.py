@@ -152,10 +152,11 @@ class Dynamics:
 
     def mass(self, body: str) -> Array:
         """A body's mass under each draw, shape (draw,), kg."""
-        known = dict(self.scene.body(body).known)
+        own = self.scene.body(body)
+        known = dict(own.known)
         if "mass" in known:
             return np.full(self.draws, float(known["mass"]))
-        return self.phi[:, self.layout.index("mass", body)]
+        return self.phi[:, self.layout.index("mass", own.owner)]
 
     def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
         """The most that a push without friction can do: m/s^2 and rad/s^2, shape (draw,) each."""

@@ -29,7 +29,8 @@ def learned_library(
     ----------
     posteriors : mapping of str to InferenceData or DataTree
         By the name that the set will have; of one that has several bodies each is a set, called
-        ``name.body``. What its scene knew of a body goes into the set.
+        ``name.body``, or ``name.class`` where bodies share parameters. What its scene knew of a
+        body goes into the set.
     probabilities : mapping, optional
         As for :class:`pbrl_ppl.ParameterLibrary`.
 
@@ -47,14 +48,15 @@ def learned_library(
             found = {key: float(value) for key, value in body.known}
             for label, values in flat.data_vars.items():
                 key, _, owner = str(label).rstrip("]").partition("[")
-                if owner == body.name and key not in _OTHERS:
+                if owner in (body.name, body.owner) and key not in _OTHERS:
                     found[key] = _mean(key, values.to_numpy())
-            sets[name if len(scene.dynamic) == 1 else f"{name}.{body.name}"] = found
+            alone = len({body.owner for body in scene.dynamic}) == 1
+            sets[name if alone else f"{name}.{body.owner}"] = found
     return ParameterLibrary(sets, probabilities)
 
 
 def library_probabilities(idata: Any) -> pd.DataFrame:
-    """Posterior probability of every parameter set: one row a body, one column a set.
+    """Posterior probability of every parameter set: one row a body or class, one column a set.
 
     Parameters
     ----------
@@ -69,11 +71,12 @@ def library_probabilities(idata: Any) -> pd.DataFrame:
     if "library" not in idata.attrs:
         raise PosteriorError("posterior: its model has no library; pass library= to physics_model")
     names = ParameterLibrary.from_json(str(idata.attrs["library"])).names
-    index = group(idata, "posterior")["library_index"].transpose("chain", "draw", "body")
+    index = group(idata, "posterior")["library_index"].transpose("chain", "draw", ...)
+    (dim,) = index.dims[2:]
     share = {name: (index == i).mean(("chain", "draw")) for i, name in enumerate(names)}
     return pd.DataFrame(
         {name: probability.to_numpy() for name, probability in share.items()},
-        index=index["body"].to_numpy(),
+        index=index[dim].to_numpy(),
     )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
@@ -68,7 +69,7 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
     layout = build_layout(scene, attach(scene, (), known_effects(idata, effects)))
     posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
     draws = fold_draws(layout, posterior)
-    found: dict[str, dict[str, dict[str, float]]] = {body.name: {} for body in scene.bodies}
+    found: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for block in layout.blocks:
         # a remainder is of one recording, and no physics that a scene could declare
         if block.of != "body" or LEARNED_REMAINDER in block.name:
@@ -86,7 +87,8 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
             found[owner][block.name] = {k: getattr(matched, k) for k in matched.hyper_names}
     bodies = []
     for body in scene.bodies:
-        new = {name: tuple(hyper.items()) for name, hyper in found[body.name].items()}
+        own = found[body.owner] | found[body.name]  # those that it shares, and its effects'
+        new = {name: tuple(hyper.items()) for name, hyper in own.items()}
         laws = tuple(name for name in body.effects if name != LEARNED_REMAINDER)
         known = tuple((dict(body.prior) | new).items())
         bodies.append(replace(body, prior=known, effects=laws))

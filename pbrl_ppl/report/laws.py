@@ -125,7 +125,7 @@ def _inertia(problem: Problem, phi: Array, body: int, name: str) -> tuple[float,
     moving = problem.scene.moving[body]
     known = dict(moving.known)
     values = dict(zip(problem.layout.labels, phi.tolist(), strict=True))
-    mass = known.get("mass", values.get(f"mass[{moving.name}]"))
+    mass = known.get("mass", values.get(f"mass[{moving.owner}]"))
     if mass is None:
         unit = "rad/s²" if name == "omega" else "m/s²"
         return 1.0, "residual acceleration", unit

@@ -57,7 +57,7 @@ class Pieces:
     def of(cls, problem: Problem) -> Pieces:
         """A piece for each part of the scene; one for each body that joints leave alone."""
         labels = problem.layout.labels
-        names = [body.name for body in problem.scene.moving]
+        moving = problem.scene.moving
         met = np.zeros(problem.segments.n, dtype=bool)
         own: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
         for part in problem.simulator.parts:
@@ -66,7 +66,8 @@ class Pieces:
                 continue
             met = problem.trajectories.touching
             for body in part.bodies:
-                chosen = problem.layout.subset((names[body],)).labels
+                kept = moving[body].name, moving[body].owner
+                chosen = problem.layout.subset(kept).labels
                 places = np.array([labels.index(label) for label in chosen], dtype=int)
                 own.append((places, np.array([body])))
         apart, rows = np.flatnonzero(~met), np.flatnonzero(met)

@@ -313,13 +313,15 @@ def _scene(
     dropped = {tuple(label.rstrip("]").split("[")) for label in left_out}
     bodies = []
     for body in scenes[0].bodies:
+        owners = (body.owner, body.name)  # of Table 1's parameters, and of its effects'
         others = [set(scene.body(body.name).effects) for scene in scenes]
         kept = tuple(name for name in body.effects if all(name in own for own in others))
-        prior = {name: hyper for name, hyper in body.prior if (name, body.name) not in dropped}
+        gone = {name for name, owner in dropped if owner in owners}
+        prior = {name: hyper for name, hyper in body.prior if name not in gone}
         prior |= {
             label.partition("[")[0]: tuple(hyper.items())
             for label, hyper in priors.items()
-            if label.endswith(f"[{body.name}]")
+            if label.partition("[")[2].rstrip("]") in owners
         }
         bodies.append(replace(body, effects=kept, prior=tuple(prior.items())))
     return scenes[0].replace(bodies=tuple(bodies))

@@ -99,6 +99,16 @@ def label(value: object, where: str) -> str:
     return value
 
 
+def names(value: object, where: str) -> tuple[str, ...]:
+    """Return a tuple of different names."""
+    if isinstance(value, str) or not isinstance(value, Iterable):
+        raise SceneError(f"{where} is {value!r}, expected a list of names")
+    found = tuple(label(name, where) for name in value)
+    if len(set(found)) < len(found):
+        raise SceneError(f"{where} {list(found)} names one twice; drop it")
+    return found
+
+
 def vector(value: object, length: int, where: str) -> Any:
     """Return a tuple of this many finite numbers."""
     if isinstance(value, str | Mapping) or not isinstance(value, Iterable):

@@ -14,6 +14,7 @@ from pbrl_ppl.scene.checks import (
     index_probabilities,
     known_parameters,
     label,
+    names,
     nearest,
     vector,
 )
@@ -50,6 +51,11 @@ class Body:
         Effects of the catalogue that are declared from the start.
     pose : tuple of float, optional
         ``x, y, theta`` (m, m, rad) of a static body; of another, its reference pose.
+    object_class : str, optional
+        Class of the OO-MDP, such as ``chair``; TOML key ``class``. Bodies of one class with equal
+        attributes have one set of Table 1's parameters, under the name `owner`.
+    attributes : tuple of str
+        Attributes of the OO-MDP, such as ``wheels_locked``.
 
     Raises
     ------
@@ -60,6 +66,8 @@ class Body:
     --------
     >>> Body("cart", Shape.box(1.0, 0.6), known={"mass": 2.0}).known
     (('mass', 2.0),)
+    >>> Body("seat 3", Shape.circle(0.3), object_class="chair", attributes=("locked",)).owner
+    'chair (locked)'
     """
 
     name: str
@@ -71,6 +79,8 @@ class Body:
     prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
     effects: tuple[str, ...] = ()
     pose: tuple[float, float, float] | None = None
+    object_class: str | None = None
+    attributes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         label(self.name, "body: name")
@@ -82,13 +92,11 @@ class Body:
         flag(self.wheel, f"{where}: wheel")
         flag(self.static, f"{where}: static")
         object.__setattr__(self, "known", known_parameters(self.known, where))
-        if isinstance(self.effects, str) or not isinstance(self.effects, Iterable):
-            raise SceneError(f"{where}: effects is {self.effects!r}, expected a list of names")
-        effects = tuple(label(effect, f"{where}: effects") for effect in self.effects)
-        if len(set(effects)) < len(effects):
-            raise SceneError(f"{where}: effects {list(effects)} names one twice; drop it")
-        object.__setattr__(self, "effects", effects)
-        object.__setattr__(self, "prior", hyper_parameters(self.prior, where, effects))
+        for key in ("effects", "attributes"):
+            object.__setattr__(self, key, names(getattr(self, key), f"{where}: {key}"))
+        object.__setattr__(self, "prior", hyper_parameters(self.prior, where, self.effects))
+        if self.object_class is not None:
+            label(self.object_class, f"{where}: class")
         for name in dict(self.known).keys() & dict(self.prior).keys():
             raise SceneError(f"{where}: {name} is in both known and prior; drop one of them")
         if self.pose is not None:
@@ -100,6 +108,14 @@ class Body:
         flag(self.kinematic, f"{where}: kinematic")
         if self.kinematic:
             self._check_kinematic(where)
+
+    @property
+    def owner(self) -> str:
+        """What owns its parameters of Table 1: its class with its attributes, or itself."""
+        if self.object_class is None:
+            return self.name
+        listed = ", ".join(sorted(self.attributes))
+        return f"{self.object_class} ({listed})" if listed else self.object_class
 
     def _check_kinematic(self, where: str) -> None:
         """Raise `SceneError` where a kinematic body is given what only dynamic bodies have."""
@@ -208,10 +224,10 @@ class Joint:
             if anchor is not None:
                 object.__setattr__(self, key, vector(anchor, 2, f"{where}: {key}"))
 
-    def _check_bodies(self, names: object) -> tuple[str, str]:
-        if isinstance(names, str) or not isinstance(names, Iterable):
-            raise SceneError(f"joint: bodies is {names!r}, expected two names")
-        bodies = tuple(label(name, "joint: bodies") for name in names)
+    def _check_bodies(self, given: object) -> tuple[str, str]:
+        if isinstance(given, str) or not isinstance(given, Iterable):
+            raise SceneError(f"joint: bodies is {given!r}, expected two names")
+        bodies = tuple(label(name, "joint: bodies") for name in given)
         if len(bodies) != 2:
             raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
         if bodies[0] == bodies[1]:

@@ -26,6 +26,7 @@ from pbrl_ppl.scene.checks import (
     stated_noise,
     vector,
 )
+from pbrl_ppl.scene.classes import check_classes
 from pbrl_ppl.scene.parts import WORLD, Body, Joint, Wall
 from pbrl_ppl.scene.shape import Shape
 
@@ -130,6 +131,7 @@ class Scene:
                     f'body "{body.name}": wheel = true but nothing presses it on the floor; set '
                     "normal_gravity (9.81 in a top view) in [world], or wheel = false"
                 )
+        check_classes(self.bodies)
 
     def _check_joints(self) -> None:
         names = [WORLD, *(body.name for body in self.bodies)]
@@ -195,7 +197,8 @@ class Scene:
         bodies, walls, joints = [], [], []
         for where, table in arrays["body"]:
             with located(where):
-                bodies.append(Body(**{**table, "shape": Shape(**table["shape"])}))
+                given = {("object_class" if k == "class" else k): v for k, v in table.items()}
+                bodies.append(Body(**given | {"shape": Shape(**table["shape"])}))
         for where, table in arrays["wall"]:
             with located(where):
                 walls.append(Wall(table["from"], table["to"]))
@@ -219,6 +222,8 @@ class Scene:
         for body in self.bodies:
             table = dict(vars(body), shape=vars(body.shape), known=dict(body.known))
             table["prior"] = {name: dict(hyper) for name, hyper in body.prior}
+            table["class"] = table.pop("object_class")
+            table["attributes"] = body.attributes or None
             sections.append(("[[body]]", table))
         sections += [("[[wall]]", {"from": w.start, "to": w.end}) for w in self.walls]
         for joint in self.joints:
@@ -235,6 +240,14 @@ class Scene:
     def dynamic(self) -> tuple[Body, ...]:
         """The moving bodies that forces move: those that are not kinematic, in order."""
         return tuple(body for body in self.moving if not body.kinematic)
+
+    @property
+    def owners(self) -> dict[str, tuple[str, ...]]:
+        """Names of the moving bodies by what owns their parameters of Table 1: `Body.owner`."""
+        found: dict[str, tuple[str, ...]] = {}
+        for body in self.moving:
+            found[body.owner] = (*found.get(body.owner, ()), body.name)
+        return found
 
     @property
     def joinable(self) -> tuple[str, ...]:

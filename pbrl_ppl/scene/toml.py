@@ -20,7 +20,10 @@ KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "[noise]": ((), STATE),
     "body": (
         ("name", "shape"),
-        ("wheel", "static", "kinematic", "known", "prior", "effects", "pose"),
+        (
+            *("wheel", "static", "kinematic", "known", "prior", "effects", "pose"),
+            *("class", "attributes"),
+        ),
     ),
     "shape": (("kind",), ("size", "radius", "vertices")),
     "wall": (("from", "to"), ()),

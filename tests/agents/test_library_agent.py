@@ -6,7 +6,7 @@ import pytest
 from pbrl_ppl.agents import LibraryAgent, Task, World, run_episode
 from pbrl_ppl.errors import FitError, ParameterError
 from pbrl_ppl.model import ParameterLibrary
-from pbrl_ppl.planning import ActionSet, Goal
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal
 from pbrl_ppl.scene import Body, Scene, Shape
 
 SCENE = Scene(
@@ -46,6 +46,39 @@ def test_it_finds_which_one_it_pushes() -> None:
     assert agent.probabilities.loc["stool", "light"] == 1.0
     assert agent.estimates["mu_y[cart]"] == 0.4 and agent.estimates["mass[crate]"] == 30.0
     assert 0 < agent.fits < episode.steps  # what is foretold teaches nothing
+
+
+def test_bodies_of_a_class_are_judged_together() -> None:
+    """Four pushes of each stool in noise: one choice, surer by both together than by either."""
+    kind = {"shape": Shape.circle(0.2), "object_class": "stool", "known": CONTACT}
+    bodies = (
+        Body("stool1", **kind, pose=(0.0, 0.0, 0.0)),
+        Body("stool2", **kind, pose=(4.0, 0.0, 0.0)),
+        Body("crate", Shape.box(0.5, 0.5), known=CONTACT, pose=(8.0, 0.0, 0.0)),
+    )
+    scene = Scene(time_step=0.25, normal_gravity=9.81, bodies=bodies)
+    push = ActionSet.box("stool1", forces=(25.0,))
+    task = Task(scene, Goal.of({"stool1": (2.0, 0.0, None)}), push)
+    sets = ParameterLibrary({"light": {"mass": 8.0}, "heavy": {"mass": 30.0}})
+    truth = Dynamics.known(scene, {"mass": [8.0, 30.0]})
+    state = task.start
+    found = {}
+    for chosen in ([0], [0, 1], [1]):
+        agent = LibraryAgent(task, sets, seed=1)
+        for i in chosen:
+            for repeat in range(4):
+                action = np.zeros((3, 3))
+                action[i, repeat % 2] = 25.0
+                after = truth.step(state[None, None], action[None])[0, 0]
+                noise = np.random.default_rng([i, repeat]).normal(0.0, 0.6, after.shape)
+                agent.observe(state, action, np.where(action.any(1)[:, None], after + noise, state))
+        agent.update()
+        assert agent.probabilities.index.tolist() == ["stool", "crate"]
+        assert agent.fits == 1
+        found[tuple(chosen)] = agent.probabilities.loc["stool", "light"]
+    assert 0.5 < min(found[0,], found[1,]) < max(found[0,], found[1,]) < 0.97
+    assert found[0, 1] > max(found[0,], found[1,])
+    assert agent.estimates["mass[stool]"] in (8.0, 30.0)
 
 
 def test_noise_leaves_doubt() -> None:

@@ -64,6 +64,67 @@ def test_python_mappings_equal_toml() -> None:
     assert body == Scene.from_toml(CART).body("cart")
 
 
+def chairs(first: dict, second: dict) -> Scene:
+    """A scene of two boxes."""
+    bodies = tuple(
+        Body(f"chair{i}", **({"shape": Shape.box(1.0, 0.6)} | own))
+        for i, own in enumerate((first, second))
+    )
+    return Scene(time_step=0.1, normal_gravity=9.81, bodies=bodies)
+
+
+def test_class_and_attributes() -> None:
+    text = CART.replace("[[body]]", '[[body]]\nclass = "trolley"\nattributes = ["b", "a"]', 1)
+    scene = Scene.from_toml(text)
+    body = scene.body("cart")
+    assert (body.object_class, body.attributes) == ("trolley", ("b", "a"))
+    assert body.owner == "trolley (a, b)" and Scene.from_toml(CART).body("cart").owner == "cart"
+    assert Scene.from_toml(scene.to_toml()) == scene
+    assert "class" not in Scene.from_toml(CART).to_toml()
+    kind = {"object_class": "chair"}
+    shared = chairs(kind, kind)
+    assert shared.owners == {"chair": ("chair0", "chair1")}
+    assert shared.subset(["chair1"]).owners == {"chair": ("chair1",)}
+    apart = chairs(kind, kind | {"attributes": ["locked"], "known": {"mass": 3.0}})
+    assert apart.owners == {"chair": ("chair0",), "chair (locked)": ("chair1",)}
+    chairs(kind | {"effects": ["linear_drag"]}, kind)  # effects are each body's own
+    chairs(kind | {"shape": Shape.circle(0.3)}, kind)  # without a wheel outlines may differ
+
+
+@pytest.mark.parametrize(
+    ("own", "message"),
+    [
+        ({"known": {"mass": 2.0}}, r"differ in known: \{'mass': 2.0\} and \{\}; make them equal"),
+        ({"wheel": True}, 'shares the parameters of class "chair" with body "chair0".* wheel'),
+        ({"kinematic": True}, "differ in kinematic"),
+        ({"prior": {"mass": {"mu": 2.0}}}, "differ in prior"),
+        ({"object_class": "chair0"}, 'makes "chair0" the owner .* another body'),
+        ({"object_class": "world"}, "give the class another name"),
+        ({"object_class": ""}, "class is '', expected a name"),
+        ({"object_class": 3}, "class is 3, expected text"),
+        ({"attributes": "locked"}, "attributes is 'locked', expected a list"),
+        ({"attributes": ["a", "a"]}, "names one twice"),
+        ({"object_class": "chair (b)", "attributes": ["a"], "known": {}}, None),
+    ],
+)
+def test_bodies_of_a_class_must_agree(own: dict, message: str | None) -> None:
+    kind = {"object_class": "chair"}
+    if message is None:
+        chairs(kind, kind | own)
+        return
+    with pytest.raises(SceneError, match=message):
+        chairs(kind, kind | own)
+
+
+def test_wheels_of_a_class_need_one_outline() -> None:
+    wheeled = {"object_class": "chair", "wheel": True}
+    with pytest.raises(SceneError, match="differ in shape"):
+        chairs(wheeled, wheeled | {"shape": Shape.circle(0.3)})
+    odd = {"object_class": "chair (a)"}, {"object_class": "chair", "attributes": ["a"]}
+    with pytest.raises(SceneError, match="differ in object_class"):
+        chairs(*odd)
+
+
 @pytest.mark.skipif(not RECORDED.is_dir(), reason="../shared/data is not beside the repository")
 def test_reads_every_scene_of_the_data() -> None:
     paths = sorted(RECORDED.rglob("scene.toml"))
