@@ -32,6 +32,8 @@ from .model import Transition as Transition
 from .modes import joint_probabilities as joint_probabilities
 from .oomdp import LWR as LWR
 from .oomdp import OOLWR as OOLWR
+from .oomdp import Attributes as Attributes
+from .oomdp import Pushed as Pushed
 from .oomdp import SectorContacts as SectorContacts
 from .parameters import Prior as Prior
 from .physics import Simulator as Simulator

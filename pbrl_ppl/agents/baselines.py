@@ -41,6 +41,10 @@ class _RegressionAgent(Agent):
 class OOLWRAgent(_RegressionAgent):
     """Agent with object-oriented LWR (section 3.1).
 
+    Bodies of one class share their models, and a condition is which sectors are in contact, as the
+    paper has it. ``learner={"relations": (SectorContacts(by_object=True),)}`` tells apart with
+    what, and ``learner={"share_classes": False}`` learns each body alone.
+
     Parameters
     ----------
     task : Task

@@ -1,7 +1,17 @@
-"""Object-oriented baselines: contact predicates, conditions, LWR and OO-LWR."""
+"""Object-oriented baselines: relations, conditions, LWR and OO-LWR."""
 
-from pbrl_ppl.oomdp.contacts import Condition, SectorContacts
+from pbrl_ppl.oomdp.contacts import SectorContacts
 from pbrl_ppl.oomdp.lwr import LWR, OOLWR
 from pbrl_ppl.oomdp.regression import Regression
+from pbrl_ppl.oomdp.relations import Attributes, Condition, Pushed, Relation
 
-__all__ = ["LWR", "OOLWR", "Condition", "Regression", "SectorContacts"]
+__all__ = [
+    "LWR",
+    "OOLWR",
+    "Attributes",
+    "Condition",
+    "Pushed",
+    "Regression",
+    "Relation",
+    "SectorContacts",
+]

@@ -1,8 +1,9 @@
-"""Sector contact predicates, and the condition that they make: Cond(s, a)."""
+"""Sector contact predicates, by ray casting."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,19 +11,20 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import FitError, HistoryError
 from pbrl_ppl.oomdp.frames import turned
 from pbrl_ppl.oomdp.rays import spans
+from pbrl_ppl.oomdp.relations import Condition, condition
 from pbrl_ppl.physics import Scenery, circles, scenery
 from pbrl_ppl.scene import WORLD, Scene
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-#: A body's condition: what touches it, and in which of its sectors. Nothing touches a free body.
-Condition = frozenset[tuple[str, int]]
 
-
+@final
 @dataclass(frozen=True)
 class SectorContacts:
     """Contact predicates of sectors in a body's frame, by ray casting (section 3.1.1, Fig. 1).
+
+    A :class:`pbrl_ppl.oomdp.Relation`. Walls and static bodies count as moving bodies do.
 
     Rays go out from the body's origin. One is in contact with an object if, along it, the two
     solids are no farther apart than the collision radius; a sector is if any of its rays is. So
@@ -47,7 +49,8 @@ class SectorContacts:
         Collision radius epsilon_c (m).
     by_object : bool
         Whether it is told apart what touches a sector: other moving bodies, static ones, walls
-        (all of them are one object, ``world``). Otherwise there is one object, ``anything``.
+        (all of them are one object, ``world``). The paper's conditions say which sectors are in
+        contact, and not with what: there is one object, ``anything``.
 
     Raises
     ------
@@ -65,13 +68,15 @@ class SectorContacts:
     >>> scene = Scene(time_step=0.1, bodies=(Body("cart", Shape.box(1.0, 0.6)),), walls=(wall,))
     >>> contacts = SectorContacts()
     >>> contacts.conditions(scene, np.zeros((1, 1, 6)))  # 0.1 m in front of it
-    [[frozenset({('world', 0)})]]
+    [[frozenset({'contact_0'})]]
+    >>> SectorContacts(by_object=True).conditions(scene, np.zeros((1, 1, 6)))
+    [[frozenset({'contact_0(world)'})]]
     """
 
     sectors: int = 4
     rays: int = 10
     radius: float = 0.2
-    by_object: bool = True
+    by_object: bool = False
 
     def __post_init__(self) -> None:
         for name in ("sectors", "rays"):
@@ -89,6 +94,14 @@ class SectorContacts:
         walls = (WORLD,) if scene.walls else ()
         return (*(body.name for body in scene.moving), *walls, *static)
 
+    def labels(self, scene: Scene) -> tuple[str, ...]:
+        """Names of a body's predicates: ``contact_0``, or ``contact_0(world)`` by object."""
+        return tuple(
+            f"contact_{sector}" + f"({name})" * self.by_object
+            for name in self.objects(scene)
+            for sector in range(self.sectors)
+        )
+
     @property
     def directions(self) -> Array:
         """Directions of the rays in the body's frame, sector by sector, shape (ray, 2)."""
@@ -96,7 +109,7 @@ class SectorContacts:
         angle = 2 * np.pi * middle / (self.sectors * self.rays)
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
-    def of(self, scene: Scene, states: Array) -> Flags:
+    def of(self, scene: Scene, states: Array, wrenches: Array | None = None) -> Flags:
         """Predicates contact_theta(obj) of every moving body.
 
         Parameters
@@ -105,6 +118,8 @@ class SectorContacts:
             Shapes, walls, static bodies and joints.
         states : ndarray
             States or poses, shape (n, body, 6 or 3), SI units, bodies as in ``scene.moving``.
+        wrenches : ndarray, optional
+            No matter: contacts do not depend on the action.
 
         Returns
         -------
@@ -144,13 +159,13 @@ class SectorContacts:
         return flags
 
     def conditions(self, scene: Scene, states: Array) -> list[list[Condition]]:
-        """Cond(s, a) of every moving body in each state: predicates that hold; contacts need no a.
+        """Contact predicates of every moving body that hold in each state.
 
         Parameters and errors as of :meth:`of`. The outer list is over states, the inner one over
         bodies.
         """
-        names, flags = self.objects(scene), self.of(scene, states)
-        return [[condition(body, names) for body in state] for state in flags]
+        labels, flags = self.labels(scene), self.of(scene, states)
+        return [[condition(body, labels) for body in state] for state in flags]
 
     def _meet(self, world: Scenery, body: int, other: int, poses: Array) -> Flags:
         """Which sectors of a body are in contact with another solid, shape (n, sector)."""
@@ -167,8 +182,3 @@ class SectorContacts:
                 gap = np.maximum(its[..., 0] - mine[..., 1], mine[..., 0] - its[..., 1])
                 touched |= gap <= self.radius
         return np.asarray(touched.reshape(-1, self.sectors, self.rays).any(axis=-1))
-
-
-def condition(flags: Flags, objects: tuple[str, ...]) -> Condition:
-    """A body's condition, from its predicates of shape (object, sector)."""
-    return frozenset((objects[i], int(sector)) for i, sector in np.argwhere(flags))

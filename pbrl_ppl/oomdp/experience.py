@@ -1,4 +1,4 @@
-"""Transitions of one body by condition, and a regression for each condition."""
+"""Transitions of one body, or of a class, by condition, and a regression for each condition."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ Flags = NDArray[np.bool_]
 
 
 class Experience:
-    """Observed transitions of one body, assigned to effect models by condition (section 3.1.3).
+    """Observed transitions of a body or a class, assigned to effect models by condition.
+
+    See section 3.1.3 of the paper.
 
     Distances are in units of each input's standard deviation over all conditions, so that one with
     few transitions measures them as the others do.

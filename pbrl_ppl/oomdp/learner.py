@@ -1,4 +1,4 @@
-"""A learner of transitions that a planner can plan with: one regression a body and condition."""
+"""A learner of transitions to plan with: one regression for each body or class and condition."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _DIVERGED = 1e6
 
 
 class Learner(ABC):
-    """Independent single-body models of transitions, learned as they are observed.
+    """Independent models of transitions of single bodies, learned as they are observed.
 
     A :class:`pbrl_ppl.planning.TransitionModel`: :func:`pbrl_ppl.plan` plans with it.
 
@@ -43,6 +43,8 @@ class Learner(ABC):
         data, so that lambda has no unit; the paper names none. Otherwise in SI units.
     pose_invariant : bool
         Whether a body's transitions are learned in its own frame, without its pose.
+    share_classes : bool
+        Whether bodies of one class share their models.
 
     Raises
     ------
@@ -64,6 +66,7 @@ class Learner(ABC):
         ridge: float,
         standardise: bool,
         pose_invariant: bool,
+        share_classes: bool,
     ) -> None:
         if isinstance(neighbours, bool) or not isinstance(neighbours, int) or neighbours < 1:
             raise FitError(f"LWR: neighbours is {neighbours!r}, expected a whole number from 1 up")
@@ -72,16 +75,22 @@ class Learner(ABC):
                 raise FitError(f"LWR: {name} is {value!r}, expected a number above 0")
         self.scene, self.pose_invariant = scene, pose_invariant
         options = {"neighbours": neighbours, "bandwidth": bandwidth, "ridge": ridge}
-        self._own = {
-            i: Experience(standardise=standardise, options=options)
-            for i, body in enumerate(scene.moving)
-            if not body.kinematic
-        }
+        self._own: dict[int, Experience] = {}
+        of_class: dict[str, Experience] = {}
+        for i, body in enumerate(scene.moving):
+            if not body.kinematic:
+                own = Experience(standardise=standardise, options=options)
+                if share_classes and body.object_class is not None:
+                    own = of_class.setdefault(body.object_class, own)
+                self._own[i] = own
         self.transitions = 0
 
     @abstractmethod
-    def predicates(self, states: Array) -> Flags:
-        """Predicates of each moving body in states (n, body, 6), shape (n, body, ...)."""
+    def predicates(self, states: Array, wrenches: Array) -> Flags:
+        """Predicates of each moving body in states (n, body, 6) under wrenches (n, body, 3).
+
+        Shape (n, body, predicate).
+        """
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -129,7 +138,7 @@ class Learner(ABC):
                 " and next states, expected as many of each"
             )
         begin, wrench, after = arrays
-        flags = self.predicates(begin)
+        flags = self.predicates(begin, wrench)
         for i, own in self._own.items():
             x = inputs(begin[:, i], wrench[:, i], pose_invariant=self.pose_invariant)
             y = displacements(begin[:, i], after[:, i], pose_invariant=self.pose_invariant)
@@ -246,7 +255,7 @@ class Learner(ABC):
             )
         rows = np.flatnonzero(np.asarray(np.isfinite(states[0]).all(axis=(1, 2))))
         begin, pushes = states[0, rows], wrenches[rows]
-        flags = self.predicates(begin)
+        flags = self.predicates(begin, pushes)
         out = np.full_like(states[0], np.nan)
         for i in range(k):
             own, state, push = self._own.get(i), begin[:, i], pushes[:, i]
@@ -260,7 +269,7 @@ class Learner(ABC):
         return np.asarray(out[None])
 
     def experience(self, body: str) -> Experience:
-        """What was observed of a body.
+        """What was observed of a body, and of those of its class where they share models.
 
         Raises
         ------

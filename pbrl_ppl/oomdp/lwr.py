@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.oomdp.contacts import Condition, SectorContacts, condition
+from pbrl_ppl.oomdp.contacts import SectorContacts
 from pbrl_ppl.oomdp.experience import ungrouped
 from pbrl_ppl.oomdp.learner import Learner
+from pbrl_ppl.oomdp.relations import Attributes, Condition, Relation, all_labels, condition, flat
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
@@ -73,17 +74,20 @@ class LWR(Learner):
     ) -> None:
         super().__init__(
             scene, neighbours=neighbours, bandwidth=bandwidth, ridge=ridge,
-            standardise=standardise, pose_invariant=pose_invariant,
+            standardise=standardise, pose_invariant=pose_invariant, share_classes=False,
         )  # fmt: skip
 
-    def predicates(self, states: Array) -> Flags:
+    def predicates(self, states: Array, wrenches: Array) -> Flags:
         """None, shape (n, body, 0)."""
         return np.zeros((*states.shape[:2], 0), dtype=bool)
 
 
 @final
 class OOLWR(Learner):
-    """Object-oriented LWR: a pose-invariant model for each body in each condition (section 3.1).
+    """Object-oriented LWR: a pose-invariant model for each class in each condition (section 3.1).
+
+    A body without a class is one by itself. A condition, Cond(s, a), is the set of the predicates
+    that hold for the body.
 
     Where a condition was never observed there is no model, and :meth:`step` gives NaN, through
     which no plan leads. The paper does not say what its agent does there; it says that it had to
@@ -92,16 +96,20 @@ class OOLWR(Learner):
     Parameters
     ----------
     scene : Scene
-        Orders the bodies, and says what they may touch.
-    contacts : SectorContacts, optional
-        Predicates that make the conditions; Table 2's by default.
+        Orders the bodies; says their classes and attributes, and what they may touch.
+    relations : sequence of Relation, optional
+        Predicates that make the conditions: :class:`SectorContacts`, :class:`Pushed`,
+        :class:`Attributes`, or your own. By default the paper's sector contacts, and the attributes
+        if bodies of the scene have any.
+    share_classes : bool
+        Whether bodies of one class share their models; otherwise each has its own.
     neighbours, bandwidth, ridge, standardise
         As of :class:`LWR`.
 
     Raises
     ------
     FitError
-        As :class:`LWR`.
+        As :class:`LWR`, or if one of the relations is none, or two predicates have one name.
 
     References
     ----------
@@ -115,7 +123,7 @@ class OOLWR(Learner):
     >>> model = OOLWR(scene)
     >>> model.observe([[0, 0, 0, 1, 0, 0]], [[0, 0, 0]], [[0.1, 0, 0, 0, 0, 0]])  # stopped
     >>> model.conditions("puck")
-    {frozenset({('world', 0)}): 1}
+    {frozenset({'contact_0'}): 1}
     >>> bool(np.isnan(model.step(np.full((1, 1, 1, 6), -5.0), np.zeros((1, 1, 3)))).all())
     True
     """
@@ -124,7 +132,8 @@ class OOLWR(Learner):
         self,
         scene: Scene,
         *,
-        contacts: SectorContacts | None = None,
+        relations: Sequence[Relation] | None = None,
+        share_classes: bool = True,
         neighbours: int = 1000,
         bandwidth: float = 1.5,
         ridge: float = 1e-3,
@@ -132,25 +141,31 @@ class OOLWR(Learner):
     ) -> None:
         super().__init__(
             scene, neighbours=neighbours, bandwidth=bandwidth, ridge=ridge,
-            standardise=standardise, pose_invariant=True,
+            standardise=standardise, pose_invariant=True, share_classes=share_classes,
         )  # fmt: skip
-        self.contacts = SectorContacts() if contacts is None else contacts
+        if relations is None:
+            attributes = (Attributes(),) * any(body.attributes for body in scene.moving)
+            relations = (SectorContacts(), *attributes)
+        self.relations = tuple(relations)
+        self.labels = all_labels(self.relations, scene)
 
-    def predicates(self, states: Array) -> Flags:
-        """Contact predicates, shape (n, body, object, sector)."""
-        return self.contacts.of(self.scene, states)
+    def predicates(self, states: Array, wrenches: Array) -> Flags:
+        """Predicates as :attr:`labels` names them, shape (n, body, predicate)."""
+        every = [flat(relation.of(self.scene, states, wrenches)) for relation in self.relations]
+        none = np.zeros((*states.shape[:2], 0), dtype=bool)
+        return np.concatenate([none, *every], axis=-1)
 
     def conditions(self, body: str) -> Mapping[Condition, int]:
-        """Conditions in which a body was observed, and how often: each has a model.
+        """Conditions in which a body, or one of its class, was observed, and how often.
+
+        Each has a model.
 
         Raises
         ------
         FitError
             If the scene has no such body that forces move.
         """
-        names = self.contacts.objects(self.scene)
-        size = len(names) * self.contacts.sectors
         return {
-            condition(ungrouped(key, size).reshape(len(names), -1), names): count
+            condition(ungrouped(key, len(self.labels)), self.labels): count
             for key, count in self.experience(body).counts.items()
         }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Wedge
@@ -60,11 +62,13 @@ def draw_contacts(
         raise SceneError(f"no moving body is named {body!r}; there are {', '.join(names)}")
     i = names.index(body)
     states = np.asarray(states, dtype=float)
-    (conditions,) = contacts.conditions(scene, states[None])
+    contacts = replace(contacts, by_object=True)  # for the title
+    objects, flags = contacts.objects(scene), contacts.of(scene, states[None])[0, i]
+    met = [(objects[j], int(sector)) for j, sector in np.argwhere(flags)]
     draw_scene(axes, scene, states)
     x, y, turn = states[i, :3]
     reach = scene.moving[i].shape.bounding_radius + contacts.radius
-    touched = {sector for _, sector in conditions[i]}
+    touched = {sector for _, sector in met}
     width = 360.0 / contacts.sectors
     for sector in range(contacts.sectors):
         middle = np.degrees(turn) + width * sector
@@ -85,5 +89,5 @@ def draw_contacts(
     for dx, dy in ends:
         axes.plot([x, x + dx], [y, y + dy], color="black", linewidth=0.4, alpha=0.6, zorder=2.6)
     axes.set(xlim=(x - 1.5 * reach, x + 1.5 * reach), ylim=(y - 1.5 * reach, y + 1.5 * reach))
-    said = ", ".join(f"{name} in sector {sector}" for name, sector in sorted(conditions[i]))
+    said = ", ".join(f"{name} in sector {sector}" for name, sector in sorted(met))
     axes.set_title(f"{body}: {said or 'nothing in contact'}")

@@ -10,7 +10,7 @@ from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 BOX = Shape.box(0.9, 0.5)
 #: Concave: a corner sofa.
 SOFA = Shape.polygon([(-1.0, -0.6), (1.4, -0.6), (1.4, 0.2), (-0.2, 0.2), (-0.2, 1.0), (-1.0, 1.0)])
-CONTACTS = SectorContacts()
+CONTACTS = SectorContacts(by_object=True)
 
 
 def pair(shape: Shape = BOX, other: Shape | None = None) -> Scene:
@@ -133,9 +133,19 @@ def test_objects() -> None:
     assert flags.shape == (200, 3, 5, 4)
     assert flags.any(axis=(0, 3)).sum() == 3 * 5 - 3  # a body never touches itself
     assert not flags[:, [0, 1, 2], [0, 1, 2]].any()
-    merged = SectorContacts(by_object=False)
+    merged = SectorContacts()  # as the paper has it: which sectors, not with what
     np.testing.assert_array_equal(merged.of(scene, at)[:, :, 0], flags.any(axis=2))
     assert merged.objects(scene) == ("anything",)
+    assert merged.labels(scene) == ("contact_0", "contact_1", "contact_2", "contact_3")
+    assert CONTACTS.labels(scene)[3 * 4 + 1] == "contact_1(world)"
+
+
+def test_walls_and_static_bodies_count() -> None:
+    """Without telling them apart, too."""
+    wall, post = Wall((0.5, -2.0), (0.5, 2.0)), Body("post", BOX, static=True, pose=(0.9, 0, 0))
+    alone = Scene(time_step=0.1, bodies=(Body("body", BOX),))
+    for scene in (alone.replace(walls=(wall,)), alone.replace(bodies=(*alone.bodies, post))):
+        assert SectorContacts().conditions(scene, poses((0, 0, 0))) == [[{"contact_0"}]]
 
 
 @pytest.mark.parametrize(("shift", "turn"), [((5.0, -3.0), 0.0), ((0, 0), 2.1), ((-40, 7), -0.6)])
@@ -213,7 +223,7 @@ def test_conditions_are_values() -> None:
     for state in range(len(at)):
         for body in range(3):
             expected = {
-                (name, sector)
+                f"contact_{sector}({name})"
                 for i, name in enumerate(names)
                 for sector in range(4)
                 if flags[state, body, i, sector]

@@ -289,8 +289,8 @@ def test_bad_settings(wrong) -> None:
 
 def test_paper_s_settings() -> None:
     """Table 2."""
-    contacts = OOLWR(FREE).contacts
-    assert contacts == SectorContacts(sectors=4, rays=10, radius=0.2)
+    (contacts,) = OOLWR(FREE).relations
+    assert contacts == SectorContacts(sectors=4, rays=10, radius=0.2, by_object=False)
 
 
 def test_true_dynamics_are_a_transition_model() -> None:

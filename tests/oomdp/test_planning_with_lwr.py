@@ -55,7 +55,7 @@ def test_unknown_contacts_bar_the_way(free) -> None:
     states = found.predicted["predicted"].isel(draw=0).to_numpy()
     assert np.isfinite(states).all()
     # every interval but the last begins where it has a model
-    assert not model.contacts.of(ROOM, states[:-1]).any()
+    assert not model.relations[0].of(ROOM, states[:-1]).any()
 
 
 def test_acts_on_it(free) -> None:
