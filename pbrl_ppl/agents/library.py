@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from typing import Any, ClassVar, final
 
@@ -11,12 +12,14 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.task import Task
-from pbrl_ppl.errors import FitError
+from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import Noise, ParameterLibrary, Problem, build_layout
+from pbrl_ppl.model import Noise, ParameterLibrary, Problem, build_layout, build_model
 from pbrl_ppl.modes import choose_from_library
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import Dynamics
+from pbrl_ppl.posterior import group
+from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import THETA, wrapped
 
@@ -36,7 +39,8 @@ class LibraryAgent(Agent):
     A body is judged by the transitions in which it moves or is pushed and touches no other moving
     one, each by itself with a noise of its own: given the noise, bodies apart are independent.
     Bodies of one class with equal attributes share parameters, and so one choice and noise. The
-    paper walks among the choices; here the sum over them is exact, and as many draws are kept. The
+    paper walks among the choices; here the sum over them is exact, and as many draws are kept, or
+    with ``method="paper"`` PyMC walks on the schedule of Table 2, which takes seconds a body. The
     most frequent choice (MAP) is planned with; a body of which nothing was seen is like a set drawn
     from the prior.
 
@@ -46,6 +50,8 @@ class LibraryAgent(Agent):
         Scene, goal and actions. The scene declares no effects.
     library : ParameterLibrary
         The sets, and their probabilities.
+    method : str
+        ``exact``: the sum over the sets; ``paper``: Metropolis, as of :func:`pbrl_ppl.fit`.
     **options
         As of :class:`Agent`.
 
@@ -60,6 +66,8 @@ class LibraryAgent(Agent):
         If the scene declares effects, or has a kinematic body.
     ParameterError
         If the library does not fit the scene's bodies.
+    ValueError
+        If ``method`` is neither.
 
     References
     ----------
@@ -68,8 +76,13 @@ class LibraryAgent(Agent):
 
     name: ClassVar[str] = "PBRL, categorical"
 
-    def __init__(self, task: Task, library: ParameterLibrary, **options: Any) -> None:
+    def __init__(
+        self, task: Task, library: ParameterLibrary, *, method: str = "exact", **options: Any
+    ) -> None:
+        if method not in ("exact", "paper"):
+            raise ValueError(f"method is {method!r}, expected 'exact' or 'paper'")
         super().__init__(task, **options)
+        self.method = method
         scene = task.scene
         if any(body.effects or body.kinematic for body in scene.bodies):
             raise FitError("PBRL: the scene has effects or a kinematic body, which no set is for")
@@ -163,7 +176,13 @@ class LibraryAgent(Agent):
         history = from_segments(scene, state, action[:, None], after[:, None])
         among = _of_one(self.library, scene, name)
         problem = Problem.of(scene, history, noise=Noise(scalar=True), library=among)
-        _, _, index, _ = choose_from_library(problem, _DRAWS, 1, self.seed)
+        if self.method == "paper":
+            with warnings.catch_warnings():  # of one chain, as the paper has it
+                warnings.simplefilter("ignore", ConvergenceWarning)
+                idata = fit(build_model(problem), method="paper", seed=self.seed, progress=False)
+            index = group(idata, "posterior")["library_index"].to_numpy()
+        else:
+            _, _, index, _, _ = choose_from_library(problem, _DRAWS, 1, self.seed)
         share = np.bincount(index[..., 0].ravel(), minlength=len(among.names)) / _DRAWS
         found = dict(zip(among.names, share.tolist(), strict=True))
         self._probability[name] = np.array([found.get(each, 0.0) for each in self.library.names])

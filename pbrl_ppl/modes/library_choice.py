@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import minimize
-from scipy.special import logsumexp
+from scipy.special import logsumexp, softmax
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.model import Observations, Problem, estimate_sigma, log_density, log_noise_prior
@@ -42,7 +42,7 @@ class _Combinations:
             raise FitError(
                 f"fit: {', '.join(bodies)} meet in this history, so that {count} combinations of"
                 f" parameter sets are to be summed over; give some probability 0 for some bodies,"
-                " record the bodies apart, or sample the model with pm.sample"
+                " record the bodies apart, or walk among them with method='paper'"
             )
         self.observations = Observations(measured, problem.observations.columns)
         self.indices = np.array(list(product(*possible)), dtype=np.intp).reshape(count, -1)
@@ -72,7 +72,7 @@ class _Combinations:
 
 def choose_from_library(
     problem: Problem, draws: int, chains: int, seed: int
-) -> tuple[Array, Array, Ints, Array]:
+) -> tuple[Array, Array, Ints, Array, Ints]:
     """Draw sigma from its marginal posterior, and the parameter sets given sigma.
 
     Given sigma, bodies that have nothing to do with each other are independent, and the sum over
@@ -98,6 +98,9 @@ def choose_from_library(
         Of the parameter set in the library, shape (chain, draw, owner), as in `Scene.owners`.
     accepted : ndarray
         Share of the proposals of sigma that were, shape (chain, draw).
+    best : ndarray of int
+        Most probable choice, sigma summed out by the draws, shape (owner,): of bodies that meet,
+        their most probable combination.
 
     Raises
     ------
@@ -129,6 +132,7 @@ def choose_from_library(
     proposal = stats.multivariate_t(found, np.diag(shape), df=_TAIL)
     n = draws * _THIN + _BURN
     sigmas, chosen, accepted = [], [], []
+    shares = [np.zeros(len(own.indices)) for own in parts]
     for _ in range(chains):
         x = proposal.rvs(n, random_state=rng).reshape(n, -1)
         log_weight = density(x) - np.atleast_1d(proposal.logpdf(x))
@@ -143,8 +147,9 @@ def choose_from_library(
         log_sigma = x[kept[drawn]]
         sigmas.append(np.exp(log_sigma))
         index = np.zeros((draws, len(names)), dtype=np.intp)
-        for own, part in zip(parts, problem.simulator.parts, strict=True):
+        for own, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
             joint = own.log_joint(np.exp(log_sigma) * ones, problem.nu())
+            share += softmax(joint, axis=1).sum(axis=0)
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
             columns = [names.index(owner) for owner in part.simulator.scene.owners]
@@ -154,7 +159,11 @@ def choose_from_library(
     indices = np.stack(chosen)
     of = indices[..., [names.index(owner) for owner in owners]]
     phi = table[np.arange(len(owners)), of]
-    return phi, np.stack(sigmas), indices, np.stack(accepted)
+    best = np.zeros(len(names), dtype=np.intp)
+    for own, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
+        columns = [names.index(owner) for owner in part.simulator.scene.owners]
+        best[columns] = own.indices[share.argmax()]
+    return phi, np.stack(sigmas), indices, np.stack(accepted), best
 
 
 def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> Array:

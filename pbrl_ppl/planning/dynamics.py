@@ -16,7 +16,7 @@ from pbrl_ppl.physics import Simulator, after_recording
 from pbrl_ppl.planning.noise import StepNoise, step_noise
 from pbrl_ppl.planning.transition_model import rollout
 from pbrl_ppl.posterior import draws as all_draws
-from pbrl_ppl.posterior import group, known_effects, parameter_draws, problem_of
+from pbrl_ppl.posterior import group, known_effects, parameter_draws, problem_of, stored_mode
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH
 
@@ -89,8 +89,8 @@ class Dynamics:
         idata : InferenceData or DataTree
             As made by :func:`pbrl_ppl.fit`, or loaded.
         draws : int, optional
-            Chosen at random without replacement; without it, the single one of highest posterior
-            density (MAP), by :func:`pbrl_ppl.model.log_posterior`.
+            Chosen at random without replacement; without it, the posterior's mode (MAP) as the
+            posterior holds it, or else the draw of highest :func:`pbrl_ppl.model.log_posterior`.
         seed : int
             Of the choice.
         effects : iterable of Effect
@@ -106,7 +106,10 @@ class Dynamics:
         effects = known_effects(idata, effects)
         problem = problem_of(idata, effects)  # all of its effects are declared in its scene
         phi, sigma = parameter_draws(problem, idata)
-        if draws is None:
+        mode = stored_mode(problem, idata) if draws is None else None
+        if mode is not None:
+            phi, sigma, chosen = mode.phi[None], mode.sigma[None], np.array([0])
+        elif draws is None:
             likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
             known = likelihood.transpose("chain", "draw").to_numpy().ravel()
             choice = None

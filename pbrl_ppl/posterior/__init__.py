@@ -35,19 +35,23 @@ from pbrl_ppl.posterior.store import (
     scene_of,
     smoothed,
 )
+from pbrl_ppl.posterior.stored_mode import MODE, Point, climbed_text, stored_mode
 from pbrl_ppl.posterior.updated_prior import moment_matched, updated_scene
 
 __all__ = [
     "DATATREE",
     "HDI_PROB",
     "MIN_ESS",
+    "MODE",
     "Comparison",
     "Identifiability",
+    "Point",
     "both_places",
     "both_recordings",
     "by_number",
     "by_trajectory",
     "checked",
+    "climbed_text",
     "compare",
     "complete",
     "convergence",
@@ -80,6 +84,7 @@ __all__ = [
     "scene_of",
     "separate",
     "smoothed",
+    "stored_mode",
     "uninformed",
     "updated_scene",
     "versions",

@@ -34,6 +34,7 @@ from pbrl_ppl.posterior.store import (
     group,
     groups,
 )
+from pbrl_ppl.posterior.stored_mode import MODE, Point, mode_text
 
 Array = NDArray[np.float64]
 
@@ -54,6 +55,7 @@ def complete(
     seed: int,
     method: str,
     asked: tuple[int, int] | None = None,
+    mode: Point | None = None,
 ) -> Any:
     """Add to a trace what the posterior file must hold: likelihood, predictions, prior, origin.
 
@@ -69,6 +71,8 @@ def complete(
         The sampler's name.
     asked : tuple of int, optional
         Draws a chain, and chains, that were asked for, where an interrupt left fewer.
+    mode : Point, optional
+        The posterior's mode, to be stored.
 
     Returns
     -------
@@ -118,6 +122,8 @@ def complete(
     idata = placed(idata, places(problem.segments))
     if ATTRIBUTE in trace.attrs:
         idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
+    if mode is not None:
+        idata.attrs[MODE] = mode_text(problem, mode, phi, sigma, likelihood.sum(axis=1))
     if problem.trajectories is not None and len(phi) > 1:
         idata.attrs[LINEARISATION] = json.dumps(linearisation(problem, phi, sigma))
     return checked(problem, idata, asked)

@@ -45,10 +45,10 @@ def checked_problem(
             " with as resume="
         )
     given = "start" if start is not None else "resume" if resume is not None else None
-    if problem.library is not None and (method != DEFAULT or given):
+    if problem.library is not None and (method not in (DEFAULT, "paper") or given):
         raise FitError(
-            "fit: a model with a library is summed over exactly; leave out method=, start= and"
-            " resume="
+            "fit: a model with a library is summed over exactly, or walked over by method='paper';"
+            " leave out method= or use that, and leave out start= and resume="
         )
     if problem.layout.discrete.any():
         if method == "smc":

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import ATTRIBUTE, Mode, Pair, Weighed, index_law, stored
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
-from pbrl_ppl.posterior import from_groups, group, groups
+from pbrl_ppl.posterior import Point, from_groups, group, groups
 from pbrl_ppl.sampling.traces import posterior_dataset
 
 Array = NDArray[np.float64]
@@ -86,6 +86,30 @@ def mix(
     return from_groups(data, {ATTRIBUTE: stored(found)})
 
 
+def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:
+    """The mode of the most probable configuration, as a point of the whole model.
+
+    Anchors of joints that join nothing are at the centre of their prior.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of a scene with joints of unknown bodies.
+    found : sequence of Weighed
+        Its configurations.
+    """
+    best = max(found, key=lambda weighed: weighed.probability)
+    layout = problem.layout
+    own = dict(zip(best.mode.problem.layout.labels, best.mode.phi.tolist(), strict=True))
+    phi = np.array([own.get(label, np.nan) for label in layout.labels])[None]
+    for joint, pair in best.configuration.pairs:
+        a, b = (layout.priors[layout.index(name, joint)].probabilities for name in JOINT_INDICES)
+        law = index_law(pair, problem.scene, a, b)
+        _put_indices(problem, phi, np.array([True]), joint, np.array([law.argmax()]))
+    _fill_anchors(problem, phi, None)
+    return Point(phi[0], best.mode.sigma)
+
+
 def allocate(probability: Array, n: int) -> Labels:
     """Share ``n`` draws out by probability, to within one draw each (largest remainders).
 
@@ -138,19 +162,31 @@ def _set_indices(
     rng: np.random.Generator,
 ) -> None:
     """Draw i_a and i_b of what a joint joins, and turn the anchors round with them, in place."""
+    places = (problem.layout.index(name, joint) for name in JOINT_INDICES)
+    law = index_law(pair, problem.scene,
+                    *(problem.layout.priors[place].probabilities for place in places))  # fmt: skip
+    drawn = rng.choice(law.size, size=int(here.sum()), p=law.ravel())
+    _put_indices(problem, phi, here, joint, drawn)
+
+
+def _put_indices(
+    problem: Problem, phi: Array, here: NDArray[np.bool_], joint: str, chosen: Labels
+) -> None:
+    """Put places in the flat table of (i_a, i_b) into phi, and turn the anchors, in place."""
     layout, own = problem.layout, phi[here]
     a, b = (layout.index(name, joint) for name in JOINT_INDICES)
-    law = index_law(pair, problem.scene, *(layout.priors[place].probabilities for place in (a, b)))
-    drawn = rng.choice(law.size, size=len(own), p=law.ravel())
-    own[:, a], own[:, b] = np.divmod(drawn, len(law))
+    own[:, a], own[:, b] = np.divmod(chosen, len(problem.scene.joinable))
     turned = own[:, a] > own[:, b]
     anchors = np.array([layout.index(name, joint) for name in JOINT_ANCHORS])
     own[:, anchors] = np.where(turned[:, None], own[:, np.roll(anchors, 2)], own[:, anchors])
     phi[here] = own
 
 
-def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator) -> None:
-    """Draw the anchors of joints that join nothing from their prior, given the index, in place."""
+def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator | None) -> None:
+    """Draw the anchors of joints that join nothing from their prior, given the index, in place.
+
+    At the prior's centre without a generator.
+    """
     layout = problem.layout
     for block in layout.blocks:
         for owner, conditional in zip(block.owners, block.conditional, strict=False):
@@ -161,7 +197,8 @@ def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator) -> Non
             index = phi[..., layout.index(f"i_{block.name[0]}", owner)]
             for i, prior in enumerate(conditional):
                 here = missing & (index == i)
-                column[here] = prior.sample(rng, int(here.sum()))
+                n = int(here.sum())
+                column[here] = prior.centre if rng is None else prior.sample(rng, n)
 
 
 def _stats(traces: Mapping[int, Any], label: Labels) -> xr.Dataset:

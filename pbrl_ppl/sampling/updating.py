@@ -16,12 +16,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import RefitWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.model import (
-    Problem,
-    along_trajectories,
-    build_model,
-    single_transitions,
-)
+from pbrl_ppl.model import Problem, along_trajectories, build_model, single_transitions
 from pbrl_ppl.posterior import (
     MIN_ESS,
     both_places,
@@ -51,6 +46,7 @@ from pbrl_ppl.sampling.update_checks import (
     judgement,
     more_noise,
 )
+from pbrl_ppl.sampling.updated_mode import climb_from
 
 Array = NDArray[np.float64]
 
@@ -106,6 +102,8 @@ def update(
         ``attrs``, ``updates`` lists (as JSON) for each update the transitions, what the weights
         were worth (``share``), ``pareto_k``, and what was done: ``reweighted``, ``moved`` or
         ``refitted``. The group ``before_updates`` holds the draws that the next update starts from.
+        The stored mode is climbed to anew from the old one under all data; over a library or joints
+        of unknown bodies, reweighted draws have none.
 
     Raises
     ------
@@ -152,6 +150,8 @@ def update(
         "seed": seed,
         **how,
     }
+    if how["did"] != "refitted":
+        climb_from(idata, result, effects)
     chained = f"{idata.attrs['data_sha256']}{history.data_sha256}"
     result.attrs["updates"] = json.dumps([*done, entry])
     result.attrs["data_sha256"] = hashlib.sha256(chained.encode()).hexdigest()

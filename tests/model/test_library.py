@@ -296,7 +296,9 @@ def test_refused_fits(apartment, monkeypatch) -> None:
     library = ParameterLibrary({"x": {"mass": 1.0}, "y": {"mass": 2.0}})
     model = physics_model(scene, history, library=library)
     for options in ({"method": "nuts"}, {"resume": object()}):
-        with pytest.raises(FitError, match="summed over exactly; leave out"):
+        with pytest.raises(
+            FitError, match="summed over exactly, or walked over by method='paper'; leave out"
+        ):
             quick(model, **options)
     monkeypatch.setattr("pbrl_ppl.modes.library_choice._MOST", 10)
     with pytest.raises(FitError, match=r"2 combinations of parameter sets.*give some"):

@@ -30,6 +30,7 @@ from pbrl_ppl.modes.configurations import (
 from pbrl_ppl.modes.evidence import Evidence, _Law, importance, laplace
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import Simulator
+from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import (
     convergence,
     draws,
@@ -574,6 +575,8 @@ def test_map_is_the_best_configuration_s_mode(model) -> None:
     anchors = [named[name].item() for name in ("a_x", "a_y", "b_x", "b_y")]
     np.testing.assert_allclose(anchors, np.ravel(HELD), atol=5e-3)
     assert joint_probabilities(idata)["joint1"]["a-b"] > 0.999
+    # and it is what the file holds as the mode
+    np.testing.assert_allclose(Dynamics.of(idata).phi[0], [0, 1, *anchors], rtol=1e-12)
 
 
 def test_no_joint_is_found_where_there_is_none() -> None:
@@ -585,6 +588,9 @@ def test_no_joint_is_found_where_there_is_none() -> None:
     named = draws(idata)
     assert named["i_a"].item() == named["i_b"].item()
     assert next(iter(joint_probabilities(idata)["joint1"])) == "none"
+    i_a, i_b, *anchors = Dynamics.of(idata).phi[0]  # of the stored mode
+    assert i_a == i_b
+    assert np.isfinite(anchors).all()
 
 
 @pytest.mark.slow

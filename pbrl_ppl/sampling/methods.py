@@ -1,0 +1,194 @@
+"""The samplers of `fit`, each with the schedule it has where nothing else is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from copy import deepcopy
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pymc as pm
+
+from pbrl_ppl.errors import FitError
+from pbrl_ppl.modes import Mode
+from pbrl_ppl.sampling.emulation import emulate
+from pbrl_ppl.sampling.equal_wheels import evened_logp
+from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
+from pbrl_ppl.sampling.starts import blank_point, gaussian_blocks
+from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+from pbrl_ppl.sampling.traces import as_trace, thinned
+
+#: Engine steps that cost no more than what samplers do beside them.
+_LITTLE = 2000
+
+
+@dataclass(frozen=True)
+class Method:
+    """A sampler, and how long it runs where nothing else is asked for.
+
+    Parameters
+    ----------
+    run : callable
+        ``run(job) -> trace``.
+    draws, tune, thin : int
+        Draws kept and tuning draws of each chain; steps a draw.
+    chains : int
+        Chains.
+    """
+
+    run: Callable[[Job], Any]
+    draws: int
+    tune: int
+    thin: int
+    chains: int = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """Arguments of a sampler's run; ``about`` is None over the sets of a library."""
+
+    model: pm.Model
+    about: Mode | None
+    seed: int
+    draws: int
+    tune: int
+    chains: int
+    thin: int
+    cores: int
+    progress: bool
+    starts: list[dict[str, Any]]
+
+    @property
+    def mode(self) -> Mode:
+        """The mode that the chains start about.
+
+        Raises
+        ------
+        FitError
+            If there is none.
+        """
+        if self.about is None:
+            raise FitError("fit: a model with a library has no mode to sample about; leave out"
+                           " method=, or use 'paper'")  # fmt: skip
+        return self.about
+
+    def sample(self, step: Any, steps_a_draw: int = 1) -> Any:
+        """``pm.sample`` from the starts; how it converged is judged elsewhere."""
+        try:
+            trace = pm.sample(
+                draws=self.draws * steps_a_draw,
+                tune=self.tune,
+                chains=self.chains,
+                cores=self.cores,
+                step=step,
+                initvals=self.starts,
+                random_seed=self.seed,
+                progressbar=self.progress,
+                quiet=not self.progress,
+                compute_convergence_checks=False,
+                discard_tuned_samples=True,
+            )
+        except ValueError as error:
+            if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
+                raise KeyboardInterrupt from error
+            raise
+        return thinned(trace, steps_a_draw)
+
+
+def _metropolis(job: Job) -> Any:
+    """Block-wise adaptive Metropolis with a surrogate; see AdaptiveMetropolis."""
+    problem, model = job.mode.problem, job.model
+    blocks = gaussian_blocks(model, job.mode)
+    options: dict[str, Any] = {"inner": 10, "initial_point": blank_point(model, problem)}
+    options["extra"] = evened_logp(model, problem)
+    if job.mode.others and len(blocks) == 1:
+        hills = [gaussian_blocks(model, peak)[0] for peak in job.mode.others]
+        jumps = Jumps((deepcopy(blocks[0]), *hills))  # the block itself adapts
+    else:
+        jumps = None
+    # an exact step of one block, in engine steps; where that is little, looking ahead is no use
+    engine = problem.simulator
+    cost = engine.steps * problem.segments.n * problem.data.horizon / len(engine.parts)
+    if cost > _LITTLE:
+        unpack = Unpack(model, problem)
+        if emulator := emulate(job.mode, unpack, blocks, job.seed):
+            options |= {"rough": Surrogate(problem, unpack, emulator), "inner": 45, "plain": 0.3}
+    return job.sample(
+        AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, jumps=jumps, **options)
+    )
+
+
+def _paper(job: Job) -> Any:
+    """One random-walk Metropolis step a variable, as PyMC 2 did: burn in, then keep each n-th.
+
+    Which set of a library each body has is proposed uniformly, body by body.
+    """
+    discrete = job.model.discrete_value_vars
+    steps = [
+        pm.CategoricalGibbsMetropolis([variable], model=job.model)
+        if job.model.rvs_to_values[variable] in discrete
+        else pm.Metropolis([variable])
+        for variable in job.model.free_RVs
+    ]
+    return job.sample(steps, job.thin)
+
+
+def _demetropolisz(job: Job) -> Any:
+    """Differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
+    return job.sample(pm.DEMetropolisZ(job.model.free_RVs), job.thin)
+
+
+def _nuts(job: Job) -> Any:
+    """NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
+    return job.sample(pm.NUTS(job.model.free_RVs), job.thin)
+
+
+def _smc(job: Job) -> Any:
+    """Sequential Monte Carlo from the prior: for several modes and few parameters."""
+    return pm.sample_smc(
+        draws=job.draws,
+        chains=job.chains,
+        cores=job.cores,
+        random_seed=job.seed,
+        progressbar=job.progress,
+        compute_convergence_checks=False,
+    )
+
+
+def _map(job: Job) -> Any:
+    """The mode alone, as a posterior of one draw."""
+    values = job.mode.problem.named(job.mode.phi, job.mode.sigma)
+    draws = {name: np.asarray(value)[None, None] for name, value in values.items()}
+    return as_trace(job.model, draws, {"lp": np.array([[job.mode.log_posterior]])})
+
+
+def _laplace(job: Job) -> Any:
+    """Independent draws from the Gaussian at the mode; of the noise, of its logarithm."""
+    rng, mode = np.random.default_rng(job.seed), job.mode
+    shape = job.chains, job.draws
+    phi = mode.draws(rng, job.chains * job.draws)
+    centre, covariance = mode.noise_gaussian()
+    louder = rng.standard_normal((len(phi), len(centre))) @ np.linalg.cholesky(covariance).T
+    sigma = np.exp(centre + louder)
+    values = mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
+    return as_trace(job.model, values, {"accept": np.ones(shape)})
+
+
+#: The samplers by name. The paper's schedule is that of Table 2 for the cart: 30 chains of 20,000
+#: iterations, of which the first 1,000 are burnt in and each tenth of the others is kept. (PyMC 2
+#: counted the burn-in among the iterations.)
+METHODS: Mapping[str, Method] = {
+    "metropolis": Method(_metropolis, draws=800, tune=500, thin=1),
+    "paper": Method(_paper, draws=1900, tune=1000, thin=10, chains=30),
+    "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),
+    "smc": Method(_smc, draws=1000, tune=0, thin=1),
+    "nuts": Method(_nuts, draws=500, tune=500, thin=1),
+    "laplace": Method(_laplace, draws=250, tune=0, thin=1),
+    "map": Method(_map, draws=1, tune=0, thin=1),
+}
+
+#: Table 2's schedule for the apartment, whose prior is a library: one chain of 5,000 iterations.
+OVER_LIBRARY: Mapping[str, Method] = {
+    "paper": Method(_paper, draws=400, tune=1000, thin=10, chains=1),
+}
