@@ -49,7 +49,7 @@ class Learner(ABC):
     Raises
     ------
     FitError
-        If ``neighbours`` is below 1, or ``bandwidth`` or ``ridge`` not positive.
+        If ``neighbours`` is below 1, ``bandwidth`` not positive or ``ridge`` negative.
 
     Attributes
     ----------
@@ -70,9 +70,10 @@ class Learner(ABC):
     ) -> None:
         if isinstance(neighbours, bool) or not isinstance(neighbours, int) or neighbours < 1:
             raise FitError(f"LWR: neighbours is {neighbours!r}, expected a whole number from 1 up")
-        for name, value in (("bandwidth", bandwidth), ("ridge", ridge)):
-            if not 0 < value < np.inf:
-                raise FitError(f"LWR: {name} is {value!r}, expected a number above 0")
+        if not 0 < bandwidth < np.inf:
+            raise FitError(f"LWR: bandwidth is {bandwidth!r}, expected a number above 0")
+        if not 0 <= ridge < np.inf:
+            raise FitError(f"LWR: ridge is {ridge!r}, expected a number from 0 (Eq. 4) up")
         self.scene, self.pose_invariant = scene, pose_invariant
         options = {"neighbours": neighbours, "bandwidth": bandwidth, "ridge": ridge}
         self._own: dict[int, Experience] = {}

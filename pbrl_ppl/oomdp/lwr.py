@@ -35,7 +35,7 @@ class LWR(Learner):
     bandwidth : float
         Of the kernel, lambda.
     ridge : float
-        As of :class:`pbrl_ppl.oomdp.Regression`.
+        As of :class:`pbrl_ppl.oomdp.Regression`; 0 is Eq. 4 as it stands.
     standardise : bool
         Whether distances are in units of each input's standard deviation; otherwise in SI units.
     pose_invariant : bool
@@ -44,7 +44,7 @@ class LWR(Learner):
     Raises
     ------
     FitError
-        If ``neighbours`` is below 1, or ``bandwidth`` or ``ridge`` not positive.
+        If ``neighbours`` is below 1, ``bandwidth`` not positive or ``ridge`` negative.
 
     References
     ----------

@@ -12,6 +12,8 @@ Array = NDArray[np.float64]
 
 #: Weights that are made at a time, to spare memory.
 _WEIGHTS = 4_000_000
+#: Eigenvalue of X' W X, as a share of the largest, below which it is rounding.
+_SINGULAR = 1e-13
 
 
 class Regression:
@@ -35,7 +37,10 @@ class Regression:
     bandwidth : float
         Lambda, squared units of distance.
     ridge : float
-        As a share of the trace of ``X' W X``; with 0 in the limit, it is Eq. 4 as it stands.
+        As a share of the trace of ``X' W X``; 0 is Eq. 4 as it stands. Where ``X' W X`` is singular
+        (an eigenvalue below 1e-13 of the largest), that is its least-norm solution, of beta by
+        columns in units of ``scale``: directions in which the weighted data do not vary predict
+        nothing.
     scale : ndarray, optional
         Unit of distance of each column, shape (p,); 1 by default.
 
@@ -62,7 +67,7 @@ class Regression:
         self._x = x / self.scale
         self._tree = cKDTree(self._x) if len(x) > neighbours else None
         # the squares of singular values are what a ridge is added to
-        self._everywhere = np.linalg.lstsq(self._x, y, rcond=ridge**0.5)[0]
+        self._everywhere = np.linalg.lstsq(self._x, y, rcond=max(ridge, _SINGULAR) ** 0.5)[0]
         # X' W X and X' W y are weighted sums of these, one row a training input
         columns = np.concatenate([self._x, y], axis=1)
         self._products = np.einsum("ni,nj->nij", self._x, columns).reshape(len(x), -1)
@@ -77,6 +82,9 @@ class Regression:
         n, p = at.shape
         products = (self._weights(at) @ self._products).reshape(n, p, self._products.shape[1] // p)
         square, cross = products[..., :p], products[..., p:]
+        if not self.ridge:
+            beta = np.linalg.pinv(square, rcond=_SINGULAR, hermitian=True) @ cross
+            return np.asarray(np.einsum("mp,mpq->mq", at, beta))
         size = np.trace(square, axis1=1, axis2=2) + np.finfo(float).tiny ** 0.5
         added = self.ridge * size[:, None, None]
         beta = np.linalg.solve(square + added * np.eye(p), cross + added * self._everywhere)

@@ -42,6 +42,30 @@ def test_is_weighted_least_squares(neighbours) -> None:
     np.testing.assert_allclose(regression(queries), expected, rtol=1e-7, atol=1e-9)
 
 
+@pytest.mark.parametrize("neighbours", [60, 1000])
+def test_no_ridge_is_eq_4(neighbours) -> None:
+    """Within 1e-9 of NumPy's weighted least squares, on well-conditioned data."""
+    rng = np.random.default_rng(10)
+    x = rng.normal(size=(200, 4))
+    y = np.stack([np.sin(x[:, 0]) * x[:, 1], abs(x[:, 2])], axis=1)
+    queries = rng.normal(size=(30, 4))
+    regression = Regression(x, y, neighbours=neighbours, ridge=0)
+    expected = [by_hand(x, y, at, neighbours, 1.5, np.ones(4)) for at in queries]
+    np.testing.assert_allclose(regression(queries), expected, rtol=0, atol=1e-9)
+
+
+def test_no_ridge_is_the_least_norm_solution_of_a_singular_system() -> None:
+    """Columns that are the same share their coefficient; one that is zero has none."""
+    rng = np.random.default_rng(11)
+    one = rng.normal(size=(30, 1))
+    x = np.concatenate([one, one, np.zeros((30, 1))], axis=1)
+    regression = Regression(x, 4.0 * one, ridge=0)
+    queries = np.array([[1.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [1.0, -1.0, 5.0]])
+    np.testing.assert_allclose(regression(queries)[:, 0], [4.0, 2.0, 0.0, 0.0], atol=1e-9)
+    few = Regression(x[:1], 4.0 * one[:1], ridge=0)
+    np.testing.assert_allclose(few(x[:1]), 4.0 * one[:1], atol=1e-9)
+
+
 def test_bandwidth_is_local() -> None:
     """A kink is followed with a narrow kernel, and cut off with a wide one."""
     x = np.random.default_rng(5).uniform(-2, 2, (400, 1))
