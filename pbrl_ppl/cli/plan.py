@@ -44,6 +44,10 @@ def plan(
     draws: Annotated[
         int | None, typer.Option(min=1, help="Posterior draws to plan with; the MAP if not given.")
     ] = None,
+    weight: Annotated[
+        float | None,
+        typer.Option(help="Of A*'s heuristic: 1 is A* itself, more is quicker; 3 if not given."),
+    ] = None,
     tail: Annotated[
         float, typer.Option(help="Share of the worst draws that count; 1 is the expectation.")
     ] = 1.0,
@@ -98,6 +102,10 @@ def plan(
         places = dict(pose(text, only, "--start") for text in start or ())
         allowed = None if actions is None else ActionSet.load(actions)
         limit: dict[str, Any] = {} if nodes is None else {"nodes": nodes}
+        if weight is not None:
+            if method != "astar":
+                raise GoalError(f"--weight: it is of astar, and --method is {method}; leave it out")
+            limit["weight"] = weight
         progress("planning")
         result = make_plan(
             idata, places, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,

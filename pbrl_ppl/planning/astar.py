@@ -73,8 +73,9 @@ def astar(
         The goal is reached where the mean shortfall of the worst share of draws is within the
         tolerances: 1 for the expectation, less for conditional value at risk.
     weight : float
-        Of the heuristic: 1 is A*; more is quicker, and as far as the heuristic is admissible and
-        cells hold one state, the plan costs at most so many times the least. See
+        Of the heuristic: 1 is A*, which goes on until no node of the queue can lead to a cheaper
+        plan; more is quicker, ends at the first plan, and as far as the heuristic is admissible and
+        cells hold one state, that costs at most so many times the least. See
         :class:`pbrl_ppl.planning.bound.TimeToGo` for where it is.
     nodes : int
         States to generate at most, each draw's own, the guiding search's among them.
@@ -118,7 +119,7 @@ def astar(
             search.generated += guide.generated
         while search.open():
             now = time.monotonic()
-            if search.best and not improve:
+            if search.best and not improve and (weight > 1 or search.settled()):
                 break
             if search.generated >= nodes or now - begin > limit:
                 stopped = "nodes" if search.generated >= nodes else "time"
@@ -174,6 +175,10 @@ class _Search:
             self.refined += 1
             self.begin()
         return bool(self.queue)
+
+    def settled(self) -> bool:
+        """Whether nothing in the queue has a lower priority than the best plan's cost."""
+        return self.queue[0][0] >= self.least_cost
 
     def begin(self) -> None:
         """Reset tree, queue and closed set to the root."""

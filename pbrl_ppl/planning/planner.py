@@ -153,7 +153,7 @@ def plan(
         ``astar``: a whole plan, over the action set; ``mppi``: a receding horizon for dynamic
         tasks, with any wrench up to the strongest of the set.
     draws : int, optional
-        Posterior draws to plan with; without it, the one of highest posterior density (MAP).
+        Posterior draws to plan with; without it, the posterior's mode (MAP).
     tail : float
         Share of the worst draws that count: 1 for the expectation, less for conditional value at
         risk.
@@ -174,7 +174,8 @@ def plan(
     progress : callable, optional
         Told how far the search is.
     **options
-        Of :func:`pbrl_ppl.planning.astar.astar` or :func:`pbrl_ppl.planning.receding.mppi`.
+        Of :func:`pbrl_ppl.planning.astar.astar`, such as ``weight=1`` for A* without a weight, or
+        of :func:`pbrl_ppl.planning.receding.mppi`.
 
     Returns
     -------

@@ -142,6 +142,16 @@ def test_the_mirrored_task_costs_the_same() -> None:
     assert one.duration == pytest.approx(other.duration, abs=0.11)  # cells are not mirrored
 
 
+def test_without_a_weight_no_plan_is_cheaper() -> None:
+    """A* ends where its queue cannot hold a cheaper plan, not at the first that it meets."""
+    weighted, without = (plan(known(ROOM), *ACROSS, PUSHES, weight=weight) for weight in (3, 1))
+    assert without.reached
+    assert without.duration <= weighted.duration
+    exhaustive = plan(known(ROOM), *ACROSS, PUSHES, weight=1, improve=True)
+    assert without.duration == exhaustive.duration
+    assert weighted.nodes < without.nodes <= exhaustive.nodes
+
+
 def test_the_same_seed_gives_the_same_plan() -> None:
     one, two = (plan(known(ROOM), *ACROSS, PUSHES, seed=3) for _ in range(2))
     np.testing.assert_array_equal(one.wrenches, two.wrenches)

@@ -99,6 +99,21 @@ def test_the_command_writes_the_plan_and_says_how_it_ends(tmp_path, capsys) -> N
     assert "--overwrite" in capsys.readouterr().err
 
 
+def test_the_command_s_weight_is_the_search_s(tmp_path, capsys) -> None:
+    """Written as Python plans, and no longer than with the weight that is the default."""
+    idata, times = load_posterior(file("5")), []
+    for weight in (None, 1):
+        out = tmp_path / f"{weight}.csv"
+        given = [] if weight is None else ["--weight", str(weight)]
+        assert main(["plan", str(file("5")), *COMMAND, *given, "-o", str(out)]) == 0
+        capsys.readouterr()
+        here = plan(idata, START, GOAL, seed=1, **({} if weight is None else {"weight": weight}))
+        found = pd.read_csv(out)
+        assert found["time"].max() == pytest.approx(here.duration)
+        times.append(here.duration)
+    assert times[1] <= times[0]
+
+
 def test_an_unreachable_goal_ends_with_code_1_and_the_best(tmp_path, capsys) -> None:
     path, out = tmp_path / "actions.toml", tmp_path / "plan.csv"
     path.write_text('[[action]]\nbody = "puck"\nforce = [4, 0]\nframe = "world"\n')
@@ -122,6 +137,11 @@ def test_an_unreachable_goal_ends_with_code_1_and_the_best(tmp_path, capsys) -> 
         (["--start", "0,0,0", "--goal", "1,1,-", "--actions", "none.toml"], "no such file"),
         (["--start", "0,0,0", "--goal", "1,1,-", "--method", "mpi"], 'did you mean "mppi"'),
         (["--start", "0,0,0", "--goal", "1,1,-", "--tail", "2"], "tail is 2.0"),
+        (["--start", "0,0,0", "--goal", "1,1,-", "--weight", "0.5"], "weight is 0.5"),
+        (
+            ["--start", "0,0,0", "--goal", "1,1,-", "--weight", "1", "--method", "mppi"],
+            "--weight: it is of astar",
+        ),
         (["--start", "0,0,0", "--goal", "1,1,-", "--draws", "5000"], "expected 1 to 1000"),
     ],
 )
