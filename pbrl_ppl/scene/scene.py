@@ -205,7 +205,9 @@ class Scene:
         for where, table in arrays["joint"]:
             with located(where):
                 joints.append(Joint(**table))
-        return cls(bodies=tuple(bodies), walls=tuple(walls), joints=tuple(joints), **world)
+        any_joints = world.pop("joints", None) == "any"
+        scene = cls(bodies=tuple(bodies), walls=tuple(walls), joints=tuple(joints), **world)
+        return scene.with_any_joints() if any_joints else scene
 
     def to_toml(self) -> str:
         """Return TOML text from which `from_toml` builds an equal scene."""
@@ -311,6 +313,27 @@ class Scene:
             if joint.bodies is None or set(joint.bodies) <= there
         )
         return self.replace(bodies=bodies, joints=joints)
+
+    def with_any_joints(self) -> Scene:
+        """Return a scene in which any two bodies, or a body and the world, may be joined by a rod.
+
+        That is Eq. 8's ``{J_d}^k``: as many distance joints of unknown bodies as there are dynamic
+        bodies, each of which may join nothing. In a file, ``joints = "any"`` in ``[world]``.
+
+        Raises
+        ------
+        SceneError
+            If a body has no pose: a rod keeps the length that it has in the reference poses.
+
+        Examples
+        --------
+        >>> disc = Shape.circle(0.1)
+        >>> pucks = Body("a", disc, pose=(0, 0, 0)), Body("b", disc, pose=(1, 0, 0))
+        >>> Scene(time_step=0.1, bodies=pucks).with_any_joints().joint_names
+        ('joint1', 'joint2')
+        """
+        rods = (Joint("distance", known=False),) * len(self.dynamic)
+        return self.replace(joints=(*self.joints, *rods))
 
     def with_effects(self, body_name: str, *names: str) -> Scene:
         """Return a scene in which this body has these effects declared as well.

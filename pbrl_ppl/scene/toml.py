@@ -16,7 +16,10 @@ Table = dict[str, Any]
 
 KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "the file": (("world",), ("noise", "body", "wall", "joint")),
-    "[world]": (("time_step",), ("gravity", "normal_gravity", "substeps", "test_is_later")),
+    "[world]": (
+        ("time_step",),
+        ("gravity", "normal_gravity", "substeps", "test_is_later", "joints"),
+    ),
     "[noise]": ((), STATE),
     "body": (
         ("name", "shape"),
@@ -38,7 +41,8 @@ def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
     Raises
     ------
     SceneError
-        If the text is not TOML (says the line), or a key is unknown or missing.
+        If the text is not TOML (says the line), or a key is unknown or missing, or ``joints`` of
+        ``[world]`` is not ``any``.
     """
     try:
         document = tomllib.loads(text)
@@ -46,6 +50,11 @@ def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
         raise SceneError(f"not TOML: {error}") from None
     _check_keys(document, "the file", *KEYS["the file"])
     _check_keys(document["world"], "[world]", *KEYS["[world]"])
+    if (joints := document["world"].get("joints", "any")) != "any":
+        raise SceneError(
+            f'[world]: joints is {joints!r}, expected "any" (any two bodies, or a body and the'
+            " world, may be joined by a rod); declare those that are there as [[joint]]"
+        )
     noise = document.get("noise", {})
     _check_keys(noise, "[noise]", *KEYS["[noise]"])
     arrays: dict[str, list[tuple[str, Table]]] = {}
