@@ -7,6 +7,7 @@ import pymc as pm
 import pytest
 
 from pbrl_ppl.model import ParameterLibrary
+from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, draws, group
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -76,3 +77,17 @@ def test_several_chains_of_one_sigma_a_dimension() -> None:
     assert group(first, "posterior")["sigma"].shape == (2, 20, 6)
     for name, values in draws(first).items():
         np.testing.assert_array_equal(values, draws(second)[name])
+
+
+def test_bodies_of_one_class_have_one_choice() -> None:
+    """By walk and by sum; the stored mode names the class."""
+    known = {"r": 0.2, "mu_c": 0.3}
+    bodies = tuple(Body(name, Shape.circle(0.1), known=known, object_class="puck") for name in "ab")
+    scene = Scene(time_step=0.1, substeps=4, bodies=bodies)
+    history = simulated_history(scene, {"mass": 2.2}, seed=2, trajectories=3, intervals=2)
+    model = physics_model(scene, history, library=ParameterLibrary(dict(LIBRARY.sets)))
+    for options in ({}, {"method": "paper", "draws": 20, "tune": 50, "thin": 2}):
+        idata = fit(model, seed=1, progress=False, **options)
+        assert group(idata, "posterior")["library_index"].sizes["owner"] == 1
+        assert json.loads(idata.attrs["mode"])["sets"] == {"puck": "y"}
+        assert Dynamics.of(idata).phi.tolist() == [[2.2]]
