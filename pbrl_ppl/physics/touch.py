@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.physics.properties import Array
-from pbrl_ppl.physics.solids import Solid, circles, depth, scenery
+from pbrl_ppl.physics.solids import Pairs, Scenery, Solid, circles, depth, scenery
 from pbrl_ppl.scene import Scene
 
 #: Places looked at on the ways.
@@ -36,11 +36,25 @@ def touching(scene: Scene, begin: Array, end: Array) -> NDArray[np.bool_]:
     begin, end = world.with_fixed(begin), world.with_fixed(end)
     led = {i for i, body in enumerate(scene.moving) if body.kinematic}
     touched = np.zeros(len(begin), dtype=bool)
-    for i, j in world.pairs:
-        if led.isdisjoint((i, j)):
-            a, b = world.solids[i], world.solids[j]
-            touched |= _meet(a, b, begin[:, (i, j)], end[:, (i, j)], scene.time_step)
+    pairs = tuple(pair for pair in world.pairs if led.isdisjoint(pair))
+    if not pairs:
+        return touched
+    near = _near(world, pairs, begin, scene.time_step) | _near(world, pairs, end, scene.time_step)
+    for p in np.flatnonzero(near.any(axis=0)):
+        (i, j), rows = pairs[p], np.flatnonzero(near[:, p])
+        ends = (each[rows][:, (i, j)] for each in (begin, end))
+        touched[rows] |= _meet(world.solids[i], world.solids[j], *ends, scene.time_step)
     return touched
+
+
+def _near(world: Scenery, pairs: Pairs, states: Array, dt: float) -> NDArray[np.bool_]:
+    """Pairs whose bounding circles may meet within an interval of states, shape (n, pair)."""
+    i, j = np.array(pairs).T
+    width = np.array([solid.width for solid in world.solids])
+    rate = states[:, i, 3:5] - states[:, j, 3:5]
+    way = dt * (1.0 + _SHARE) * np.hypot(rate[..., 0], rate[..., 1])
+    way += _OUTLINE * np.minimum(width[i], width[j])
+    return np.asarray(circles(world.solids, pairs, states) > -way)
 
 
 def _meet(a: Solid, b: Solid, begin: Array, end: Array, dt: float) -> NDArray[np.bool_]:
@@ -54,7 +68,8 @@ def _meet(a: Solid, b: Solid, begin: Array, end: Array, dt: float) -> NDArray[np
         rate = state[:, 0, 3:5] - state[:, 1, 3:5]
         reach = outline + dt * _SHARE * np.hypot(rate[:, 0], rate[:, 1])
         gap = reach + dt * _SHARE * np.abs(state[..., 5]) @ np.array([a.reach, b.reach])
-        for share in np.linspace(0.0, 1.0, _LOOKS):
+        looks = np.linspace(0.0, 1.0, _LOOKS if state[..., 3:].any() else 1)  # at rest, one will do
+        for share in looks:
             at = state[..., :3] + share * way * state[..., 3:]
             # circles about a body bound how near it is, however fast it turns
             near = np.flatnonzero(circles((a, b), ((0, 1),), at)[:, 0] > -reach)
