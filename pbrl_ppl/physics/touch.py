@@ -42,8 +42,8 @@ def touching(scene: Scene, begin: Array, end: Array) -> NDArray[np.bool_]:
     near = _near(world, pairs, begin, scene.time_step) | _near(world, pairs, end, scene.time_step)
     for p in np.flatnonzero(near.any(axis=0)):
         (i, j), rows = pairs[p], np.flatnonzero(near[:, p])
-        ends = (each[rows][:, (i, j)] for each in (begin, end))
-        touched[rows] |= _meet(world.solids[i], world.solids[j], *ends, scene.time_step)
+        first, last = begin[rows][:, (i, j)], end[rows][:, (i, j)]
+        touched[rows] |= _meet(world.solids[i], world.solids[j], first, last, scene.time_step)
     return touched
 
 
