@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from itertools import combinations
 from typing import Any, ClassVar, final
 
 import numpy as np
@@ -17,6 +18,7 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, FitError, UninformedWarning
 from pbrl_ppl.history import from_segments
+from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import Dynamics
@@ -192,9 +194,42 @@ class PBRLAgent(Agent):
         )
         return mode if free.all() else None
 
+    def _climbed(self, effects: tuple[Attached, ...], whole: Problem) -> Mode | None:
+        """Mode climbed to from that of the bodies that moved; None where all of them did.
+
+        Bodies that nothing moved or touched keep their prior. Those that moved are fitted first to
+        the transitions without contact, whose likelihood is smooth, then to all.
+        """
+        scene, (state, inputs, after) = self.task.scene, self._data()
+        every = [body.name for body in scene.moving]
+        moved = (state != state[0]).any(axis=(0, 2)) | state[0, :, 3:].any(axis=1)
+        moved |= inputs[..., :3].any(axis=(0, 2))
+        for i, j in combinations(range(len(every)), 2):
+            pair = scene.subset([every[i], every[j]]).replace(walls=())
+            if moved[[i, j]].any() and touching(pair, state[:, [i, j]], after[:, [i, j]]).any():
+                moved[[i, j]] = True
+        if moved.all() or not moved.any():
+            return None
+        part = scene.subset([name for name, each in zip(every, moved, strict=True) if each])
+        own = {body.name for body in part.moving}
+        extra = tuple(each for each in effects if each.body in own)
+        extra = extra[len(attach(part, (), self._catalogue)) :]
+
+        def fitted(rows: Any, initial: Array | None = None) -> Mode:
+            start, acting, end = (each[rows][:, moved] for each in (state, inputs, after))
+            history = from_segments(part, start, acting[:, None], end[:, None])
+            problem = physics_model(part, history, extra, sigma=self._noise).problem
+            return find_mode(problem, seed=self.seed, initial=initial)
+
+        free = ~touching(scene, state, after)
+        mode = fitted(slice(None), fitted(free).phi if free.any() else None)
+        return find_mode(whole, initial=whole.layout.from_layout(mode.problem.layout, mode.phi))
+
     def _fit(self) -> None:
         start = self._revised() if self.revise else None
-        model = self._model((*self._declared, *(each.attached for each in self.added)))
+        effects = (*self._declared, *(each.attached for each in self.added))
+        model = self._model(effects)
+        start = start or self._climbed(effects, model.problem)
         method = "map" if self.draws is None else "laplace"
         with warnings.catch_warnings():
             # that the data do not say everything yet is why it is still learning

@@ -1,5 +1,7 @@
 """Four agents in worlds whose truth is known."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -47,6 +49,34 @@ def test_the_true_model_is_the_bound(learned) -> None:
     best = run_episode(TrueModelAgent(CART, CART_TRUTH), world, steps=30)
     assert best.reached and best.steps <= episode.steps
     assert best.dataset["planned"].all()
+
+
+def test_bodies_that_nothing_touched_keep_their_prior() -> None:
+    """A search begins with the bodies that moved or were touched, without contact."""
+    (cart,) = CART.scene.dynamic
+    far = [replace(cart, name=f"far{i}", pose=(0.0, 4.0 + 2.0 * i, 0.0)) for i in range(2)]
+    near = replace(cart, name="near", pose=(0.95, 0.0, 0.0), wheel=False)
+    scene = CART.scene.replace(bodies=(replace(cart, pose=(0.0, 0.0, 0.0)), near, *far))
+    truth = {
+        name: ([value] * 3 if name in ("w_x", "w_y", "w_theta", "mu_x", "mu_y") else [value] * 4)
+        for name, value in CART_TRUTH.items()
+    }
+    task = Task(scene, CART.goal, CART.actions)
+    agent, world = PBRLAgent(task, seed=1), World(task, truth)
+    state = world.reset(1)
+    for i in (13, 16, 14, 16, 13, 1, 5, 16):  # forwards, into the next
+        action = task.wrenches(state)[i]
+        outcome = world.step(action)
+        agent.observe(state, action, outcome.observed)
+        state = outcome.state
+    assert abs(state[1, 3:]).max() > 0.0  # it was met
+    agent.update()
+    for name in ("mass", "mu_x", "w_x"):
+        assert agent.estimates[f"{name}[cart]"] == pytest.approx(CART_TRUTH[name], rel=0.02)
+    assert agent.estimates["mass[near]"] == pytest.approx(CART_TRUTH["mass"], rel=0.02)
+    prior = dict(zip(agent.model.layout.labels, agent.model.layout.priors, strict=True))
+    for body in ("far0", "far1"):
+        assert agent.estimates[f"mu_y[{body}]"] == prior[f"mu_y[{body}]"].centre
 
 
 def test_round_a_wall() -> None:
