@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import cmath
+import json
 import warnings
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, final
 
 import numpy as np
@@ -50,6 +51,9 @@ class Box2DWorld(World):
         As of :class:`World`.
     step : float
         About what a step of the engine is (s).
+    acting : callable, optional
+        What acts in place of the commanded wrenches (body, 3): an effect that no agent is told of.
+        Its ``repr`` describes it in the files of episodes.
 
     Raises
     ------
@@ -80,6 +84,7 @@ class Box2DWorld(World):
         sigma: float = 0.0,
         spread: float = 0.0,
         step: float = 0.001,
+        acting: Callable[[Array], Array] | None = None,
     ) -> None:
         scene = task.scene
         if not 0 < step <= scene.time_step:
@@ -99,7 +104,7 @@ class Box2DWorld(World):
                     f"Box2D world: a convex part of {solid.name} has more than {_CORNERS} corners;"
                     " use World for such scenes"
                 )
-        self._steps = max(1, round(scene.time_step / step))
+        self._steps, self._acting = max(1, round(scene.time_step / step)), acting
         super().__init__(task, parameters, sigma=sigma, spread=spread)
         layout, phi = self._truth.layout, self._truth.phi[0]
         given = dict(zip(layout.labels, phi.tolist(), strict=True))
@@ -111,7 +116,14 @@ class Box2DWorld(World):
             for body in scene.moving
         ]
 
+    @property
+    def description(self) -> str:
+        """Engine, true parameters and what acts in place of the command, as JSON."""
+        said = json.loads(super().description)
+        return json.dumps(said if self._acting is None else said | {"acting": repr(self._acting)})
+
     def _play(self, state: Array, action: Array) -> Array:
+        action = action if self._acting is None else self._acting(action)
         engine, rigid = self._engine(state)
         step = self.task.scene.time_step / self._steps
         for i in range(self._steps):
