@@ -1,9 +1,13 @@
-"""Learn each piece of furniture by itself, and keep the modes: the paper's categorical prior.
+"""Learn furniture by itself, and keep the modes: the paper's categorical prior.
 
-Run from anywhere: `python models/apartment/make_library.py` writes library.json in a minute or two.
+The library is of other instances of the furniture than the apartment's: same outlines, other masses
+and frictions. Each is pushed about by itself, and what is kept is the mode of its posterior.
+
+Run from anywhere: `python models/apartment/make_library.py` writes library.json in some minutes.
 """
 
 import warnings
+from itertools import product
 
 import numpy as np
 from task import LIBRARY_FILE, SCENE, TRUTH
@@ -14,11 +18,25 @@ from pbrl_ppl.model import build_layout
 
 #: Transitions of each trial, and the noise of what is measured (m, rad, m/s, rad/s).
 COUNT, SIGMA = 60, 0.005
+#: Instances of each piece; they differ from the apartment's by these factors (logarithms' standard
+#: deviations, of mass and of friction) and by so much in the wheel's place (m).
+INSTANCES, MASS, FRICTION, PLACE = 10, 0.1, 0.1, 0.02
 
 
-def trial(number: int, name: str) -> tuple[pp.Scene, pp.History]:
-    """Random pushes of one body from random states, a wall beside it in a third of them."""
-    rng = np.random.default_rng([7, number])
+def instance(rng: np.random.Generator, known: dict[str, float]) -> dict[str, float]:
+    """Parameters of another instance of a body."""
+    other = dict(known, mass=known["mass"] * rng.lognormal(0.0, MASS))
+    for name in ("mu_x", "mu_y"):
+        if name in known:
+            other[name] = min(known[name] * rng.lognormal(0.0, FRICTION), 1.0)
+    if "w_x" in known:
+        other["w_x"] = known["w_x"] + rng.normal(0.0, PLACE)
+    return other
+
+
+def trial(number: int, name: str, copy: int) -> tuple[pp.Scene, pp.History]:
+    """Random pushes of one instance from random states, a wall beside it in a third of them."""
+    rng = np.random.default_rng([7, number, copy])
     alone = SCENE.subset([name])
     body, layout = alone.dynamic[0], build_layout(SCENE)
     truth = layout.to_dict(layout.to_vector(TRUTH))
@@ -27,6 +45,7 @@ def trial(number: int, name: str) -> tuple[pp.Scene, pp.History]:
         for block in layout.blocks
         if name in block.owners
     }
+    known = instance(rng, known)
     hung = bool(alone.joints)
     reach, mass = body.shape.bounding_radius, known["mass"]
     if not hung:
@@ -56,8 +75,10 @@ def trial(number: int, name: str) -> tuple[pp.Scene, pp.History]:
 def main() -> None:
     """A trial and a fit of each, and the file."""
     sets, kinds = {}, {}
-    for number, body in enumerate(SCENE.dynamic):
-        alone, history = trial(number, body.name)
+    for number, copy in product(range(len(SCENE.dynamic)), range(INSTANCES)):
+        body = SCENE.dynamic[number]
+        alone, history = trial(number, body.name, copy)
+        name = f"{body.name}_{copy + 1}"
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # castors: what is not there cannot be learned
             model = pp.physics_model(alone, history, sigma="scalar")
@@ -66,8 +87,8 @@ def main() -> None:
         values = dict(dict(learned.sets)[body.name])
         for key in ("w_x", "w_y", "w_theta", "mu_x", "mu_y"):
             values.setdefault(key, 0.0)  # a wheel of no friction is none
-        sets[body.name] = {key: round(value, 6) for key, value in values.items()}
-        print(body.name, sets[body.name], flush=True)
+        sets[name] = {key: round(value, 6) for key, value in values.items()}
+        print(name, sets[name], flush=True)
     for body in SCENE.dynamic:
         x_min, x_max, y_min, y_max = body.shape.bounds
         kinds[body.name] = {  # a wheel is somewhere under its body

@@ -18,11 +18,9 @@ GOAL = pp.Goal(
         pp.Target("kitchen_table", theta=0.4, angle_tolerance=0.4),
     )
 )
-_CART = pp.ActionSet.box(
-    "shopping_cart", forces=(-60.0, 0.0, 60.0), lateral=(-60.0, 0.0, 60.0), torques=(-6.0, 0.0, 6.0)
-)
-_TURNS = tuple(pp.Action("kitchen_table", torque=torque) for torque in (-6.0, 6.0))
-#: Pushes of the cart along and across, turns, and turns of the table (N, N m).
+_CART = pp.ActionSet.box("shopping_cart", forces=(-30.0, 0.0, 30.0), torques=(-5.0, 0.0, 5.0))
+_TURNS = tuple(pp.Action("kitchen_table", torque=torque) for torque in (-4.0, 4.0))
+#: Pushes of the cart by its handle, turns of it and of the table (N, N m).
 ACTIONS = pp.ActionSet((*_CART.actions, *_TURNS))
 TASK = pp.Task(SCENE, GOAL, ACTIONS)
 
