@@ -2,16 +2,27 @@
 PYTHON ?= python3
 VENV ?= .venv
 PYTEST_ARGS ?=
+PAPER_ARGS ?= --resume
 
 BIN := $(VENV)/bin
 CART := models/shopping_cart
 
-.PHONY: demo test test-fast test-generation test-long lint notebooks docs clean
+PAPER := shopping_cart apartment wrong_model wrong_model_box2d scaling
+
+.PHONY: demo paper test test-fast test-generation test-long lint notebooks docs clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/.installed
 	$(BIN)/pbrl-ppl close-loop $(CART)/scene.toml $(CART)/recorded/train.csv \
 	    --test $(CART)/recorded/test.csv -o out/demo --overwrite
+
+# The paper's experiments at their published size, and their numbers; an interrupted run goes on.
+# A smoke size: make paper PAPER_ARGS=--quick, into folders of another name.
+paper: $(VENV)/.installed-test
+	for experiment in 04_shopping_cart.py 05_apartment.py 06_wrong_model.py "06_wrong_model.py --box2d" \
+	    07_scaling.py; do $(BIN)/python analysis/$$experiment $(PAPER_ARGS) || exit 1; done
+	$(BIN)/python analysis/benchmarks/agents.py --results \
+	    $(PAPER:%=out/%$(if $(findstring --quick,$(PAPER_ARGS)),_quick))
 
 # A file's fixtures are made once, by the worker that has it; tests/conftest.py has the order.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 10

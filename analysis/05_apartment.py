@@ -1,4 +1,4 @@
-"""Figure 4(c) of the paper: valid plans in the apartment against observations.
+"""Figure 4(c) of the paper: plans and rewards in the apartment against observations.
 
     python analysis/05_apartment.py                 # ten seeds of each agent, in out/apartment
     python analysis/05_apartment.py --resume        # go on where a run was interrupted
@@ -6,12 +6,15 @@
     python analysis/05_apartment.py --only oolwr --seeds 2 --workers 1
     python analysis/05_apartment.py --box2d         # the world in another engine than the agents'
 
+Plans: observations are of random actions of the task, any of whose bodies is as likely, in episodes
+of 25 from the start; all agents of a seed observe the same. After so many of them an agent learns,
+and plans once from the start, with two thirds of the goal's tolerances; its plan is played in the
+true world without looking. It is valid if the goal is reached.
+
+Rewards: the paper's axis. Agents act, observe and learn until the goal is reached, in 60 steps at
+most.
+
 Each trial of an agent is a process and a file of its own.
-Observations are of random actions of the task, any of whose bodies is as likely, in episodes of 25
-from the start. After so many of them an agent learns, and plans once from the start, with two
-thirds of the goal's tolerances; its plan is played in the true world without looking. It is valid
-if the goal is reached. The reward is that of the last state (m), of the start where there is no
-plan.
 """
 
 from __future__ import annotations
@@ -22,41 +25,43 @@ import time
 from concurrent.futures import as_completed
 from dataclasses import replace
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
+import pandas as pd
 import xarray as xr
-from scipy import stats
+from experiments import curve, of_episodes, origin, save, share, summary, to_end
 
 import pbrl_ppl as pp
 from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.errors import EpisodeError
-from pbrl_ppl.history import write_atomically
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
 from apartment.task import TASK, TRUTH, library, world
 
 OUT = Path("out") / "apartment"
-#: Actions of an exploring episode.
-LENGTH = 25
-#: Search for a plan, the same for all agents; the true model's takes 3500 states.
+#: Actions of an exploring episode, and of one in which an agent acts.
+LENGTH, STEPS = 25, 60
+#: Search for a plan, the same for all agents; the true model's takes 1200 states.
 SEARCH = {"weight": 5.0, "nodes": 20_000}
-#: Numbers of observations at which agents plan; what is enough for PBRL need not be repeated.
+#: Numbers of observations at which agents plan.
 COUNTS = {
     "true": (0,),
     "pbrl": (1, 3, 10, 30),
-    "continuous": (30,),
+    "continuous": (1, 3, 10, 30),
     "oolwr": (10, 100, 1000),
+    "oolwr_by_object": (10, 100, 1000),
 }
 NAMES = {
     "true": "true model",
     "pbrl": "PBRL, categorical",
     "continuous": "PBRL, continuous",
     "oolwr": "OO-LWR",
+    "oolwr_by_object": "OO-LWR, by object",
 }
-
+#: Agents that act, in searches of fewer states: there is one a step.
+ACTING, ACTING_NODES = ("true", "pbrl", "continuous", "oolwr"), 5_000
 
 #: What a plan must reach in the model: what lies at the rim of the goal there may be outside.
 AIM = pp.Goal(
@@ -74,7 +79,7 @@ class Explorer(pp.Agent):
     model = None
 
     def act(self, state: np.ndarray) -> np.ndarray:
-        """One of the task's actions."""
+        """Return one of the task's actions."""
         pushed = [action.body for action in self.task.actions.actions]
         body = self._rng.choice(sorted(set(pushed)))
         chosen = self._rng.choice([i for i, each in enumerate(pushed) if each == body])
@@ -84,18 +89,20 @@ class Explorer(pp.Agent):
         """Learn nothing."""
 
 
-def agent(name: str, seed: int) -> pp.Agent:
-    """One of the four."""
+def agent(name: str, seed: int, **options: object) -> pp.Agent:
+    """Return one of the five."""
     if name == "true":
-        return pp.TrueModelAgent(TASK, TRUTH, seed=seed)
+        return pp.TrueModelAgent(TASK, TRUTH, seed=seed, **options)
     if name == "pbrl":
-        return pp.LibraryAgent(TASK, library(), seed=seed)
-    kinds = {"continuous": partial(pp.PBRLAgent, sigma="scalar"), "oolwr": pp.OOLWRAgent}
-    return kinds[name](TASK, seed=seed)
+        return pp.LibraryAgent(TASK, library(), seed=seed, **options)
+    if name == "continuous":
+        return pp.PBRLAgent(TASK, sigma="scalar", seed=seed, **options)
+    contacts = pp.SectorContacts(by_object=name == "oolwr_by_object")
+    return pp.OOLWRAgent(TASK, learner={"relations": (contacts,)}, seed=seed, **options)
 
 
 def explored(count: int, seed: int, sigma: float, box2d: bool) -> list[tuple[np.ndarray, ...]]:
-    """Observed transitions."""
+    """Return so many observed transitions."""
     found: list[tuple[np.ndarray, ...]] = []
     part = 0
     while len(found) < count:
@@ -115,10 +122,10 @@ def explored(count: int, seed: int, sigma: float, box2d: bool) -> list[tuple[np.
 def trial(
     name: str, seed: int, counts: tuple[int, ...], sigma: float, box2d: bool, path: Path
 ) -> xr.Dataset:
-    """Plans of one agent after so many observations, and where they lead; kept in a file."""
+    """Plan after so many observations, play the plans, and keep what came out in a file."""
     learner, seen = agent(name, seed), 0
     every = explored(max(counts), seed, sigma, box2d)
-    rows = {key: [] for key in ("foreseen", "valid", "reward", "models", "update", "search")}
+    rows = {key: [] for key in ("planned", "valid", "reward", "models", "update", "search")}
     for count in counts:
         for transition in every[seen:count]:
             learner.observe(*transition)
@@ -130,11 +137,9 @@ def trial(
         valid, reward = False, TASK.reward(TASK.start)
         if plan.reached:
             valid, reward = played(plan.wrenches, box2d)
-        # of OO-LWR: effect models so far, one a body and condition
-        bodies = [body.name for body in TASK.scene.dynamic]
-        models = (
-            sum(len(learner.model.conditions(body)) for body in bodies) if name == "oolwr" else 0
-        )
+        # effect models of OO-LWR so far, one a body and condition
+        conditions = getattr(learner.model, "conditions", lambda body: ())
+        models = sum(len(conditions(body.name)) for body in TASK.scene.dynamic)
         new = (plan.reached, valid, reward, models, learned - begin, searched - learned)
         for key, value in zip(rows, new, strict=True):
             rows[key].append(value)
@@ -146,18 +151,22 @@ def trial(
         )
     variables = {key: ("observations", np.array(values)) for key, values in rows.items()}
     attrs = {"agent": name, "seed": seed, "sigma": sigma, "box2d": int(box2d)}
-    attrs["scene"] = TASK.scene.to_toml()
-    found = xr.Dataset(variables, {"observations": list(counts)}, attrs)
-    write_atomically(path, lambda to: found.to_netcdf(to, engine="h5netcdf"))
+    found = xr.Dataset(variables, {"observations": list(counts)}, attrs | described())
+    save(found, path)
     return found
 
 
+def described() -> dict[str, str]:
+    """Return the scene and the actions, for a file's attributes."""
+    return {"scene": TASK.scene.to_toml(), "actions": str(TASK.actions)}
+
+
 def played(wrenches: np.ndarray, box2d: bool) -> tuple[bool, float]:
-    """Whether a plan reaches the goal in the true world, and the last reward."""
+    """Play a plan in the true world: whether it reaches the goal, and the last reward (m)."""
     true = world(box2d=box2d)
     state = true.reset(0)
     for wanted in wrenches:
-        # a body's heading is not quite what the plan foretold, and with it the wrench
+        # a body's heading is not quite what the plan predicted, and with it the wrench
         each = TASK.wrenches(state)
         outcome = true.step(each[np.argmin(((each - wanted) ** 2).sum(axis=(1, 2)))])
         state = outcome.state
@@ -167,7 +176,7 @@ def played(wrenches: np.ndarray, box2d: bool) -> tuple[bool, float]:
 
 
 def stored(path: Path, counts: tuple[int, ...], options: argparse.Namespace) -> xr.Dataset:
-    """A trial of an earlier run.
+    """Return a trial of an earlier run.
 
     Raises
     ------
@@ -179,7 +188,7 @@ def stored(path: Path, counts: tuple[int, ...], options: argparse.Namespace) -> 
             found = opened.load()
     except Exception as error:  # HDF5 raises many kinds on a damaged file
         raise EpisodeError(f"{path}: this is not a NetCDF file: {error}") from None
-    if found.attrs.get("scene") != TASK.scene.to_toml():
+    if any(found.attrs.get(key) != value for key, value in described().items()):
         raise EpisodeError(f"{path}: this is a trial in another scene; give another folder")
     wanted = (counts, options.sigma, options.box2d)
     own = (found["observations"].to_numpy(), found.attrs["sigma"], found.attrs.get("box2d", 0))
@@ -188,80 +197,76 @@ def stored(path: Path, counts: tuple[int, ...], options: argparse.Namespace) -> 
     return found
 
 
-def run(options: argparse.Namespace, counts: dict[str, tuple[int, ...]]) -> xr.Dataset:
-    """Run what is missing; all trials."""
+def plans(options: argparse.Namespace, counts: dict[str, tuple[int, ...]]) -> xr.Dataset:
+    """Run the trials that are missing; return all of them by agent, seed and observations."""
     folder = options.out / f"sigma_{options.sigma:g}"
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.glob("*.nc")) and not options.resume:
         raise EpisodeError(
             f"{folder}: there are trials; go on with --resume, or give another --out"
         )
-    every, left = [], []
+    every, left = {}, []
     for seed in range(1, options.seeds + 1):
         for name in options.only:
             path = folder / f"{name}-{seed}.nc"
             if path.is_file():
-                every.append(stored(path, counts[name], options))
+                every[name, seed] = stored(path, counts[name], options)
             else:
                 left.append((name, seed, counts[name], options.sigma, options.box2d, path))
     workers = min(options.workers, len(left))
     if workers < 2:
-        every += [trial(*each) for each in left]
+        every |= {each[:2]: trial(*each) for each in left}
     else:
         with processes(workers) as executor:
-            running = [executor.submit(trial, *each) for each in left]
-            every += [future.result() for future in as_completed(running)]
-    return joined(every, options)
-
-
-def joined(every: list[xr.Dataset], options: argparse.Namespace) -> xr.Dataset:
-    """All trials in one small dataset: agent, seed, observations."""
-    rows = [
-        each.assign_coords(agent=each.attrs["agent"], seed=each.attrs["seed"])
-        .expand_dims(["agent", "seed"])
-        .drop_attrs()
-        .astype(float)
-        for each in every
+            running = {executor.submit(trial, *each): each[:2] for each in left}
+            for future in as_completed(running):
+                every[running[future]] = future.result()
+    seeds = pd.Index(range(1, options.seeds + 1), name="seed")
+    agents = [
+        xr.concat([every[name, seed].drop_attrs().astype(float) for seed in seeds], seeds)
+        for name in options.only
     ]
-    whole = xr.combine_by_coords(rows, combine_attrs="drop", join="outer")
-    # a dataset may come back without a name
-    whole = whole if isinstance(whole, xr.Dataset) else whole.to_dataset()
-    command = f"python analysis/05_apartment.py --sigma {options.sigma:g}"
-    command += " --box2d" * options.box2d
-    return whole.assign_attrs(
-        command=f"{command} --seeds {options.seeds} --only {' '.join(options.only)}",
-        sigma=options.sigma, nodes=SEARCH["nodes"], start=TASK.reward(TASK.start),
-        versions=", ".join(f"{p} {version(p)}" for p in ("pbrl_ppl", "pymunk", "pymc", "numpy")),
-        scene=TASK.scene.to_toml(),
+    return xr.concat(agents, pd.Index(options.only, name="agent"), join="outer").sortby(
+        "observations"
+    )
+
+
+def acting(options: argparse.Namespace, steps: int) -> dict[str, list[pp.Episode]]:
+    """Run the episodes that are missing; return all of them by agent."""
+    search = {**SEARCH, "nodes": ACTING_NODES}
+    return pp.run_episodes(
+        {name: partial(agent, name, **search) for name in ACTING if name in options.only},
+        world(options.sigma, box2d=options.box2d), range(1, options.seeds + 1),
+        options.out / f"acting_{options.sigma:g}", steps=steps, workers=options.workers,
+        progress=partial(print, flush=True),
     )  # fmt: skip
 
 
-def draw(data: xr.Dataset, path: Path) -> None:
-    """Rewards and the share of valid plans against observations."""
-    figure, axes = plt.subplots(1, 2, figsize=(10, 3.6), layout="constrained")
+def draw(data: xr.Dataset, done: dict[str, list[pp.Episode]], steps: int, path: Path) -> None:
+    """Draw the share of valid plans against observations, and rewards against steps."""
+    figure, axes = plt.subplots(1, 2, figsize=(11, 3.6), layout="constrained")
+    colours = {name: f"C{i}" for i, name in enumerate(NAMES)}
     for name in data["agent"].to_numpy():
-        own = data.sel(agent=name).dropna("observations", how="all")
-        n = own["observations"].to_numpy()
-        rewards = own["reward"].transpose("seed", "observations").to_numpy()
-        low = high = mean = np.nanmean(rewards, axis=0)
-        if len(rewards) > 1:
-            ends = stats.bootstrap(
-                (rewards,), np.mean, method="percentile", rng=np.random.default_rng(1)
-            )
-            low, high = ends.confidence_interval
-        axes[0].errorbar(n, mean, [mean - low, high - mean], marker="o", label=NAMES[name])
-        axes[1].plot(n, own["valid"].mean("seed"), marker="o")
-    axes[0].set_ylabel("reward where the plan ends (m)")
-    axes[1].set_ylabel("share of valid plans")
-    for axis in axes:
-        axis.set_xscale("symlog", linthresh=1)
-        axis.set_xlabel("observations")
-    figure.legend(loc="outside right center", frameon=False)
+        valid = data["valid"].sel(agent=name).dropna("observations", how="all")
+        found = np.array([share(hits) for hits in valid.transpose("observations", "seed").values])
+        mean, low, high = found.T
+        at = valid["observations"].to_numpy() * 1.06 ** list(NAMES).index(name)  # side by side
+        axes[0].errorbar(
+            at, mean, [mean - low, high - mean], marker="o", capsize=2, label=NAMES[name],
+            color=colours[name],
+        )  # fmt: skip
+    axes[0].set_xscale("symlog", linthresh=1)
+    axes[0].set(xlabel="observations", ylabel="share of valid plans", ylim=(-0.03, 1.03))
+    for name, episodes in done.items():
+        rewards = np.array([episode.rewards(steps) for episode in episodes])
+        curve(axes[1], rewards, NAMES[name], color=colours[name])
+    axes[1].set(xlabel="steps", ylabel="reward: minus the distance to the goal (m)")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
     figure.savefig(path, dpi=120)
 
 
-def main() -> None:
-    """Run what is missing, say what came out, draw."""
+def run() -> None:
+    """Run what is missing, print the tables, draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--sigma", type=float, default=0.0, help="noise of the observations")
@@ -272,27 +277,33 @@ def main() -> None:
     parser.add_argument("--box2d", action="store_true", help="the world in Box2D")
     parser.add_argument("--quick", action="store_true", help="one seed, few observations, for CI")
     options = parser.parse_args()
-    counts = COUNTS
+    counts, steps = COUNTS, STEPS
     if options.box2d:
         options.out = options.out.with_name(options.out.name + "_box2d")
     if options.quick:
-        # the continuous prior of eleven bodies takes a minute
-        counts = {"true": (0,), "pbrl": (3,), "oolwr": (3, 10)}
+        counts, steps = {"true": (0,), "pbrl": (3,), "oolwr": (3, 10)}, 3
         options.only = [name for name in options.only if name in counts]
         options.seeds, options.out = 1, options.out.with_name(options.out.name + "_quick")
     if options.seeds < 1 or options.workers < 1:
         parser.error("--seeds and --workers: expected 1 or more")
-    try:
-        data = run(options, counts)
-    except EpisodeError as error:
-        parser.error(str(error))
-    except KeyboardInterrupt:
-        print("interrupted: finished trials are kept; go on with --resume", file=sys.stderr)
-        sys.exit(130)
-    write_atomically(options.out / "figure_4c.nc", lambda to: data.to_netcdf(to, engine="h5netcdf"))
-    draw(data, options.out / "figure_4c.png")
+    data, done = plans(options, counts), acting(options, steps)
+    command = f"05_apartment.py --sigma {options.sigma:g}" + " --box2d" * options.box2d
+    command += f" --seeds {options.seeds} --only {' '.join(options.only)}"
+    about = origin(command) | described() | {"sigma": options.sigma}
+    about |= {"start": TASK.reward(TASK.start), "nodes": SEARCH["nodes"]}
+    save(data.assign_attrs(about), options.out / "figure_4c.nc")
+    kept = of_episodes(done, steps, ("bumped", "planned", "seconds"))
+    save(kept.assign_attrs(about), options.out / "figure_4c_acting.nc")
+    draw(data, done, steps, options.out / "figure_4c.png")
     print(data["valid"].mean("seed").to_pandas().to_string(na_rep="-"))
-    print(f"\n{options.out / 'figure_4c.nc'}, figure_4c.png")
+    rows = [summary(NAMES[name], episodes, steps) for name, episodes in done.items()]
+    print(pd.DataFrame(rows).to_string(index=False))
+    print(f"\n{options.out / 'figure_4c.nc'}, figure_4c_acting.nc, figure_4c.png")
+
+
+def main() -> None:
+    """Run the experiment."""
+    to_end(run, "trials")
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
     python analysis/06_wrong_model.py              # ten episodes of each, in out/wrong_model
     python analysis/06_wrong_model.py --resume     # go on where a run was interrupted
+    python analysis/06_wrong_model.py --box2d      # the world in another engine than the agents'
     python analysis/06_wrong_model.py --quick      # two short ones, for CI
     python analysis/06_wrong_model.py --sigma 0.01  # with noise: hours rather than minutes
     python analysis/benchmarks/agents.py --results out/wrong_model
@@ -18,20 +19,18 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Mapping
+from dataclasses import dataclass
 from functools import partial
-from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import xarray as xr
-from scipy import stats
+from experiments import curve, of_episodes, origin, save, summary, to_end
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import EpisodeError
-from pbrl_ppl.history import write_atomically
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "models" / "shopping_cart"))
 from task import SPREAD, TASK, TRUTH
@@ -53,81 +52,48 @@ AGENTS = {
 }
 
 
-def world(name: str, sigma: float) -> pp.World:
-    """The cart with an effect, and noise on what is observed."""
-    truth = TRUTH | WORLDS[name]
-    return pp.World(TASK, truth, (EFFECTS[name],), sigma=sigma, spread=SPREAD)
+@dataclass(frozen=True)
+class Hidden:
+    """The undeclared effect in a world of another engine: the command turned, and a force added."""
+
+    angle: float = 0.0
+    force: tuple[float, float] = (0.0, 0.0)
+
+    def __call__(self, wrench: np.ndarray) -> np.ndarray:
+        """Return what acts in place of commanded wrenches (body, 3)."""
+        c, s = np.cos(self.angle), np.sin(self.angle)
+        out = wrench.copy()
+        out[:, :2] = wrench[:, :2] @ np.array([[c, s], [-s, c]]) + self.force
+        return out
+
+
+def world(name: str, sigma: float, box2d: bool = False) -> pp.World:
+    """Return the cart's world with an effect, and noise on what is observed."""
+    sizes = WORLDS[name]
+    if not box2d:
+        return pp.World(TASK, TRUTH | sizes, (EFFECTS[name],), sigma=sigma, spread=SPREAD)
+    from pbrl_ppl.agents.box2d_world import Box2DWorld
+
+    hidden = Hidden(*sizes.values()) if len(sizes) == 1 else Hidden(force=tuple(sizes.values()))
+    return Box2DWorld(TASK, TRUTH, sigma=sigma, spread=SPREAD, acting=hidden)
 
 
 def agent(kind: str, effect: str, seed: int) -> pp.Agent:
-    """One of the three."""
+    """Return one of the three."""
     known = (EFFECTS[effect],) if kind == "informed" else ()
     return pp.PBRLAgent(TASK, seed=seed, nodes=NODES, effects=known, revise=kind == "revising")
 
 
-def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean over the first axis, and the ends of its 95 % interval."""
-    found = stats.bootstrap((values,), np.mean, method="percentile", rng=np.random.default_rng(1))
-    return values.mean(axis=0), *found.confidence_interval
-
-
-def added(episode: pp.Episode) -> str:
-    """Which effects the agent had added at the end, and after how many transitions."""
-    found = [f"{each['effect']} after {each['transitions']}" for each in episode.added]
-    return ", ".join(found) or "nothing"
-
-
-def summary(kind: str, episodes: list[pp.Episode], steps: int) -> dict[str, object]:
-    """A row of the table."""
-    total, low, high = interval(np.array([each.rewards(steps).sum() for each in episodes]))
-    reached = [episode.steps for episode in episodes if episode.reached]
-    seconds = np.concatenate([episode.dataset["seconds"] for episode in episodes])
-    return {
-        "agent": AGENTS[kind],
-        "reached": f"{len(reached)}/{len(episodes)}",
-        "steps to goal (median)": f"{np.median(reached):.0f}" if reached else "-",
-        "return (m)": f"{total:.0f} [{low:.0f}, {high:.0f}]",
-        "s a step (median)": f"{np.median(seconds):.2f}",
-    }
-
-
-def kept(done: Mapping[str, list[pp.Episode]], steps: int) -> xr.Dataset:
-    """What is kept of a world's episodes: by step, what is NaN after the goal is reached."""
-    agents = []
-    for episodes in done.values():
-        every = []
-        for episode in episodes:
-            own = episode.dataset[["bumped", "planned", "seconds"]].astype(float)
-            own = own.assign_coords(interval=np.arange(1, episode.steps + 1))
-            own = own.reindex(interval=np.arange(1, steps + 1)).rename(interval="step")
-            own["reward"] = ("time", episode.rewards(steps))
-            own["reached"], own["added"] = float(episode.reached), added(episode)
-            every.append(own.drop_attrs())
-        agents.append(xr.concat(every, pd.Index([each.seed for each in episodes], name="seed")))
-    return xr.concat(agents, pd.Index(list(done), name="agent")).drop_encoding()
-
-
-def main() -> None:
-    """Run what is missing, print the tables, draw."""
-    try:
-        run()
-    except EpisodeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted: finished episodes are kept; go on with --resume", file=sys.stderr)
-        sys.exit(130)
-
-
 def run() -> None:
-    """All of it; errors are the caller's."""
+    """Run what is missing, print the tables, draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--episodes", type=int, default=10)
     parser.add_argument("--steps", type=int, default=60)
+    parser.add_argument("--sigma", type=float, default=0.0, help="noise of the observations")
     parser.add_argument("--workers", type=int, help="processes; all processors by default")
-    parser.add_argument("--sigma", type=float, default=0.0, help="noise (m, rad, m/s, rad/s)")
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--resume", action="store_true", help="go on with what is in the folder")
+    parser.add_argument("--box2d", action="store_true", help="the world in Box2D")
     parser.add_argument("--quick", action="store_true", help="two episodes of 4 steps, for CI")
     options = parser.parse_args()
     episodes, steps = (2, 4) if options.quick else (options.episodes, options.steps)
@@ -137,10 +103,10 @@ def run() -> None:
         parser.error("--steps: expected 1 or more")
     if not 0 <= options.sigma < np.inf:
         parser.error("--sigma: expected a finite number from 0 up")
-    kind = (f"_sigma_{options.sigma:g}" if options.sigma else "") + "_quick" * options.quick
-    out = options.out.with_name(options.out.name + kind)
+    kind = (f"_sigma_{options.sigma:g}" if options.sigma else "") + "_box2d" * options.box2d
+    out = options.out.with_name(options.out.name + kind + "_quick" * options.quick)
     if any(out.glob("*/*.nc")) and not options.resume:
-        parser.error(f"{out}: there are episodes; go on with --resume, or give another --out")
+        raise EpisodeError(f"{out}: there are episodes; go on with --resume, or give another --out")
     figure, axes = plt.subplots(
         1, len(WORLDS), figsize=(10, 3.6), sharey=True, layout="constrained"
     )
@@ -148,12 +114,12 @@ def run() -> None:
     for name, axis in zip(WORLDS, axes, strict=True):
         agents = {kind: partial(agent, kind, name) for kind in AGENTS}
         done = pp.run_episodes(
-            agents, world(name, options.sigma), range(1, episodes + 1), out / name,
+            agents, world(name, options.sigma, options.box2d), range(1, episodes + 1), out / name,
             steps=steps, workers=options.workers, progress=partial(print, flush=True),
         )  # fmt: skip
-        found.append(kept(done, steps))
+        found.append(of_episodes(done, steps, ("bumped", "planned", "seconds")))
         print(f"\n{name} undeclared, {episodes} episodes of at most {steps} steps")
-        rows = [summary(kind, each, steps) for kind, each in done.items()]
+        rows = [summary(AGENTS[kind], each, steps) for kind, each in done.items()]
         print(pd.DataFrame(rows).to_string(index=False))
         print("added:", "; ".join(found[-1]["added"].sel(agent="revising").to_numpy()))
         returns = found[-1]["reward"].sum("time").mean("seed")
@@ -164,27 +130,25 @@ def run() -> None:
             flush=True,
         )
         for kind, own in done.items():
-            mean, low, high = interval(np.array([episode.rewards(steps) for episode in own]))
-            (line,) = axis.plot(mean, label=AGENTS[kind])
-            axis.fill_between(
-                np.arange(len(mean)), low, high, color=line.get_color(), alpha=0.2, linewidth=0
-            )
+            curve(axis, np.array([episode.rewards(steps) for episode in own]), AGENTS[kind])
         axis.set_title(f"{name.replace('_', ' ')} undeclared", loc="left", fontsize=10)
         axis.set_xlabel("steps")
     axes[0].set_ylabel("reward: minus the distance to the goal (m)")
     figure.legend(*axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False)
-    figure.savefig(out / "wrong_model.png", dpi=120)
+    command = f"06_wrong_model.py --episodes {episodes} --steps {steps} --sigma {options.sigma:g}"
+    about = origin(command + " --box2d" * options.box2d)
     whole = xr.concat(found, pd.Index(list(WORLDS), name="world")).assign_attrs(
-        command=f"python analysis/06_wrong_model.py --episodes {episodes} --steps {steps}"
-        f" --sigma {options.sigma:g}",
-        sizes=str(WORLDS), sigma=options.sigma, scene=TASK.scene.to_toml(),
-        versions=", ".join(f"{p} {version(p)}" for p in ("pbrl_ppl", "pymunk", "pymc")),
-    )  # fmt: skip
-    packed = {name: {"zlib": True} for name in whole if whole[name].dtype.kind == "f"}
-    write_atomically(
-        out / "wrong_model.nc", lambda to: whole.to_netcdf(to, engine="h5netcdf", encoding=packed)
+        sizes=str(WORLDS), sigma=options.sigma, scene=TASK.scene.to_toml(), **about
     )
-    print(f"\n{out / 'wrong_model.nc'}, wrong_model.png")
+    path = out / f"wrong_model{'_box2d' * options.box2d}.nc"
+    save(whole, path)
+    figure.savefig(path.with_suffix(".png"), dpi=120)
+    print(f"\n{path}, {path.stem}.png")
+
+
+def main() -> None:
+    """Run the experiment."""
+    to_end(run)
 
 
 if __name__ == "__main__":

@@ -5,9 +5,10 @@
     python analysis/07_scaling.py --quick    # one and two objects, a seed, for CI
 
 Boxes on casters stand in a square room, close together: one of them is pushed at a time, at random.
-Left: OO-LWR has a model for each condition of each body, of which there are 2^(|O| n_s) (section
-3.1.3 of the paper); shown are the bound and how many of them 1000 observations have met. Right: how
-many observations PBRL needs until the mass of every box is known to 5 % (the mode of the posterior
+Left: OO-LWR has a model for each condition of each body. There are 2^(|O| n_s) of them where a
+condition tells what touches a sector (section 3.1.3 of the paper), 2^n_s where it tells only that
+something does; shown are both bounds, and how many 1000 observations have met. Right: how many
+observations PBRL needs until the mass of every box is known to 5 % (the mode of the posterior
 against the truth, noise as of a motion capture). Each room is a process and a file of its own, all
 of them are in scaling.nc.
 """
@@ -15,21 +16,20 @@ of them are in scaling.nc.
 from __future__ import annotations
 
 import argparse
-import sys
 import warnings
 from concurrent.futures import as_completed
-from importlib.metadata import version
 from pathlib import Path
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pandas as pd
 import xarray as xr
+from experiments import origin, save, to_end
+from matplotlib.axes import Axes
 
 import pbrl_ppl as pp
 from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.errors import EpisodeError
-from pbrl_ppl.history import write_atomically
 from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Simulator
@@ -45,7 +45,7 @@ OBSERVED = 1000
 #: Observations of an episode, each from the start.
 LENGTH = 25
 TOLERANCE = 0.05
-CONTACTS = pp.SectorContacts()
+CONTACTS = {"": pp.SectorContacts(), "_by_object": pp.SectorContacts(by_object=True)}
 
 
 def room(objects: int) -> tuple[Scene, np.ndarray]:
@@ -102,11 +102,11 @@ def explore(
     return scene, dict(zip(layout.labels, masses, strict=True)), pd.DataFrame(rows)
 
 
-def conditions_met(scene: Scene, seen: pd.DataFrame) -> int:
-    """Pairs of a body and a condition, among the states from which something was pushed."""
+def conditions_met(scene: Scene, seen: pd.DataFrame, contacts: pp.SectorContacts) -> int:
+    """Count pairs of a body and a condition, among states from which something was pushed."""
     pushed = seen[seen["force_x"].notna()]
     poses = pushed[["x", "y", "theta"]].to_numpy().reshape(-1, len(scene.moving), 3)
-    found = CONTACTS.conditions(scene, poses)
+    found = contacts.conditions(scene, poses)
     return len({(i, condition) for state in found for i, condition in enumerate(state)})
 
 
@@ -145,18 +145,22 @@ def observations_needed(scene: Scene, masses: dict[str, float], seen: pd.DataFra
 def measured(objects: int, seed: int, observed: int, path: Path) -> xr.Dataset:
     """What a room shows, kept in a file."""
     scene, masses, seen = explore(objects, observed, seed)
-    met, needed = conditions_met(scene, seen), observations_needed(scene, masses, seen)
+    met = {
+        f"conditions_met{kind}": float(conditions_met(scene, seen, contacts))
+        for kind, contacts in CONTACTS.items()
+    }
+    needed = observations_needed(scene, masses, seen)
+    values = met | {"observations_needed": needed}
     found = xr.Dataset(
-        {
-            "conditions_met": (("seed", "objects"), [[float(met)]]),
-            "observations_needed": (("seed", "objects"), [[needed]]),
-        },
+        {name: (("seed", "objects"), [[value]]) for name, value in values.items()},
         {"seed": [seed], "objects": [objects]},
         {"observations": observed, "tolerance": TOLERANCE},
     )
-    write_atomically(path, lambda to: found.to_netcdf(to, engine="h5netcdf"))
+    save(found, path)
     print(
-        f"{objects} objects, seed {seed}: {met} conditions, {needed:.0f} observations", flush=True
+        f"{objects} objects, seed {seed}: {met['conditions_met']:.0f} conditions"
+        f" ({met['conditions_met_by_object']:.0f} by object), {needed:.0f} observations",
+        flush=True,
     )
     return found
 
@@ -179,8 +183,8 @@ def stored(path: Path, observed: int) -> xr.Dataset:
     return found
 
 
-def run(options: argparse.Namespace, counts: list[int], observed: int) -> xr.Dataset:
-    """Run what is missing; everything the figure shows."""
+def measured_all(options: argparse.Namespace, counts: list[int], observed: int) -> xr.Dataset:
+    """Measure the rooms that are missing; return what the figure shows."""
     folder = options.out / "rooms"
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.glob("*.nc")) and not options.resume:
@@ -201,45 +205,45 @@ def run(options: argparse.Namespace, counts: list[int], observed: int) -> xr.Dat
             running = [executor.submit(measured, *each) for each in left]
             every += [future.result() for future in as_completed(running)]
     whole = xr.combine_by_coords(every, combine_attrs="override")
-    touchable = np.array(counts)  # the other boxes, and the walls
-    bound = touchable * 2.0 ** (touchable * CONTACTS.sectors)
-    return whole.assign(conditions=("objects", bound)).assign_attrs(
-        command=f"python analysis/07_scaling.py --seeds {options.seeds}",
-        pbrl_ppl=version("pbrl_ppl"),
-    )
+    bodies, sectors = np.array(counts), CONTACTS[""].sectors
+    bounds = {
+        "conditions": ("objects", bodies * 2.0**sectors),
+        "conditions_by_object": ("objects", bodies * 2.0 ** (bodies * sectors)),  # others and walls
+    }
+    return whole.assign(bounds).assign_attrs(origin(f"07_scaling.py --seeds {options.seeds}"))
 
 
 def drawn(found: xr.Dataset, path: Path) -> None:
-    """The two panels."""
+    """Draw the two panels."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.0, 3.6), layout="constrained")
     objects = found["objects"]
-    left.semilogy(
-        objects, found["conditions"], "o-", color="#D55E00", label="possible: $|O|\\,2^{|O| n_s}$"
-    )
-    for name, axes, label in (
-        ("conditions_met", left, f"met in {found.attrs['observations']} observations"),
-        ("observations_needed", right, "PBRL, every mass to 5 %"),
+    observed = found.attrs["observations"]
+    for kind, colour, bound, told in (
+        ("_by_object", "#D55E00", "$|O|\\,2^{|O| n_s}$", "with what"),
+        ("", "#E69F00", "$|O|\\,2^{n_s}$", "that something touches"),
     ):
-        middle = found[name].median("seed")
-        low, high = (found[name].quantile(q, "seed") for q in (0.0, 1.0))
-        axes.errorbar(
-            objects,
-            middle,
-            [middle - low, high - middle],
-            fmt="o-",
-            color="#0072B2",
-            capsize=3,
-            label=label,
-        )
+        bounds = found[f"conditions{kind}"]
+        left.semilogy(objects, bounds, "--", color=colour, label=f"possible: {bound}")
+        bars(left, found[f"conditions_met{kind}"], colour, f"met in {observed}: {told}")
+    bars(right, found["observations_needed"], "#0072B2", "PBRL, every mass to 5 %")
     left.set(xlabel="objects", ylabel="models of OO-LWR")
     right.set(xlabel="objects", ylabel="observations", ylim=(0, None))
     for axes in (left, right):
         axes.spines[["top", "right"]].set_visible(False)
-        axes.legend(frameon=False)
+        axes.legend(frameon=False, fontsize=8)
     figure.savefig(path, dpi=130)
 
 
-def main() -> None:
+def bars(axes: Axes, values: xr.DataArray, colour: str, label: str) -> None:
+    """Draw the median over seeds, and the range."""
+    middle, low, high = values.median("seed"), values.min("seed"), values.max("seed")
+    axes.errorbar(
+        values["objects"], middle, [middle - low, high - middle], fmt="o-", color=colour,
+        capsize=3, label=label,
+    )  # fmt: skip
+
+
+def run() -> None:
     """Measure, keep and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=5)
@@ -254,19 +258,15 @@ def main() -> None:
         options.out = options.out.with_name(options.out.name + "_quick")
     if options.seeds < 1 or options.workers < 1:
         parser.error("--seeds and --workers: expected 1 or more")
-    try:
-        found = run(options, counts, observed)
-    except EpisodeError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
-    except KeyboardInterrupt:
-        print("interrupted: finished rooms are kept; go on with --resume", file=sys.stderr)
-        sys.exit(130)
-    write_atomically(
-        options.out / "scaling.nc", lambda path: found.to_netcdf(path, engine="h5netcdf")
-    )
+    found = measured_all(options, counts, observed)
+    save(found, options.out / "scaling.nc")
     drawn(found, options.out / "scaling.png")
     print(f"figure: {options.out / 'scaling.png'}")
+
+
+def main() -> None:
+    """Run the experiment."""
+    to_end(run, "rooms")
 
 
 if __name__ == "__main__":
