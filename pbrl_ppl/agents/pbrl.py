@@ -34,7 +34,7 @@ _FORETOLD = 1e-4
 _SURPRISE = 4.0
 #: Transitions that a model is criticised with at least, and the chance of trying an effect in all
 #: of a clean episode.
-_LEAST, _LEVEL = 4, 0.01
+_LEAST, _LEVEL = 3, 0.01
 
 
 @final

@@ -30,6 +30,9 @@ MOST_ADDED = 3
 #: Log-likelihoods of few transitions that differ by less choose between no effects: the catalogue's
 #: order does, in which the simpler goes first (nats; a score of 10, as in `inseparable`).
 _TIE = 5.0
+#: Up to so many transitions all candidates are refitted, whatever their scores; a refit counts
+#: where it explains so much of the squared residuals, for the declared model's own fit may be poor.
+_FEW, _DECISIVE = 16, 0.99
 #: Precision of an angle of which nothing is known, as if it were normal (1/rad^2).
 _CIRCLE = 3.0 / np.pi**2
 
@@ -45,7 +48,8 @@ class Revision:
     transitions : int
         How many the agent had observed when it first added it.
     p_value : float
-        Of the score test, corrected for the candidates and for the looks at each.
+        Of the score test, or of the share of the misfit that a refit explains, corrected for the
+        candidates and for the looks at each.
     elpd_difference, elpd_difference_se : float
         Gain in cross-validated log predictive density, and its standard error (nats).
     not_separable_from : tuple of str
@@ -154,9 +158,16 @@ class _Step:
         missing = candidates(mode.problem.scene, mode.problem.physics.effects, self.catalogue)
         ranked = rank_candidates(mode, missing)
         leading = _significant(mode, ranked, missing, self.level)[:TRIED]
+        fits = {each: known.get(each.attached) or _climbed(mode, each) for each in leading}
+        chances = {each: _p_value(mode, each) for each in ranked}
+        if mode.problem.segments.n <= _FEW:  # a score far from the truth says little of so few
+            for each, (refit, chance) in _refitted(mode, ranked, missing, self.level).items():
+                chances[each] = min(chances[each], chance)
+                fits[each] = max(fits.get(each, refit), refit, key=lambda one: one.log_posterior)
+            leading = sorted(fits, key=lambda each: -fits[each].log_posterior)[:TRIED]
+            fits = {each: fits[each] for each in leading}
         if not leading:
             return None
-        fits = {each: known.get(each.attached) or _climbed(mode, each) for each in leading}
 
         def rank(signature: Signature) -> int:
             return missing.index(signature.attached)
@@ -186,7 +197,7 @@ class _Step:
                 revision = Revision(
                     best.attached,
                     mode.problem.segments.n,
-                    min(1.0, _p_value(mode, best) * len(missing)),
+                    min(1.0, chances[best] * len(missing)),
                     gained.total,
                     gained.error,
                     inseparable(best, ranked),
@@ -212,24 +223,46 @@ def _significant(
     return sorted(kept, key=ranked.index)
 
 
+def _refitted(
+    mode: Mode, ranked: list[Signature], missing: tuple[Attached, ...], level: float
+) -> dict[Signature, tuple[Mode, float]]:
+    """Refits that explain nearly all of the misfit, and the chance of that; of twins, the first."""
+    before = float((mode.whitened_residual() ** 2).sum())
+    found: dict[Signature, tuple[Mode, float]] = {}
+    for signature in sorted(ranked, key=lambda each: missing.index(each.attached)):
+        if not any(twins(signature, earlier) for earlier in found):
+            refit = _climbed(mode, signature, estimate=False)
+            after = float((refit.problem.whitened(refit.phi, mode.sigma) ** 2).sum())
+            share = 1.0 - after / before
+            chance = _chance(mode, signature, share)
+            if share > _DECISIVE and chance * len(ranked) < level:
+                found[signature] = refit, chance
+    return found
+
+
 def _p_value(mode: Mode, signature: Signature) -> float:
-    """Chance of a score statistic, by the beta law: few residuals tell the noise roughly."""
-    candidate, q = signature.candidate, signature.basis.shape[1]
-    residual = mode.whitened_residual()
-    free = np.count_nonzero(residual) - np.linalg.matrix_rank(mode.jacobian) - q
-    if q == 0 or free < 1:
+    """Chance of a score statistic where nothing is missing."""
+    total = float((mode.whitened_residual() ** 2).sum())
+    return _chance(mode, signature, min(signature.candidate.statistic / total, 1.0))
+
+
+def _chance(mode: Mode, signature: Signature, share: float) -> float:
+    """Chance of explaining a share of the squares, by the beta law: few residuals tell no noise."""
+    q = signature.basis.shape[1]
+    free = np.count_nonzero(mode.whitened_residual()) - np.linalg.matrix_rank(mode.jacobian) - q
+    if q == 0 or free < 1 or share <= 0.0:
         return 1.0
-    share = min(candidate.statistic / float((residual**2).sum()), 1.0)
-    return float(min(1.0, candidate.looks * beta.sf(share, q / 2, free / 2)))
+    return float(min(1.0, signature.candidate.looks * beta.sf(share, q / 2, free / 2)))
 
 
-def _climbed(mode: Mode, signature: Signature) -> Mode:
-    """Mode with the candidate in the model, climbed to from the score's estimate."""
+def _climbed(mode: Mode, signature: Signature, *, estimate: bool = True) -> Mode:
+    """Mode with the candidate, climbed to from the score's estimate or from its prior's centre."""
     attached, old = signature.attached, mode.problem
     problem = old.with_physics(effects=(*old.physics.effects, attached))
     phi = problem.layout.from_layout(old.layout, mode.phi)
-    places = [problem.layout.labels.index(label) for label in attached.labels]
-    phi[places] = list(signature.candidate.estimate.values())
+    if estimate:
+        places = [problem.layout.labels.index(label) for label in attached.labels]
+        phi[places] = list(signature.candidate.estimate.values())
     return find_mode(problem, initial=inside(problem.layout.priors, phi))
 
 
