@@ -91,10 +91,8 @@ def cart(data: xr.Dataset, prefix: str = "") -> dict[str, float]:
     pbrl, true = (total.sel(agent=name).to_numpy() for name in ("pbrl", "true"))
     out = {f"pbrl_return_over_true{key}": value for key, value in ratio(pbrl, true).items()}
     out["pbrl_steps_over_true"] = over(steps.median("seed"), "pbrl", "true")
-    for name in ("oolwr", "oolwr_by_object"):
-        if name in names:
-            out[f"{name}_steps_over_pbrl"] = over(steps.median("seed"), name, "pbrl")
-            out[f"{name}_bumps_over_pbrl"] = over(bumps, name, "pbrl")
+    out["oolwr_steps_over_pbrl"] = over(steps.median("seed"), "oolwr", "pbrl")
+    out["oolwr_bumps_over_pbrl"] = over(bumps, "oolwr", "pbrl")
     out["lwr_plateau"] = float(last.where(data["reached"] == 0).sel(agent="lwr").median())
     out |= {f"{name}_success": float(data["reached"].sel(agent=name).mean()) for name in names}
     seconds = data["seconds"].sel(agent="pbrl").to_numpy()
