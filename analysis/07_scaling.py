@@ -30,9 +30,8 @@ from matplotlib.axes import Axes
 import pbrl_ppl as pp
 from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.errors import EpisodeError
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from pbrl_ppl.state import STATE, WRENCH
 
@@ -82,7 +81,7 @@ def explore(
     scene, grid = room(objects)
     layout = build_layout(scene)
     masses = rng.uniform(5.0, 20.0, objects)
-    simulator = Simulator(scene, layout, substeps=100)
+    simulator = Simulator(Physics(scene, substeps=100))
     rows: list[dict[str, object]] = []
     for episode in range(-(-observations // LENGTH)):
         state = np.zeros((objects, 6))

@@ -21,7 +21,7 @@ from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.effects import attach
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import trajectory_mode
 from pbrl_ppl.posterior import draws
 from pbrl_ppl.report import plot_rollout, png

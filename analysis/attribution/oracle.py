@@ -16,7 +16,7 @@ from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.effects import Attached, attach
-from pbrl_ppl.model import Problem, bodies_acceleration
+from pbrl_ppl.likelihood import Problem, bodies_acceleration
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.state import STATE

@@ -29,9 +29,9 @@ import pytensor.tensor as pt
 from pbrl_ppl import Body, Scene, Shape, Simulator, SimulatorOp
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History, fill_hinges
-from pbrl_ppl.model import Problem, build_layout
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.parameters import Layout, box, differentiate
-from pbrl_ppl.physics import PartedSimulator, calls, pointers
+from pbrl_ppl.physics import PartedSimulator, Physics, build_layout, calls, pointers
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Joint, Wall
 
@@ -144,7 +144,7 @@ def arms_sides(n: int) -> tuple[Callable[[], float], Callable[[], float]]:
     start[..., 2], start[..., 5] = rng.normal(0, 1, (n, 2)), rng.normal(0, 4, (n, 2))
     start, actions = hung(scene, start), np.zeros((n, 1, 2, 3))
     actions[..., 2] = rng.normal(0, 0.3, (n, 1, 2))
-    lane, engine = Simulator(scene, layout, attached), Simulator(scene, layout, attached)
+    lane, engine = Simulator(Physics(scene, attached)), Simulator(Physics(scene, attached))
     engine(phi, start[:1], actions[:1])
     for worlds in engine._worlds.values():
         for world in worlds:
@@ -208,7 +208,7 @@ def _bare(fn, world, start, step, substeps):  # type: ignore[no-untyped-def]
 
 def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[], None]:
     """The engine's own C stepping of the same world from the same states, and nothing else."""
-    world = World(simulator.scene)
+    world = World(simulator.physics.scene)
     given = simulator._properties(phi[None])
     world.set_properties(given.bodies[0, 0], given.joints[0])
     where = pointers.pointers(world)
@@ -236,7 +236,7 @@ def free_sides(
         layout = build_layout(scene, attached)
         given = {block.name: (CART | SIZES)[block.name] for block in layout.blocks}
         simulators.append(
-            (Simulator(scene, layout, attached, extrapolate=False), layout.to_vector(given))
+            (Simulator(Physics(scene, attached, extrapolate=False)), layout.to_vector(given))
         )
     (ours, phi), (theirs, known) = simulators
     return timed(lambda: ours(phi, start, actions)), timed(bare(theirs, known, start))
@@ -289,9 +289,9 @@ def rows() -> list[Row]:
     phi = layout.to_vector(CART)
     start, actions = cart_data(TRANSITIONS)
     many = cart_data(MANY)
-    plain = Simulator(scene, layout, extrapolate=False)
-    usual = Simulator(scene, layout)
-    two = Simulator(scene, layout, threads=2)
+    plain = Simulator(Physics(scene, extrapolate=False))
+    usual = Simulator(Physics(scene))
+    two = Simulator(Physics(scene, threads=2))
     np.testing.assert_allclose(
         plain(phi, start, actions), naive(start, actions), rtol=1e-9, atol=1e-9
     )
@@ -301,7 +301,7 @@ def rows() -> list[Row]:
     pool = ThreadPoolExecutor(2)
 
     apartment = Scene.load(APARTMENT)
-    rooms = Simulator(apartment, build_layout(apartment), extrapolate=False)
+    rooms = Simulator(Physics(apartment, extrapolate=False))
     furniture = apartment_data(apartment, TRANSITIONS)
     bodies = len(apartment.dynamic)
 
@@ -339,7 +339,7 @@ def op_sides(
     scene: Scene, layout: Layout, phi: np.ndarray, start: np.ndarray, actions: np.ndarray
 ) -> tuple[Callable[[], float], Callable[[], float]]:
     """A compiled pytensor function of the Op, and the Simulator; each call at another phi."""
-    op = SimulatorOp(scene, layout)
+    op = SimulatorOp(Physics(scene))
     variable = pt.dvector("phi")
     function = pytensor.function([variable], op(variable, start, actions), trust_input=True)
     wiggle = np.random.default_rng(3)
@@ -355,10 +355,9 @@ def op_sides(
 
 def touching(scene: Scene) -> float:
     """Share of the apartment's transitions in which shapes come close enough to touch."""
-    layout = build_layout(scene)
     phi, start, actions = apartment_data(scene, TRANSITIONS)
     plain, extrapolated = (
-        Simulator(scene, layout, extrapolate=extrapolate)(phi, start, actions)
+        Simulator(Physics(scene, extrapolate=extrapolate))(phi, start, actions)
         for extrapolate in (0, 1)
     )
     return float((plain == extrapolated).all(axis=(1, 2, 3)).mean())

@@ -29,12 +29,12 @@ from pytensor.graph.op import Op
 
 import pbrl_ppl as pp
 from pbrl_ppl.history import lever
-from pbrl_ppl.model import Problem, sigma_prior
-from pbrl_ppl.model.likelihood import next_state_logp
-from pbrl_ppl.model.table1 import build_layout, random_variable
+from pbrl_ppl.likelihood import Problem, sigma_prior
+from pbrl_ppl.model.density import next_state_logp
+from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
-from pbrl_ppl.physics import PartedSimulator
+from pbrl_ppl.physics import PartedSimulator, Physics, build_layout
 from pbrl_ppl.posterior.store import az, convergence, group
 from pbrl_ppl.sampling.fitting import METHODS
 
@@ -61,7 +61,7 @@ def simulate(
     """A history of single transitions (n, k, 6) under wrenches (n, k, 3), by Eq. 13."""
     rng = np.random.default_rng(seed)
     n, k = start.shape[:2]
-    end = PartedSimulator(scene, build_layout(scene))(phi, start, actions[:, None])[:, 0]
+    end = PartedSimulator(Physics(scene))(phi, start, actions[:, None])[:, 0]
     end = end + noise * rng.standard_normal(end.shape)
     states = np.stack([start, end], axis=1).reshape(-1, 6)
     wrenches = np.stack([actions, np.full_like(actions, np.nan)], axis=1).reshape(-1, 3)
@@ -138,7 +138,7 @@ def furniture(n: int, joined: bool) -> tuple[pp.Scene, pp.History]:
     at_cart, at_trailer = lever(start[:, 0], front)[0], lever(start[:, 1], back)[0]
     start[:, 1, :2] = start[:, 0, :2] + at_cart - at_trailer
     pushes = rng.normal(0, [6.0, 6.0, 1.5], (2, n, 1, 4, 3)) * mass[:, None]
-    start = PartedSimulator(truth, layout)(phi, start, pushes[0])[:, 0]
+    start = PartedSimulator(Physics(truth))(phi, start, pushes[0])[:, 0]
     return scene, simulate(truth, phi, start, pushes[1, :, 0], NOISE, 1)
 
 

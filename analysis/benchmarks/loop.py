@@ -23,7 +23,7 @@ from pathlib import Path
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import loop
 from pbrl_ppl.effects import attach, candidates
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
 
 sys.path.insert(0, str(Path(__file__).parent))

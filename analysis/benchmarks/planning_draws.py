@@ -19,7 +19,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 import pbrl_ppl as pp
-from pbrl_ppl.model import build_layout
+from pbrl_ppl.physics import build_layout
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.scene import Wall
 

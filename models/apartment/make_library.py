@@ -14,7 +14,7 @@ from task import LIBRARY_FILE, SCENE, TRUTH
 
 import pbrl_ppl as pp
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import build_layout
+from pbrl_ppl.physics import build_layout
 
 #: Transitions of each trial, and the noise of what is measured (m, rad, m/s, rad/s).
 COUNT, SIGMA = 60, 0.005

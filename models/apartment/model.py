@@ -31,9 +31,9 @@ def apartment_model(scene: pp.Scene, history: pp.History) -> pm.Model:
     wheels = [name for name in LOG_MASS if name not in NO_WHEEL]
     bounds = np.array([scene.body(name).shape.bounds for name in wheels])
     x_min, x_max, y_min, y_max = bounds.T
-    problem = pp.physics_model(scene, history).problem  # gives the order of phi
+    physics = pp.Physics.declare(scene)  # gives the order of phi
     # bodies that were apart in this history are simulated apart
-    simulate = pp.SimulatorOp(scene, problem.layout, parts=problem.physics.parts)
+    simulate = pp.SimulatorOp(physics.in_parts(history))
     with pm.Model(coords={"body": list(LOG_MASS), "wheel": wheels}) as model:
         # Table 1, m and r
         mass = pm.LogNormal("mass", mu=list(LOG_MASS.values()), sigma=0.5, dims="body")

@@ -21,11 +21,9 @@ def rooms_model(scene: pp.Scene, history: pp.History) -> pm.Model:
     transitions = history.segments(horizon=1)
     start, actions = transitions.start, transitions.actions
     measured = transitions.observed  # (transition, 1, body, state)
-    problem = pp.physics_model(scene, history).problem  # gives the order of phi
+    physics = pp.Physics.declare(scene)  # gives the order of phi
     # bodies that were apart in this history are simulated apart
-    simulate = pp.SimulatorOp(
-        scene, problem.layout, problem.physics.effects, parts=problem.physics.parts
-    )
+    simulate = pp.SimulatorOp(physics.in_parts(history))
     with pm.Model(
         coords={"body": ["robot", "table", "couch"], "feet": ["table", "couch"]}
     ) as model:

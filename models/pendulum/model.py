@@ -21,8 +21,8 @@ def pendulum_model(scene: pp.Scene, history: pp.History) -> pm.Model:
     transitions = history.segments(horizon=1)
     start, actions = transitions.start, transitions.actions
     measured = transitions.observed[..., MEASURED]  # (transition, 1, body, state)
-    problem = pp.physics_model(scene, history).problem  # gives the order of phi
-    simulate = pp.SimulatorOp(scene, problem.layout, problem.physics.effects)
+    physics = pp.Physics.declare(scene)  # gives the order of phi
+    simulate = pp.SimulatorOp(physics)
     with pm.Model() as model:
         # Table 1, restitution and contact friction: the arm touches nothing
         r = pm.LogNormal("r", mu=-1.5, sigma=1.0)

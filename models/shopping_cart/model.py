@@ -21,8 +21,8 @@ def cart_model(scene: pp.Scene, history: pp.History) -> pm.Model:
     start, actions = transitions.start, transitions.actions
     measured = transitions.observed  # (transition, 1, body, state)
     x_min, x_max, y_min, y_max = scene.body("cart").shape.bounds
-    problem = pp.physics_model(scene, history).problem  # gives the order of phi
-    simulate = pp.SimulatorOp(scene, problem.layout)
+    physics = pp.Physics.declare(scene)  # gives the order of phi
+    simulate = pp.SimulatorOp(physics)
     with pm.Model() as model:
         # Table 1, m and r
         mass = pm.LogNormal("mass", mu=1.0, sigma=1.5)

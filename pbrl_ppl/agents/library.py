@@ -14,9 +14,11 @@ from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.task import Task
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import Noise, ParameterLibrary, Problem, build_layout, build_model
+from pbrl_ppl.likelihood import Noise, Problem
+from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import choose_from_library
-from pbrl_ppl.physics import touching
+from pbrl_ppl.parameters import ParameterLibrary
+from pbrl_ppl.physics import build_layout, touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit

@@ -18,7 +18,7 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, FitError, UninformedWarning
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import Dynamics

@@ -70,7 +70,8 @@ def check(
             progress("comparing with draws from the prior")
             from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
             from pbrl_ppl.effects import attach
-            from pbrl_ppl.model import Problem, build_model
+            from pbrl_ppl.likelihood import Problem
+            from pbrl_ppl.model import build_model
 
             horizon = telling_horizon(loaded)
             model = build_model(Problem.of(declared, loaded, attach(declared, ()), horizon=horizon))

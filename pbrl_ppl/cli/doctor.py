@@ -27,7 +27,6 @@ def doctor(as_json: AsJson = False, quiet: Quiet = False) -> None:
         progress("loading the packages")
         import threadpoolctl
 
-        from pbrl_ppl.model import Transition  # noqa: F401  # its libraries are looked at below
         from pbrl_ppl.posterior import versions
 
         found: dict[str, Any] = {"versions": versions(), "platform": platform.platform()}
@@ -62,24 +61,22 @@ def _engine() -> dict[str, Any]:
     """Which loop there is, how far it is from the plain one, and its time for a transition."""
     import numpy as np
 
-    from pbrl_ppl.model import build_layout
-    from pbrl_ppl.physics import Simulator
+    from pbrl_ppl.physics import Physics, calls
     from pbrl_ppl.scene import Body, Scene, Shape, Wall
 
     # a puck that hits a wall, so that contacts are in it
     puck = Body("puck", Shape.circle(0.1), known=(("r", 0.5), ("mu_c", 0.3)))
     scene = Scene(time_step=0.1, bodies=(puck,), walls=(Wall((1.0, -1.0), (1.0, 1.0)),))
-    layout = build_layout(scene)
     start = np.zeros((100, 1, 6))
     start[:, 0, 0], start[:, 0, 3] = np.linspace(0.0, 0.8, 100), 2.0
     actions = np.zeros((100, 1, 1, 3))
-    simulators = [Simulator(scene, layout, path=path) for path in (None, "plain")]
-    states = [simulator(np.ones(1), start, actions) for simulator in simulators]
+    fast, slow = Physics(scene), Physics(scene, engine="python")
+    states = [physics.predict(np.ones(1), start, actions) for physics in (fast, slow)]
     begin = time.perf_counter()
-    simulators[0](np.ones(1), start, actions)
+    fast.predict(np.ones(1), start, actions)
     spent = time.perf_counter() - begin
     return {
-        "path": simulators[0].path,
+        "path": "compiled" if calls.AVAILABLE else "plain",
         "difference": float(np.abs(states[0] - states[1]).max()),
         "microseconds_per_transition": 1e6 * spent / len(start),
     }

@@ -125,7 +125,7 @@ def _parameters(
 
         scene = Scene.load(source)
         from pbrl_ppl.effects import attach
-        from pbrl_ppl.model import build_layout
+        from pbrl_ppl.physics import build_layout
 
         layout, substeps = build_layout(scene, attach(scene)), scene.substeps
         phi = np.full((1, layout.size), np.nan)
@@ -164,7 +164,7 @@ def _simulated(
     import numpy as np
 
     from pbrl_ppl.effects import attach
-    from pbrl_ppl.physics import Simulator, check_history
+    from pbrl_ppl.physics import Physics, check_history
 
     # one piece a trajectory, which its end cuts short
     segments = recorded.segments(int(recorded.dataset["n_rows"].max()) - 1)
@@ -176,8 +176,8 @@ def _simulated(
             " or pass estimate_velocities=True"
         )
     check_history(scene, recorded, segments)
-    simulator = Simulator(scene, layout, attach(scene), substeps=substeps, threads=2)
-    predicted = simulator(phi, segments.start, segments.inputs)
+    physics = Physics(scene, attach(scene), substeps=substeps, threads=2)
+    predicted = physics.predict(phi, segments.start, segments.inputs)
     follows = recorded.dataset["kinematic"].to_numpy()
     n_rows = recorded.dataset["n_rows"].to_numpy()
     result = []

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t, wilcoxon
 
 from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.model import robust
+from pbrl_ppl.likelihood import robust
 from pbrl_ppl.modes import Mode, profile_sigma
 from pbrl_ppl.parameters import box, differentiate, inside, prior_residual, prior_slopes
 

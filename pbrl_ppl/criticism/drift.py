@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
-from pbrl_ppl.model import Problem, noise_medians, ranges
+from pbrl_ppl.likelihood import Problem, noise_medians, ranges
 from pbrl_ppl.modes import Mode, profile_sigma, trajectory_evidence, trajectory_mode
 
 Array = NDArray[np.float64]

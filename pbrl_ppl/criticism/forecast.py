@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem, TrajectoryNoise
+from pbrl_ppl.likelihood import Problem, TrajectoryNoise
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]

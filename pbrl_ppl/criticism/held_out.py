@@ -14,7 +14,7 @@ from pbrl_ppl.criticism.forecast import filtered_states, forecast
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
-from pbrl_ppl.model import Problem, along_trajectories, cells_of
+from pbrl_ppl.likelihood import Problem, along_trajectories, cells_of
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
 from pbrl_ppl.state import STATE, STATE_UNITS

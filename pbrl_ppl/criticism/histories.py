@@ -14,7 +14,7 @@ from pbrl_ppl.history import (
     unused_velocities,
     without_bad_frames,
 )
-from pbrl_ppl.model import cells_of, check_moves
+from pbrl_ppl.likelihood import cells_of, check_moves
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE
 

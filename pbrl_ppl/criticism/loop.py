@@ -32,7 +32,8 @@ from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ConvergenceWarning, PriorWarning
 from pbrl_ppl.history import History, without_measurements
-from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import try_effect
 from pbrl_ppl.sampling import fit

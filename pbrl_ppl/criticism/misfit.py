@@ -14,7 +14,7 @@ from pbrl_ppl.criticism.dependence import Dependence, find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import Left, noise_alone
-from pbrl_ppl.model import bodies_acceleration
+from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 

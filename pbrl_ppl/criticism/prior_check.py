@@ -14,7 +14,8 @@ from scipy.stats import binom
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History, longest_gap, measurement_noise
-from pbrl_ppl.model import Problem, prior_predictive_draws
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.model import prior_predictive_draws
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, wrapped
 

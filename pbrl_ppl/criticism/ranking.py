@@ -16,7 +16,7 @@ from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, single_transitions
+from pbrl_ppl.likelihood import Problem, single_transitions
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.scene import Scene
 

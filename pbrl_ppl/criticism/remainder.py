@@ -19,7 +19,8 @@ from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learned_remainder
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.state import STATE

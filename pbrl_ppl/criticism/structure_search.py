@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pbrl_ppl.effects import Attached
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.parameters import inside
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.model import bodies_acceleration
+from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import NOTHING, Mode, profile_sigma
 from pbrl_ppl.state import STATE
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
@@ -11,27 +11,20 @@ import pymc as pm
 import pytensor.tensor as pt
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Attached, Effect, attach
-from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history import History, check_start, measured_alone
-from pbrl_ppl.model.cells import ACCELERATION, DRIFT, JOLT
-from pbrl_ppl.model.library import ParameterLibrary
-from pbrl_ppl.model.likelihood import (
+from pbrl_ppl.likelihood import (
+    ACCELERATION,
+    DRIFT,
+    JOLT,
     Observations,
-    difference,
-    next_state_logp,
+    Problem,
+    TrajectoryNoise,
     next_state_random,
 )
-from pbrl_ppl.model.noise import Noise
+from pbrl_ppl.model.density import difference, next_state_logp, tail_tensor
 from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
-from pbrl_ppl.model.problem import Problem
-from pbrl_ppl.model.smoothing import along_trajectories
 from pbrl_ppl.model.table1 import random_variable
-from pbrl_ppl.model.tails import tail_tensor
-from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
-from pbrl_ppl.parameters import Block, Layout
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
 from pbrl_ppl.state import INPUT, STATE
 
 #: Dimensions of the noises along trajectories.
@@ -40,70 +33,12 @@ _NOISE_DIMS = {
 }  # fmt: skip
 
 
-def declared_problem(
-    scene: Scene,
-    history: History,
-    effects: Iterable[Effect | Attached] = (),
-    *,
-    horizon: int = 1,
-    sigma: str = "per_dimension",
-    nu: float | None = None,
-    substeps: int | None = None,
-    threads: int = 1,
-    library: ParameterLibrary | None = None,
-    trajectories: bool = False,
-) -> Problem:
-    """Declare the problem of a scene and a history; see :func:`pbrl_ppl.physics_model`.
-
-    Whole trajectories are linearised at the prior's centre, which is no place to sample about: a
-    mode has to be found first.
-    """
-    if sigma not in ("per_dimension", "scalar"):
-        raise ValueError(f"sigma is {sigma!r}, expected 'per_dimension' or 'scalar'")
-    if horizon < 1:
-        raise ValueError(f"horizon is {horizon}, expected at least 1")
-    if nu is not None and not 0 < nu < np.inf:
-        raise ValueError(f"nu is {nu}, expected degrees of freedom above 0, or None for a Gaussian")
-    if trajectories and (horizon > 1 or library is not None):
-        raise ValueError(
-            "trajectories is given with horizon or library; whole trajectories need neither: leave"
-            " it out"
-        )
-    if trajectories and sigma == "scalar":
-        raise ValueError("sigma is 'scalar', expected 'per_dimension' with trajectories")
-    if trajectories:
-        history = measured_alone(history)
-    else:
-        check_start(history, scene)
-    longest = int(history.dataset["n_rows"].max()) - 1
-    if horizon > longest:
-        raise HistoryError(
-            f"horizon is {horizon} intervals, and the longest trajectory has {longest}; use a"
-            " shorter horizon"
-        )
-    problem = Problem.of(
-        scene,
-        history,
-        attach(scene, effects),
-        horizon=horizon,
-        substeps=substeps,
-        threads=threads,
-        noise=Noise(scalar=sigma == "scalar", nu=nu),
-        library=library,
-    )
-    if trajectories:
-        centre = np.array([prior.centre for prior in problem.layout.priors])
-        problem = along_trajectories(problem, centre)
-    return problem
-
-
 def build_model(problem: Problem) -> pm.Model:
     """Declare the pm.Model of a problem; see :func:`pbrl_ppl.physics_model`."""
     observations, segments, layout = problem.observations, problem.segments, problem.layout
     physics, noise = problem.physics, problem.noise
-    settings = (physics.scene, layout, physics.effects, physics.substeps, physics.threads,
-                physics.parts, getattr(noise.trajectories, "sensitivity", None))  # fmt: skip
-    simulate = SimulatorOp(*settings)
+    sensitivity = getattr(noise.trajectories, "sensitivity", None)
+    simulate = SimulatorOp(physics, sensitivity)
     with pm.Model(coords=_coords(problem)) as model:
         start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
         actions = pm.Data("actions", problem.inputs, dims=("transition", "step", "body", "wrench"))
@@ -126,7 +61,7 @@ def build_model(problem: Problem) -> pm.Model:
         # the likelihood takes bodies apart that were apart in the data; in draws they may meet
         whole = predicted
         if len(problem.simulator.parts) > 1:
-            whole = OneWorldOp(*settings)(phi, start, actions)[..., columns]
+            whole = OneWorldOp(physics, sensitivity)(phi, start, actions)[..., columns]
         shape: dict[str, Any] = {"noise": noise.trajectories, "nu": noise.nu}
         shape["linearised"] = np.nan_to_num(observations.values)
         tail = [tail_tensor(physics, table1, noise.nu)] if problem.tails else []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from typing import Any
 
@@ -15,12 +15,9 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_funcify
 
-from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError, SimulationError
-from pbrl_ppl.model.sensitivity import Engine, Sensitivity
-from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import Memory, OneWorld, PartedSimulator, Parts
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.likelihood import Sensitivity
+from pbrl_ppl.physics import Memory, Physics
 from pbrl_ppl.state import INPUT, WRENCH
 
 Array = NDArray[np.float64]
@@ -29,25 +26,10 @@ Array = NDArray[np.float64]
 class _EngineOp(Op):
     """Base of the prediction and of its derivative: inputs, and the answer to impossible ones."""
 
-    __props__ = ("scene", "layout", "effects", "substeps", "threads", "parts", "sensitivity")
+    __props__ = ("physics", "sensitivity")
 
-    def __init__(
-        self,
-        scene: Scene,
-        layout: Layout,
-        effects: tuple[Attached, ...] = (),
-        substeps: int | None = None,
-        threads: int = 1,
-        parts: Parts | None = None,
-        sensitivity: Sensitivity | None = None,
-    ) -> None:
-        self.scene, self.layout, self.effects, self.parts = scene, layout, effects, parts
-        self.sensitivity = sensitivity
-        self.substeps = scene.substeps if substeps is None else substeps
-        self.threads = threads
-        self.simulator = PartedSimulator(
-            scene, layout, effects, parts, substeps=self.substeps, threads=threads
-        )
+    def __init__(self, physics: Physics, sensitivity: Sensitivity | None = None) -> None:
+        self.physics, self.sensitivity = physics, sensitivity
 
     @property
     def _last(self) -> tuple[int, ...]:
@@ -57,7 +39,9 @@ class _EngineOp(Op):
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         raise NotImplementedError
 
-    def _following(self, engine: Engine, phi: Array, start: Array, actions: Array) -> Array:
+    def _following(
+        self, engine: Callable[..., Array], phi: Array, start: Array, actions: Array
+    ) -> Array:
         """What an engine predicts, from start states that follow phi."""
         if self.sensitivity is None:
             return engine(phi, start, actions)
@@ -71,7 +55,7 @@ class _EngineOp(Op):
         SimulationError
             If an input has the wrong number of dimensions or a static shape that does not fit.
         """
-        k, p = len(self.scene.moving), self.layout.size
+        k, p = len(self.physics.scene.moving), self.physics.layout.size
         actions = pt.as_tensor_variable(actions)
         width = len(INPUT) if actions.type.shape[-1:] == (len(INPUT),) else len(WRENCH)
         inputs = []
@@ -121,31 +105,31 @@ class SimulatorOp(_EngineOp):
 
     Parameters
     ----------
-    scene : Scene
-        Known geometry.
-    layout : Layout
-        Order of phi.
-    effects : tuple of Attached
-        All effects of the model.
-    substeps : int, optional
-        Engine steps an interval; the scene's by default.
-    threads : int
-        Worlds that run side by side.
-    parts : tuple of tuple of str, optional
-        Moving bodies in parts that never touch and share no joint, each with an engine of its own;
-        see :func:`pbrl_ppl.physics.coupling.independent_parts`.
+    physics : Physics
+        Scene, effects and the engine's settings.
     sensitivity : Sensitivity, optional
-        Of the start states, where those are smoothed ones of whole trajectories.
+        Derivative of smoothed start states of whole trajectories by phi.
+    engine : str, optional
+        ``chipmunk`` or ``contact-free`` to force one; see :class:`Physics`.
     """
+
+    def __init__(
+        self,
+        physics: Physics,
+        sensitivity: Sensitivity | None = None,
+        *,
+        engine: str | None = None,
+    ) -> None:
+        super().__init__(physics if engine is None else physics.changed(engine=engine), sensitivity)
 
     @property
     def _last(self) -> tuple[int, ...]:
-        return len(self.scene.moving), 6
+        return len(self.physics.scene.moving), 6
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         if self.sensitivity is None:
-            return self.simulator.recall(phi, start, actions)
-        follow = partial(self._following, self.simulator.recall)
+            return self.physics.simulator.recall(phi, start, actions)
+        follow = partial(self._following, self.physics.simulator.recall)
         # a copy: what is remembered must not be written into
         return self._memory.recall((phi, start, actions), follow).copy()
 
@@ -157,7 +141,7 @@ class SimulatorOp(_EngineOp):
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
     ) -> list[Any]:
         """Vector-Jacobian product; start states and actions are data and have no derivative."""
-        jacobian = JacobianOp(*(getattr(self, name) for name in self.__props__))(*inputs)
+        jacobian = JacobianOp(self.physics, self.sensitivity)(*inputs)
         return [
             (cotangents[0][..., None] * jacobian).sum(axis=(0, 1, 2, 3)),
             *(
@@ -177,18 +161,10 @@ class OneWorldOp(_EngineOp):
 
     @property
     def _last(self) -> tuple[int, ...]:
-        return len(self.scene.moving), 6
+        return len(self.physics.scene.moving), 6
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
-        return self._following(self.one_world, phi, start, actions)
-
-    @cached_property
-    def one_world(self) -> OneWorld:
-        """The engine."""
-        return OneWorld(
-            self.scene, self.layout, self.effects, self.parts, substeps=self.substeps,
-            threads=self.threads,
-        )  # fmt: skip
+        return self._following(self.physics.one_world, phi, start, actions)
 
 
 class JacobianOp(_EngineOp):
@@ -199,12 +175,12 @@ class JacobianOp(_EngineOp):
 
     @property
     def _last(self) -> tuple[int, ...]:
-        return len(self.scene.moving), 6, self.layout.size
+        return len(self.physics.scene.moving), 6, self.physics.layout.size
 
     def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
         if self.sensitivity is not None:
             start = self.sensitivity.begun(self.sensitivity.moved(phi), start)
-        return self.simulator.jacobian(phi, start, actions)
+        return self.physics.jacobian(phi, start, actions)
 
 
 @numba_funcify.register(_EngineOp)

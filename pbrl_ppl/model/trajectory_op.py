@@ -14,8 +14,7 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_funcify
 
-from pbrl_ppl.model.likelihood import log_density
-from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
+from pbrl_ppl.likelihood import TrajectoryNoise, log_density
 
 Array = NDArray[np.float64]
 

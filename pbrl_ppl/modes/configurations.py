@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import Problem, index_priors
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes.evidence import Evidence
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior
+from pbrl_ppl.physics import index_priors
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import gammaln, ndtr, ndtri
 from scipy.stats import truncnorm
 
-from pbrl_ppl.model import log_posterior, noise_law
+from pbrl_ppl.likelihood import log_posterior, noise_law
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior, evened
 

@@ -13,7 +13,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import lever
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes.configurations import (
     MOST,
     Configuration,

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from pbrl_ppl.model import Problem, log_posterior
+from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, noise_gaussian, profile_sigma
 from pbrl_ppl.modes.tails import best_tails, tail_precision
 from pbrl_ppl.parameters import box, differentiate, inside, likeliest, prior_residual
@@ -43,7 +43,7 @@ class Mode:
     covariance : ndarray
         Laplace covariance of phi, shape (p, p).
     log_posterior : float
-        As of :func:`pbrl_ppl.model.log_posterior`.
+        As of :func:`pbrl_ppl.likelihood.log_posterior`.
     others : tuple of Mode
         Lower ones, that may yet hold a share of the posterior.
     """

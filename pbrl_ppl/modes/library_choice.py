@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp, softmax
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import Observations, Problem, estimate_sigma, log_density, log_noise_prior
+from pbrl_ppl.likelihood import Observations, Problem, estimate_sigma, log_density, log_noise_prior
 from pbrl_ppl.physics import Part
 
 Array = NDArray[np.float64]
@@ -30,7 +30,7 @@ class _Combinations:
     """Every combination of parameter sets of one part's bodies: its prior and its residuals."""
 
     def __init__(self, problem: Problem, part: Part, table: Array) -> None:
-        bodies = list(part.simulator.scene.owners)
+        bodies = list(part.physics.scene.owners)
         library = problem.library
         if library is None:
             raise FitError("fit: the model has no library to choose from")
@@ -49,7 +49,7 @@ class _Combinations:
         self.log_prior = np.sum(
             [np.log(p[self.indices[:, i]]) for i, p in enumerate(priors)], axis=0
         )
-        owners = [owner for block in part.simulator.layout.blocks for owner in block.owners]
+        owners = [owner for block in part.physics.layout.blocks for owner in block.owners]
         whose = [bodies.index(owner) for owner in owners]
         phi = table[part.places, self.indices[:, whose]].reshape(count, -1)
         segments = problem.segments
@@ -152,7 +152,7 @@ def choose_from_library(
             share += softmax(joint, axis=1).sum(axis=0)
             # the largest of log-probabilities with Gumbel noise is a draw
             which = (joint + rng.gumbel(size=joint.shape)).argmax(axis=1)
-            columns = [names.index(owner) for owner in part.simulator.scene.owners]
+            columns = [names.index(owner) for owner in part.physics.scene.owners]
             index[:, columns] = own.indices[which]
         chosen.append(index)
     owners = [owner for block in problem.layout.blocks for owner in block.owners]
@@ -161,7 +161,7 @@ def choose_from_library(
     phi = table[np.arange(len(owners)), of]
     best = np.zeros(len(names), dtype=np.intp)
     for own, part, share in zip(parts, problem.simulator.parts, shares, strict=True):
-        columns = [names.index(owner) for owner in part.simulator.scene.owners]
+        columns = [names.index(owner) for owner in part.physics.scene.owners]
         best[columns] = own.indices[share.argmax()]
     return phi, np.stack(sigmas), indices, np.stack(accepted), best
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import wrightomega
 
-from pbrl_ppl.model import (
+from pbrl_ppl.likelihood import (
     Problem,
     TrajectoryNoise,
     exponential,

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import Problem, estimate_sigma
+from pbrl_ppl.likelihood import Problem, estimate_sigma
 from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, gaussian_profile
 from pbrl_ppl.modes.threads import one_blas_thread

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes.noise import FAR_OFF
 from pbrl_ppl.parameters import box
 

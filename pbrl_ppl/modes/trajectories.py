@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import (
+from pbrl_ppl.likelihood import (
     Problem,
     along_trajectories,
     log_posterior,

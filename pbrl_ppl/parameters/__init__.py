@@ -9,6 +9,7 @@ from pbrl_ppl.parameters.layout import (
     Block,
     Layout,
 )
+from pbrl_ppl.parameters.library import ParameterLibrary
 from pbrl_ppl.parameters.priors import (
     Prior,
     box,
@@ -37,6 +38,7 @@ __all__ = [
     "WHEEL_PARAMETERS",
     "Block",
     "Layout",
+    "ParameterLibrary",
     "Prior",
     "Wheel",
     "beside",

@@ -2,13 +2,14 @@
 
 from pbrl_ppl.physics.coupling import Parts, independent_parts, joined_parts
 from pbrl_ppl.physics.inputs import after_recording
-from pbrl_ppl.physics.memory import Memory
-from pbrl_ppl.physics.one_world import OneWorld
-from pbrl_ppl.physics.parts import Part, PartedSimulator
+from pbrl_ppl.physics.parts import Memory, OneWorld, Part, PartedSimulator
+from pbrl_ppl.physics.physics import Physics
 from pbrl_ppl.physics.placement import check_history, check_placement, overlap
 from pbrl_ppl.physics.simulator import Simulator
 from pbrl_ppl.physics.solids import Scenery, circles, scenery
+from pbrl_ppl.physics.table1 import build_layout, index_priors
 from pbrl_ppl.physics.touch import touching
+from pbrl_ppl.physics.transition import Transition
 from pbrl_ppl.physics.trial import try_effect
 
 __all__ = [
@@ -17,13 +18,17 @@ __all__ = [
     "Part",
     "PartedSimulator",
     "Parts",
+    "Physics",
     "Scenery",
     "Simulator",
+    "Transition",
     "after_recording",
+    "build_layout",
     "check_history",
     "check_placement",
     "circles",
     "independent_parts",
+    "index_priors",
     "joined_parts",
     "overlap",
     "scenery",

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.physics import calls, compiled, lockstep, lockstep_chain
 from pbrl_ppl.physics.lockstep import free_bodies
 from pbrl_ppl.physics.pointers import pointers
@@ -81,16 +82,20 @@ class Engine:
     ----------
     build : callable
         Builds a world.
+    name : str
+        Which engine; see :class:`Physics`.
     """
 
-    def __init__(self, build: Callable[[], World]) -> None:
-        self._build = build
+    def __init__(self, build: Callable[[], World], name: str = "auto") -> None:
+        self._build, self._name = build, name
         self._renew()
 
     def _renew(self) -> None:
         self.world = self._build()
-        self.pointers, self.free = pointers(self.world), free_bodies(self.world)
-        self.chain = lockstep_chain.chain_of(self.world)
+        self.pointers = pointers(self.world)
+        fast = self._name != "chipmunk"
+        self.free = free_bodies(self.world) if fast else ()
+        self.chain = lockstep_chain.chain_of(self.world) if fast else None
         #: Whether friction under bodies is solved for many transitions side by side.
         self.slides = any(len(free.ring) for free in self.free)
 
@@ -117,6 +122,11 @@ class Engine:
             items = items[np.concatenate([np.zeros(0, dtype=bool), *left])]
         elif self.chain is not None and len(items):
             items = self._joined(self.chain, batch, items, out)
+        if len(items) and self._name == "contact-free":
+            raise SimulationError(
+                f"engine 'contact-free': {len(items)} of {last - first} transitions have contacts,"
+                " or joints that the fast path lacks; use 'auto' or 'chipmunk'"
+            )
         while len(items):
             done = compiled.rollout(calls.FUNCTIONS, self.pointers, *batch, items, out)
             if done < len(items):  # diverged: that world is spoilt, and the item is lost

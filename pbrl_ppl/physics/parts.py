@@ -1,20 +1,60 @@
-"""A scene whose bodies fall into parts that never touch: one engine a part, each with a memory."""
+"""Engines of scenes in parts: bodies that never meet are simulated apart, each part once."""
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from itertools import combinations, product
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import SimulationError
-from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics.coupling import Parts
-from pbrl_ppl.physics.memory import Memory
+from pbrl_ppl.physics.coupling import SHARE, come_near
 from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.simulator import Simulator
-from pbrl_ppl.scene import Scene
+
+if TYPE_CHECKING:
+    from pbrl_ppl.physics.physics import Physics
+
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+#: Largest difference of one world's prediction from a part's that counts as rounding (SI units).
+_ROUNDING = 1e-6
+#: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
+_REMEMBERED = 4
+
+
+class Memory:
+    """The last few results of a function, by its arguments; they do not go into a pickle."""
+
+    def __init__(self) -> None:
+        self._known: OrderedDict[Hashable, Array] = OrderedDict()
+
+    def __getstate__(self) -> dict[str, object]:
+        """Nothing."""
+        return {"_known": OrderedDict()}
+
+    def recall(self, arguments: tuple[Array, ...], compute: Callable[..., Array]) -> Array:
+        """``compute(*arguments)``, or what it gave for equal arguments a moment ago.
+
+        Examples
+        --------
+        >>> memory, one = Memory(), np.ones(2)
+        >>> memory.recall((one,), np.exp) is memory.recall((np.ones(2),), np.exp)
+        True
+        """
+        parameters, *data = arguments  # of what is large, a hash will do
+        key = (parameters.tobytes(), *((own.shape, hash(own.tobytes())) for own in data))
+        if key in self._known:
+            self._known.move_to_end(key)
+        else:
+            self._known[key] = compute(*arguments)
+            if len(self._known) > _REMEMBERED:
+                self._known.popitem(last=False)
+        return self._known[key]
 
 
 @dataclass(eq=False)
@@ -26,69 +66,45 @@ class Part:
     bodies: NDArray[np.intp]
     memory: Memory = field(default_factory=Memory)
 
+    @property
+    def physics(self) -> Physics:
+        """Its scene, effects and parameters."""
+        return self.simulator.physics
+
 
 class PartedSimulator:
     """As :class:`Simulator`, for parts whose bodies neither touch each other nor share a joint.
 
-    Proposals that agree in a part's parameters are simulated once for it: a derivative, or a
+    Proposals that agree in the parameters of a part are simulated once for it: a derivative, or a
     sampler that moves one part at a time, costs for many bodies what it costs for each alone.
-    Bodies of different parts go through each other; predictions are :class:`OneWorld`'s.
+    Bodies of different parts go through each other; see :class:`OneWorld`.
 
     Parameters
     ----------
-    scene : Scene
-        Known geometry.
-    layout : Layout
-        Order of the unknown parameters in phi.
-    effects : tuple of Attached
-        All effects of the model.
-    parts : tuple of tuple of str
-        Every moving body's name once; see :func:`independent_parts`. None for a scene in one
-        part.
-    substeps, threads, extrapolate
-        As for :class:`Simulator`.
+    physics : Physics
+        Scene, effects, settings and parts.
 
     Raises
     ------
     SimulationError
-        If ``parts`` does not hold every moving body once.
+        If the parts do not hold every moving body once.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        layout: Layout,
-        effects: tuple[Attached, ...] = (),
-        parts: Parts | None = None,
-        *,
-        substeps: int | None = None,
-        threads: int = 1,
-        extrapolate: bool = True,
-    ) -> None:
-        names = [body.name for body in scene.moving]
-        parts = (tuple(names),) if parts is None else parts
+    def __init__(self, physics: Physics) -> None:
+        names = tuple(body.name for body in physics.scene.moving)
+        parts = (names,) if physics.parts is None else physics.parts
         given = [name for part in parts for name in part]
         if sorted(given) != sorted(names):
             raise SimulationError(
                 f"parts hold {', '.join(given)}, expected each moving body once: {', '.join(names)}"
             )
-        labels = self._labels = layout.labels
+        labels = self._labels = physics.layout.labels
         self.parts = []
         for part in parts:
-            own = scene if len(parts) == 1 else scene.subset(part)
-            kept = (*part, *own.owners, *own.joint_names)
-            chosen = layout if len(parts) == 1 else layout.subset(kept)
-            simulator = Simulator(
-                own,
-                chosen,
-                tuple(attached for attached in effects if attached.body in part),
-                substeps=substeps,
-                threads=threads,
-                extrapolate=extrapolate,
-            )
-            places = np.array([labels.index(label) for label in chosen.labels], dtype=int)
-            bodies = np.array([names.index(body.name) for body in own.moving], dtype=int)
-            self.parts.append(Part(simulator, places, bodies))
+            own = physics if len(parts) == 1 else physics.part(part)
+            places = np.array([labels.index(label) for label in own.layout.labels], dtype=int)
+            bodies = np.array([names.index(body.name) for body in own.scene.moving], dtype=int)
+            self.parts.append(Part(Simulator(own), places, bodies))
 
     @property
     def steps(self) -> int:
@@ -113,7 +129,7 @@ class PartedSimulator:
         return out if phi.ndim == 2 else out[0]
 
     def recall(self, phi: Array, start: Array, actions: Array) -> Array:
-        """Predict for one phi, or recall what was said of these very inputs a moment ago."""
+        """Return the prediction for one phi, from memory if it was just computed."""
         if phi.shape != (len(self._labels),):
             raise SimulationError(
                 f"phi has shape {phi.shape}, expected ({len(self._labels)},):"
@@ -136,3 +152,65 @@ class PartedSimulator:
 
 def _of(part: Part, start: Array, actions: Array) -> tuple[Array, Array]:
     return start[..., part.bodies, :], actions[:, :, part.bodies]
+
+
+class OneWorld:
+    """As :class:`PartedSimulator`, but bodies of different parts meet.
+
+    A body that comes near none of another part, or that one world predicts as its part does, has
+    the prediction of the likelihood, to the last bit; others have that of one world.
+
+    Parameters
+    ----------
+    physics : Physics
+        Scene, effects, settings and parts.
+    """
+
+    def __init__(self, physics: Physics) -> None:
+        self.parted = physics.simulator
+        # contacts are not extrapolated, nor is anything else in a transition that has one
+        self._apart = PartedSimulator(physics.changed(extrapolate=False))
+        self._reach = [body.shape.bounding_radius for body in physics.scene.moving]
+        self._whole = Simulator(physics.changed(extrapolate=False, parts=None))
+
+    def __call__(self, phi: Array, start: Array, actions: Array) -> Array:
+        """Predict as :class:`Simulator` does: (transition, H, body, 6), or with proposals first."""
+        return self.meetings(phi, start, actions)[0]
+
+    def meetings(self, phi: Array, start: Array, actions: Array) -> tuple[Array, Bools]:
+        """Predict, and return which bodies touch another part, shape (..., transition, body)."""
+        states = self.parted(phi, start, actions)
+        met = np.zeros((*states.shape[:-3], states.shape[-2]), dtype=bool)
+        if len(self.parted.parts) == 1:
+            return states, met
+        whole, apart = self._whole(phi, start, actions), self._apart(phi, start, actions)
+        # in a contact within a part too, for the solver's iterations depend on the others
+        differ: Bools = np.asarray((~_same(whole, apart)).any(axis=(-3, -1)))
+        if not differ.any():
+            return states, met
+        for bodies_a, bodies_b in combinations((part.bodies for part in self.parted.parts), 2):
+            both = np.concatenate([bodies_a, bodies_b])
+            moved = differ[..., both].any(axis=-1)
+            if not moved.any():
+                continue
+            near: Bools = self._near(whole, start, bodies_a, bodies_b)
+            near |= self._near(apart, start, bodies_a, bodies_b)
+            met[..., both] |= np.expand_dims(moved & near, -1)
+        return np.where((met & differ)[..., None, :, None], whole, states), met
+
+    def _near(self, states: Array, start: Array, bodies_a: Ints, bodies_b: Ints) -> Bools:
+        """Whether a body of one part comes near one of another, shape (..., transition)."""
+        begin = start[..., :, None, :, :2]
+        first = np.broadcast_to(begin, (*states.shape[:-4], *begin.shape[-4:]))
+        places = np.concatenate([first, states[..., :2]], axis=-3)
+        found = np.zeros(states.shape[:-3], dtype=bool)
+        for i, j in product(bodies_a, bodies_b):
+            way = places[..., i, :] - places[..., j, :]
+            least = (1.0 + SHARE) * (self._reach[i] + self._reach[j])
+            found |= come_near(way[..., :-1, :], way[..., 1:, :], least).any(axis=-1)
+        return found
+
+
+def _same(a: Array, b: Array) -> Bools:
+    """Whether numbers are the same to rounding, or both are lost."""
+    return np.asarray((abs(a - b) <= _ROUNDING) | (np.isnan(a) & np.isnan(b)))

@@ -8,24 +8,27 @@ from collections import OrderedDict
 from collections.abc import Iterator
 from functools import cached_property, partial
 from itertools import compress
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Attached, Clock, Command, Force, at_stage, needs_inputs
+from pbrl_ppl.effects import Clock, Command, Force, at_stage, needs_inputs
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import fill_hinges, hung_bodies
-from pbrl_ppl.parameters import Layout, differentiate
+from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
 from pbrl_ppl.physics.inputs import after_recording, check_shapes
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
 from pbrl_ppl.physics.rods import on_rod
 from pbrl_ppl.physics.world import FINER, World
-from pbrl_ppl.scene import Scene
 
-PATHS = ("compiled", "plain")
+if TYPE_CHECKING:
+    from pbrl_ppl.physics.physics import Physics
+
+#: Engines by name; see :class:`Physics`.
+ENGINES = ("auto", "chipmunk", "contact-free", "python")
 #: Step of a finite difference as a share of a parameter's scale: about the cube root of the
 #: engine's rounding error. And what stands for an infinite bound.
 _STEP, _FAR = 1e-5, 1e300
@@ -41,6 +44,23 @@ Choice = tuple[Joined, bool, tuple[bool, ...]]
 _ONE_WORLD: Choice = ((), False, ())
 
 
+def check_engine(name: str) -> None:
+    """Refuse an engine that does not exist or is not available on this machine.
+
+    Raises
+    ------
+    SimulationError
+        If so.
+    """
+    available = ENGINES if calls.AVAILABLE else ("auto", "python")
+    if name not in available:
+        raise SimulationError(
+            f"engine is {name!r}, expected one of {', '.join(available)}"
+            + " (others need compiled calls of Chipmunk, which this platform lacks)"
+            * (name in ENGINES)
+        )
+
+
 class Simulator:
     """The deterministic f of Eq. 7 for a scene with effects, over batches.
 
@@ -50,63 +70,23 @@ class Simulator:
 
     Parameters
     ----------
-    scene : Scene
-        Known geometry.
-    layout : Layout
-        Order of the unknown parameters in phi.
-    effects : tuple of Attached
-        All effects of the model.
-    substeps : int, optional
-        Engine steps a sampling interval; the scene's by default.
-    threads : int
-        Worlds that run side by side. The result does not depend on it.
-    path : str, optional
-        ``compiled`` or ``plain``; the fastest available by default. The results agree.
-    extrapolate : bool
-        Whether to cancel the leading errors.
-
-    Raises
-    ------
-    SimulationError
-        If substeps or threads are below 1, or the path is unknown or not available.
+    physics : Physics
+        Scene, effects and settings; its parts are not used.
     """
 
-    def __init__(
-        self,
-        scene: Scene,
-        layout: Layout,
-        effects: tuple[Attached, ...] = (),
-        *,
-        substeps: int | None = None,
-        threads: int = 1,
-        path: str | None = None,
-        extrapolate: bool = True,
-    ) -> None:
-        substeps = scene.substeps if substeps is None else substeps
-        if substeps < 1 or threads < 1:
-            raise SimulationError(
-                f"substeps is {substeps} and threads is {threads}; both must be at least 1"
-            )
-        path = path or ("compiled" if calls.AVAILABLE else "plain")
-        if path not in PATHS or (path == "compiled" and not calls.AVAILABLE):
-            raise SimulationError(f"path {path!r} is not available; use one of {PATHS}")
-        self.scene, self.layout, self.effects = scene, layout, effects
-        self.substeps, self.threads, self.path = substeps, threads, path
-        self.extrapolate = extrapolate
-        self._properties = EngineProperties(scene, effects, layout)
+    def __init__(self, physics: Physics) -> None:
+        self.physics = physics
+        self._properties = EngineProperties(physics.scene, physics.effects, physics.layout)
         self._worlds: OrderedDict[Choice, list[Engine]] = OrderedDict()
         self._lock = threading.Lock()  # the worlds serve one call at a time
 
-    def __getstate__(self) -> dict[str, object]:
-        """State to pickle, without the C objects: another process builds its own."""
-        left = ("_lock", "_commands", "_forces")
-        kept = {key: value for key, value in self.__dict__.items() if key not in left}
-        return kept | {"_worlds": OrderedDict()}
+    def __getstate__(self) -> Physics:
+        """Return the state to pickle, without C objects: another process builds its own."""
+        return self.physics
 
-    def __setstate__(self, state: dict[str, object]) -> None:
+    def __setstate__(self, physics: Physics) -> None:
         """Restore a pickled simulator."""
-        self.__dict__.update(state)
-        self._lock = threading.Lock()
+        Simulator.__init__(self, physics)
 
     def __call__(self, phi: Array, start: Array, actions: Array) -> Array:
         """Predict the states after each interval of each transition.
@@ -140,14 +120,15 @@ class Simulator:
         # of one kind, for numba compiles the rollout anew for another
         start = np.require(start, float, ("C", "W"))
         actions = np.require(actions, float, ("C", "W"))
-        check_shapes(self.scene, self.layout, phi, start, actions)
+        check_shapes(self.physics.scene, self.physics.layout, phi, start, actions)
         proposals = np.atleast_2d(phi)
         inputs, clock = self._inputs(actions)
         given = self._properties(proposals, clock)
         starts = self._on_rods(self._states(proposals, start), given.joints)
         n, horizon, k = actions.shape[:3]
         out = np.full((len(proposals), n, horizon, k, 6), np.nan)
-        run = self._run_plain if self.path == "plain" else self._run_compiled
+        plain = self.physics.engine == "python" or not calls.AVAILABLE
+        run = self._run_plain if plain else self._run_compiled
         extra = (*self._properties.under, self._properties.tied)
         if not (any(extra) or given.indices.shape[1]):
             run(_ONE_WORLD, given, starts, inputs, out.reshape(-1, horizon, k, 6))
@@ -170,7 +151,7 @@ class Simulator:
         is when candidates are scored.
         """
         sliding = self._properties.slides(given.bodies)
-        tied = given.joints[:, len(self.scene.joints) :, -1] > 0
+        tied = given.joints[:, len(self.physics.scene.joints) :, -1] > 0
         proposals, joints, _ = given.indices.shape
         indices = given.indices.reshape(proposals, 2 * joints)
         keys = np.column_stack([sliding, tied, indices])
@@ -182,7 +163,7 @@ class Simulator:
 
     def _inputs(self, actions: Array) -> tuple[Array, Clock | None]:
         """Inputs of the rollout, and times of the intervals."""
-        if not needs_inputs(self.effects):
+        if not needs_inputs(self.physics.effects):
             return np.ascontiguousarray(actions[..., :3]), None
         if actions.shape[-1] == 3:
             previous = np.zeros_like(actions)
@@ -202,10 +183,10 @@ class Simulator:
             flat = {name: value[..., 0] for name, value in values.items()}
             states[:, :, i] = sensor.invert(states[:, :, i], flat)
         # a hinged body's place follows from its angle
-        names = [body.name for body in self.scene.moving]
-        hung = [names.index(name) for name in hung_bodies(self.scene)]
+        names = [body.name for body in self.physics.scene.moving]
+        hung = [names.index(name) for name in hung_bodies(self.physics.scene)]
         states[:, :, hung, 0:2] = states[:, :, hung, 3:5] = np.nan
-        fill_hinges(states, self.scene)
+        fill_hinges(states, self.physics.scene)
         return states
 
     def _on_rods(self, states: Array, joints: Array) -> Array:
@@ -213,7 +194,7 @@ class Simulator:
         if self._properties.tied:
             states = _each(states, len(joints))
         for i, position in self._properties.tied:
-            moment = self.scene.moving[i].shape.unit_moment
+            moment = self.physics.scene.moving[i].shape.unit_moment
             states[:, :, i] = on_rod(states[:, :, i], joints[:, position], moment)
         return states
 
@@ -234,13 +215,13 @@ class Simulator:
             friction or a contact makes a kink it is the derivative of one side or a mean of both.
         """
         phi = np.asarray(phi, dtype=float)
-        lower, upper = self.layout.bounds
+        lower, upper = self.physics.layout.bounds
         # never on a bound: a body has no mass of zero
         lower = np.where(phi > lower, 0.5 * (phi + np.maximum(lower, -_FAR)), lower)
         upper = np.where(phi < upper, 0.5 * (phi + np.minimum(upper, _FAR)), upper)
         return differentiate(
-            lambda points: self(points, start, actions), phi, _STEP * self.layout.scale(phi),
-            lower, upper,
+            lambda points: self(points, start, actions),
+            phi, _STEP * self.physics.layout.scale(phi), lower, upper,
         )  # fmt: skip
 
     @cached_property
@@ -250,9 +231,10 @@ class Simulator:
         The engine's error is a series in the substep (Richardson, 1911): two runs cancel its first
         term, three its second as well. Friction on the floor has kinks that a third run amplifies.
         """
-        kinks = any(body.wheel for body in self.scene.moving) or any(self._properties.under)
-        runs = (2 if kinks else 3) if self.extrapolate else 1
-        counts = [self.substeps >> i for i in range(runs) if self.substeps >> i]
+        physics = self.physics
+        kinks = any(body.wheel for body in physics.scene.moving) or any(self._properties.under)
+        runs = (2 if kinks else 3) if physics.extrapolate else 1
+        counts = [physics.substeps >> i for i in range(runs) if physics.substeps >> i]
         # in closed form: a solver's last digits differ between machines
         weights = [math.prod(n / (n - other) for other in counts if other != n) for n in counts]
         return np.array(counts, dtype=np.int64), np.array(weights, dtype=float)
@@ -262,7 +244,7 @@ class Simulator:
         """Address, body, first parameter and memory of each command law."""
         memory = [
             isinstance(attached.effect.stage, Command) and attached.effect.stage.memory
-            for attached in at_stage(self.effects, Command)
+            for attached in at_stage(self.physics.effects, Command)
         ]
         return (*self._laws(Command), np.array(memory, dtype=bool))
 
@@ -272,8 +254,8 @@ class Simulator:
         return self._laws(Force)
 
     def _laws(self, kind: type) -> tuple[NDArray[Any], ...]:
-        acting = at_stage(self.effects, kind)
-        names = [body.name for body in self.scene.moving]
+        acting = at_stage(self.physics.effects, kind)
+        names = [body.name for body in self.physics.scene.moving]
         sizes = [len(attached.effect.parameters) for attached in acting]
         stages = [attached.effect.stage for attached in acting]
         addresses = [calls.law_address(s.law) for s in stages if isinstance(s, Command | Force)]
@@ -288,7 +270,8 @@ class Simulator:
         own = self._properties
         patches, wheels = own.under if slides else ((), ())
         rods = tuple(compress(own.tied, there))
-        return World(self.scene, own.joints.hinges, joined, own.n_discs, patches, wheels, rods)
+        scene, hinges = self.physics.scene, own.joints.hinges
+        return World(scene, hinges, joined, own.n_discs, patches, wheels, rods)
 
     def _run_plain(
         self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array
@@ -298,8 +281,8 @@ class Simulator:
             start = starts[p if len(starts) > 1 else 0, t]
             total = np.zeros_like(out[item])
             stepped = partial(
-                plain.rollout, effects=self.effects, given=given, proposal=p, item=t, start=start,
-                inputs=inputs[t],
+                plain.rollout, effects=self.physics.effects, given=given, proposal=p, item=t,
+                start=start, inputs=inputs[t],
             )  # fmt: skip
             for level, (count, weight) in enumerate(zip(*self.levels, strict=True)):
                 states, touched = stepped(self._new_world(choice), substeps=int(count))
@@ -312,7 +295,7 @@ class Simulator:
                     break
                 total += weight * states
             else:
-                given_path = [body.kinematic for body in self.scene.moving]
+                given_path = [body.kinematic for body in self.physics.scene.moving]
                 total[:, given_path] = out[item][:, given_path]  # but for rounding it is so
                 out[item] = total
 
@@ -321,16 +304,16 @@ class Simulator:
     ) -> None:
         batch = Batch(
             tuple(given[:-1]), self._commands, self._forces, starts, inputs,
-            self.scene.time_step, self.scene.normal_gravity, *self.levels,
+            self.physics.scene.time_step, self.physics.scene.normal_gravity, *self.levels,
         )  # fmt: skip
         steps = len(out) * inputs.shape[1] * int(self.levels[0].sum())
-        workers = max(1, min(self.threads, len(out), steps // _A_THREAD))
+        workers = max(1, min(self.physics.threads, len(out), steps // _A_THREAD))
         with self._lock:
             self._worlds[choice] = engines = self._worlds.pop(choice, [])
             while len(self._worlds) > _KEPT:
                 self._worlds.popitem(last=False)
             while len(engines) < workers:
-                engines.append(Engine(partial(self._new_world, choice)))
+                engines.append(Engine(partial(self._new_world, choice), self.physics.engine))
             found, slides = out, engines[0].slides and len(out) > 0
             if slides:
                 found, (batch, order) = np.empty_like(out), batch.by_speed()

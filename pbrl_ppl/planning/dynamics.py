@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import build_layout, log_posterior
-from pbrl_ppl.physics import Simulator, after_recording
+from pbrl_ppl.likelihood import log_posterior
+from pbrl_ppl.physics import Physics, after_recording
 from pbrl_ppl.planning.noise import StepNoise, step_noise
 from pbrl_ppl.planning.transition_model import rollout
 from pbrl_ppl.posterior import draws as all_draws
@@ -57,19 +57,20 @@ class Dynamics:
         declared: Iterable[Effect] = catalogue,
     ) -> None:
         attached = attach(scene, effects, declared)
-        self.scene, self.layout, self._noise = scene, build_layout(scene, attached), noise
+        substeps = scene.substeps if substeps is None else substeps
+        self._physics = Physics(scene, attached, substeps, threads)
+        self.scene, self.layout, self._noise = scene, self._physics.layout, noise
         self.phi = np.atleast_2d(np.asarray(phi, dtype=float))
         self._whole = needs_inputs(attached)
         #: Wrenches that acted before the start, shape (body, 3); an actuator may remember them.
         self.before = np.zeros((len(scene.moving), len(WRENCH)))
-        self._engine = Simulator(scene, self.layout, attached, substeps=substeps, threads=threads)
 
     @classmethod
     def known(
         cls, scene: Scene, parameters: Mapping[str, object], effects: Any = (), **options: Any
     ) -> Dynamics:
         """Dynamics of named parameters, as of :class:`pbrl_ppl.Transition`: the true model, say."""
-        layout = build_layout(scene, attach(scene, effects))
+        layout = Physics.declare(scene, effects).layout
         return cls(scene, layout.to_vector(parameters), effects, **options)
 
     @classmethod
@@ -90,7 +91,7 @@ class Dynamics:
             As made by :func:`pbrl_ppl.fit`, or loaded.
         draws : int, optional
             Chosen at random without replacement; without it, the posterior's mode (MAP) as the
-            posterior holds it, or else the draw of highest :func:`pbrl_ppl.model.log_posterior`.
+            posterior holds it, or else the draw of highest :func:`log_posterior`.
         seed : int
             Of the choice.
         effects : iterable of Effect
@@ -194,7 +195,10 @@ class Dynamics:
         lost = np.asarray(~np.isfinite(states).all(axis=(-2, -1)))
         given = np.where(lost[..., None, None], 0.0, states) if lost.any() else states
         out = np.stack(
-            [self._engine(p, s, actions)[:, 0] for p, s in zip(self.phi, given, strict=True)]
+            [
+                self._physics.predict(p, s, actions)[:, 0]
+                for p, s in zip(self.phi, given, strict=True)
+            ]
         )
         out[lost] = np.nan
         return out

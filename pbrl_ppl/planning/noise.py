@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Cells, Problem, next_state_random
+from pbrl_ppl.likelihood import Cells, Problem, next_state_random
 
 Array = NDArray[np.float64]
 

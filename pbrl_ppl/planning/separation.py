@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import Rival
-from pbrl_ppl.model import TrajectoryNoise
+from pbrl_ppl.likelihood import TrajectoryNoise
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning.dynamics import Dynamics

@@ -11,10 +11,10 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, attach, catalogue
-from pbrl_ppl.model import Observations, build_layout, whiten
+from pbrl_ppl.likelihood import Observations, whiten
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Physics, build_layout
 from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.store import group, likeliest_draw, scalars, scene_of
 from pbrl_ppl.state import STATE
@@ -322,8 +322,8 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array,
     """Layout, the likeliest draw, and the whitened residual's derivative there."""
     scene = scene_of(idata)
     attached = attach(scene, (), known_effects(idata, effects))
-    layout = build_layout(scene, attached)
-    simulator = Simulator(scene, layout, attached, substeps=int(idata.attrs["substeps"]), threads=2)
+    physics = Physics(scene, attached, substeps=int(idata.attrs["substeps"]), threads=2)
+    layout = physics.layout
     data, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
     columns = tuple(STATE.index(str(name)) for name in measured["state"].values)
     observations = Observations(measured.to_numpy(), columns)
@@ -335,7 +335,7 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array,
     sigma = np.array([told[n] if own is None else own[best] for n, own in inferred.items()])
 
     def residual(points: Array) -> Array:
-        states = simulator(points, data["start"].to_numpy(), data["actions"].to_numpy())
+        states = physics.predict(points, data["start"].to_numpy(), data["actions"].to_numpy())
         z = whiten(observations.residual(states), sigma, None)
         return np.nan_to_num(z.reshape(len(points), -1))
 

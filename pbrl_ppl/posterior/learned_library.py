@@ -10,7 +10,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import ParameterLibrary
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior.store import group, scalars, scene_of
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem, smoothed
+from pbrl_ppl.likelihood import Problem, smoothed
 
 Array = NDArray[np.float64]
 

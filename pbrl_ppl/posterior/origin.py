@@ -20,15 +20,15 @@ from pbrl_ppl.effects import (
 )
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
-from pbrl_ppl.model import (
+from pbrl_ppl.likelihood import (
     Noise,
     Observations,
-    ParameterLibrary,
     Problem,
     along_trajectories,
     sigma_prior,
     with_sensitivity,
 )
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.recording import SMOOTHED, with_recording
 from pbrl_ppl.posterior.store import (

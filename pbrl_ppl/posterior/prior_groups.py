@@ -6,7 +6,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem, exponential, noise_law
+from pbrl_ppl.likelihood import Problem, exponential, noise_law
 from pbrl_ppl.parameters import Prior, beside, prior_draws
 
 Array = NDArray[np.float64]

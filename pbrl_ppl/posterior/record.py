@@ -17,7 +17,7 @@ from pbrl_ppl.errors import (
     LinearisationWarning,
     UninformedWarning,
 )
-from pbrl_ppl.model import ACCELERATION, DRIFT, JOLT, Problem
+from pbrl_ppl.likelihood import ACCELERATION, DRIFT, JOLT, Problem
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed

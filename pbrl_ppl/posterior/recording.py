@@ -9,7 +9,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, Sensitivity, TrajectoryNoise, cells_of, linearised
+from pbrl_ppl.likelihood import Problem, Sensitivity, TrajectoryNoise, cells_of, linearised
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]

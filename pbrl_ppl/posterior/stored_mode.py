@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import Problem, log_posterior
+from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import beside
 

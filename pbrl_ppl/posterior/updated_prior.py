@@ -16,9 +16,9 @@ from scipy.stats import truncnorm
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import build_layout, index_priors
 from pbrl_ppl.modes import ATTRIBUTE, index_law
 from pbrl_ppl.parameters import JOINT_INDICES, Prior, fold_draws
+from pbrl_ppl.physics import build_layout, index_priors
 from pbrl_ppl.posterior.known_effects import known_effects
 from pbrl_ppl.posterior.store import scalars, scene_of
 from pbrl_ppl.scene import Joint, Scene

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import Findings
 from pbrl_ppl.effects import Effect
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import group, problem_of
 from pbrl_ppl.report.motion import likeliest
 from pbrl_ppl.state import STATE

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import PRODUCTS, Findings
 from pbrl_ppl.effects import Effect
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import problem_of
 from pbrl_ppl.report.evidence import binned, recorded
 from pbrl_ppl.report.motion import likeliest

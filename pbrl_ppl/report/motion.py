@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.criticism import Findings
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import likeliest_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import wrapped

@@ -16,7 +16,7 @@ from pbrl_ppl.criticism import (
     Added,
     Findings,
 )
-from pbrl_ppl.model import ACCELERATION
+from pbrl_ppl.likelihood import ACCELERATION
 from pbrl_ppl.posterior import draws, group
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

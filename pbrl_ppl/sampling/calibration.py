@@ -23,7 +23,7 @@ from rich.progress import track
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History, write_atomically
-from pbrl_ppl.model import Problem, declared_problem
+from pbrl_ppl.likelihood import Problem, declared_problem
 from pbrl_ppl.posterior import versions
 from pbrl_ppl.sampling.ranks import Calibration
 from pbrl_ppl.sampling.replication import Record, draw_truths, labels, replicate

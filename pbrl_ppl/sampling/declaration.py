@@ -9,8 +9,10 @@ import pymc as pm
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.history import History
-from pbrl_ppl.model import ParameterLibrary, Problem, build_model, declared_problem
+from pbrl_ppl.likelihood import Problem, declared_problem
+from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_trajectory_mode, following, trajectory_mode
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import linearised_as
 from pbrl_ppl.scene import Scene
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.sampling.emulator import Emulator, Pieces, monomials

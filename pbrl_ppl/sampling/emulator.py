@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 
 Array = NDArray[np.float64]
 
@@ -61,7 +61,7 @@ class Pieces:
         met = np.zeros(problem.segments.n, dtype=bool)
         own: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
         for part in problem.simulator.parts:
-            if len(part.bodies) == 1 or problem.trajectories is None or part.simulator.scene.joints:
+            if len(part.bodies) == 1 or problem.trajectories is None or part.physics.scene.joints:
                 own.append((part.places, part.bodies))
                 continue
             met = problem.trajectories.touching

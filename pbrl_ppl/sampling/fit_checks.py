@@ -8,7 +8,7 @@ from typing import Any
 import pymc as pm
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 
 #: The sampler where none is asked for.

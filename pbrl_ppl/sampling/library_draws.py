@@ -9,8 +9,9 @@ import pymc as pm
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import ParameterLibrary, Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import choose_from_library, profile_sigma
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import Point, group
 from pbrl_ppl.sampling.traces import as_trace
 
@@ -60,7 +61,7 @@ def most_frequent(problem: Problem, trace: Any) -> Point:
     names = list(problem.scene.owners)
     best = np.zeros(index.shape[1], dtype=np.intp)
     for part in problem.simulator.parts:
-        columns = [names.index(owner) for owner in part.simulator.scene.owners]
+        columns = [names.index(owner) for owner in part.physics.scene.owners]
         found, counts = np.unique(index[:, columns], axis=0, return_counts=True)
         best[columns] = found[counts.argmax()]
     return _point(problem, best)

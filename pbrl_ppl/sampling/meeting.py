@@ -11,7 +11,8 @@ import pymc as pm
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import MeetingWarning
-from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.model import build_model
 from pbrl_ppl.posterior import linearised_as, parameter_draws
 
 Array = NDArray[np.float64]

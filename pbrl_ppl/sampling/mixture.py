@@ -10,7 +10,8 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem, build_model
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import ATTRIBUTE, Mode, Pair, Weighed, index_law, stored
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
 from pbrl_ppl.posterior import Point, from_groups, group, groups

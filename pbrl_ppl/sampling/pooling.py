@@ -19,8 +19,8 @@ from scipy.stats import norm
 
 from pbrl_ppl.effects import Effect, attach, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws, prior_draws, wheels
+from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior import HDI_PROB, moment_matched, scalars, scene_of
 from pbrl_ppl.sampling.population import Population, population
 from pbrl_ppl.scene import Scene

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.model import Problem, log_density, log_noise_prior
+from pbrl_ppl.likelihood import Problem, log_density, log_noise_prior
 from pbrl_ppl.parameters import evened, gathered, inside
 from pbrl_ppl.sampling.metropolis import TARGET_ACCEPTANCE, Gaussian
 from pbrl_ppl.sampling.starts import constrain, unconstrain

@@ -19,13 +19,8 @@ from pbrl_ppl.errors import (
     UninformedWarning,
 )
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import (
-    Problem,
-    build_model,
-    prior_predictive_draws,
-    simulated_trajectories,
-    with_measurements,
-)
+from pbrl_ppl.likelihood import Problem, simulated_trajectories, with_measurements
+from pbrl_ppl.model import build_model, prior_predictive_draws
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
 from pbrl_ppl.sampling.fitting import fit

@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from scipy.special import expit
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import Prior, gathered, inside
 from pbrl_ppl.posterior import group, parameter_draws

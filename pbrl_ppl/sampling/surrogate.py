@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
 
-from pbrl_ppl.model import Problem, whiten
+from pbrl_ppl.likelihood import Problem, whiten
 from pbrl_ppl.sampling.emulator import Emulator
 from pbrl_ppl.sampling.equal_wheels import evened_logp
 from pbrl_ppl.sampling.starts import blank_point

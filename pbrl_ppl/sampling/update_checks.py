@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
-from pbrl_ppl.model import Problem, cells_of
+from pbrl_ppl.likelihood import Problem, cells_of
 from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, recorded, scene_of
 from pbrl_ppl.state import STATE
 

@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import RefitWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, along_trajectories, build_model, single_transitions
+from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
+from pbrl_ppl.model import build_model
 from pbrl_ppl.posterior import (
     MIN_ESS,
     both_places,

@@ -5,7 +5,7 @@ import pytest
 
 from pbrl_ppl.agents import LibraryAgent, Task, World, run_episode
 from pbrl_ppl.errors import FitError, ParameterError
-from pbrl_ppl.model import ParameterLibrary
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.marks import OBJECT_MODE

@@ -25,7 +25,7 @@ from pbrl_ppl.cli.scene_text import _HEAD
 from pbrl_ppl.cli.terminal import warnings_in_a_line
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError
 from pbrl_ppl.history import History
-from pbrl_ppl.model.table1 import table1
+from pbrl_ppl.physics.table1 import table1
 from pbrl_ppl.posterior import group, load_posterior, record
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape

@@ -9,7 +9,7 @@ from scipy.stats import chi2, kstest
 from pbrl_ppl.criticism.score import inseparable, rank_candidates, twins
 from pbrl_ppl.effects import attach, candidates, catalogue
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, single_transitions
+from pbrl_ppl.likelihood import Problem, single_transitions
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE

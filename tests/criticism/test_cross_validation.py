@@ -10,7 +10,7 @@ from scipy.special import logsumexp
 from pbrl_ppl.criticism.cross_validation import LEAST_FOLDS, Change, folds, leave_out
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, along_trajectories, log_prior
+from pbrl_ppl.likelihood import Problem, along_trajectories, log_prior
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.modes.laplace import finish
 from pbrl_ppl.scene import Scene

@@ -20,7 +20,7 @@ from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import attach
-from pbrl_ppl.model import Problem, bodies_acceleration, smoothed
+from pbrl_ppl.likelihood import Problem, bodies_acceleration, smoothed
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
 from tests.helpers.histories import COLUMNS

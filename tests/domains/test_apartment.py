@@ -5,8 +5,7 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.history import lever
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator, overlap
+from pbrl_ppl.physics import Physics, Simulator, build_layout, overlap
 from tests.helpers.places import MODELS
 
 pytestmark = pytest.mark.one_stack  # nothing is fitted here
@@ -39,7 +38,7 @@ def test_the_kitchen_table_turns_about_its_post_and_clears_the_walls(scene, trut
     start = np.array([[*body.pose, 0, 0, 0] for body in scene.dynamic])[None]
     actions = np.zeros((1, 20, len(scene.dynamic), 3))
     actions[..., i, 2] = 3.0
-    states = Simulator(scene, layout)(layout.to_vector(truth), start, actions)[0, :, i]
+    states = Simulator(Physics(scene))(layout.to_vector(truth), start, actions)[0, :, i]
     held = states[:, :2] + lever(states, post.anchor_a)[0]
     np.testing.assert_allclose(held, np.tile(post.anchor_b, (20, 1)), atol=0.01)
     assert states[-1, 2] - start[0, i, 2] > 1.0

@@ -8,8 +8,8 @@ import pytest
 
 from pbrl_ppl.criticism import revise
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Transition
 from pbrl_ppl.modes import Mode, find_mode
+from pbrl_ppl.physics import Transition
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Scene
 

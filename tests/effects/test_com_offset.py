@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from pbrl_ppl.scene import Joint, Scene, Shape
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, simulator, state
 
-PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 BOX = Shape.box(0.9, 0.55)
 MASS, OFF = 2.0, (0.13, -0.07)
 INERTIA = MASS * BOX.unit_moment
@@ -50,7 +50,7 @@ def fly(start, wrench, gravity=(0.0, 0.0), force=lambda v: np.zeros(2)) -> np.nd
 @PATHS
 def test_a_free_body_turns_about_its_centre_of_mass(path) -> None:
     start = state(0.3, -0.2, 0.7, 1.0, -0.5, 3.0)
-    got = predict(free(), start, effects={"com_offset": OFF}, path=path)[0, 0]
+    got = predict(free(), start, effects={"com_offset": OFF}, engine=path)[0, 0]
     np.testing.assert_allclose(got, fly(start, (0.0, 0.0, 0.0)), atol=2e-6)
 
 
@@ -59,7 +59,7 @@ def test_a_push_at_the_origin_turns_the_body_and_gravity_does_not(path) -> None:
     start, wrench, gravity = state(theta=0.4, omega=-1.0), (3.0, -2.0, 0.3), (0.5, -1.0)
     got = predict(
         free(gravity=gravity), start, wrench,
-        effects={"com_offset": OFF, "linear_drag": 1.5}, path=path,
+        effects={"com_offset": OFF, "linear_drag": 1.5}, engine=path,
     )[0, 0]  # fmt: skip
     expected = fly(start, wrench, np.array(gravity), lambda v: -1.5 * v)
     np.testing.assert_allclose(got, expected, atol=2e-4)
@@ -91,7 +91,7 @@ def test_physical_pendulum(path) -> None:
     place = -turned(0.6, pivot)
     speed = -1.0 * np.array([-place[1], place[0]])
     start = state(*place, 0.6, *speed, -1.0)
-    got = predict(scene, start, effects={"com_offset": off}, path=path)[0, 0]
+    got = predict(scene, start, effects={"com_offset": off}, engine=path)[0, 0]
     np.testing.assert_allclose(got[[2, 5]], end, atol=1e-5)
     np.testing.assert_allclose(got[:2], -turned(got[2], pivot), atol=1e-6)
 
@@ -146,8 +146,8 @@ def test_double_pendulum_with_heavy_ends() -> None:
 
     sim = simulator(scene, (BY_NAME["com_offset"], BY_NAME["inertia_scale"]))
     values = dict(zip(("upper", "lower"), offs, strict=True))
-    phi = np.zeros(sim.layout.size)
-    for i, label in enumerate(sim.layout.labels):
+    phi = np.zeros(sim.physics.layout.size)
+    for i, label in enumerate(sim.physics.layout.labels):
         name, owner = label[:-1].split("[")
         which = ("upper", "lower").index(owner)
         phi[i] = (
@@ -176,8 +176,8 @@ def test_paths_agree(timed) -> None:
     actions[..., 7] = 0.1 * np.arange(3)[:, None]
     actions[..., 8] = 0.1 * np.arange(1, 4)[:, None]
     sims = [
-        simulator(scene, tuple(BY_NAME[name] for name in effects), path=path)
-        for path in ("compiled", "plain")
+        simulator(scene, tuple(BY_NAME[name] for name in effects), engine=path)
+        for path in ("auto", "python")
     ]
-    got, plain = (sim(phi_of(sim.layout, effects), start, actions) for sim in sims)
+    got, plain = (sim(phi_of(sim.physics.layout, effects), start, actions) for sim in sims)
     np.testing.assert_allclose(got, plain, atol=1e-11)

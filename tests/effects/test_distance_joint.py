@@ -12,7 +12,7 @@ from pbrl_ppl.physics.rods import on_rod
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 
-PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 BOX = Shape.box(0.9, 0.55)
 A, B, LENGTH = (0.2, 0.1), (1.5, 0.4), np.hypot(1.3, 0.3)
 WALL = (Wall((1.0, -2.0), (1.0, 2.0)),)
@@ -36,11 +36,11 @@ def test_it_is_the_joint_of_table_1(path, walls, wheel) -> None:
     start = rng.normal(0, [0.05, 0.05, 0.1, 1, 1, 2], (20, 1, 6))
     start[:, 0] = on_rod(start[:, 0][None], np.array([[*A, *B, LENGTH]]), BOX.unit_moment)[0]
     actions = rng.normal(0, [10, 10, 2], (20, 3, 1, 3))
-    declared = simulator(scene(True, walls, **wheel), path=path)(np.zeros(0), start, actions)
-    own = simulator(scene(False, walls, **wheel), (BY_NAME["distance_joint"],), path=path)
+    declared = simulator(scene(True, walls, **wheel), engine=path)(np.zeros(0), start, actions)
+    own = simulator(scene(False, walls, **wheel), (BY_NAME["distance_joint"],), engine=path)
     both = own(np.array([[*A, *B, LENGTH], np.zeros(5)]), start, actions)
     np.testing.assert_allclose(both[0], declared, rtol=0, atol=1e-12)
-    without = simulator(scene(False, walls, **wheel), path=path)(np.zeros(0), start, actions)
+    without = simulator(scene(False, walls, **wheel), engine=path)(np.zeros(0), start, actions)
     np.testing.assert_array_equal(both[1], without)
     assert np.abs(both[0] - without).max() > 0.01
 
@@ -50,7 +50,7 @@ def test_it_goes_round_at_its_speed(path) -> None:
     """Held at its centre, without forces, it goes on a circle: v t / L round, at the same speed."""
     rod = {"distance_joint": (0.0, 0.0, 0.0, 0.0, 1.5)}
     still = Scene(time_step=0.5, substeps=400, bodies=(body("box", BOX),))
-    got = predict(still, state(x=1.5, vy=0.9), effects=rod, path=path)[0, 0]
+    got = predict(still, state(x=1.5, vy=0.9), effects=rod, engine=path)[0, 0]
     angle = 0.9 * 0.5 / 1.5
     expected = state(1.5 * np.cos(angle), 1.5 * np.sin(angle))
     expected[3:5] = 0.9 * np.array([-np.sin(angle), np.cos(angle)])
@@ -64,12 +64,12 @@ def test_two_rods_are_there_each_for_itself() -> None:
     sim = simulator(two, (BY_NAME["distance_joint"],))
     start = np.stack([state(x=1.5, vy=0.9), state(x=8.5, y=5.0, vy=-0.9)])[None]
     lengths = (
-        sim.layout.labels.index("distance_joint_length[a]"),
-        sim.layout.labels.index("distance_joint_length[b]"),
+        sim.physics.layout.labels.index("distance_joint_length[a]"),
+        sim.physics.layout.labels.index("distance_joint_length[b]"),
     )
-    phi = np.zeros((4, sim.layout.size))
-    phi[:, sim.layout.labels.index("distance_joint_b_x[b]")] = 7.0
-    phi[:, sim.layout.labels.index("distance_joint_b_y[b]")] = 5.0
+    phi = np.zeros((4, sim.physics.layout.size))
+    phi[:, sim.physics.layout.labels.index("distance_joint_b_x[b]")] = 7.0
+    phi[:, sim.physics.layout.labels.index("distance_joint_b_y[b]")] = 5.0
     phi[:, list(lengths)] = [[0.0, 0.0], [1.5, 0.0], [0.0, 1.5], [1.5, 1.5]]
     states = sim(phi, start, np.zeros((1, 1, 2, 3)))[:, 0, 0]
     free, one, other, both = states

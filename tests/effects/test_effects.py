@@ -26,7 +26,7 @@ AWAY = {
     "magnus_force": 0.01,
     "saturation": 1.0 - BY_NAME["saturation"].null[0],
 }
-PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 
 
 def free(time_step: float = 1.0, substeps: int = 200) -> Scene:
@@ -79,10 +79,10 @@ def test_null_value_is_no_effect(name, path) -> None:
     rng = np.random.default_rng(8)
     start = rng.normal(0, 1, (15, 2, 6)) * [0.2, 0.2, 1, 2, 2, 2]
     actions = rng.normal(0, 5, (15, 2, 2, 3))
-    without = simulator(scene, path=path)(np.zeros(0), start, actions)
+    without = simulator(scene, engine=path)(np.zeros(0), start, actions)
     effect = BY_NAME[name]
-    sim = simulator(scene, (effect,), path=path)
-    null = np.repeat(effect.null, sim.layout.size // len(effect.parameters))
+    sim = simulator(scene, (effect,), engine=path)
+    null = np.repeat(effect.null, sim.physics.layout.size // len(effect.parameters))
     np.testing.assert_array_equal(sim(null, start, actions), without)
     away = sim(null + AWAY.get(name, 0.3), start, actions)
     if isinstance(effect.stage, Noise):  # it changes the likelihood alone
@@ -98,7 +98,7 @@ def test_null_value_is_no_effect(name, path) -> None:
 @pytest.mark.parametrize("c", [0.5, 4.0])
 def test_linear_drag_decays_exponentially(c, path) -> None:
     k = c / MASS
-    got = predict(free(), state(vx=1.5, vy=-1.0), effects={"linear_drag": c}, path=path)[0, 0]
+    got = predict(free(), state(vx=1.5, vy=-1.0), effects={"linear_drag": c}, engine=path)[0, 0]
     share = -math.expm1(-k) / k
     expected = state(1.5 * share, -share, 0, 1.5 * math.exp(-k), -math.exp(-k))
     np.testing.assert_allclose(got, expected, atol=2e-4 * c)
@@ -110,7 +110,7 @@ def test_quadratic_drag(path) -> None:
     c, speed = 1.3, 2.5
     grown = 1 + c * speed / MASS
     start = state(vx=0.6 * speed, vy=0.8 * speed)
-    got = predict(free(), start, effects={"quadratic_drag": c}, path=path)[0, 0]
+    got = predict(free(), start, effects={"quadratic_drag": c}, engine=path)[0, 0]
     way, left = MASS / c * math.log(grown), speed / grown
     expected = state(0.6 * way, 0.8 * way, 0, 0.6 * left, 0.8 * left)
     np.testing.assert_allclose(got, expected, atol=2e-4)
@@ -120,7 +120,7 @@ def test_quadratic_drag(path) -> None:
 def test_angular_drag_decays_exponentially(path) -> None:
     c = 0.2
     k = c / INERTIA
-    got = predict(free(), state(vx=1.0, omega=3.0), effects={"angular_drag": c}, path=path)[0, 0]
+    got = predict(free(), state(vx=1.0, omega=3.0), effects={"angular_drag": c}, engine=path)[0, 0]
     expected = state(1.0, 0, -3 * math.expm1(-k) / k, 1.0, 0, 3 * math.exp(-k))
     np.testing.assert_allclose(got, expected, atol=1e-4)
 
@@ -128,7 +128,7 @@ def test_angular_drag_decays_exponentially(path) -> None:
 @PATHS
 def test_constant_wrenches(path) -> None:
     effects = {"constant_force": (1.0, -2.0), "constant_torque": 0.3}
-    got = predict(free(), state(omega=1.0), (0.5, 0.5, 0.1), effects=effects, path=path)[0, 0]
+    got = predict(free(), state(omega=1.0), (0.5, 0.5, 0.1), effects=effects, engine=path)[0, 0]
     a = np.array([1.5 / MASS, -1.5 / MASS, 0.4 / INERTIA])
     np.testing.assert_allclose(
         got, np.array([*(a / 2), *a]) + state(theta=1.0, omega=1.0), atol=1e-10
@@ -139,12 +139,14 @@ def test_constant_wrenches(path) -> None:
 def test_body_force_turns_with_the_body(path) -> None:
     """Turning at omega, a body-fixed force sums to F (sin wt, 1 - cos wt) / (m w)."""
     force, omega = 3.0, 2.0
-    got = predict(free(), state(omega=omega), effects={"body_force": (force, 0.0)}, path=path)[0, 0]
+    got = predict(free(), state(omega=omega), effects={"body_force": (force, 0.0)}, engine=path)[
+        0, 0
+    ]
     k = force / (MASS * omega)
     np.testing.assert_allclose(
         got[3:5], [k * math.sin(omega), k * (1 - math.cos(omega))], atol=2e-4
     )
-    sideways = predict(free(), state(theta=0.4), effects={"body_force": (0.0, force)}, path=path)
+    sideways = predict(free(), state(theta=0.4), effects={"body_force": (0.0, force)}, engine=path)
     a = force / MASS
     np.testing.assert_allclose(
         sideways[0, 0, 3:], [-a * math.sin(0.4), a * math.cos(0.4), 0.0], atol=1e-10
@@ -156,7 +158,7 @@ def test_push_offset_is_the_moment_of_the_force(path) -> None:
     offset, force, theta = np.array([0.1, -0.05]), np.array([3.0, 1.0]), 0.7
     short = free(time_step=1e-3, substeps=10)
     got = predict(
-        short, state(theta=theta), (*force, 0.2), effects={"push_offset": offset}, path=path
+        short, state(theta=theta), (*force, 0.2), effects={"push_offset": offset}, engine=path
     )[0, 0]
     c, s = math.cos(theta), math.sin(theta)
     arm = np.array([[c, -s], [s, c]]) @ offset
@@ -168,14 +170,14 @@ def test_push_offset_is_the_moment_of_the_force(path) -> None:
 @PATHS
 def test_push_offset_moves_only_the_commanded_force(path) -> None:
     effects = {"push_offset": (0.3, 0.2), "constant_force": (5.0, 5.0), "linear_drag": 1.0}
-    got = predict(free(), state(vx=1.0), effects=effects, path=path)
+    got = predict(free(), state(vx=1.0), effects=effects, engine=path)
     np.testing.assert_allclose(got[0, 0, [2, 5]], 0.0, atol=1e-12)
 
 
 @PATHS
 def test_actuator_rotation_turns_the_commanded_force(path) -> None:
     effects = {"actuator_rotation": 0.3, "constant_force": (0.0, 1.0)}
-    got = predict(free(), state(theta=1.0), (4.0, 0.0, 0.2), effects=effects, path=path)[0, 0]
+    got = predict(free(), state(theta=1.0), (4.0, 0.0, 0.2), effects=effects, engine=path)[0, 0]
     a = np.array([4 * math.cos(0.3), 4 * math.sin(0.3) + 1.0]) / MASS
     np.testing.assert_allclose(got[3:], [*a, 0.2 / INERTIA], atol=1e-10)
 
@@ -185,7 +187,7 @@ def test_gravity_tilt_turns_gravity_for_all_masses_alike(path) -> None:
     """A free fall, beside a force that stays as it is."""
     scene = free().replace(gravity=(0.6, -G))
     effects = {"gravity_tilt": 0.2, "constant_force": (1.0, 0.0)}
-    got = predict(scene, state(omega=1.0), effects=effects, path=path)[0, 0]
+    got = predict(scene, state(omega=1.0), effects=effects, engine=path)[0, 0]
     c, s = math.cos(0.2), math.sin(0.2)
     a = np.array([c * 0.6 + s * G + 1.0 / MASS, s * 0.6 - c * G])
     np.testing.assert_allclose(got, [*(a / 2), 1.0, *a, 1.0], atol=1e-10)
@@ -210,7 +212,7 @@ def test_gravity_tilt_needs_gravity_in_the_plane() -> None:
 def test_gains_are_of_the_command_alone(effects, factors, path) -> None:
     """Along the world's axes, whatever the heading, and not of what else acts."""
     effects = effects | {"constant_force": (0.0, 2.0)}
-    got = predict(free(), state(theta=0.7), (4.0, 3.0, 0.2), effects=effects, path=path)[0, 0]
+    got = predict(free(), state(theta=0.7), (4.0, 3.0, 0.2), effects=effects, engine=path)[0, 0]
     x, y, turn = np.array([4.0, 3.0, 0.2]) * factors
     np.testing.assert_allclose(got[3:], [x / MASS, (y + 2.0) / MASS, turn / INERTIA], atol=1e-10)
 
@@ -220,7 +222,7 @@ def test_magnus_force_turns_the_motion(path) -> None:
     """Without a torque the velocity turns at c omega / m and keeps its size."""
     c, omega = 0.5, 2.0
     got = predict(
-        free(), state(vx=1.0, vy=0.5, omega=omega), effects={"magnus_force": c}, path=path
+        free(), state(vx=1.0, vy=0.5, omega=omega), effects={"magnus_force": c}, engine=path
     )[0, 0]
     turned = complex(1.0, 0.5) * np.exp(1j * c * omega / MASS)
     np.testing.assert_allclose(got[3:], [turned.real, turned.imag, omega], atol=2e-4)
@@ -230,7 +232,7 @@ def test_magnus_force_turns_the_motion(path) -> None:
 def test_a_spring_swings_about_its_anchor(path) -> None:
     k, anchor = 3.0, np.array([0.5, -1.0])
     rate = math.sqrt(k / MASS)
-    got = predict(free(), state(vx=0.4), effects={"spring": (k, *anchor)}, path=path)[0, 0]
+    got = predict(free(), state(vx=0.4), effects={"spring": (k, *anchor)}, engine=path)[0, 0]
     c, s = math.cos(rate), math.sin(rate)
     place = anchor - c * anchor + np.array([0.4 / rate * s, 0.0])
     np.testing.assert_allclose(got[:2], place, atol=2e-4)
@@ -242,7 +244,9 @@ def test_a_spring_swings_about_its_anchor(path) -> None:
 def test_a_torsion_spring_turns_back_the_shorter_way(path) -> None:
     k = 0.3
     rate = math.sqrt(k / INERTIA)
-    got = predict(free(), state(theta=3.0), effects={"torsion_spring": (k, -3.1)}, path=path)[0, 0]
+    got = predict(free(), state(theta=3.0), effects={"torsion_spring": (k, -3.1)}, engine=path)[
+        0, 0
+    ]
     off = 6.1 - 2 * math.pi  # 0.18 rad short of it
     assert got[2] == pytest.approx(3.0 - off + off * math.cos(rate), abs=2e-4)
     assert got[5] == pytest.approx(-off * rate * math.sin(rate), abs=2e-4)
@@ -255,7 +259,7 @@ def test_a_point_attractor_conserves_energy_and_angular_momentum(path) -> None:
     scene = free(time_step=0.05, substeps=100)
     effects = {"point_attractor": (strength, *place, 0.05)}
     start = state(vx=0.3, vy=-0.6)
-    got = predict(scene, start, horizon=30, effects=effects, path=path)[:, 0]
+    got = predict(scene, start, horizon=30, effects=effects, engine=path)[:, 0]
     way, speed = got[:, :2] - place, got[:, 3:5]
 
     def energy(way, speed) -> np.ndarray:
@@ -270,7 +274,7 @@ def test_a_point_attractor_conserves_energy_and_angular_momentum(path) -> None:
 
 @PATHS
 def test_inertia_scale(path) -> None:
-    got = predict(free(), state(), (1.0, 0, 0.3), effects={"inertia_scale": 1.7}, path=path)[0, 0]
+    got = predict(free(), state(), (1.0, 0, 0.3), effects={"inertia_scale": 1.7}, engine=path)[0, 0]
     np.testing.assert_allclose(got[3:], [1 / MASS, 0, 0.3 / (1.7 * INERTIA)], atol=1e-10)
 
 
@@ -282,11 +286,11 @@ def test_pivot_effects_at_the_centroid(path) -> None:
     scene = Scene(time_step=1.0, substeps=200, bodies=(disc,), joints=(joint,))
     inertia = MASS * 0.2**2 / 2
     c = 0.05
-    damped = predict(scene, state(omega=3.0), effects={"pivot_damping": c}, path=path)[0, 0]
+    damped = predict(scene, state(omega=3.0), effects={"pivot_damping": c}, engine=path)[0, 0]
     assert damped[5] == pytest.approx(3.0 * math.exp(-c / inertia), abs=1e-3)
-    rubbed = predict(scene, state(omega=3.0), effects={"pivot_friction": c}, path=path)[0, 0]
+    rubbed = predict(scene, state(omega=3.0), effects={"pivot_friction": c}, engine=path)[0, 0]
     assert rubbed[5] == pytest.approx(3.0 - c / inertia, abs=1e-6)
-    stopped = predict(scene, state(omega=3.0), effects={"pivot_friction": 4 * c}, path=path)[0, 0]
+    stopped = predict(scene, state(omega=3.0), effects={"pivot_friction": 4 * c}, engine=path)[0, 0]
     assert stopped[5] == pytest.approx(0.0, abs=1e-9)
     assert stopped[2] == pytest.approx(3.0**2 / 2 * inertia / (4 * c), abs=1e-3)
 
@@ -345,15 +349,15 @@ def own_effects() -> tuple[Effect, Effect]:
 def test_own_effect_on_both_paths(c, speed) -> None:
     """v = v0 / sqrt(1 + 2 c v0^2 t / m)."""
     drag, wind = own_effects()
-    for path in ("compiled", "plain"):
-        sim = simulator(free(substeps=50), (wind, drag), path=path)
-        phi = sim.layout.to_vector(
+    for path in ("auto", "python"):
+        sim = simulator(free(substeps=50), (wind, drag), engine=path)
+        phi = sim.physics.layout.to_vector(
             {"cubic_drag_x_coefficient": c, "gust_force": 0.4, "gust_wave_number": 2.0}
         )
         got = sim(phi, state(vx=speed)[None, None], np.zeros((1, 1, 1, 3)))[0, 0, 0]
         expected = speed / math.sqrt(1 + 2 * c * speed**2 / MASS)
         assert got[3] == pytest.approx(expected, abs=5e-3)
-        if path == "compiled":
+        if path == "auto":
             first = got
     np.testing.assert_allclose(got, first, rtol=1e-12, atol=1e-12)
 

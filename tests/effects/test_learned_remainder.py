@@ -40,11 +40,11 @@ def test_the_law_is_its_formula() -> None:
         np.testing.assert_allclose(wrench - (1, 2, 3), force(TABLE, theta, vx, vy, omega))
 
 
-@pytest.mark.parametrize("path", ["compiled", "plain"])
+@pytest.mark.parametrize("path", ["auto", "python"])
 def test_the_engine_is_moved_by_it(path: str) -> None:
     """Over a short interval the velocity changes by force over mass."""
     scene = Scene(time_step=1e-3, substeps=2, bodies=(body("puck", Shape.box(0.4, 0.3), mass=2.0),))
-    engine = simulator(scene, (learned_remainder(TABLE),), path=path)
+    engine = simulator(scene, (learned_remainder(TABLE),), engine=path)
     begin = state(0.0, 0.0, 0.7, 0.4, -0.8, 0.5)
     after = engine(WEIGHTS, begin[None, None], np.zeros((1, 1, 1, 3)))[0, 0, 0]
     moment = 2.0 * scene.bodies[0].shape.unit_moment

@@ -6,14 +6,13 @@ import pytest
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.physics import Simulator, calls
+from pbrl_ppl.physics import Physics, Simulator, calls
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 
-PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 BOX = Shape.box(0.9, 0.55)
 MASS, MU, RADIUS = 2.0, 0.3, 0.25
 INERTIA = MASS * BOX.unit_moment
@@ -44,7 +43,7 @@ def spun(state: np.ndarray, angle: float) -> np.ndarray:
 @PATHS
 def test_a_sliding_block_stops_after_its_way(path) -> None:
     """v^2 / 2 mu g, and stays there."""
-    states = after(state(vx=1.2, vy=-0.9), horizon=12, path=path)
+    states = after(state(vx=1.2, vy=-0.9), horizon=12, engine=path)
     way = 1.5**2 / (2 * MU * G)
     np.testing.assert_allclose(states[-1, :2], [0.8 * way, -0.6 * way], rtol=2e-3)
     np.testing.assert_allclose(states[-3:, 3:], 0.0, atol=1e-12)
@@ -54,7 +53,7 @@ def test_a_sliding_block_stops_after_its_way(path) -> None:
 @PATHS
 def test_a_spinning_block_is_slowed_at_the_ring(path) -> None:
     """All of the weight is at the radius: a torque of mu m g R."""
-    states = after(state(omega=3.0), horizon=2, path=path)
+    states = after(state(omega=3.0), horizon=2, engine=path)
     slowing = MU * MASS * G * RADIUS / INERTIA
     np.testing.assert_allclose(states[:, 5], 3.0 - slowing * np.array([0.1, 0.2]), rtol=1e-9)
     np.testing.assert_allclose(states[:, :2], 0.0, atol=1e-12)
@@ -65,7 +64,7 @@ def test_a_spinning_block_is_slowed_at_the_ring(path) -> None:
 def test_a_push_below_the_limit_moves_nothing(path, angle) -> None:
     push = 0.95 * MU * MASS * G
     wrench = [push * np.cos(angle), push * np.sin(angle), 0.0]
-    states = after(state(x=0.3, theta=0.7), wrench, horizon=5, path=path)
+    states = after(state(x=0.3, theta=0.7), wrench, horizon=5, engine=path)
     # the solver's warm-up is all that it moves by, a few nanometres
     np.testing.assert_allclose(states[:, :3], np.tile([0.3, 0.0, 0.7], (5, 1)), atol=1e-8)
     np.testing.assert_allclose(states[1:], states[:-1], atol=1e-12)
@@ -131,8 +130,8 @@ def test_eight_points_are_nearly_a_ring() -> None:
 @PATHS
 def test_without_friction_it_is_as_if_it_were_not_there(path) -> None:
     start, push = state(vx=1.0, omega=2.0), [1.0, 2.0, 0.3]
-    none = after(start, push, {"sliding_friction": (0.0, RADIUS)}, horizon=3, path=path)
-    np.testing.assert_allclose(none, after(start, push, {}, horizon=3, path=path), atol=1e-12)
+    none = after(start, push, {"sliding_friction": (0.0, RADIUS)}, horizon=3, engine=path)
+    np.testing.assert_allclose(none, after(start, push, {}, horizon=3, engine=path), atol=1e-12)
 
 
 def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
@@ -146,13 +145,13 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
     )
     scene = Scene(time_step=0.05, normal_gravity=G, bodies=bodies)
     attached = attach(scene)
-    sim = Simulator(scene, build_layout(scene, attached), attached)
+    sim = Simulator(Physics(scene, attached))
     rng = np.random.default_rng(2)
     start = rng.normal(0, [0.02, 0.02, 1, 1, 1, 2], (30, 4, 6))
     start[..., :2] += [(0.0, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.3, 0.0)]
     actions = rng.normal(0, 2.0, (30, 3, 4, 3))
     actions[:, :, 1] = rng.normal((2.0, 0.0, 0.0), 0.3, (30, 3, 3))
-    phi = rng.uniform(0.1, 0.6, (2, sim.layout.size))
+    phi = rng.uniform(0.1, 0.6, (2, sim.physics.layout.size))
     return sim, phi, start, actions
 
 
@@ -160,7 +159,7 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
 def test_paths_agree_and_nothing_is_remembered() -> None:
     sim, phi, start, actions = crowd()
     expected = sim(phi, start, actions)
-    plain = Simulator(sim.scene, sim.layout, sim.effects, path="plain")
+    plain = Simulator(sim.physics.changed(engine="python"))
     some = plain(phi, start[:8], actions[:8])
     np.testing.assert_allclose(some, expected[:, :8], rtol=1e-9, atol=1e-9)
     order = np.random.default_rng(6).permutation(len(start))
@@ -175,7 +174,9 @@ def test_paths_agree_where_nothing_touches() -> None:
     rng = np.random.default_rng(3)
     start, actions = rng.normal(0, 1, (10, 1, 6)), rng.normal(0, 4, (10, 3, 1, 3))
     phi = rng.uniform(0.1, 0.5, (2, 3))
-    both = [simulator(scene, effects, path=path)(phi, start, actions) for path in ("plain", None)]
+    both = [
+        simulator(scene, effects, engine=path)(phi, start, actions) for path in ("python", "auto")
+    ]
     np.testing.assert_allclose(both[0], both[1], rtol=1e-12, atol=1e-12)
 
 

@@ -17,16 +17,15 @@ from pbrl_ppl.effects import (
     catalogue,
 )
 from pbrl_ppl.errors import EffectError
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.physics.world import FINER
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, state
 
 BOX = Shape.box(0.9, 0.55)
 MASS = 2.0
-PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 
 
 def free(time_step: float = 1.0, substeps: int = 100, **options) -> Scene:
@@ -38,8 +37,10 @@ def simulate(scene, named, start, inputs, **options):
     """Predictions (n, H, body, 6) under effects on the first body, in the order they are given."""
     first = scene.dynamic[0].name
     attached = attach(scene, [BY_NAME[name].on(first) for name in named])
-    engine = Simulator(scene, build_layout(scene, attached), attached, **options)
-    return engine(phi_of(engine.layout, named), np.asarray(start, float), np.asarray(inputs, float))
+    engine = Simulator(Physics(scene, attached, **options))
+    return engine(
+        phi_of(engine.physics.layout, named), np.asarray(start, float), np.asarray(inputs, float)
+    )
 
 
 def inputs(wrench, previous=(0.0, 0.0, 0.0), trajectory=0.0, begin=0.0, end=1.0):
@@ -54,7 +55,7 @@ def inputs(wrench, previous=(0.0, 0.0, 0.0), trajectory=0.0, begin=0.0, end=1.0)
 def test_a_turned_command_acts_beside_the_origin_as_turned(path) -> None:
     # 1 N along x, turned to y, 0.1 m ahead: 0.1 N m
     end = predict(
-        free(0.1), state(), (1.0, 0.0, 0.0), path=path,
+        free(0.1), state(), (1.0, 0.0, 0.0), engine=path,
         effects={"actuator_rotation": math.pi / 2, "push_offset": (0.1, 0.0)},
     )[0, 0]  # fmt: skip
     assert end[5] == pytest.approx(0.1 * 0.1 / (MASS * BOX.unit_moment), rel=1e-4)
@@ -75,7 +76,7 @@ def test_the_order_of_the_catalogue_does_not_matter_across_stages() -> None:
 def test_a_late_command_gives_the_momentum_of_the_one_before(share, path) -> None:
     end = simulate(
         free(substeps=50), {"actuator_delay": share}, [[state()]],
-        inputs((2.0, 0.0, 0.4), previous=(-1.0, 3.0, 0.0)), path=path,
+        inputs((2.0, 0.0, 0.4), previous=(-1.0, 3.0, 0.0)), engine=path,
     )[0, 0, 0]  # fmt: skip
     late, now = share / MASS, (1.0 - share) / MASS
     assert end[3] == pytest.approx(2.0 * now - 1.0 * late)
@@ -99,7 +100,7 @@ def test_what_comes_before_is_changed_as_what_is_held(path) -> None:
     # turned by a right angle, both the late part (from x to y) and the rest (from y to -x)
     end = simulate(
         free(), {"actuator_rotation": math.pi / 2, "actuator_delay": 0.25}, [[state()]],
-        inputs((0.0, 1.0, 0.0), previous=(1.0, 0.0, 0.0)), path=path,
+        inputs((0.0, 1.0, 0.0), previous=(1.0, 0.0, 0.0)), engine=path,
     )[0, 0, 0]  # fmt: skip
     assert end[3:5] == pytest.approx([-0.75 / MASS, 0.25 / MASS], abs=1e-9)
 
@@ -116,7 +117,9 @@ def test_the_interval_before_is_the_row_before() -> None:
 def test_an_actuators_threshold_swallows_weak_forces_and_no_torque(name, kept, path) -> None:
     """A cut-off passes a stronger force in full, a dead zone what exceeds the threshold."""
     for force, strong in (((0.6, 0.7), False), ((0.8, 0.7), True)):
-        end = simulate(free(), {name: 1.0}, [[state()]], inputs((*force, 0.3)), path=path)[0, 0, 0]
+        end = simulate(free(), {name: 1.0}, [[state()]], inputs((*force, 0.3)), engine=path)[
+            0, 0, 0
+        ]
         share = kept or 1.0 - 1.0 / np.hypot(*force)
         expected = np.array(force) / MASS * share * strong
         assert end[3:5] == pytest.approx(expected, abs=1e-9)
@@ -133,7 +136,7 @@ def test_a_load_comes_at_a_trajectory_and_a_time(path) -> None:
                 for h in range(horizon)]  # fmt: skip
         given = np.concatenate(each, axis=1)
         load = {"mass_change": (1.5, 3.0, 2.0)}
-        return simulate(free(), load, [[state()]], given, path=path)[0, :, 0, 3] * MASS
+        return simulate(free(), load, [[state()]], given, engine=path)[0, :, 0, 3] * MASS
 
     assert speed(2, 5.0) == pytest.approx([1.0])  # before that trajectory
     assert speed(3, 0.0) == pytest.approx([1.0])  # in it, before that time
@@ -165,8 +168,8 @@ def test_a_hidden_disc_is_a_static_body(path) -> None:
     with_post = Scene(time_step=1.0, substeps=25 * FINER, bodies=(moving, still))
     without = Scene(time_step=1.0, substeps=25, bodies=(moving,))
     push = np.zeros((2, 1, 1, 3))
-    expected = simulate(with_post, {}, start, push, path=path)
-    found = simulate(without, {"hidden_obstacle": (0.0, 0.1, 0.3)}, start, push, path=path)
+    expected = simulate(with_post, {}, start, push, engine=path)
+    found = simulate(without, {"hidden_obstacle": (0.0, 0.1, 0.3)}, start, push, engine=path)
     assert found == pytest.approx(expected, abs=1e-9)
     assert found[0, 0, 0, 3] < 0.5  # it bounced
     assert found[1, 0, 0, 3] == pytest.approx(1.5)
@@ -181,12 +184,12 @@ def test_a_disc_without_radius_is_no_disc() -> None:
 def test_discs_of_one_call_do_not_meet_those_of_another() -> None:
     scene = Scene(time_step=1.0, bodies=(body("puck", Shape.circle(0.2), mass=MASS),))
     attached = attach(scene, [BY_NAME["hidden_obstacle"]])
-    engine = Simulator(scene, build_layout(scene, attached), attached)
+    engine = Simulator(Physics(scene, attached))
     start, push = np.array([[state(x=-1.0, vx=1.5)]] * 3), np.zeros((3, 1, 1, 3))
     phi = np.array([[0.0, 0.0, 0.3], [0.0, 2.0, 0.3], [0.0, 0.0, 0.3], [5.0, 0.0, 0.1]])
     together = engine(phi, start, push)
     for each, expected in zip(phi, together, strict=True):
-        fresh = Simulator(scene, engine.layout, attached)
+        fresh = Simulator(Physics(scene, attached))
         assert (fresh(each, start, push) == expected).all()
 
 
@@ -199,8 +202,8 @@ def test_a_biased_sensor_shifts_what_is_measured(path) -> None:
     measured = state(x=1.0, vx=1.3, omega=0.1)
     true = measured - bias
     push = inputs((1.0, 0.5, 0.2))
-    expected = simulate(free(), {}, [[true]], push, path=path)[0, 0, 0] + bias
-    found = simulate(free(), {"sensor_bias": tuple(bias)}, [[measured]], push, path=path)[0, 0, 0]
+    expected = simulate(free(), {}, [[true]], push, engine=path)[0, 0, 0] + bias
+    found = simulate(free(), {"sensor_bias": tuple(bias)}, [[measured]], push, engine=path)[0, 0, 0]
     assert found == pytest.approx(expected, abs=1e-12)
 
 
@@ -209,9 +212,9 @@ def test_a_scaled_sensor_shows_lengths_and_angles_larger(path) -> None:
     true = state(x=1.0, y=-0.5, theta=0.4, vx=1.3, omega=0.1)
     factors = np.array([1.1, 1.1, 0.9, 1.1, 1.1, 0.9])
     push = inputs((1.0, 0.5, 0.2))
-    expected = simulate(free(), {}, [[true]], push, path=path)[0, 0, 0] * factors
+    expected = simulate(free(), {}, [[true]], push, engine=path)[0, 0, 0] * factors
     scale = {"sensor_scale": (1.1, 0.9)}
-    found = simulate(free(), scale, [[true * factors]], push, path=path)[0, 0, 0]
+    found = simulate(free(), scale, [[true * factors]], push, engine=path)[0, 0, 0]
     assert found == pytest.approx(expected, abs=1e-12)
 
 
@@ -220,7 +223,7 @@ def test_in_a_turned_frame_pushes_go_askew(path) -> None:
     """A push along the commands' x is seen to go along the frame's."""
     found = simulate(
         free(), {"frame_rotation": 0.3}, [[state(x=1.0, theta=0.1)]], inputs((2.0, 0.0, 0.0)),
-        path=path,
+        engine=path,
     )[0, 0, 0]  # fmt: skip
     way = np.array([math.cos(0.3), math.sin(0.3)])
     assert found[3:5] == pytest.approx(2.0 / MASS * way)
@@ -270,8 +273,8 @@ def test_both_paths_agree_with_effects_of_every_stage() -> None:
         [rng.normal(0, 5, (8, 3, 6)), np.full((8, 3, 1), 40.0), clock - 0.1, clock], axis=-1
     )[:, :, None]
     compiled, plain = (
-        Simulator(scene, layout, attached, substeps=8, path=path)(phi, start, given)
-        for path in ("compiled", "plain")
+        Simulator(Physics(scene, attached, substeps=8, engine=path))(phi, start, given)
+        for path in ("auto", "python")
     )
     assert compiled == pytest.approx(plain, rel=1e-9, abs=1e-9, nan_ok=True)
     diverged = np.isnan(plain).any(axis=(-3, -2, -1))  # drag of 33 kg/m at 4 substeps
@@ -287,9 +290,9 @@ def test_order_and_threads_change_nothing_with_effects_of_every_stage() -> None:
     start = rng.normal(0, 1, (60, 1, 6)) * [0.2, 0.2, 1, 2, 2, 2]
     given = rng.uniform(0, 3, (60, 1, 1, 9))
     given[..., 8] = given[..., 7] + 0.1
-    whole = Simulator(scene, layout, attached)(phi, start, given)
+    whole = Simulator(Physics(scene, attached))(phi, start, given)
     order = rng.permutation(60)
-    other = Simulator(scene, layout, attached, threads=2)(phi, start[order], given[order])
+    other = Simulator(Physics(scene, attached, threads=2))(phi, start[order], given[order])
     assert (other == whole[:, order]).all()
 
 
@@ -311,7 +314,7 @@ def test_an_effect_of_ones_own_needs_no_registry(stage) -> None:
     mine = Effect("mine", GAIN, "a gain of my own", "a test", stage)
     scene = free()
     attached = attach(scene, [mine])
-    engine = Simulator(scene, build_layout(scene, attached), attached)
+    engine = Simulator(Physics(scene, attached))
     end = engine(np.array([2.0]), np.array([[state()]]), inputs((1.0, 0, 0)))[0, 0, 0, 3] * MASS
     assert end == pytest.approx(2.0 if isinstance(stage, Command) else 0.5)
 

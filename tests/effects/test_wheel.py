@@ -8,7 +8,7 @@ from pbrl_ppl.errors import EffectError
 from pbrl_ppl.scene import Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, simulator
 
-PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 BOX = Shape.box(0.9, 0.55)
 WHEEL = {"w_x": -0.25, "w_y": 0.05, "w_theta": 0.3, "mu_x": 0.05, "mu_y": 0.4}
 WALL = (Wall((1.0, -2.0), (1.0, 2.0)),)
@@ -26,8 +26,8 @@ def test_it_is_the_wheel_of_table_1(path, walls) -> None:
     rng = np.random.default_rng(2)
     start = rng.normal(0, [0.5, 0.5, 1, 1, 1, 2], (20, 1, 6))
     actions = rng.normal(0, [10, 10, 2], (20, 3, 1, 3))
-    declared = simulator(scene(True, walls), path=path)(np.zeros(0), start, actions)
-    own = simulator(scene(False, walls), (BY_NAME["wheel"],), path=path)
+    declared = simulator(scene(True, walls), engine=path)(np.zeros(0), start, actions)
+    own = simulator(scene(False, walls), (BY_NAME["wheel"],), engine=path)
     added = own(np.array(list(WHEEL.values())), start, actions)
     np.testing.assert_allclose(added, declared, rtol=0, atol=1e-12)
     frictionless = own(np.zeros(5), start, actions)

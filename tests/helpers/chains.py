@@ -5,8 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pbrl_ppl.effects import attach
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene, Shape
 from tests.helpers.engines import BOX, proposals
 from tests.helpers.worlds import BY_NAME, G
@@ -113,4 +112,4 @@ def case(
     inputs = np.concatenate([actions, 0.5 * actions, np.zeros_like(actions)], axis=-1)
     inputs[..., 6] = np.arange(n)[:, None, None] % 3  # the trajectory, and when it begins and ends
     inputs[..., 7:] = scene.time_step * (np.arange(horizon)[:, None, None] + np.arange(2))
-    return Simulator(scene, layout, attached), phi, start, inputs
+    return Simulator(Physics(scene, attached)), phi, start, inputs

@@ -10,7 +10,7 @@ import pandas as pd
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, along_trajectories, with_measurements
+from pbrl_ppl.likelihood import Problem, along_trajectories, with_measurements
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS, NOISE

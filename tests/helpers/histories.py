@@ -8,8 +8,7 @@ import pandas as pd
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH
 
@@ -38,7 +37,7 @@ def simulated_history(
     rng = np.random.default_rng(seed)
     attached = attach(scene, effects)
     layout = build_layout(scene, attached)
-    simulator = Simulator(scene, layout, attached, substeps=substeps)
+    simulator = Simulator(Physics(scene, attached, substeps=substeps))
     names = [body.name for body in scene.dynamic]
     k = len(names)
     start = rng.normal(0.0, start_sd, (trajectories, k, 6))

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.scene import Body, Scene, Shape
 
 G = 9.81  # m/s^2
@@ -30,7 +29,7 @@ def state(x=0.0, y=0.0, theta=0.0, vx=0.0, vy=0.0, omega=0.0) -> np.ndarray:
 
 def simulator(scene: Scene, effects: tuple[Attached | Effect, ...] = (), **options) -> Simulator:
     attached = attach(scene, effects)
-    return Simulator(scene, build_layout(scene, attached), attached, **options)
+    return Simulator(Physics(scene, attached, **options))
 
 
 def predict(
@@ -51,7 +50,7 @@ def predict(
     named = dict(effects or {})
     sim = simulator(scene, tuple(BY_NAME[name] for name in named), **options)
     if phi is None:
-        phi = phi_of(sim.layout, named)
+        phi = phi_of(sim.physics.layout, named)
     k = len(scene.dynamic)
     start = np.asarray(start, dtype=float).reshape(1, k, 6)
     actions = np.broadcast_to(np.asarray(wrench, dtype=float), (1, horizon, k, 3))

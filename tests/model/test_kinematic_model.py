@@ -5,8 +5,9 @@ import pytest
 
 from pbrl_ppl.errors import GoalError, HistoryError
 from pbrl_ppl.history import History, from_segments
-from pbrl_ppl.model import Transition, along_trajectories
+from pbrl_ppl.likelihood import along_trajectories
 from pbrl_ppl.modes import find_mode
+from pbrl_ppl.physics import Transition
 from pbrl_ppl.planning import Action, ActionSet, Dynamics, Goal, plan
 from pbrl_ppl.posterior import load_posterior, problem_of, save_posterior
 from pbrl_ppl.sampling import fit, physics_model

@@ -12,8 +12,8 @@ from scipy import stats
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EffectError, HistoryError, SimulationError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, along_trajectories
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.likelihood import Problem, along_trajectories
+from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
@@ -47,11 +47,12 @@ def expected_logp(model: pm.Model, point: Mapping[str, np.ndarray], priors) -> f
     problem = model.problem
     layout, segments = problem.layout, problem.segments
     simulator = Simulator(
-        problem.scene,
-        layout,
-        problem.physics.effects,
-        substeps=problem.physics.substeps,
-        path="plain",
+        Physics(
+            problem.scene,
+            problem.physics.effects,
+            substeps=problem.physics.substeps,
+            engine="python",
+        )
     )
     predicted = simulator(layout.to_vector(point), segments.start, segments.actions)
     residual = segments.observed - predicted

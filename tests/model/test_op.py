@@ -11,8 +11,8 @@ from pytensor.gradient import NullTypeGradError
 
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import SimulationError
-from pbrl_ppl.model import SimulatorOp, build_layout
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.model import SimulatorOp
+from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.worlds import G
 
@@ -25,20 +25,20 @@ def make(effects=("linear_drag",), gravity=(0.0, 0.0), **options) -> SimulatorOp
     walls = (Wall((2.0, -9.0), (2.0, 9.0)),)
     scene = Scene(time_step=0.1, gravity=gravity, normal_gravity=G, bodies=(cart,), walls=walls)
     attached = attach(scene)
-    return SimulatorOp(scene, build_layout(scene, attached), attached, **options)
+    return SimulatorOp(Physics(scene, attached, **options))
 
 
 def inputs(op: SimulatorOp, n: int = 12, horizon: int = 2) -> tuple[np.ndarray, ...]:
     rng = np.random.default_rng(11)
     values = {"mass": 6.0, "r": 0.2, "mu_c": 0.3, "w_x": -0.2, "w_y": 0.05, "w_theta": 0.1}
     values |= {"mu_x": 0.04, "mu_y": 0.4, "linear_drag_coefficient": 1.5}
-    k = len(op.scene.dynamic)
+    k = len(op.physics.scene.dynamic)
     start = rng.normal(0, 1, (n, k, 6))
-    return op.layout.to_vector(values), start, rng.normal(0, 9, (n, horizon, k, 3))
+    return op.physics.layout.to_vector(values), start, rng.normal(0, 9, (n, horizon, k, 3))
 
 
 def expected(op: SimulatorOp, *values: np.ndarray) -> np.ndarray:
-    return Simulator(op.scene, op.layout, op.effects, substeps=op.substeps)(*values)
+    return Simulator(op.physics.changed(substeps=op.physics.substeps))(*values)
 
 
 def compiled(op: SimulatorOp, mode: str | None):
@@ -105,14 +105,14 @@ def test_joints_and_pivots() -> None:
     joint = Joint("hinge", ("arm", "world"), (0.0, 0.18), (0.0, 0.0))
     scene = Scene(time_step=0.02, gravity=(0, -G), bodies=(arm,), joints=(joint,))
     attached = attach(scene)
-    op = SimulatorOp(scene, build_layout(scene, attached), attached)
+    op = SimulatorOp(Physics(scene, attached))
     values = {"mass": 0.5, "r": 0.1, "mu_c": 0.1}
     values |= {"pivot_damping_coefficient": 0.01, "pivot_friction_torque": 0.02}
     rng = np.random.default_rng(12)
     theta, omega = rng.normal(0, 1, 10), rng.normal(0, 2, 10)
     x, y = 0.18 * np.sin(theta), -0.18 * np.cos(theta)
     start = np.stack([x, y, theta, -omega * y, omega * x, omega], axis=-1)[:, None]
-    args = op.layout.to_vector(values), start, np.zeros((10, 3, 1, 3))
+    args = op.physics.layout.to_vector(values), start, np.zeros((10, 3, 1, 3))
     np.testing.assert_array_equal(compiled(op, None)(*args), expected(op, *args))
 
 
@@ -189,7 +189,7 @@ def test_memory_tells_shapes_apart() -> None:
 def test_wrong_shapes_are_refused_when_the_graph_is_built() -> None:
     op = make()
     phi, start, actions = inputs(op)
-    p = op.layout.size
+    p = op.physics.layout.size
     with pytest.raises(SimulationError, match=rf"phi has shape \({p - 1},\), expected \({p}\)"):
         op(phi[:-1], start, actions)
     with pytest.raises(SimulationError, match="phi has shape"):
@@ -224,7 +224,7 @@ def test_an_impossible_proposal_predicts_nothing(mode, mass) -> None:
     op = make()
     phi, start, actions = inputs(op)
     impossible = phi.copy()
-    impossible[op.layout.index("mass", "cart")] = mass
+    impossible[op.physics.layout.index("mass", "cart")] = mass
     f = compiled(op, mode)
     assert np.isnan(f(impossible, start, actions)).all()
     np.testing.assert_array_equal(f(phi, start, actions), expected(op, phi, start, actions))
@@ -237,7 +237,7 @@ def test_an_impossible_proposal_predicts_nothing(mode, mass) -> None:
 def test_gradient_is_that_of_the_closed_form(mode) -> None:
     """A drifting puck: x' = x + v t + F t^2 / 2 m, so d/dm = -F t^2 / 2 m^2; r does nothing."""
     scene = Scene(time_step=0.5, bodies=(Body("puck", BOX, known={"mu_c": 0.1}),))
-    op = SimulatorOp(scene, build_layout(scene))
+    op = SimulatorOp(Physics(scene))
     phi = pt.dvector("phi")
     rng = np.random.default_rng(1)
     start, actions = rng.normal(0, 1, (5, 1, 6)), rng.normal(0, 3, (5, 1, 1, 3))
@@ -262,21 +262,21 @@ def test_all_columns_of_the_jacobian_come_in_one_call(monkeypatch) -> None:
         return call(self, points, *rest)
 
     monkeypatch.setattr(Simulator, "__call__", counted)
-    jacobian = op.simulator.jacobian(phi, start, actions)
-    assert calls == [(2 * op.layout.size, op.layout.size)]
-    assert jacobian.shape == (*actions.shape[:3], 6, op.layout.size)
+    jacobian = op.physics.jacobian(phi, start, actions)
+    assert calls == [(2 * op.physics.layout.size, op.physics.layout.size)]
+    assert jacobian.shape == (*actions.shape[:3], 6, op.physics.layout.size)
     # the mass turns force into acceleration; far from the wall elasticity does nothing
-    assert np.abs(jacobian[..., op.layout.index("mass", "cart")]).max() > 1e-3
+    assert np.abs(jacobian[..., op.physics.layout.index("mass", "cart")]).max() > 1e-3
 
 
 def test_derivative_stays_inside_the_support() -> None:
     op = make(effects=())
     _, start, actions = inputs(make())
-    phi = np.full(op.layout.size, 0.1)
-    phi[op.layout.index("mass", "cart")] = 1e-9
+    phi = np.full(op.physics.layout.size, 0.1)
+    phi[op.physics.layout.index("mass", "cart")] = 1e-9
     for name, bound in (("mu_x", 0.0), ("mu_y", 1.0), ("w_x", 0.45), ("r", 0.0)):
-        phi[op.layout.index(name, "cart")] = bound
-    assert np.isfinite(op.simulator.jacobian(phi, 0.0 * start, 1e-9 * actions)).all()
+        phi[op.physics.layout.index(name, "cart")] = bound
+    assert np.isfinite(op.physics.jacobian(phi, 0.0 * start, 1e-9 * actions)).all()
 
 
 def test_start_states_have_no_derivative() -> None:
@@ -291,7 +291,7 @@ def test_every_catalogue_effect_compiles_into_the_op() -> None:
     elsewhere = ("pivot", "wheel", "distance_joint")  # no hinge, a wheel there is, and no rod
     names = tuple(effect.name for effect in catalogue if not effect.name.startswith(elsewhere))
     op = make(effects=names, gravity=(0.0, -0.5))
-    phi = np.array([max(prior.centre, 0.05) for prior in op.layout.priors])
+    phi = np.array([max(prior.centre, 0.05) for prior in op.physics.layout.priors])
     _, start, actions = inputs(make())
     got = op(phi, start, actions).eval()
     np.testing.assert_array_equal(got, expected(op, phi, start, actions))

@@ -8,8 +8,10 @@ from scipy import stats
 
 from pbrl_ppl.effects import attach, catalogue
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.model.table1 import build_layout, random_variable, table1
+from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS, Prior
+from pbrl_ppl.physics import build_layout
+from pbrl_ppl.physics.table1 import table1
 from pbrl_ppl.scene import Body, Scene, Shape
 
 # The paper's Table 1 with a triangle's bounds: x in [-1, 1], y in [-1, 2].

@@ -15,7 +15,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError, PosteriorError, RefitWarning, UninformedWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Problem, build_layout
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, find_mode, weigh
 from pbrl_ppl.modes.configurations import (
     ATTRIBUTE,
@@ -29,7 +29,7 @@ from pbrl_ppl.modes.configurations import (
 )
 from pbrl_ppl.modes.evidence import Evidence, _Law, importance, laplace
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import (
     convergence,
@@ -78,7 +78,7 @@ def recorded(kind: str, *joined: str) -> tuple[Scene, History]:
 
 def transitions(truth: Scene, start, actions, noise) -> History:
     """Transitions (n, body, 6) that begin exactly so, under wrenches (n, 1, body, 3)."""
-    end = Simulator(truth, build_layout(truth))(np.zeros(0), start, actions)[:, 0]
+    end = Simulator(Physics(truth))(np.zeros(0), start, actions)[:, 0]
     end += np.random.default_rng(6).standard_normal(end.shape) * noise
     cells = np.concatenate([start, actions[:, 0]], -1), np.pad(end, ((0, 0),) * 2 + ((0, 3),))
     rows = [

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.errors import PosteriorError, SceneError
-from pbrl_ppl.model import build_layout, index_priors
 from pbrl_ppl.modes import Mode, Weighed
 from pbrl_ppl.modes.configurations import (
     ATTRIBUTE,
@@ -19,6 +18,7 @@ from pbrl_ppl.modes.configurations import (
     stored,
 )
 from pbrl_ppl.modes.evidence import Evidence
+from pbrl_ppl.physics import build_layout, index_priors
 from pbrl_ppl.posterior import draws, from_groups, group, updated_scene
 from pbrl_ppl.sampling import mixture, physics_model
 from pbrl_ppl.scene import WORLD, Joint, Scene

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import joint_search, weigh
 from pbrl_ppl.modes.configurations import MOST, configurations, number
 from pbrl_ppl.scene import Joint, Scene, Shape

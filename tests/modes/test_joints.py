@@ -7,21 +7,20 @@ import pytest
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.errors import FitError, ParameterError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.physics import Simulator
+from pbrl_ppl.physics import Physics, Simulator, build_layout
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import WORLD, Joint, Scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.joints import HINGED, NAMES, POSES, reference_anchors, scene
 
 KINDS = pytest.mark.parametrize("kind", ["hinge", "distance"])
-PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 
 
 def simulator(*joints: Joint, **options) -> Simulator:
     one = scene(*joints)
-    return Simulator(one, build_layout(one), **options)
+    return Simulator(Physics(one, **options))
 
 
 def data(n: int = 10) -> tuple[np.ndarray, np.ndarray]:
@@ -51,20 +50,20 @@ def test_inferred_joint_is_the_known_one(path, kind, first, second) -> None:
         at = 2 if second == WORLD else 0
         anchors[at : at + 2] = (0.6, 0.05)
     a, b = tuple(anchors[:2]), tuple(anchors[2:])
-    known = simulator(Joint(kind, (first, second), a, b), path=path)
+    known = simulator(Joint(kind, (first, second), a, b), engine=path)
     start, actions = data()
     expected = known(np.zeros(0), start, actions)
 
-    held = simulator(Joint(kind, (first, second), known=False), path=path)
+    held = simulator(Joint(kind, (first, second), known=False), engine=path)
     assert held.layout.labels == ("a_x[joint1]", "a_y[joint1]", "b_x[joint1]", "b_y[joint1]")
     np.testing.assert_array_equal(held(np.array(anchors), start, actions), expected)
 
-    free = simulator(Joint(kind, known=False), path=path)
+    free = simulator(Joint(kind, known=False), engine=path)
     assert free.layout.labels[:2] == ("i_a[joint1]", "i_b[joint1]")
     phi = np.array([index[first], index[second], *anchors])
     np.testing.assert_array_equal(free(phi, start, actions), expected)
     # and it does something
-    without = simulator(path=path)(np.zeros(0), start, actions)
+    without = simulator(engine=path)(np.zeros(0), start, actions)
     assert np.abs(expected - without).max() > 0.05
 
 
@@ -73,9 +72,9 @@ def test_inferred_joint_is_the_known_one(path, kind, first, second) -> None:
 @pytest.mark.parametrize("index", range(5))
 def test_equal_indices_nullify(path, kind, index) -> None:
     start, actions = data()
-    without = simulator(path=path)(np.zeros(0), start, actions)
+    without = simulator(engine=path)(np.zeros(0), start, actions)
     phi = np.array([index, index, 0.1, 0.2, -0.3, 0.1])
-    joined = simulator(Joint(kind, known=False), path=path)
+    joined = simulator(Joint(kind, known=False), engine=path)
     np.testing.assert_array_equal(joined(phi, start, actions), without)
 
 
@@ -85,14 +84,14 @@ def test_proposals_with_different_indices_in_one_call() -> None:
     rng = np.random.default_rng(5)
     start, actions = data()
     sim = simulator(*joints)
-    phi = np.zeros((40, sim.layout.size))
+    phi = np.zeros((40, sim.physics.layout.size))
     phi[:, :4] = rng.integers(0, 5, (40, 4))
     phi[:, 4:] = rng.uniform(-0.2, 0.2, (40, 8))
     together = sim(phi, start, actions)
     np.testing.assert_array_equal(simulator(*joints, threads=2)(phi, start, actions), together)
     for one, answer in zip(phi, together, strict=True):
         np.testing.assert_array_equal(sim(one, start, actions), answer)
-    plain = simulator(*joints, path="plain")(phi[:3], start[:3], actions[:3])
+    plain = simulator(*joints, engine="python")(phi[:3], start[:3], actions[:3])
     np.testing.assert_allclose(plain, together[:3, :3], rtol=1e-9, atol=1e-9)
 
 

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Noise, Problem
+from pbrl_ppl.likelihood import Noise, Problem
 from pbrl_ppl.modes import search, trajectory_mode
 from pbrl_ppl.modes.laplace import climb
 from pbrl_ppl.modes.search import find_mode, find_modes

@@ -7,7 +7,6 @@ from scipy import stats
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.effects.wheel import wheel
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import (
     Layout,
     evened,
@@ -19,6 +18,7 @@ from pbrl_ppl.parameters import (
     redescribed,
     wheels,
 )
+from pbrl_ppl.physics import build_layout
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.sampling.equal_wheels import evened_logp
 from tests.helpers.carts import CART, cart_scene

@@ -5,13 +5,12 @@ import pytest
 
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.errors import EffectError
-from pbrl_ppl.model import Transition, build_layout
-from pbrl_ppl.physics import Simulator, calls, independent_parts
+from pbrl_ppl.physics import Simulator, Transition, build_layout, calls, independent_parts
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.pushes import pushed
 from tests.helpers.worlds import BY_NAME, body, simulator, state
 
-PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
+PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 FINGER = Body("finger", Shape.circle(0.05), kinematic=True, known={"r": 1.0, "mu_c": 1.0})
 
 
@@ -42,7 +41,7 @@ def test_it_goes_where_it_is_told_through_a_body_at_a_wall(path) -> None:
     actions = np.zeros((6, 2, 3))
     actions[:, 0] = np.random.default_rng(0).normal((1.0, 0.0, 0.0), (0.2, 0.2, 1.0), (6, 3))
     start = np.stack([state(x=-0.2, vx=9.0), state()])
-    states = run(scene, start, actions, path=path)
+    states = run(scene, start, actions, engine=path)
     way = start[0, :3] + 0.1 * np.cumsum(actions[:, 0], axis=0)
     np.testing.assert_allclose(states[:, 0, :3], way, atol=1e-12)
     np.testing.assert_allclose(states[:, 0, 3:], actions[:, 0], atol=1e-12)
@@ -56,7 +55,7 @@ def test_a_hit_by_it_is_one_by_an_infinite_mass(r, path) -> None:
     scene = beside(body("puck", Shape.circle(0.1), mass=7.0, r=r))
     actions = np.zeros((4, 2, 3))
     actions[:, 0, 0] = 2.0
-    states = run(scene, np.stack([state(x=-0.3), state()]), actions, path=path)
+    states = run(scene, np.stack([state(x=-0.3), state()]), actions, engine=path)
     np.testing.assert_allclose(states[-1, 1], [*states[-1, 1, :3], 2.0 * (1 + r), 0, 0], atol=1e-9)
 
 
@@ -69,7 +68,7 @@ def test_a_hinge_on_it_carries_a_body_along(path) -> None:
     )
     actions = np.zeros((5, 2, 3))
     actions[:, 0, 0] = [1.0, 2.0, 0.0, -1.0, 0.5]
-    states = run(scene, np.stack([state(), state(y=-0.2)]), actions, path=path)
+    states = run(scene, np.stack([state(), state(y=-0.2)]), actions, engine=path)
     c, s = np.cos(states[:, 1, 2]), np.sin(states[:, 1, 2])
     hinge = states[:, 1, :2] + 0.2 * np.stack([-s, c], axis=-1)
     np.testing.assert_allclose(hinge, states[:, 0, :2], atol=2e-3)
@@ -100,7 +99,7 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
         [np.cos(start[:, 4, 2]), np.sin(start[:, 4, 2])], axis=-1
     )
     sim = simulator(scene)
-    phi = np.random.default_rng(5).uniform(0.1, 0.6, (2, sim.layout.size))
+    phi = np.random.default_rng(5).uniform(0.1, 0.6, (2, sim.physics.layout.size))
     return sim, phi, start, rng.normal(0, 2.0, (30, 3, 5, 3))
 
 
@@ -108,7 +107,7 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
 def test_paths_agree_and_order_and_chunks_change_nothing() -> None:
     sim, phi, start, actions = crowd()
     expected = sim(phi, start, actions)
-    plain = Simulator(sim.scene, sim.layout, sim.effects, path="plain")
+    plain = Simulator(sim.physics.changed(engine="python"))
     np.testing.assert_allclose(
         plain(phi, start[:8], actions[:8]), expected[:, :8], rtol=1e-9, atol=1e-9
     )
@@ -116,7 +115,7 @@ def test_paths_agree_and_order_and_chunks_change_nothing() -> None:
     np.testing.assert_array_equal(sim(phi, start[order], actions[order]), expected[:, order])
     parts = [sim(phi, start[i : i + 7], actions[i : i + 7]) for i in range(0, 30, 7)]
     np.testing.assert_array_equal(np.concatenate(parts, axis=1), expected)
-    two = Simulator(sim.scene, sim.layout, sim.effects, threads=2)
+    two = Simulator(sim.physics.changed(threads=2))
     np.testing.assert_array_equal(two(phi, start, actions), expected)
 
 

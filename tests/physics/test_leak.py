@@ -6,8 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator, calls
+from pbrl_ppl.physics import Physics, Simulator, calls
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.worlds import G, body
 
@@ -47,7 +46,7 @@ def simulator() -> Simulator:
             Joint("hinge", known=False),
         ),
     )
-    return Simulator(scene, build_layout(scene), threads=2)
+    return Simulator(Physics(scene, threads=2))
 
 
 @pytest.mark.long
@@ -66,7 +65,7 @@ def test_ten_million_steps_leak_nothing() -> None:
         for i in range(calls):
             phi[1:3] = i % 4  # the worlds of other choices come and go
             sim(phi, start, actions)
-        return calls * n * sim.substeps
+        return calls * n * sim.physics.substeps
 
     run(50)
     before, steps = peak(), 0

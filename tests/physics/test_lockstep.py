@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator, calls, compiled, lockstep
+from pbrl_ppl.physics import Physics, Simulator, build_layout, calls, compiled, lockstep
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import ARM, BOX, proposals
@@ -15,7 +14,7 @@ pytestmark = pytest.mark.skipif(
     not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
 )
 
-PATHS = ("compiled", "plain")
+PATHS = ("auto", "python")
 POST = Body("post", Shape.circle(0.05), static=True, pose=(3.0, -2.0, 0.7))
 
 
@@ -89,7 +88,7 @@ def case(name: str) -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
     inputs = np.concatenate([actions, 0.5 * actions, np.zeros_like(actions)], axis=-1)
     inputs[..., 6] = np.arange(40)[:, None, None] % 4  # the trajectory, and when it begins and ends
     inputs[..., 7:] = 0.1 * (np.arange(3)[:, None, None] + np.arange(2))
-    return Simulator(scene, layout, attached), phi, start, inputs
+    return Simulator(Physics(scene, attached)), phi, start, inputs
 
 
 def on_hinge(scene: Scene, start: np.ndarray) -> np.ndarray:
@@ -111,7 +110,7 @@ def on_hinge(scene: Scene, start: np.ndarray) -> np.ndarray:
 def test_it_agrees_with_the_engine(name) -> None:
     simulator, phi, start, inputs = case(name)
     got = simulator(phi, start, inputs)
-    reference = Simulator(simulator.scene, simulator.layout, simulator.effects, path="plain")
+    reference = Simulator(simulator.physics.changed(engine="python"))
     expected = reference(phi, start, inputs)
     assert np.isfinite(expected).all()
     # friction that lets a body slide, or not, is decided by the last digits now and then
@@ -137,7 +136,7 @@ def test_arrays_of_every_kind_take_what_is_compiled_already() -> None:
         expected = simulator(phi, start, inputs)
         start.setflags(write=False)
         np.testing.assert_array_equal(simulator(phi, start, np.asfortranarray(inputs)), expected)
-        coarse = Simulator(simulator.scene, simulator.layout, simulator.effects, extrapolate=False)
+        coarse = Simulator(simulator.physics.changed(extrapolate=False))
         assert np.isfinite(coarse(phi, start, inputs)).all()
     for compiled_once in (lockstep.rollout, compiled.rollout):
         assert len(compiled_once.signatures) == 1
@@ -149,7 +148,7 @@ def test_what_comes_near_something_is_left_to_the_engine() -> None:
     far = case("wheel")[0]
     touched = (near(phi, start, inputs) != far(phi, start, inputs)).any(axis=(2, 3, 4))
     assert 0.1 < touched.mean() < 0.9
-    plain = Simulator(near.scene, near.layout, path="plain")(phi, start, inputs)
+    plain = Simulator(near.physics.changed(engine="python"))(phi, start, inputs)
     np.testing.assert_allclose(near(phi, start, inputs), plain, rtol=1e-9, atol=1e-9)
 
 
@@ -167,7 +166,7 @@ def test_one_of_several_bodies_at_a_wall_is_enough(at_the_wall) -> None:
         start[:, body, 0], start[:, body, 3] = -0.7, -1.0
     layout, actions = build_layout(scene), np.zeros((40, 2, 3, 3))
     phi = np.zeros(layout.size)
-    ours, plain = (Simulator(scene, layout, path=path)(phi, start, actions) for path in PATHS)
+    ours, plain = (Simulator(Physics(scene, engine=path))(phi, start, actions) for path in PATHS)
     np.testing.assert_allclose(ours, plain, rtol=1e-9, atol=1e-9)
     bounced = (ours[:, -1, :, 3] > 0.4).all(axis=0) & (ours[:, -1, :, 0] > -0.85).all(axis=0)
     assert np.flatnonzero(bounced).tolist() == list(at_the_wall)

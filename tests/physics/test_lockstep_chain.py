@@ -30,7 +30,7 @@ CASES = {
 
 
 def like(sim: Simulator, **options) -> Simulator:
-    return Simulator(sim.scene, sim.layout, sim.effects, **options)
+    return Simulator(sim.physics.changed(**options))
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_it_agrees_with_the_engine(name, extrapolate, engine_items) -> None:
     sim, phi, start, inputs = case(*CASES[name], seed=1)
     sim = like(sim, extrapolate=extrapolate)
     got = sim(phi, start, inputs)
-    expected = like(sim, extrapolate=extrapolate, path="plain")(phi, start, inputs)
+    expected = like(sim, extrapolate=extrapolate, engine="python")(phi, start, inputs)
     assert not engine_items  # and it is the lane that said so
     assert np.isfinite(expected).all()
     np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-11)
@@ -69,7 +69,7 @@ def test_random_chains(seed, engine_items) -> None:
         scene, ("com_offset", "inertia_scale", *PIVOT[: kinds.count("h")]), seed, 6, 3
     )
     got = sim(phi, start, inputs)
-    expected = like(sim, path="plain")(phi, start, inputs)
+    expected = like(sim, engine="python")(phi, start, inputs)
     assert len(engine_items) < got[..., 0, 0, 0].size / 2  # some may fold up, and touch
     np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-11)
 
@@ -78,8 +78,8 @@ def unequal() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
     """Seven proposals that take 30 to 2000 iterations, in no order."""
     sim, phi, start, inputs = case(*CASES["double pendulum"], seed=5, n=9)
     phi = np.repeat(phi[:1], 7, axis=0)
-    phi[:, sim.layout.index("mass", "b0")] = 1.0
-    phi[:, sim.layout.index("mass", "b1")] = [40.0, 1.0, 0.01, 2000.0, 3.0, 25.0, 1.0]
+    phi[:, sim.physics.layout.index("mass", "b0")] = 1.0
+    phi[:, sim.physics.layout.index("mass", "b1")] = [40.0, 1.0, 0.01, 2000.0, 3.0, 25.0, 1.0]
     return sim, phi, start, inputs
 
 
@@ -91,7 +91,7 @@ def test_iterations_are_each_ones_own(engine_items) -> None:
     np.testing.assert_array_equal(sim(phi[::-1], start[::-1], inputs[::-1]), whole[::-1, ::-1])
     np.testing.assert_array_equal(sim(phi, start[4:5], inputs[4:5]), whole[:, 4:5])
     assert not engine_items
-    plain = like(sim, path="plain")(phi, start[:2], inputs[:2])
+    plain = like(sim, engine="python")(phi, start[:2], inputs[:2])
     np.testing.assert_allclose(whole[:, :2], plain, rtol=1e-11, atol=1e-11)
     # the most unequal ones do hang on their number
     fewer = sim(phi[1], start[:2], inputs[:2])
@@ -101,7 +101,9 @@ def test_iterations_are_each_ones_own(engine_items) -> None:
 @pytest.mark.parametrize("name", ["sliding", "trailers"])
 def test_wheels_and_patches_rest_when_their_iterations_are_done(name) -> None:
     sim, phi, start, inputs = case(*CASES[name], seed=7)
-    last = [place for place, label in enumerate(sim.layout.labels) if label.startswith("mass")][-1]
+    last = [
+        place for place, label in enumerate(sim.physics.layout.labels) if label.startswith("mass")
+    ][-1]
     phi[:, last] *= [1.0, 60.0, 25.0]
     whole = sim(phi, start, inputs)
     for one, expected in zip(phi, whole, strict=True):
@@ -126,7 +128,7 @@ def test_what_comes_near_something_is_left_to_the_engine(engine_items) -> None:
     sim, phi, start, inputs = case(chain("hhh", walls=walls), ("com_offset",), seed=6, n=30)
     got = sim(phi, start, inputs)
     assert 0.1 < len(engine_items) / got[:, :, 0, 0, 0].size < 0.9
-    expected = like(sim, path="plain")(phi, start, inputs)
+    expected = like(sim, engine="python")(phi, start, inputs)
     np.testing.assert_allclose(got, expected, rtol=1e-9, atol=1e-9)
 
 
@@ -156,7 +158,7 @@ def test_energy_and_momentum_are_kept() -> None:
         named = {f"{effect}_{p}[b{i}]": v for i in range(k) for effect, p, v in (
             ("com_offset", "x", offs[i, 0]), ("com_offset", "y", offs[i, 1]),
             ("inertia_scale", "scale", scales[i]))}  # fmt: skip
-        phi = np.array([named[label] for label in sim.layout.labels])
+        phi = np.array([named[label] for label in sim.physics.layout.labels])
         sim = like(sim, substeps=substeps, extrapolate=extrapolate)
         after = sim(phi, start, 0.0 * inputs)
         changes = []
@@ -208,13 +210,15 @@ def test_a_centre_off_the_origin(what, engine_items) -> None:
     got = sim(phi, start, inputs)
     share = len(engine_items) / got[..., 0, 0, 0].size
     assert 0.0 < share < 0.5 if what == "walls" else share == 0.0
-    expected = like(sim, path="plain")(phi, start, inputs)
+    expected = like(sim, engine="python")(phi, start, inputs)
     off = np.abs(got - expected) / (1.0 + np.abs(expected))
     assert np.quantile(off, 0.99) < 1e-11
     assert off.max() < (1e-6 if what == "sliding" else 1e-9)  # sticks or slides by a hair
     np.testing.assert_array_equal(sim(phi, start[::-1], inputs[::-1]), got[:, ::-1])
     without = phi.copy()
-    off_places = [i for i, label in enumerate(sim.layout.labels) if label.startswith("com_offset")]
+    off_places = [
+        i for i, label in enumerate(sim.physics.layout.labels) if label.startswith("com_offset")
+    ]
     without[:, off_places] = 0.0
     mixed = np.concatenate([phi, without])
     np.testing.assert_array_equal(sim(mixed, start, inputs)[3:], sim(without, start, inputs))

@@ -6,10 +6,9 @@ import pytest
 
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import inside
-from pbrl_ppl.physics import PartedSimulator, Simulator, independent_parts
+from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, independent_parts
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.sampling.starts import gaussian_blocks
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
@@ -108,8 +107,8 @@ def worlds():
     start[:, :2, 2] = start[:, :2, 5] = 0.0
     phi = np.array([prior.sample(rng, 1)[0] for prior in layout.priors])
     actions = rng.normal(0, 0.3, (12, 2, 4, 3))
-    whole = Simulator(scene, layout)
-    return whole, PartedSimulator(scene, layout, (), parts), phi, start, actions
+    whole = Simulator(Physics(scene))
+    return whole, PartedSimulator(Physics(scene, parts=parts)), phi, start, actions
 
 
 def test_parts_are_the_whole(worlds) -> None:
@@ -202,9 +201,8 @@ def test_named_joints() -> None:
 
 def test_parts_must_be_a_partition() -> None:
     scene = scene_of()
-    layout = build_layout(scene)
     with pytest.raises(SimulationError, match="each moving body once: a, b, c, d"):
-        PartedSimulator(scene, layout, (), (("a",), ("b", "c")))
-    parted = PartedSimulator(scene, layout, (), (("a", "b"), ("c", "d")))
+        PartedSimulator(Physics(scene, parts=(("a",), ("b", "c"))))
+    parted = PartedSimulator(Physics(scene, parts=(("a", "b"), ("c", "d"))))
     with pytest.raises(SimulationError, match="phi has shape"):
         parted.recall(np.zeros(3), np.zeros((1, 4, 6)), np.zeros((1, 1, 4, 3)))

@@ -7,8 +7,7 @@ import pytest
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import ParameterError, SimulationError
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator, calls
+from pbrl_ppl.physics import Physics, Simulator, build_layout, calls
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.engines import BOX, CASES, chain, mixed, proposals, ring
 from tests.helpers.worlds import body, simulator, state
@@ -24,18 +23,18 @@ TOLERANCE = {"free": 1e-12, "walls": 1e-9, "chain": 1e-12, "crowd": 1e-9, "mixed
 @pytest.fixture(scope="module", params=CASES)
 def case(request):
     sim, start, actions = CASES[request.param]()
-    phi = proposals(sim.layout, 3)
+    phi = proposals(sim.physics.layout, 3)
     return request.param, sim, phi, start, actions, sim(phi, start, actions)
 
 
 def like(sim: Simulator, **options) -> Simulator:
-    return Simulator(sim.scene, sim.layout, sim.effects, **options)
+    return Simulator(sim.physics.changed(**options))
 
 
 def test_plain_and_compiled_agree(case) -> None:
     name, sim, phi, start, actions, expected = case
     n = 12
-    got = like(sim, path="plain")(phi[:2], start[:n], actions[:n])
+    got = like(sim, engine="python")(phi[:2], start[:n], actions[:n])
     assert np.isfinite(got).all()
     np.testing.assert_allclose(got, expected[:2, :n], rtol=TOLERANCE[name], atol=TOLERANCE[name])
 
@@ -43,11 +42,11 @@ def test_plain_and_compiled_agree(case) -> None:
 def test_paths_agree_on_a_heavy_link_below_a_light_one() -> None:
     """Both take more solver iterations there."""
     sim, start, actions = chain()
-    phi = proposals(sim.layout, 2)
-    phi[:, sim.layout.index("mass", "upper")] = 0.05
-    phi[:, sim.layout.index("mass", "lower")] = [4.0, 10.0]
+    phi = proposals(sim.physics.layout, 2)
+    phi[:, sim.physics.layout.index("mass", "upper")] = 0.05
+    phi[:, sim.physics.layout.index("mass", "lower")] = [4.0, 10.0]
     expected = sim(phi, start[:5], actions[:5])
-    got = like(sim, path="plain")(phi, start[:5], actions[:5])
+    got = like(sim, engine="python")(phi, start[:5], actions[:5])
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-12)
     # one proposal's iterations are not the next one's
     np.testing.assert_array_equal(sim(phi[::-1], start[:5], actions[:5]), expected[::-1])
@@ -72,7 +71,7 @@ def test_two_contacts_at_one_instant_come_in_one_order() -> None:
     rng = np.random.default_rng(0)
     start = np.repeat(start, 100, axis=0) + rng.normal(0, 0.03, (4000, *start.shape[1:]))
     actions = np.repeat(actions, 100, axis=0)
-    phi = proposals(sim.layout, 3)[0]
+    phi = proposals(sim.physics.layout, 3)[0]
     expected = sim(phi, start, actions)
     for _ in range(6):
         order = rng.permutation(len(start))
@@ -135,14 +134,14 @@ def test_no_transitions_and_no_proposals(case) -> None:
 
 
 @pytest.mark.parametrize("threads", [1, 2])
-@pytest.mark.parametrize("path", ["compiled", "plain"])
+@pytest.mark.parametrize("path", ["auto", "python"])
 def test_divergence_is_nan_there_and_nowhere_else(path, threads) -> None:
     puck = body("puck", Shape.circle(0.1), mass=1e-12, r=0.5, mu_c=0.3)
     scene = Scene(time_step=0.1, bodies=(puck,), walls=ring(1.0))
     rng = np.random.default_rng(7)
     start = rng.normal(0, [0.5, 0.5, 1, 3, 3, 1], (40, 1, 6))
     actions = np.zeros((40, 2, 1, 3))
-    sim = simulator(scene, path=path, threads=threads)
+    sim = simulator(scene, engine=path, threads=threads)
     expected = sim(np.zeros(0), start, actions)
     lost = np.zeros(40, dtype=bool)
     lost[[0, 3, 4, 39]] = True
@@ -187,20 +186,20 @@ def test_bad_input_is_refused() -> None:
         ("linear_drag_coefficient[puck]", np.nan, "'puck'.*not finite"),
     ],
 )
-@pytest.mark.parametrize("path", ["compiled", "plain"])
+@pytest.mark.parametrize("path", ["auto", "python"])
 def test_impossible_parameters_are_refused(path, label, value, message) -> None:
     bodies = (body("other", BOX), Body("puck", BOX, effects=("inertia_scale", "linear_drag")))
     scene = Scene(time_step=0.1, bodies=bodies)
     attached = attach(scene)
     layout = build_layout(scene, attached)
-    sim = Simulator(scene, layout, attached, path=path)
+    sim = Simulator(Physics(scene, attached, engine=path))
     phi = np.full((3, layout.size), 0.5)
     phi[1, layout.labels.index(label)] = value
     with pytest.raises(ParameterError, match=message):
         sim(phi, np.zeros((1, 2, 6)), np.zeros((1, 1, 2, 3)))
 
 
-@pytest.mark.parametrize("options", [{"substeps": 0}, {"threads": 0}, {"path": "fast"}])
+@pytest.mark.parametrize("options", [{"substeps": 0}, {"threads": 0}, {"engine": "fast"}])
 def test_bad_options_are_refused(options) -> None:
     scene = Scene(time_step=0.1, bodies=(body("puck", BOX),))
     with pytest.raises(SimulationError):

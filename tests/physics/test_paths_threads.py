@@ -14,7 +14,7 @@ import numpy as np
 from tests.helpers.engines import cart, proposals
 
 sim, start, actions = cart(walls=True)
-phi = proposals(sim.layout, 20)
+phi = proposals(sim.physics.layout, 20)
 expected = sim(phi, start, actions)
 with ThreadPoolExecutor(3) as pool:
     results = list(pool.map(lambda _: sim(phi, start, actions), range(9)))

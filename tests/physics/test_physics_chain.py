@@ -58,7 +58,7 @@ def run(scene, starts, actions, effects=None, **options) -> np.ndarray:
     """States (n, intervals + 1, link, 6), the starts included."""
     named = effects or {}
     sim = simulator(scene, tuple(BY_NAME[name] for name in named), **options)
-    after = sim(phi_of(sim.layout, named), starts, actions)
+    after = sim(phi_of(sim.physics.layout, named), starts, actions)
     return np.concatenate([starts[:, None], after], axis=1)
 
 

@@ -120,7 +120,7 @@ def run(scene: Scene, start, wrench) -> np.ndarray:
         BY_NAME[name].on("puck") if name == "linear_drag" else BY_NAME[name] for name in EFFECTS
     )
     sim = simulator(scene, effects)
-    return sim(phi_of(sim.layout, VALUES), start[None], wrench[None, None])[0, 0]
+    return sim(phi_of(sim.physics.layout, VALUES), start[None], wrench[None, None])[0, 0]
 
 
 # 1e-12 as a rule, and every impact magnifies it; 1e-6 where a box stays pressed on a wall in two
@@ -373,7 +373,7 @@ def slope(scene: Scene, extrapolate: bool) -> float:
     def predictions(substeps: int, extrapolate: bool) -> np.ndarray:
         effects = tuple(BY_NAME[name] for name in DRAG)
         sim = simulator(scene, effects, substeps=substeps, extrapolate=extrapolate)
-        return sim(phi_of(sim.layout, DRAG), starts, wrenches)
+        return sim(phi_of(sim.physics.layout, DRAG), starts, wrenches)
 
     exact = predictions(2048, True)
     counts = np.array([8, 16, 32, 64, 128])

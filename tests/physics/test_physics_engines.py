@@ -19,7 +19,7 @@ def predict_all(scene, starts, wrenches, effects=None, **options) -> np.ndarray:
     """States (N, body, 6) after one interval, from (N, body, 6) and (N, body, 3)."""
     named = effects or {}
     sim = simulator(scene, tuple(BY_NAME[name] for name in named), **options)
-    return sim(phi_of(sim.layout, named), starts, wrenches[:, None])[:, 0]
+    return sim(phi_of(sim.physics.layout, named), starts, wrenches[:, None])[:, 0]
 
 
 def rms(difference: np.ndarray) -> float:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach, catalogue
-from pbrl_ppl.model import build_layout
-from pbrl_ppl.physics import Simulator, calls
+from pbrl_ppl.physics import Physics, Simulator, build_layout, calls
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import proposals
 from tests.helpers.worlds import G
@@ -75,10 +74,10 @@ def agreement(seed: int) -> None:
     inputs[..., 7] = scene.time_step * np.arange(3)[:, None]
     inputs[..., 8] = inputs[..., 7] + scene.time_step
     ours, plain = (
-        Simulator(scene, layout, attached, path=path)(phi, start, inputs)
-        for path in ("compiled", "plain")
+        Simulator(Physics(scene, attached, engine=path))(phi, start, inputs)
+        for path in ("auto", "python")
     )
-    alone = Simulator(scene, layout, attached)
+    alone = Simulator(Physics(scene, attached))
     for i in range(0, n, 4):  # whatever came before
         np.testing.assert_array_equal(alone(phi[1], start[[i]], inputs[[i]])[0], ours[1, i])
     np.testing.assert_array_equal(np.isnan(ours), np.isnan(plain))

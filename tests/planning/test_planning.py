@@ -10,8 +10,7 @@ import pytest
 from pbrl_ppl.agents import act
 from pbrl_ppl.errors import GoalError, PosteriorError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Transition
-from pbrl_ppl.physics import overlap
+from pbrl_ppl.physics import Transition, overlap
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal, astar, plan, receding
 from pbrl_ppl.planning.bound import TimeToGo
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall

@@ -8,7 +8,7 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import LinearisationWarning
-from pbrl_ppl.model import declared_problem
+from pbrl_ppl.likelihood import declared_problem
 from pbrl_ppl.posterior import from_groups, groups, parameter_draws
 from pbrl_ppl.posterior.linearisation import MOST, linearisation, linearisation_errors
 from pbrl_ppl.posterior.record import complete

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import ParameterLibrary, log_posterior
+from pbrl_ppl.likelihood import log_posterior
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.planning import Dynamics, plan
 from pbrl_ppl.posterior import (
     from_groups,

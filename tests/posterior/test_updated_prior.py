@@ -11,8 +11,9 @@ from scipy import stats
 import pbrl_ppl as pp
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import ConvergenceWarning, ParameterError, PosteriorError, SceneError
-from pbrl_ppl.model.table1 import build_layout, random_variable
+from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.parameters import Prior, fold_draws
+from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior import draws, from_groups, group, groups
 from pbrl_ppl.posterior.updated_prior import moment_matched, updated_scene
 from pbrl_ppl.sampling import fit, physics_model

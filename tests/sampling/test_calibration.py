@@ -14,7 +14,8 @@ from scipy import stats
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import Noise, Problem, build_model, declared_problem
+from pbrl_ppl.likelihood import Noise, Problem, declared_problem
+from pbrl_ppl.model import build_model
 from pbrl_ppl.report import plot_calibration, png
 from pbrl_ppl.sampling import calibrate, calibration, physics_model, replication
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, Calibration, bins, holm, rank, uniformity

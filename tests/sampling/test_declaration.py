@@ -10,7 +10,7 @@ import pbrl_ppl as pp
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import ConvergenceWarning, PosteriorError
 from pbrl_ppl.history import History
-from pbrl_ppl.model import declared_problem, simulated_trajectories, smoothed
+from pbrl_ppl.likelihood import declared_problem, simulated_trajectories, smoothed
 from pbrl_ppl.posterior import convergence, from_groups, group, groups, parameter_draws
 from pbrl_ppl.posterior.store import az, load_posterior, save_posterior, scalars
 from pbrl_ppl.scene import Body, Scene, Shape

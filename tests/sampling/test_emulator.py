@@ -7,7 +7,7 @@ import pymc as pm
 import pytest
 
 from pbrl_ppl.effects import attach
-from pbrl_ppl.model import Problem, along_trajectories, single_transitions
+from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
 from pbrl_ppl.modes import find_mode, trajectory_mode
 from pbrl_ppl.posterior.store import az, group
 from pbrl_ppl.sampling import emulation, fit, fitting, physics_model

@@ -7,7 +7,7 @@ import pytest
 from scipy.special import logsumexp
 
 from pbrl_ppl.errors import ConvergenceWarning
-from pbrl_ppl.model import log_prior
+from pbrl_ppl.likelihood import log_prior
 from pbrl_ppl.posterior import convergence, draws
 from pbrl_ppl.sampling import fit, physics_model
 from tests.helpers.carts import CART, cart_scene

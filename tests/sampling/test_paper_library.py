@@ -6,7 +6,7 @@ import numpy as np
 import pymc as pm
 import pytest
 
-from pbrl_ppl.model import ParameterLibrary
+from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, draws, group
 from pbrl_ppl.sampling import fit, physics_model

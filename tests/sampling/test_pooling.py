@@ -9,7 +9,7 @@ from scipy import stats
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import build_layout
+from pbrl_ppl.physics import build_layout
 from pbrl_ppl.sampling import pool
 from pbrl_ppl.sampling.population import Population, population
 from pbrl_ppl.scene import Scene

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach
-from pbrl_ppl.model import Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.sampling import starts
 from tests.helpers.carts import CART, cart_scene

@@ -18,7 +18,8 @@ from pbrl_ppl.errors import (
     RefitWarning,
 )
 from pbrl_ppl.history import History
-from pbrl_ppl.model import along_trajectories, build_model
+from pbrl_ppl.likelihood import along_trajectories
+from pbrl_ppl.model import build_model
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import loo_pit, problem_of
 from pbrl_ppl.posterior.store import (

@@ -9,7 +9,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.model import along_trajectories, declared_problem, simulated_trajectories
+from pbrl_ppl.likelihood import along_trajectories, declared_problem, simulated_trajectories
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, group, parameter_draws, problem_of
 from pbrl_ppl.posterior.store import scalars

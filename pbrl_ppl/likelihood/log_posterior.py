@@ -1,0 +1,129 @@
+"""The log-posterior in numpy: the one definition that searches, samplers and planners share."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.likelihood.problem import Problem
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+
+def noise_law(problem: Problem) -> tuple[Array, float]:
+    """P(sigma): log of each sigma's median, and the standard deviation of log sigma.
+
+    Errors of measuring are log-normal. An unexplained acceleration and a correlated error are
+    exponential, whatever the spread says: penalised-complexity priors (Simpson et al., Statistical
+    Science 32, 2017), under which motion follows the physics unless the data say otherwise.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its sigma is one a state dimension, or one for all.
+
+    Returns
+    -------
+    centre : ndarray
+        Logarithm of the medians, shape (state,), or (1,) for a scalar sigma.
+    spread : float
+        Standard deviation of log sigma where it is log-normal.
+    """
+    median, spread = problem.noise_prior
+    centre = np.log(median)
+    return (centre.mean(keepdims=True) if problem.noise.scalar else centre), spread
+
+
+def exponential(problem: Problem) -> NDArray[np.bool_]:
+    """Which noise parameters have an exponential prior, not a log-normal one, shape (state,).
+
+    They are the unexplained accelerations, and correlated errors of measuring.
+    """
+    mask = np.zeros(len(problem.noise_prior[0]), dtype=bool)
+    if problem.trajectories is not None:
+        cells = problem.trajectories.cells
+        mask[[*cells.accelerations, *cells.drift_parameters]] = True
+    return mask
+
+
+def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
+    """Log-density of log sigma, shape (...), at (..., state), or (..., 1) for a scalar sigma."""
+    centre, spread = noise_law(problem)
+    normal = -0.5 * ((log_sigma - centre) / spread) ** 2 - np.log(spread) - 0.5 * np.log(2 * np.pi)
+    if problem.trajectories is None:
+        return np.asarray(normal.sum(axis=-1))
+    # of sigma / scale, whose density is exp(-sigma / scale)
+    u = log_sigma - centre + np.log(np.log(2.0))
+    return np.asarray(np.where(exponential(problem), u - np.exp(u), normal).sum(axis=-1))
+
+
+def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
+    """Derivative of :func:`log_noise_prior` by log sigma, same shape."""
+    centre, spread = noise_law(problem)
+    normal = (centre - log_sigma) / spread**2
+    if problem.trajectories is None:
+        return np.asarray(normal)
+    u = log_sigma - centre + np.log(np.log(2.0))
+    return np.where(exponential(problem), 1.0 - np.exp(u), normal)
+
+
+def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = None) -> Array:
+    """Log-density of parameters and sigma under the declared prior.
+
+    Parameters
+    ----------
+    problem : Problem
+        Declares it.
+    phi : ndarray
+        Parameters in the layout's order, shape (..., p), SI units.
+    sigma : ndarray
+        Shape (..., state), all the same for a scalar sigma.
+    choice : ndarray of int, optional
+        Which parameter set each owner has, shape (..., owner), as in `Scene.owners`, where the
+        problem has such sets: then the parameters follow from it, and its probability counts.
+
+    Returns
+    -------
+    ndarray
+        Shape (...), normalised; of sigma, not of its logarithm, as PyMC's before transforms.
+    """
+    log_sigma = np.log(sigma[..., :1] if problem.noise.scalar else sigma)
+    of_noise = log_noise_prior(problem, log_sigma) - log_sigma.sum(axis=-1)
+    if problem.library is None:
+        return np.asarray(of_noise + problem.layout.log_prior(phi).sum(axis=-1))
+    if choice is None:
+        raise ValueError("choice is missing: the parameters follow from which set each body has")
+    names = list(problem.scene.owners)
+    with np.errstate(divide="ignore"):  # a set that a body cannot have
+        table = np.log([problem.library.prior(name) for name in names])
+    return np.asarray(of_noise + table[np.arange(len(names)), choice].sum(axis=-1))
+
+
+def log_posterior(
+    problem: Problem,
+    phi: Array,
+    sigma: Array,
+    choice: Ints | None = None,
+    *,
+    log_likelihood: Array | None = None,
+) -> Array:
+    """Log-posterior up to the evidence: what PyMC's model says, without transforms.
+
+    Parameters
+    ----------
+    problem : Problem
+        Data and prior.
+    phi, sigma, choice : ndarray
+        As for :func:`log_prior`.
+    log_likelihood : ndarray, optional
+        Of all transitions, shape (...), where it is known already: the engine is not run.
+
+    Returns
+    -------
+    ndarray
+        Shape (...).
+    """
+    if log_likelihood is None:
+        log_likelihood = problem.log_density(problem.residual(phi), sigma, phi).sum(axis=-1)
+    return np.asarray(log_likelihood + log_prior(problem, phi, sigma, choice))

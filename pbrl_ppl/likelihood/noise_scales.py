@@ -1,0 +1,94 @@
+"""Scales of the noise along trajectories, from what bodies do: medians of its priors."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import History, unseen
+from pbrl_ppl.likelihood.cells import Cells
+from pbrl_ppl.likelihood.problem import Problem
+from pbrl_ppl.state import STATE, THETA
+
+Array = NDArray[np.float64]
+
+#: Medians of the log-normal priors of errors of measuring and of contact accelerations, as shares
+#: of what the states do in a step, and their log-scale.
+SENSOR_SHARE, JOLT_SHARE, SPREAD = 0.1, 0.1, 2.0
+#: An unexplained acceleration is larger than this share of the bodies' acceleration with so much
+#: probability: physics is nearly deterministic, and a random force follows whatever is smooth.
+ACCELERATION_SHARE, ACCELERATION_CHANCE = 0.1, 0.01
+#: A correlated error of measuring is larger than this share of the range of what it measures with
+#: the same probability: an error that lasts follows whatever is smooth, too.
+DRIFT_SHARE = 0.01
+#: Median of an exponential law, as a share of what it exceeds with that probability.
+_MEDIAN = np.log(2.0) / -np.log(ACCELERATION_CHANCE)
+#: A position's velocity is so many places on.
+_RATE = 3
+
+
+def noise_medians(cells: Cells, history: History, states: Array) -> Array:
+    """Medians of the noise parameters' priors, from how much the states change.
+
+    Errors of measuring are scaled by the change from one row that shows the bodies to the next.
+    """
+    real = np.isfinite(history.dataset["clock"].to_numpy())
+    shown = real & ~unseen(history).any(axis=-1)
+    each, seen = (
+        _typical(cells, [np.diff(own[row], axis=0) for own, row in zip(states, rows, strict=True)])
+        for rows in (real, shown)
+    )
+    dt = float(history.dataset.attrs["time_step"])
+    sensors = SENSOR_SHARE * seen[list(cells.sensors)]
+    steps = ACCELERATION_SHARE * _MEDIAN * _vectors(each, cells.rates) / dt
+    jolts = JOLT_SHARE * each[list(cells.jolts)] / dt
+    drifts = DRIFT_SHARE * _MEDIAN * ranges(cells, history, states)
+    return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts, drifts]), 1e-9))
+
+
+def ranges(cells: Cells, history: History, states: Array) -> Array:
+    """Largest distance between values of each dimension that has correlated errors, shape (drift,).
+
+    Of x and y the larger one: a sensor of places is as far off in both.
+
+    Parameters
+    ----------
+    cells : Cells
+        Says which dimensions those are.
+    history : History
+        Says which rows there are.
+    states : ndarray
+        Shape (trajectory, time, body, 6), SI units.
+    """
+    real = np.isfinite(history.dataset["clock"].to_numpy())
+    values = states[real].reshape(-1, states.shape[2] * len(STATE))[:, cells.places]
+    extent = np.ptp(values, axis=0)
+    dimension = cells.places % len(STATE)
+    turns = dimension % _RATE == THETA
+    place = dimension < _RATE
+    return np.array([extent[place & (turns == (d == THETA))].max() for d in cells.drifts])
+
+
+def _typical(cells: Cells, changes: list[Array]) -> Array:
+    """Root mean square of changes (row, body, 6) of each dimension's cells, shape (6,)."""
+    square = np.concatenate([own.reshape(len(own), -1) for own in changes]) ** 2
+    own = square.mean(axis=0)[cells.places]
+    of = cells.places % len(STATE)
+    return np.array([np.sqrt(own[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
+
+
+def _vectors(each: Array, rates: tuple[int, ...]) -> Array:
+    """Sizes (6,) of velocities' changes, those of x and y as one vector, shape (rate,)."""
+    plane = [d for d in rates if d % _RATE != THETA]
+    size = float(np.sqrt((each[plane] ** 2).sum()))
+    return np.array([each[d] if d % _RATE == THETA else size for d in rates])
+
+
+def bodies_acceleration(problem: Problem) -> Array:
+    """Root mean square acceleration of the bodies along smoothed trajectories, shape (velocity,).
+
+    Of x and y it is that of the vector, whatever the axes' directions (m/s^2); of omega in rad/s^2.
+    """
+    cells, segments = problem.trajectory_noise.cells, problem.segments
+    change = segments.observed[:, 0] - segments.start
+    return _vectors(_typical(cells, [change]), cells.rates) / problem.scene.time_step

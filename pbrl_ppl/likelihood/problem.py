@@ -1,0 +1,334 @@
+"""An inference problem in numpy: data, physics and noise, and the likelihood they make."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.effects import Attached
+from pbrl_ppl.errors import ParameterError
+from pbrl_ppl.history import History, Segments
+from pbrl_ppl.likelihood.data import Data
+from pbrl_ppl.likelihood.noise import Noise, sigma_prior
+from pbrl_ppl.likelihood.tails import degrees_of_freedom, tail_places
+from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
+from pbrl_ppl.likelihood.transitions import (
+    Observations,
+    cells,
+    log_density,
+    next_state_random,
+    robust,
+    whiten,
+)
+from pbrl_ppl.parameters import Layout, ParameterLibrary
+from pbrl_ppl.physics import OneWorld, PartedSimulator, Physics
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE
+
+Array = NDArray[np.float64]
+
+#: Phi, start states and wrenches in, next states out.
+Engine = Callable[[Array, Array, Array], Array]
+#: How far predictions may differ and be the same to the likelihood, in units of the noise.
+_SAME = 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """An inference problem in plain numpy: what a model of :func:`physics_model` is made of.
+
+    A change of one of its parts keeps the others, with the worlds and segments they have made.
+
+    Parameters
+    ----------
+    data : Data
+        Measured segments.
+    physics : Physics
+        What predicts them.
+    noise : Noise
+        How they scatter about the predictions.
+    library : ParameterLibrary, optional
+        Parameter sets of which each body has one, in place of Table 1.
+    """
+
+    data: Data
+    physics: Physics
+    noise: Noise
+    library: ParameterLibrary | None = None
+
+    @classmethod
+    def of(
+        cls,
+        scene: Scene,
+        history: History,
+        effects: tuple[Attached, ...] = (),
+        *,
+        horizon: int = 1,
+        substeps: int | None = None,
+        threads: int = 1,
+        columns: tuple[int, ...] | None = None,
+        noise: Noise | None = None,
+        library: ParameterLibrary | None = None,
+        together: tuple[str, ...] = (),
+    ) -> Problem:
+        """Build one from a scene and a history; by default all is as in the paper.
+
+        Arguments are those of :class:`Data`, :class:`Physics` and of the problem itself;
+        ``substeps`` are the scene's by default.
+        """
+        steps = scene.substeps if substeps is None else substeps
+        physics = Physics(scene, effects, steps, threads, together=together)
+        return cls(
+            Data(scene, history, horizon, columns),
+            physics.in_parts(history),
+            Noise() if noise is None else noise,
+            library,
+        )
+
+    def with_data(self, **changes: Any) -> Problem:
+        """The same problem of other data; arguments are fields of :class:`Data`."""
+        return self.on(replace(self.data, **changes))
+
+    def on(self, data: Data) -> Problem:
+        """The same problem of other data.
+
+        The noise along trajectories, which is of these, is left out. Bodies that have to do with
+        each other in another history are found anew; where they are the same, the physics stay.
+        """
+        physics = self.physics
+        if data.history is not self.data.history:
+            physics = physics.in_parts(data.history)
+        return replace(
+            self, data=data, physics=physics, noise=replace(self.noise, trajectories=None)
+        )
+
+    def with_physics(self, **changes: Any) -> Problem:
+        """The same problem with other physics; arguments are fields of :class:`Physics`."""
+        physics, noise = self.physics.changed(**changes), self.noise
+        if "scene" in changes or "together" in changes:
+            physics = physics.in_parts(self.data.history)
+        if noise.trajectories is not None and physics.layout.labels != self.layout.labels:
+            still = replace(noise.trajectories, sensitivity=None)  # it is by other parameters
+            noise = replace(noise, trajectories=still)
+        return replace(self, physics=physics, noise=noise)
+
+    def with_noise(self, **changes: Any) -> Problem:
+        """The same problem with other noise; arguments are fields of :class:`Noise`."""
+        return replace(self, noise=replace(self.noise, **changes))
+
+    @property
+    def coarse(self) -> Problem:
+        """The same problem with few engine steps."""
+        return replace(self, physics=self.physics.coarse)
+
+    @property
+    def rough(self) -> Problem:
+        """The same problem with few engine steps where it has more: for a change, or a slope."""
+        return replace(self, physics=self.physics.rough)
+
+    def joined(self, phi: Array, sigma: Array) -> Problem:
+        """The same problem with the bodies in one part that meet in one world; itself if none do.
+
+        Parameters
+        ----------
+        phi, sigma : ndarray
+            Draws at which to look, shapes (n, p) and (n, state).
+        """
+        if len(self.simulator.parts) == 1:
+            return self
+        segments, columns = self.segments, list(self.observations.columns)
+        states, met = self.one_world.meetings(phi, segments.start, self.inputs)
+        if not met.any():
+            return self
+        apart = self.simulator(phi, segments.start, self.inputs)
+        off = abs(self.observations.wrapped((states - apart)[..., columns]))
+        if self.trajectories is not None:  # the noise of measuring; what is not measured has none
+            sensors, every = self.trajectories.cells.sensors, sigma
+            stated = dict(self.scene.noise)
+            sigma = np.full((len(phi), len(columns)), np.inf)
+            for i, d in enumerate(columns):
+                sigma[:, i] = stated.get(STATE[d], np.inf)
+                if d in sensors:
+                    sigma[:, i] = every[:, sensors.index(d)]
+        matters = np.any(~(off <= _SAME * sigma[:, None, None, None]), axis=(2, 3, 4))
+        names = [body.name for body in self.scene.moving]
+        own = [
+            names[i] for i in np.flatnonzero((met & np.expand_dims(matters, -1)).any(axis=(0, 1)))
+        ]
+        if not own:
+            return self
+        return self.with_physics(together=tuple(dict.fromkeys((*self.physics.together, *own))))
+
+    @property
+    def scene(self) -> Scene:
+        """The scene of the physics."""
+        return self.physics.scene
+
+    @property
+    def layout(self) -> Layout:
+        """Order of the unknown parameters in phi."""
+        return self.physics.layout
+
+    @property
+    def simulator(self) -> PartedSimulator:
+        """The engine of the likelihood, in parts."""
+        return self.physics.simulator
+
+    @property
+    def one_world(self) -> OneWorld:
+        """The engine of predictions, in which bodies that were apart in the data may meet."""
+        return self.physics.one_world
+
+    @property
+    def segments(self) -> Segments:
+        """The measured segments."""
+        return self.data.segments
+
+    @property
+    def inputs(self) -> Array:
+        """What acts in the segments' intervals, as far as the effects look at it.
+
+        Shape (transition, H, body, 3), or (transition, H, body, 9) as in
+        :data:`pbrl_ppl.state.INPUT`.
+        """
+        return self.physics.inputs(self.segments)
+
+    @property
+    def observations(self) -> Observations:
+        """Observations at the segments' steps."""
+        return self.data.observations
+
+    @cached_property
+    def noise_prior(self) -> tuple[Array, float]:
+        """Medians of sigma's prior, shape (state,), and its log-scale; given, or from the data."""
+        if self.noise.prior is None:
+            return sigma_prior(self.observations, self.segments)
+        median, spread = self.noise.prior
+        return np.array(median), spread
+
+    @property
+    def trajectories(self) -> TrajectoryNoise | None:
+        """The noise along whole trajectories, if the likelihood is of those."""
+        return self.noise.trajectories
+
+    @property
+    def trajectory_noise(self) -> TrajectoryNoise:
+        """The same where it must be of those.
+
+        Raises
+        ------
+        TypeError
+            If the likelihood is of single transitions.
+        """
+        if self.trajectories is None:
+            raise TypeError("the problem is one of single transitions, expected whole trajectories")
+        return self.trajectories
+
+    def quiet(self, sigma: Array, share: float) -> Array:
+        """Noise of trajectories, a step's no larger than a share of its prior's median."""
+        steps, sigma = self.trajectory_noise.cells.accelerations, sigma.copy()
+        sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])
+        return sigma
+
+    @property
+    def noise_variables(self) -> dict[str, tuple[str, ...]]:
+        """Variables of the noise, and the state dimensions of each, in the order of sigma."""
+        if self.trajectories is None:
+            return {"sigma": self.observations.names}
+        return self.trajectories.cells.variables
+
+    def named(self, phi: Array, sigma: Array) -> dict[str, Array]:
+        """The model's variables at phi, shape (..., p), and sigma, shape (..., parameter)."""
+        if self.noise.scalar:
+            return self.layout.to_dict(phi) | {"sigma": sigma[..., 0]}
+        ends = np.cumsum([len(own) for own in self.noise_variables.values()])[:-1]
+        noise = dict(zip(self.noise_variables, np.split(sigma, ends, axis=-1), strict=True))
+        return self.layout.to_dict(phi) | noise
+
+    @property
+    def measured(self) -> Array:
+        """Measured next states, shape (transition, H, body, state), NaN where missing."""
+        values = self.observations.values
+        if self.trajectories is None:
+            return values
+        segments = self.segments
+        observed = self.data.history.dataset["observed"].to_numpy()
+        raw = observed[segments.trajectory, segments.step + 1][:, None]
+        return np.asarray(raw[..., self.observations.columns])
+
+    def predict(self, phi: Array, engine: Engine | None = None) -> Array:
+        """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""
+        engine, given = engine or self.simulator, (phi, self.segments.start, self.inputs)
+        if self.trajectories is None or self.trajectories.sensitivity is None:
+            return engine(*given)
+        return self.trajectories.sensitivity.predicted(engine, *given)
+
+    def residual(self, phi: Array, engine: Engine | None = None) -> Array:
+        """Measured minus predicted, shape (..., transition, H, body, state)."""
+        return self.observations.residual(self.predict(phi, engine))
+
+    def whitened(self, phi: Array, sigma: Array, engine: Engine | None = None) -> Array:
+        """Residuals in units of their noise, shape (..., transition, cell)."""
+        return whiten(self.residual(phi, engine), sigma, self.trajectories)
+
+    @cached_property
+    def tails(self) -> tuple[int, ...]:
+        """Where phi holds parameters of the noise's tails."""
+        return tuple(tail_places(self.physics))
+
+    def nu(self, phi: Array | None = None) -> float | Array | None:
+        """Degrees of freedom of the noise at phi; None for a Gaussian.
+
+        Shape (..., 1, 1, body, 1) where an effect of the noise stage says so.
+
+        Raises
+        ------
+        ParameterError
+            If they depend on phi, and there is none.
+        """
+        if not self.tails:
+            return self.noise.nu
+        if phi is None:
+            raise ParameterError("the noise's tails depend on the parameters; give phi")
+        return degrees_of_freedom(self.physics, phi, self.noise.nu)
+
+    def robust(self, phi: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
+        """Least-squares residuals: half their squares are the negative log-density but a constant.
+
+        Shape (..., transition, cell).
+        """
+        residual = self.residual(phi, engine)
+        z = whiten(residual, sigma, self.trajectories)
+        nu = self.nu(phi)
+        if self.trajectories is not None:
+            return robust(z, self.trajectories.of_cells(nu, residual.shape))
+        return robust(z, cells(nu, residual.shape))
+
+    def log_density(self, residual: Array, sigma: Array, phi: Array | None = None) -> Array:
+        """Log-likelihood of each transition, shape (..., transition); see `likelihood`.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Shape (..., transition, H, body, state).
+        sigma : ndarray
+            Shape (..., state).
+        phi : ndarray, optional
+            Shape (..., p); needed where the noise's tails are inferred.
+        """
+        seen = self.observations.measured
+        return log_density(residual, sigma, self.trajectories, seen, self.nu(phi))
+
+    def next_states(
+        self, states: Array, sigma: Array, rng: np.random.Generator, phi: Array | None = None
+    ) -> Array:
+        """Draw measured next states by Eq. 13 about predictions (..., transition, H, body, 6)."""
+        predicted = states[..., self.observations.columns]
+        if self.trajectories is not None:
+            return self.trajectories.random(predicted, self.observations.values, sigma, rng)
+        return next_state_random(predicted, sigma, rng, nu=self.nu(phi))

@@ -1,0 +1,112 @@
+"""Sensitivity of smoothed states to the parameters: where trajectories are linearised moves too.
+
+A parameter and the states are often known together far better than each alone, such as a wheel's
+angle and a heading. With the states held fast, another angle would be judged by motions that no
+body made: by slips and stops that are not there. Predictions start from the states that go with the
+parameters, to first order, and are taken back along the slope by as much: where the motion is
+linear, nothing changes. See E. L. Haseltine and J. B. Rawlings, Critical evaluation of extended
+Kalman filtering and moving-horizon estimation (2005), on the point of linearisation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.likelihood.cells import Cells
+from pbrl_ppl.parameters import Layout, change_from
+from pbrl_ppl.scene import Scene
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+#: No state moves as far as this (SI units): a sampler may look at parameters that say so.
+_FAR = 1e6
+#: Predicts next states from phi, start states and inputs, as a simulator does.
+Engine = Callable[[Array, Array, Array], Array]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Sensitivity:
+    """Derivative by the parameters of the states before transitions.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its hinges hold hung bodies.
+    layout : Layout
+        Order of phi.
+    cells : Cells
+        Coordinates of the state.
+    slope : ndarray
+        Derivative of the next state by the state, shape (transition, cell, cell).
+    phi : ndarray
+        Parameters that the states were smoothed with, one set a transition, shape (transition, p).
+    before : ndarray
+        Derivative of the state before each transition, shape (transition, cell, p).
+    """
+
+    scene: Scene
+    layout: Layout
+    cells: Cells
+    slope: Array
+    phi: Array
+    before: Array
+
+    @cached_property
+    def _sets(self) -> list[tuple[Array, Bools, Array]]:
+        """Each set of parameters of phi, the transitions it is of, and their derivatives.
+
+        The latter have the shape (transition * cell, p).
+        """
+        sets, which = np.unique(self.phi, axis=0, return_inverse=True)
+        rows = [which.ravel() == i for i in range(len(sets))]
+        own = [self.before[row].reshape(-1, self.phi.shape[1]) for row in rows]
+        return list(zip(sets, rows, own, strict=True))
+
+    def at(self, rows: NDArray[np.intp]) -> Sensitivity:
+        """That of these transitions alone."""
+        return replace(self, slope=self.slope[rows], phi=self.phi[rows], before=self.before[rows])
+
+    def moved(self, phi: Array) -> Array:
+        """How far the states are from where they were smoothed, shape (..., transition, cell)."""
+        result = np.empty((*phi.shape[:-1], *self.before.shape[:2]))
+        for own, rows, by_phi in self._sets:
+            change = change_from(self.layout, phi, own) @ by_phi.T
+            result[..., rows, :] = change.reshape(*phi.shape[:-1], -1, result.shape[-1])
+        return result
+
+    def begun(self, moved: Array, start: Array) -> Array:
+        """States before the transitions, shape (..., transition, body, 6), moved from a start."""
+        states = np.broadcast_to(start, (*moved.shape[:-2], *start.shape))
+        return self.cells.completed(self.scene, self._added(states, moved))
+
+    def predicted(self, engine: Engine, phi: Array, start: Array, inputs: Array) -> Array:
+        """Next states as if from the smoothed ones, shape (..., transition, 1, body, 6).
+
+        Parameters
+        ----------
+        engine : callable
+            As :class:`pbrl_ppl.physics.PartedSimulator`.
+        phi : ndarray
+            Parameters, shape (..., p).
+        start : ndarray
+            Smoothed states before the transitions, shape (transition, body, 6), SI units.
+        inputs : ndarray
+            What acts, shape (transition, 1, body, 3 or 9).
+        """
+        moved = self.moved(phi)
+        moved = np.where(np.abs(moved) < _FAR, moved, np.nan)  # nothing is predicted from there
+        states = engine(phi, self.begun(np.nan_to_num(moved), start), inputs)
+        back = np.matmul(self.slope, moved[..., None])[..., 0]
+        return self._added(states, -back[..., None, :])
+
+    def _added(self, states: Array, change: Array) -> Array:
+        """States (..., body, 6) with their cells changed by as much, shape (..., cell)."""
+        states = np.array(states, order="C")  # so that what is reshaped is a view of it
+        flat = states.reshape(*states.shape[:-2], -1)
+        flat[..., self.cells.places] += change
+        return states

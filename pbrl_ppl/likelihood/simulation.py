@@ -1,0 +1,77 @@
+"""Simulated trajectories with both noises: of every step, and of measuring."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import History
+from pbrl_ppl.likelihood.problem import Problem
+from pbrl_ppl.likelihood.smoothing import along_trajectories
+from pbrl_ppl.physics import touching
+
+Array = NDArray[np.float64]
+
+
+def simulated_trajectories(
+    problem: Problem, phi: Array, sigma: Array, rng: np.random.Generator
+) -> Array:
+    """Measured states of whole trajectories, from the recorded first states and commands.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories; says where each begins, what acts and what is measured.
+    phi, sigma : ndarray
+        Parameters and noise parameters, shapes (p,) and (parameter,).
+    rng : Generator
+        Of both noises.
+
+    Returns
+    -------
+    ndarray
+        Shape (trajectory, time, body, 6), SI units; NaN where the recording has no measurement, and
+        everywhere in a trajectory in which the engine diverged.
+    """
+    cells, segments = problem.trajectory_noise.cells, problem.segments
+    observed = problem.data.history.dataset["observed"].to_numpy()
+    states = problem.data.smoothed_states.copy()
+    flat = states.reshape(*states.shape[:2], -1)
+    for step in range(states.shape[1] - 1):
+        now = np.flatnonzero(segments.step == step)
+        own = segments.trajectory[now]
+        begin, inputs = states[own, step], problem.inputs[now]
+        lost = ~np.isfinite(begin).all(axis=(1, 2))
+        ends = problem.one_world(phi, np.where(lost[:, None, None], 0.0, begin), inputs)[:, 0]
+        ends[lost] = np.nan
+        met = touching(problem.scene, begin, np.nan_to_num(ends))
+        pushes = cells.pushes(sigma, met, rng)
+        flat[own[:, None], step + 1, cells.places] = cells.of(ends) + pushes
+        cells.completed(problem.scene, states[:, step + 1])
+    errors = cells.errors(sigma) * rng.standard_normal((*flat.shape[:2], len(cells.places)))
+    measured = states.copy()
+    measured.reshape(flat.shape)[..., cells.places] += errors
+    return np.where(np.isfinite(observed), measured, np.nan)
+
+
+def with_measurements(problem: Problem, observed: Array) -> Problem:
+    """The problem of whole trajectories with other measurements of the same cells.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories; its noise prior and its cells stay.
+    observed : ndarray
+        Shape (trajectory, time, body, 6), SI units, NaN where missing.
+    """
+    noise = problem.trajectory_noise
+    dataset = problem.data.history.dataset.copy()
+    start = dataset["start"].to_numpy()
+    dataset["observed"] = dataset["observed"].copy(data=observed)
+    known = np.where(np.isfinite(observed), observed, start)
+    dataset["start"] = dataset["start"].copy(data=known)
+    history = History(dataset)
+    centre = np.array([prior.centre for prior in problem.layout.priors])
+    return along_trajectories(
+        problem.with_data(history=history, states=None), centre, None, noise.cells
+    )

@@ -1,0 +1,288 @@
+"""Smoothed states of trajectories, where transitions are linearised: an iterated Kalman smoother.
+
+See B. M. Bell, The iterated Kalman smoother as a Gauss-Newton method (1994).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.history import longest_gap, unseen
+from pbrl_ppl.likelihood.cells import Cells, check_moves
+from pbrl_ppl.likelihood.noise_scales import SPREAD, noise_medians
+from pbrl_ppl.likelihood.problem import Problem
+from pbrl_ppl.likelihood.recorded_cells import cells_of, first_states
+from pbrl_ppl.likelihood.sensitivity import Sensitivity
+from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
+from pbrl_ppl.physics import touching
+from pbrl_ppl.state import STATE
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+#: A state that was not measured may be this many times as large as any that is estimated.
+_FAR = 10.0
+#: Smoothing ends with a round that moves no state by more than this, in standard deviations.
+_SETTLED, _ROUNDS = 0.05, 4
+#: Share of the median of an unexplained acceleration's prior that is a little.
+_LITTLE = 0.1
+#: States are smoothed with unexplained accelerations that fall to those given by so much, one after
+#: the other.
+_SHARES = (0.5, 1.0)
+#: A position's velocity is so many places on.
+_RATE = 3
+
+
+def along_trajectories(
+    problem: Problem, phi: Array, sigma: Array | None = None, cells: Cells | None = None
+) -> Problem:
+    """The problem with the likelihood of whole trajectories, linearised at smoothed states.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of any horizon and noise.
+    phi : ndarray
+        Where to linearise, shape (p,).
+    sigma : ndarray, optional
+        Noise parameters to smooth with, shape (parameter,): errors of measuring each state
+        dimension, then unexplained accelerations. Without it, a guess from what one step leaves.
+    cells : Cells, optional
+        Coordinates and noise parameters of the training data, where these are others.
+
+    Returns
+    -------
+    Problem
+        Of horizon 1, its noise a :class:`TrajectoryNoise`.
+
+    Raises
+    ------
+    HistoryError
+        If nothing moves.
+    """
+    history = problem.data.history
+    states = first_states(history)
+    states = foreseen(problem.on(replace(problem.data, horizon=1, states=states)), phi)
+    given = cells is not None
+    if cells is None:
+        cells = cells_of(problem.scene, history)
+        check_moves(cells, problem.scene)
+        medians = tuple(noise_medians(cells, history, states).tolist())
+        problem = problem.with_noise(prior=(medians, SPREAD), scalar=False, trajectories=None)
+    data = replace(problem.data, horizon=1, states=states, columns=cells.columns)
+    problem = problem.on(data)
+    begin = _guess(problem, cells, phi)
+    sigma = begin if sigma is None else sigma
+    noise = _sloped(problem, cells, phi, begin, _steps(problem, cells, begin))
+    problem = smoothed(problem.with_noise(trajectories=noise), phi, begin)
+    if sigma is not begin:  # what the physics alone make of far-off states may be far off, too
+        for share in _SHARES:
+            problem = smoothed(problem, phi, _between(begin, sigma, share, cells))
+    if not given:  # the noise of measurements adds to the changes of states as measured
+        moved = noise_medians(cells, history, problem.data.smoothed_states)
+        steps = list(cells.accelerations)
+        least = problem.noise_prior[0].copy()
+        least[steps] = np.minimum(least[steps], moved[steps])
+        problem = problem.with_noise(prior=(tuple(least.tolist()), SPREAD))
+    return problem
+
+
+def single_transitions(problem: Problem) -> Problem:
+    """The problem with the likelihood of single transitions (Eq. 11), as a search begins with."""
+    horizon = longest_gap(problem.data.history)
+    data = replace(problem.data, horizon=horizon, states=None, columns=None)
+    return problem.on(data).with_noise(prior=None)
+
+
+def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
+    """The same problem, linearised anew about the states smoothed at phi and sigma.
+
+    With next to no unexplained acceleration states are smoothed as if there were a little: where
+    bodies stick and slip, no start leads to what physics alone make of it.
+    """
+    steps = list(problem.trajectory_noise.cells.accelerations)
+    sigma = sigma.copy()
+    sigma[steps] = np.maximum(sigma[steps], _LITTLE * problem.noise_prior[0][steps])
+    for _ in range(_ROUNDS):
+        noise = problem.trajectory_noise
+        cells = noise.cells
+        residual = cells.of_residual(problem.residual(phi))
+        before, after = noise.smoothed(residual, sigma)
+        spread = np.sqrt(np.median(np.diagonal(noise.covariance(sigma), axis1=1, axis2=2), axis=0))
+        states = _moved(problem, cells, noise.first, before, after)
+        if not (np.isfinite(states).all() and np.isfinite(spread).all()):
+            break  # no motion fits such data: stay where it was linearised last
+        problem = replace(problem, data=replace(problem.data, states=states))
+        problem = replace(problem, data=replace(problem.data, states=foreseen(problem, phi)))
+        problem = problem.with_noise(trajectories=_sloped(problem, cells, phi, sigma, spread))
+        shown = after[noise.seen.any(axis=1)]
+        if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
+            break
+    return problem
+
+
+def with_sensitivity(problem: Problem, phi: Array, sigma: Array) -> Problem:
+    """The same problem, its smoothed states following the parameters to first order.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories, its states smoothed at phi and sigma.
+    phi : ndarray
+        Shape (p,).
+    sigma : ndarray
+        Noise parameters, shape (parameter,).
+    """
+    if not len(phi):
+        return problem
+    noise, segments = problem.trajectory_noise, problem.segments
+    cells, nothing = noise.cells, np.zeros_like(noise.measured)
+    slopes = problem.rough.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
+    still = replace(noise, begin=nothing, measured=nothing, sensitivity=None)
+    before = np.empty((*nothing.shape, len(phi)))
+    for j, own in enumerate(cells.of(np.moveaxis(slopes, -1, 0))):
+        first, after = still.smoothed(-np.nan_to_num(own), sigma)
+        before[:, :, j] = np.where(noise.first[:, None], first, np.roll(after, 1, axis=0))
+    if not np.isfinite(before).all():
+        return problem
+    origin = np.tile(phi, (segments.n, 1))
+    follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
+    return problem.with_noise(trajectories=replace(noise, sensitivity=follow))
+
+
+def foreseen(problem: Problem, phi: Array) -> Array:
+    """Linearised states; in a sparse recording what no row shows as predicted from the row before.
+
+    What a body meets on its way is nowhere near a straight line between far apart rows.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its data hold the states; of horizon 1.
+    phi : ndarray
+        Parameters to predict with, shape (p,).
+
+    Returns
+    -------
+    ndarray
+        Shape (trajectory, time, body, 6), SI units.
+    """
+    history, states = problem.data.history, problem.data.smoothed_states
+    if longest_gap(history) == 1:
+        return states
+    hidden, states = unseen(history), states.copy()
+    segments, inputs = problem.segments, problem.inputs
+    for step in np.flatnonzero(hidden.any(axis=(0, 2))):
+        now = np.flatnonzero(segments.step == step - 1)
+        own = segments.trajectory[now]
+        ends = problem.one_world(phi, states[own, step - 1], inputs[now])[:, 0]
+        found = hidden[own, step] & np.isfinite(ends).all(axis=-1)
+        states[own, step] = np.where(found[..., None], ends, states[own, step])
+    return states
+
+
+def _steps(problem: Problem, cells: Cells, sigma: Array) -> Array:
+    """How well cells are known from a row and the next, shape (cell,): steps of slopes."""
+    error = cells.errors(sigma)
+    known = {place: error[i] / problem.scene.time_step for i, place in enumerate(cells.places)}
+    below = np.array([known.get(place - _RATE, 0.0) for place in cells.places])
+    rate = (cells.places % len(STATE) >= _RATE) & (cells.sensor < 0)
+    return np.where(rate, np.maximum(error, below), error)
+
+
+def _between(begin: Array, end: Array, share: float, cells: Cells) -> Array:
+    """Noise parameters, the accelerations on their way from one to the other, by factors."""
+    sigma, steps = end.copy(), list(cells.accelerations)
+    larger = np.maximum(begin, end)[steps]
+    sigma[steps] = larger ** (1.0 - share) * end[steps] ** share
+    return sigma
+
+
+def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
+    """Noise parameters to begin with, from the residuals of single steps at measured states."""
+    residual = cells.of_residual(problem.residual(phi))
+    size = np.sqrt(np.nanmedian(residual**2, axis=0)) / 0.67
+    by_dimension = {
+        d: float(np.sqrt(np.mean(size[cells.places % len(STATE) == d] ** 2))) for d in cells.columns
+    }
+    dt = problem.scene.time_step
+    guess = [by_dimension[d] / np.sqrt(2) for d in cells.sensors]
+    guess += [by_dimension[d] / np.sqrt(2) / dt for d in (*cells.rates, *cells.jolts)]
+    guess += [by_dimension[d] / np.sqrt(2) for d in cells.drifts]
+    return np.maximum(guess, problem.noise_prior[0] * 0.01)
+
+
+def _moved(problem: Problem, cells: Cells, first: Bools, before: Array, after: Array) -> Array:
+    """Linearised states, moved by the smoothed deviations."""
+    segments = problem.segments
+    states = problem.data.smoothed_states.copy()
+    flat = states.reshape(*states.shape[:2], -1)
+    at = segments.trajectory[:, None], segments.step[:, None] + 1, cells.places
+    flat[at] += after
+    begin = segments.trajectory[first, None], segments.step[first, None], cells.places
+    flat[begin] += before[first]
+    return cells.completed(problem.scene, states)
+
+
+def _sloped(
+    problem: Problem, cells: Cells, phi: Array, sigma: Array, steps: Array
+) -> TrajectoryNoise:
+    """Linearise the transitions about the problem's states by central differences."""
+    segments = problem.segments
+    d, n = len(cells.places), segments.n
+    moved = np.tile(segments.start, (2 * d, 1, 1, 1))
+    flat = moved.reshape(2 * d, n, -1)
+    for i, place in enumerate(cells.places):
+        flat[2 * i, :, place] += steps[i]
+        flat[2 * i + 1, :, place] -= steps[i]
+    moved = cells.completed(problem.scene, moved).reshape(2 * d * n, *segments.start.shape[1:])
+    inputs = np.tile(problem.inputs, (2 * d, 1, 1, 1))
+    # the slope of what a fine engine does is that of what a coarse one does, all but exactly
+    ends = cells.of(problem.rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
+    slope = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
+    return linearised(problem, cells, np.nan_to_num(slope), sigma)
+
+
+def linearised(problem: Problem, cells: Cells, slope: Array, sigma: Array) -> TrajectoryNoise:
+    """The noise along a problem's trajectories, from the slopes at its states.
+
+    Parameters
+    ----------
+    problem : Problem
+        Its data hold the states.
+    cells : Cells
+        Coordinates and noise parameters.
+    slope : ndarray
+        Derivative of the next state by the state, shape (transition, cell, cell).
+    sigma : ndarray
+        Noise parameters at which the states were smoothed, shape (parameter,).
+    """
+    segments, states = problem.segments, problem.data.smoothed_states
+    trajectory, step = segments.trajectory, segments.step
+    observed = problem.data.history.dataset["observed"].to_numpy()
+    deviation = cells.wrapped(cells.of(observed) - cells.of(states))
+    end, begin = deviation[trajectory, step + 1], deviation[trajectory, step]
+    far = _FAR * np.abs(cells.of(states)).max(axis=(0, 1)) + 1.0
+    return TrajectoryNoise(
+        cells=cells,
+        slope=np.ascontiguousarray(slope),
+        first=step == 0,
+        seen=np.isfinite(end),
+        measured=np.nan_to_num(end),
+        begin=np.nan_to_num(begin),
+        wide=np.where(np.isfinite(begin), 0.0, far**2),
+        sigma=np.asarray(sigma, dtype=float),
+        touching=_touching(problem, cells),
+    )
+
+
+def _touching(problem: Problem, cells: Cells) -> Bools:
+    """In which transitions bodies touch, where that has noise of its own, shape (transition,)."""
+    segments, states = problem.segments, problem.data.smoothed_states
+    if not cells.jolts:
+        return np.zeros(segments.n, dtype=bool)
+    trajectory, step = segments.trajectory, segments.step
+    return touching(problem.scene, states[trajectory, step], states[trajectory, step + 1])

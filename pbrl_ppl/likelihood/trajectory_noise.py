@@ -1,0 +1,300 @@
+"""Noise along trajectories: errors of measured states, and what a step adds, told apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pbrl_ppl.likelihood.cells import Cells
+from pbrl_ppl.likelihood.extended import Extended
+from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score
+from pbrl_ppl.likelihood.sensitivity import Sensitivity
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+Ints = NDArray[np.intp]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class TrajectoryNoise:
+    """Two noises of transitions that are linearised along their trajectories.
+
+    Neighbouring transitions share a measured state, so their residuals are correlated. Whitened
+    along the trajectory they are the innovations of a Kalman filter. The noise parameters are the
+    standard deviations of a measurement, R, one a measured state dimension, followed by those of an
+    unexplained acceleration, held over an interval, Q, one a velocity, of what comes on top of it
+    where bodies touch: how they part depends on more than any engine knows; and of errors of
+    measuring that are correlated from row to row.
+
+    The filter's state is the cells as measured without a row's own error, which is the state plus
+    the correlated errors, followed by those errors: each measurement then is of one coordinate.
+
+    Parameters
+    ----------
+    cells : Cells
+        Coordinates of the state.
+    slope : ndarray
+        Derivative F of the next state by the state, shape (transition, cell, cell).
+    first : ndarray of bool
+        Whether a transition is its trajectory's first, shape (transition,).
+    seen : ndarray of bool
+        Whether a cell was measured at the transition's end, shape (transition, cell).
+    measured : ndarray
+        Measured minus linearised state at the transition's end, shape (transition, cell).
+    begin : ndarray
+        The same before the transition, for the first of a trajectory; 0 where not measured.
+    wide : ndarray
+        Variance of that where it was not measured, 0 elsewhere, shape (transition, cell).
+    sigma : ndarray
+        Noise parameters at which it was linearised, shape (parameter,).
+    touching : ndarray of bool
+        Whether bodies touch in a transition, shape (transition,).
+    sensitivity : Sensitivity, optional
+        How the states that were linearised at follow the parameters; without it they stay.
+    """
+
+    cells: Cells
+    slope: Array
+    first: Bools
+    seen: Bools
+    measured: Array
+    begin: Array
+    wide: Array
+    sigma: Array
+    touching: Bools
+    sensitivity: Sensitivity | None = None
+    _known: dict[bytes, tuple[Array, Array, Array, Array]] = field(
+        default_factory=dict, init=False, repr=False
+    )
+
+    @cached_property
+    def _extended(self) -> Extended:
+        """The filter's linear model."""
+        return Extended.of(self.cells, self.slope, self.seen)
+
+    def _gains(self, sigma: Array) -> tuple[Array, Array, Array, Array]:
+        """Gain, scale and covariance of the filter at noise parameters, and the log of the scale.
+
+        The first three are as of :func:`kalman.gains`; the last is summed, shape (transition,).
+        """
+        key = np.ascontiguousarray(sigma).tobytes()
+        known = self._known.get(key)
+        if known is None:
+            if len(self._known) > 3:
+                self._known.clear()
+            own = self._extended
+            gain, scale, after = gains(
+                own.slope, self.first, own.seen, self._begin(sigma),
+                own.padded(self.cells.white(sigma) ** 2), own.steps(sigma), self.kind,
+            )  # fmt: skip
+            known = self._known[key] = gain, scale, after, np.log(scale).sum(axis=1)
+        return known
+
+    def scale(self, sigma: Array) -> Array:
+        """Standard deviation of each innovation, shape (transition, cell); 1 where not seen."""
+        return self._gains(sigma)[1][:, : len(self.cells.places)]
+
+    def covariance(self, sigma: Array) -> Array:
+        """Covariance of filtered states, shape (transition, cell, cell)."""
+        return self._extended.covariance(self.cells, self._gains(sigma)[2])
+
+    @property
+    def last(self) -> Bools:
+        """Whether a transition is its trajectory's last, shape (transition,)."""
+        return np.append(self.first[1:], True)
+
+    @property
+    def kind(self) -> Ints:
+        """1 where bodies touch in a transition and 0 elsewhere, shape (transition,)."""
+        return self.touching.astype(np.int64)
+
+    def whiten(self, residual: Array, sigma: Array) -> Array:
+        """Innovations over their standard deviations.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Linearised minus predicted states, shape (..., transition, 1, body, state).
+        sigma : ndarray
+            Noise parameters, shape (parameter,) or (..., parameter) with the same leading axes.
+
+        Returns
+        -------
+        ndarray
+            Shape (..., transition, cell), dimensionless; 0 where nothing was measured.
+        """
+        return self.whitened(residual, sigma)[0]
+
+    def whitened(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """As :meth:`whiten`, with the logarithm of the standard deviations.
+
+        The latter is summed over the cells, shape (..., transition) as that of sigma leads.
+        """
+        cells = self.cells.of_residual(residual)
+        lead = cells.shape[:-2]
+        rows = cells.reshape(-1, *cells.shape[-2:])
+        if sigma.ndim == 1:
+            return self.filtered(rows, sigma)[0].reshape(cells.shape), self._gains(sigma)[3]
+        sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
+        own, which = np.unique(sigmas, axis=0, return_inverse=True)
+        white, log_scale = np.empty_like(rows), np.empty(rows.shape[:-1])
+        for i, row in enumerate(own):
+            mine = which.ravel() == i
+            white[mine], log_scale[mine] = self.filtered(rows[mine], row)[0], self._gains(row)[3]
+        return white.reshape(cells.shape), log_scale.reshape(cells.shape[:-1])
+
+    def filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """White innovations and filtered deviations of cells' residuals (set, transition, cell)."""
+        white, state = self._filtered(residual, sigma)
+        cells = self.cells
+        return white[..., : len(cells.places)], self._extended.states(cells, state)
+
+    def _filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """As :meth:`filtered`, of the filter's coordinates."""
+        own, (gain, scale, *_) = self._extended, self._gains(sigma)
+        rows = np.ascontiguousarray(own.padded(residual))  # another layout would be compiled, too
+        white, state = innovations(
+            own.slope, self.first, own.seen, gain, scale, rows,
+            own.padded(self.begin), own.padded(self.measured),
+        )  # fmt: skip
+        return white, state
+
+    def of_cells(self, nu: float | Array | None, shape: tuple[int, ...]) -> float | Array | None:
+        """Degrees of freedom of each innovation, of those of residuals of this shape."""
+        if not isinstance(nu, np.ndarray) or nu.ndim == 0:
+            return nu
+        return self.cells.of_residual(np.broadcast_to(nu, shape))
+
+    def log_scale(self, sigma: Array) -> Array:
+        """Logarithm of the innovations' standard deviations, summed, shape (transition,)."""
+        return self._gains(sigma)[3]
+
+    def smoothed(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """Smoothed deviations before and after each transition, shape (transition, cell) each."""
+        own, cells = self._extended, self.cells
+        white, filtered = self._filtered(residual[None], sigma)
+        before, _, after = self._pulled(white[0], sigma)
+        begin = own.padded(self.begin) - self._begin(sigma) * before
+        end = filtered[0] - np.einsum("kab,kb->ka", self._gains(sigma)[2], after)
+        return own.states(cells, begin), own.states(cells, end)
+
+    def pulled(self, weighted: Array, sigma: Array) -> Array:
+        """Derivative of a sum of white innovations by the predictions, shape (transition, cell)."""
+        padded = self._extended.padded(weighted)
+        return self._pulled(padded, sigma)[1][:, : weighted.shape[1]]
+
+    def _pulled(self, weighted: Array, sigma: Array) -> tuple[Array, Array, Array]:
+        """As of :func:`kalman.adjoint`."""
+        own, (gain, scale, *_) = self._extended, self._gains(sigma)
+        pulled: tuple[Array, Array, Array] = adjoint(
+            own.slope, self.last, own.seen, gain, scale, weighted
+        )
+        return pulled
+
+    def score(self, residual: Array, sigma: Array) -> tuple[float, Array]:
+        """Gaussian log-likelihood, and its derivative by the logarithm of the noise parameters.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Shape (transition, 1, body, state).
+        sigma : ndarray
+            Shape (parameter,).
+        """
+        own, cells, d = self._extended, self.cells, len(self.cells.places)
+        white = self._filtered(cells.of_residual(residual)[None], sigma)[0][0]
+        gain, scale, _, log_scale = self._gains(sigma)
+        sensor, step, begin, _ = score(
+            own.slope, self.last, own.seen, gain, scale, white, self.kind
+        )
+        # measured states begin a trajectory: their error is that of measuring
+        began = np.where(self.first[:, None], begin, 0.0)
+        measured = np.where(self.wide > 0, 0.0, began[:, :d]).sum(axis=0)
+        slope = np.zeros(len(sigma))
+        free = cells.sensor >= 0
+        np.add.at(slope, cells.sensor[free], (sensor[:d] + measured)[free])
+        np.add.at(slope, cells.drifted[1], began[:, d:].sum(axis=0))
+        steps = np.where(own.always[:, None, None], step.sum(axis=0), step[1])
+        np.add.at(slope, own.pushed, np.einsum("ja,jab,jb->j", own.push, steps, own.push))
+        norm = -0.5 * np.log(2 * np.pi) * self.seen.sum()
+        value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
+        return value, sigma**2 * slope
+
+    def auxiliary(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """Residual of each measurement given all others, in standard deviations.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Of cells, shape (transition, cell).
+        sigma : ndarray
+            Shape (parameter,).
+
+        Returns
+        -------
+        end, begin : ndarray
+            At a transition's end, and before the first of a trajectory, shape (transition, cell)
+            each; 0 where nothing was measured.
+        """
+        own, (gain, scale, *_) = self._extended, self._gains(sigma)
+        white = self._filtered(residual[None], sigma)[0][0]
+        every = score(own.slope, self.last, own.seen, gain, scale, white, self.kind)[3]
+        end, begin = every[..., : residual.shape[1]]
+        return end, np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0)
+
+    def foreseen(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+        """Mean and covariance of each measurement, as deviations, given those before it.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Shape (transition, cell).
+        sigma : ndarray
+            Shape (parameter,).
+
+        Returns
+        -------
+        mean, covariance : ndarray
+            Shapes (transition, cell) and (transition, cell, cell).
+        """
+        own, d, first = self._extended, len(self.cells.places), self.first[:, None]
+        after, filtered = self._gains(sigma)[2], self._filtered(residual[None], sigma)[1][0]
+        state = np.where(first, own.padded(self.begin), np.roll(filtered, 1, axis=0))
+        begin = self._begin(sigma)[:, :, None] * np.eye(own.slope.shape[1])
+        known = np.where(first[..., None], begin, np.roll(after, 1, axis=0))
+        covariance = own.slope @ known @ own.slope.transpose(0, 2, 1) + own.steps(sigma)[self.kind]
+        return (
+            np.einsum("kab,kb->ka", own.slope, state)[:, :d] - residual,
+            covariance[:, :d, :d] + np.diag(self.cells.white(sigma) ** 2),
+        )
+
+    def random(
+        self, predicted: Array, linearised: Array, sigma: Array, rng: np.random.Generator
+    ) -> Array:
+        """Draw measured next states, given those before (Eq. 13), shape of ``predicted``.
+
+        Parameters
+        ----------
+        predicted, linearised : ndarray
+            States, shape (transition, 1, body, state).
+        sigma : ndarray
+            Noise parameters, shape (parameter,).
+        """
+        mean, covariance = self.foreseen(self.cells.of_residual(linearised - predicted), sigma)
+        factor = np.linalg.cholesky(covariance)
+        drawn = mean + np.einsum("kab,kb->ka", factor, rng.standard_normal(mean.shape))
+        result = linearised.copy()
+        body, dimension = np.divmod(self.cells.places, 6)
+        result[:, 0, body, np.searchsorted(self.cells.columns, dimension)] += drawn
+        return result
+
+    def _begin(self, sigma: Array) -> Array:
+        """Variance of the filter's state before each transition that is its trajectory's first."""
+        state = np.where(self.wide > 0, self.wide, self.cells.white(sigma) ** 2)
+        error = np.broadcast_to(
+            sigma[self.cells.drifted[1]] ** 2, (len(state), len(self.cells.drifted[1]))
+        )
+        return np.hstack([state, error])

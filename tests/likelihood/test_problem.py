@@ -1,0 +1,97 @@
+"""Problem: a change of data, physics or noise keeps the others with all that they have made."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from pbrl_ppl.effects import attach, catalogue
+from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
+from pbrl_ppl.likelihood import data as data_module
+from pbrl_ppl.scene import Body, Scene, Shape
+from tests.helpers.histories import simulated_history
+
+pytestmark = pytest.mark.one_stack  # plain numpy
+PUCKS = Scene(time_step=0.1, bodies=tuple(Body(name, Shape.circle(0.2)) for name in "ab"))
+TRUTH = {"mass": [2.0, 3.0], "r": [0.2, 0.2], "mu_c": [0.3, 0.3]}
+
+
+@pytest.fixture
+def checks(monkeypatch) -> list[int]:
+    """One entry for each time that start states are checked."""
+    seen: list[int] = []
+    check = data_module.check_history
+
+    def counted(scene, history, segments) -> None:
+        seen.append(segments.n)
+        check(scene, history, segments)
+
+    monkeypatch.setattr(data_module, "check_history", counted)
+    return seen
+
+
+@pytest.fixture
+def problem() -> Problem:
+    return Problem.of(PUCKS, simulated_history(PUCKS, TRUTH, seed=1), substeps=5)
+
+
+def test_other_noise_keeps_the_engine_and_the_checked_data(problem, checks) -> None:
+    engine, rough, segments = problem.simulator, problem.coarse.simulator, problem.segments
+    for other in (problem.with_noise(prior=((1.0,) * 6, 2.0)), problem.with_noise(nu=4.0)):
+        assert other.simulator is engine
+        assert other.coarse.simulator is rough
+        assert other.segments is segments
+        assert other.observations is problem.observations
+    assert checks == [segments.n]
+
+
+def test_other_physics_keep_the_checked_data(problem, checks) -> None:
+    drag = next(effect for effect in catalogue if effect.name == "linear_drag")
+    segments, engine = problem.segments, problem.simulator
+    fewer = PUCKS.replace(bodies=tuple(Body(n, Shape.circle(0.2), known={"r": 0.1}) for n in "ab"))
+    for other in (
+        problem.with_physics(effects=attach(PUCKS, [drag])),
+        problem.with_physics(scene=fewer),
+        problem.with_physics(substeps=10),
+    ):
+        assert other.segments is segments
+        assert other.noise is problem.noise
+        assert other.simulator is not engine
+    assert problem.with_physics(substeps=5, threads=1).simulator is engine
+    assert checks == [segments.n]
+
+
+def test_other_data_keep_the_engine_where_its_parts_are_the_same(problem) -> None:
+    longer = problem.with_data(horizon=2)
+    assert longer.simulator is problem.simulator
+    assert longer.segments.actions.shape[1] == 2
+    apart = problem.with_data(history=simulated_history(PUCKS, TRUTH, seed=2))
+    assert apart.simulator is problem.simulator
+    poses = np.array([[0.0, 0.0, 0.0], [0.45, 0.0, 0.0]])
+    meeting = problem.with_data(history=simulated_history(PUCKS, TRUTH, seed=3, poses=poses))
+    assert [len(each.bodies) for each in problem.simulator.parts] == [1, 1]
+    assert [len(each.bodies) for each in meeting.simulator.parts] == [2]
+
+
+def test_noise_along_trajectories_is_of_its_own_data(problem) -> None:
+    phi = problem.layout.to_vector(TRUTH)
+    whole = along_trajectories(problem.with_noise(nu=4.0), phi)
+    assert whole.trajectories is not None
+    assert whole.simulator is problem.simulator
+    for other in (whole.with_data(states=None), whole.with_data(history=problem.data.history)):
+        assert other.trajectories is None
+        assert other.noise.nu == 4.0
+    # other noise and other physics keep it, with the smoothed states that it is about
+    for other in (whole.with_noise(nu=None), whole.with_physics(substeps=10)):
+        assert other.trajectories is whole.trajectories
+        assert other.segments is whole.segments
+    assert single_transitions(whole).trajectories is None
+    np.testing.assert_array_equal(single_transitions(whole).segments.start, problem.segments.start)
+
+
+def test_what_was_computed_does_not_travel(problem) -> None:
+    small = len(pickle.dumps(problem))
+    phi = problem.layout.to_vector(TRUTH)
+    here = problem.predict(phi)
+    assert len(pickle.dumps(problem)) == small
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(problem)).predict(phi), here)

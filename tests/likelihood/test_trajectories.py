@@ -1,0 +1,321 @@
+"""Likelihood of whole trajectories: whitening, smoothing, derivatives, simulated data."""
+
+from dataclasses import replace
+
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+import pytest
+from pytensor import function
+from pytensor.graph.traversal import ancestors
+from scipy.stats import multivariate_normal
+
+from pbrl_ppl.effects import attach
+from pbrl_ppl.history import History
+from pbrl_ppl.likelihood import (
+    Problem,
+    along_trajectories,
+    declared_problem,
+    simulated_trajectories,
+    smoothed,
+    with_measurements,
+)
+from pbrl_ppl.model import build_model
+from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
+from pbrl_ppl.sampling import physics_model
+from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.state import wrapped
+from tests.helpers.histories import simulated_history
+
+PUCK = Scene(
+    time_step=0.1,
+    substeps=2,
+    bodies=(
+        Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}, effects=("linear_drag",)),
+    ),
+)
+TRUTH = {"mass": 2.0, "linear_drag_coefficient": 0.8}
+PHI = np.array([2.0, 0.8])
+#: Errors of measuring x, y, theta, vx, vy, omega, and unexplained accelerations.
+NOISE = np.array([2e-3, 2e-3, 4e-3, 1e-2, 1e-2, 2e-2, 0.3, 0.3, 0.5])
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    history = simulated_history(PUCK, TRUTH, seed=1, trajectories=3, intervals=4, substeps=2)
+    return along_trajectories(Problem.of(PUCK, history, attach(PUCK)), PHI, NOISE)
+
+
+def dense(noise, sigma) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance of the first trajectory's measurements after the first, given a flat start."""
+    n = int(np.flatnonzero(noise.first)[1])
+    d = len(noise.cells.places)
+    step = (noise.cells.push.T * sigma[noise.cells.pushed] ** 2) @ noise.cells.push
+    r = np.diag(noise.cells.errors(sigma) ** 2)
+    # residuals e' - F e + w of neighbours share the error e of a measured state
+    whole = np.zeros((n * d, n * d))
+    for k in range(n):
+        f, own = noise.slope[k], slice(k * d, (k + 1) * d)
+        whole[own, own] = r + f @ r @ f.T + step
+        if k + 1 < n:
+            then = slice((k + 1) * d, (k + 2) * d)
+            whole[own, then] = -r @ noise.slope[k + 1].T
+            whole[then, own] = whole[own, then].T
+    return whole, np.arange(n)
+
+
+def test_whitening_is_that_of_the_whole_covariance(problem) -> None:
+    """DESIGN section 7: R + F R F' + Q with itself, -R F' with its successor."""
+    noise = problem.trajectories
+    covariance, own = dense(noise, NOISE)
+    residual = noise.cells.of_residual(problem.residual(PHI))[own]
+    begin = np.where(
+        noise.first[own][:, None], noise.begin[own], np.roll(noise.measured, 1, 0)[own]
+    )
+    # z' - f(s) - F (z - s), with z' = s' + y'
+    equation = noise.measured[own] + residual - np.einsum("kab,kb->ka", noise.slope[own], begin)
+    expected = multivariate_normal(np.zeros(len(covariance)), covariance).logpdf(equation.ravel())
+    density = problem.log_density(problem.residual(PHI), NOISE)[own].sum()
+    np.testing.assert_allclose(density, expected, rtol=1e-9)
+
+
+def test_what_was_not_measured_is_left_out(problem) -> None:
+    """A cell that is missing is one of a very large error, but for its own density."""
+    dataset = problem.data.history.dataset.copy()
+    observed = dataset["observed"].values.copy()
+    observed[:, 2, 0, [0, 3]] = np.nan
+    dataset["observed"] = dataset["observed"].copy(data=observed)
+    gaps = problem.with_data(history=History(dataset), states=None)
+    gaps = along_trajectories(gaps, PHI, NOISE, problem.trajectories.cells)
+    noise, whole = gaps.trajectories, problem.trajectories
+    assert (~noise.seen).sum() == 6
+    covariance, own = dense(whole, NOISE)
+    vague = covariance.copy()
+    d = len(whole.cells.places)
+    huge = 10.0
+    jitter = np.zeros((len(own) * d, 2))
+    for j, cell in enumerate((0, 3)):  # measured at the second transition's end
+        jitter[d + cell, j] = 1.0
+        jitter[2 * d : 3 * d, j] = -whole.slope[2][:, cell]
+    vague += huge**2 * jitter @ jitter.T
+    residual = whole.cells.of_residual(problem.residual(PHI))[own]
+    begin = np.where(
+        whole.first[own][:, None], whole.begin[own], np.roll(whole.measured, 1, 0)[own]
+    )
+    equation = whole.measured[own] + residual - np.einsum("kab,kb->ka", whole.slope[own], begin)
+    expected = multivariate_normal(np.zeros(len(vague)), vague).logpdf(equation.ravel())
+    expected += np.log(huge**2 * 2 * np.pi)
+    seen = np.where(noise.seen, whole.measured, 0.0)
+    fixed = replace(whole, seen=noise.seen, measured=seen)
+    gaps = problem.with_noise(trajectories=fixed)
+    value = gaps.log_density(problem.residual(PHI), NOISE)[own].sum()
+    np.testing.assert_allclose(value, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("missing", [False, True])
+def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
+    """By the logarithm of every noise parameter; the first states are measured, or not at all."""
+    noise = problem.trajectories
+    if missing:
+        seen, wide = noise.seen.copy(), noise.wide.copy()
+        seen[1, 2:4] = seen[5] = False
+        wide[:, 4] = 3.0
+        noise = replace(noise, seen=seen, wide=wide)
+        problem = problem.with_noise(trajectories=noise)
+    residual, at = problem.residual(PHI * 1.2), np.log(NOISE * np.linspace(0.5, 2.0, len(NOISE)))
+    value, slope = noise.score(residual, np.exp(at))
+
+    def density(log_sigma) -> float:
+        return float(problem.log_density(residual, np.exp(log_sigma), PHI).sum())
+
+    assert value == pytest.approx(density(at), rel=1e-12)
+    steps = 1e-5 * np.eye(len(at))
+    by_differences = [(density(at + h) - density(at - h)) / 2e-5 for h in steps]
+    np.testing.assert_allclose(slope, by_differences, rtol=1e-6, atol=1e-6 * np.abs(slope).max())
+
+
+def test_smoothed_states_are_the_likeliest(problem) -> None:
+    """No state is moved once the smoother has settled, and the fit of all is a minimum there."""
+    settled = smoothed(problem, PHI, NOISE)
+    noise = settled.trajectories
+    before, after = noise.smoothed(noise.cells.of_residual(settled.residual(PHI)), NOISE)
+    assert np.abs(np.vstack([before[noise.first], after]) / noise.cells.errors(NOISE)).max() < 0.05
+    # a puck with drag is linear: there is one answer, wherever smoothing began
+    moved = replace(problem.data, states=problem.data.states + 1e-3)
+    again = smoothed(replace(problem, data=moved), PHI, NOISE)
+    difference = (again.data.states - settled.data.states)[..., :3]
+    assert np.abs(difference).max() < 1e-4
+
+
+def test_smoothing_stops_where_no_motion_fits(problem) -> None:
+    """The engine diverges from speeds beyond measure: states stay where they were."""
+    states = problem.data.smoothed_states.copy()
+    states[..., 3] = 1e9
+    lost = replace(problem, data=replace(problem.data, states=states))
+    again = smoothed(lost, PHI, NOISE)
+    np.testing.assert_array_equal(again.data.smoothed_states, states)
+
+
+def test_derivative_is_that_of_differences(problem) -> None:
+    noise = problem.trajectories
+    given = [pt.tensor4("deviation"), pt.tensor4("residual"), pt.vector("sigma"), pt.vector("tail")]
+    weights = np.random.default_rng(2).normal(size=problem.segments.n)
+    total = (TrajectoryDensityOp(noise)(*given) * weights).sum()
+    value = function(given, total)
+    slopes = function(given, pt.grad(total, given[:3]))
+    deviation = problem.measured - problem.observations.values
+    rng = np.random.default_rng(3)
+    at = problem.residual(PHI) + 1e-3 * rng.normal(size=problem.residual(PHI).shape)
+    for nu in (0.0, 0.2):
+        tails = np.array([nu])
+        point = deviation, at, NOISE
+        slope = slopes(*point, tails)
+        for _ in range(5):
+            for i, size in enumerate((1e-6, 1e-6, 1e-6 * NOISE)):
+                step = size * rng.normal(size=point[i].shape)
+                ends = [
+                    value(*(x + sign * step if j == i else x for j, x in enumerate(point)), tails)
+                    for sign in (1, -1)
+                ]
+                np.testing.assert_allclose(
+                    2 * (slope[i] * step).sum(), ends[0] - ends[1], rtol=1e-4
+                )
+
+
+def density_of_the_model(problem) -> float:
+    model = build_model(problem)
+    assert [variable.name for variable in model.free_RVs] == [
+        "mass", "linear_drag_coefficient", "sigma", "unexplained_acceleration",
+    ]  # fmt: skip
+    point = {
+        "mass": PHI[:1], "linear_drag_coefficient": PHI[1:],
+        "sigma": NOISE[:6], "unexplained_acceleration": NOISE[6:],
+    }  # fmt: skip
+    return model.compile_logp(vars=model.observed_RVs)(
+        {model.rvs_to_values[v].name: np.log(point[v.name]) for v in model.free_RVs}
+    )
+
+
+def test_the_model_is_the_problem(problem) -> None:
+    value = density_of_the_model(problem)
+    np.testing.assert_allclose(value, problem.log_density(problem.residual(PHI), NOISE).sum())
+
+
+def test_the_data_are_in_the_model_s_graph(problem) -> None:
+    """Other measurements have the density that the filter gives them; a gap makes no difference."""
+    observed = problem.data.history.dataset["observed"].to_numpy().copy()
+    observed[1, 2, 0, :3] = np.nan
+    gappy = along_trajectories(with_measurements(problem, observed), PHI, NOISE)
+    model = build_model(gappy)
+    density = model.logp(model.observed_RVs)
+    assert model.rvs_to_values[model["next_state"]] in ancestors([density])
+    other = gappy.measured + 1e-3 * np.random.default_rng(5).normal(size=gappy.measured.shape)
+    (moved,) = model.replace_rvs_by_values([pm.logp(model["next_state"], np.nan_to_num(other))])
+    point = {"mass": PHI[:1], "linear_drag_coefficient": PHI[1:],
+             "sigma": NOISE[:6], "unexplained_acceleration": NOISE[6:]}  # fmt: skip
+    found = model.compile_fn(moved)(
+        {model.rvs_to_values[v].name: np.log(point[v.name]) for v in model.free_RVs}
+    )
+    noise = gappy.trajectories
+    deviation = noise.cells.of_residual(np.nan_to_num(other) - gappy.observations.values)
+    there = gappy.with_noise(trajectories=replace(noise, measured=deviation))
+    np.testing.assert_allclose(found, there.log_density(there.residual(PHI), NOISE))
+    assert abs(found.sum() - gappy.log_density(gappy.residual(PHI), NOISE).sum()) > 0.1
+
+
+def test_the_model_is_the_problem_where_a_body_turns_by_more_than_half_a_turn() -> None:
+    """An interval's turn of 4 rad is one of -2.3 rad to the sensor, whichever way it is counted."""
+    history = simulated_history(PUCK, TRUTH, seed=3, trajectories=2, intervals=5, substeps=2)
+    dataset = history.dataset.copy()
+    for name in ("start", "observed"):
+        values = dataset[name].to_numpy().copy()
+        values[..., 2] = wrapped(values[..., 2] + 4.0 * np.arange(values.shape[1])[:, None])
+        values[..., 5] += 40.0
+        dataset[name] = dataset[name].copy(data=values)
+    fast = along_trajectories(Problem.of(PUCK, History(dataset), attach(PUCK)), PHI, NOISE)
+    density = fast.log_density(fast.residual(PHI), NOISE).sum()
+    assert density_of_the_model(fast) == pytest.approx(density, rel=1e-9)
+    assert density > -1e4  # a turn more or less would cost a million
+
+
+def test_draws_of_the_model_have_its_covariance(problem) -> None:
+    """Posterior predictive draws: mean and covariance of a measurement, given those before."""
+    noise = problem.trajectories
+    rng = np.random.default_rng(4)
+    drawn = np.array([problem.next_states(problem.predict(PHI), NOISE, rng) for _ in range(4000)])
+    mean, covariance = noise.foreseen(noise.cells.of_residual(problem.residual(PHI)), NOISE)
+    cells = drawn[:, :, 0, 0] - problem.observations.values[:, 0, 0]
+    sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+    # 72 means and 72 variances of 4000 draws: 5 standard errors, chance of a false alarm 1e-4
+    assert (np.abs(cells.mean(axis=0) - mean) < 5 * sd / np.sqrt(4000)).all()
+    ratio = cells.var(axis=0) / sd**2
+    assert (np.abs(ratio - 1) < 5 * np.sqrt(2 / 4000)).all()
+
+
+def test_simulated_trajectories_have_both_noises(problem) -> None:
+    """Innovations of simulated data at the truth are standard normal and white."""
+    rng = np.random.default_rng(5)
+    white = []
+    for _ in range(40):
+        made = with_measurements(problem, simulated_trajectories(problem, PHI, NOISE, rng))
+        made = smoothed(made, PHI, NOISE)
+        white.append(made.whitened(PHI, NOISE).reshape(3, 4, 6))
+    z = np.array(white)
+    # 2880 cells: sd of the mean square 0.026, of a correlation over 2160 pairs 0.022; 4 of each
+    assert abs((z**2).mean() - 1) < 0.105
+    assert abs((z[:, :, 1:] * z[:, :, :-1]).mean()) < 0.086
+
+
+def test_what_never_moves_has_no_noise() -> None:
+    """A fall seen as x = 0: its error is given, and no noise parameter is inferred from it."""
+    history = simulated_history(PUCK, TRUTH, seed=1, trajectories=3, intervals=4, substeps=2)
+    frame = history.to_dataframe().assign(x=0.0, vx=0.0)
+    still = physics_model(PUCK, History.from_dataframe(frame, PUCK), trajectories=True)
+    noise = still.problem.noise_variables
+    assert noise["sigma"] == ("y", "theta", "vy", "omega")
+    assert noise["unexplained_acceleration"] == ("vy", "omega")
+
+
+@pytest.mark.parametrize("options", [{"horizon": 2}, {"sigma": "scalar"}])
+def test_options_that_do_not_go_together_are_refused(options) -> None:
+    history = simulated_history(PUCK, TRUTH, seed=1, trajectories=2, intervals=4, substeps=2)
+    with pytest.raises(ValueError, match="trajectories"):
+        physics_model(PUCK, history, trajectories=True, **options)
+
+
+@pytest.mark.parametrize("stated", [("x", "omega"), ("x", "y", "theta", "vx", "vy", "omega")])
+def test_a_stated_noise_is_not_inferred(problem, stated) -> None:
+    truth = dict(zip(("x", "y", "theta", "vx", "vy", "omega"), NOISE, strict=False))
+    scene = PUCK.replace(noise={name: truth[name] for name in stated})
+    history = problem.data.history
+    known = along_trajectories(Problem.of(scene, history, attach(scene)), PHI)
+    free = [name for name in truth if name not in stated]
+    assert list(known.noise_variables.get("sigma", ())) == free
+    sigma = np.array([*(truth[name] for name in free), *NOISE[6:]])
+    np.testing.assert_array_equal(known.trajectories.cells.errors(sigma), NOISE[:6])
+    # linearised where all are inferred, the density is the same
+    same = known.trajectories.cells
+    states = replace(problem, noise=replace(problem.noise, trajectories=problem.trajectories))
+    noise = replace(states.trajectories, cells=same)
+    there = states.with_noise(trajectories=noise)
+    residual = problem.residual(PHI)
+    np.testing.assert_allclose(
+        there.log_density(residual, sigma), problem.log_density(residual, NOISE), rtol=1e-12
+    )
+    model = build_model(known)
+    assert ("sigma" in [variable.name for variable in model.free_RVs]) == bool(free)
+    assert np.isfinite(model.compile_logp()(model.initial_point()))
+
+
+def test_computed_velocities_are_left_out_of_the_model() -> None:
+    history = simulated_history(PUCK, TRUTH, seed=1, trajectories=6, intervals=40, substeps=2)
+    frame = history.to_dataframe()
+    for rows in frame.groupby("trajectory").groups.values():
+        for position, rate in (("x", "vx"), ("y", "vy"), ("theta", "omega")):
+            angles = np.unwrap(frame.loc[rows, position])
+            frame.loc[rows, rate] = np.gradient(angles, PUCK.time_step)
+    computed = History.from_dataframe(frame, PUCK)
+    problem = declared_problem(PUCK, computed, trajectories=True)
+    assert problem.noise_variables["sigma"] == ("x", "y", "theta")
+    eq_11 = physics_model(PUCK, computed).problem
+    assert len(eq_11.noise_variables["sigma"]) == 6  # the paper's likelihood takes what it is given
