@@ -14,7 +14,7 @@ from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.task import Task
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.likelihood import Noise, Problem
+from pbrl_ppl.likelihood import Problem, TransitionLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import choose_from_library
 from pbrl_ppl.parameters import ParameterLibrary
@@ -177,7 +177,9 @@ class LibraryAgent(Agent):
         state, action, after = (np.array(each) for each in zip(*seen, strict=True))
         history = from_segments(scene, state, action[:, None], after[:, None])
         among = _of_one(self.library, scene, name)
-        problem = Problem.of(scene, history, noise=Noise(scalar=True), library=among)
+        problem = Problem.of(
+            scene, history, likelihood=TransitionLikelihood(scalar=True), library=among
+        )
         if self.method == "paper":
             with warnings.catch_warnings():  # of one chain, as the paper has it
                 warnings.simplefilter("ignore", ConvergenceWarning)

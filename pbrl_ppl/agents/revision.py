@@ -227,7 +227,7 @@ def _refitted(
     mode: Mode, ranked: list[Signature], missing: tuple[Attached, ...], level: float
 ) -> dict[Signature, tuple[Mode, float]]:
     """Refits that explain nearly all of the misfit, and the chance of that; of twins, the first."""
-    before = float((mode.whitened_residual() ** 2).sum())
+    before = float((mode.whitened_residual**2).sum())
     found: dict[Signature, tuple[Mode, float]] = {}
     for signature in sorted(ranked, key=lambda each: missing.index(each.attached)):
         if not any(twins(signature, earlier) for earlier in found):
@@ -242,14 +242,14 @@ def _refitted(
 
 def _p_value(mode: Mode, signature: Signature) -> float:
     """Chance of a score statistic where nothing is missing."""
-    total = float((mode.whitened_residual() ** 2).sum())
+    total = float((mode.whitened_residual**2).sum())
     return _chance(mode, signature, min(signature.candidate.statistic / total, 1.0))
 
 
 def _chance(mode: Mode, signature: Signature, share: float) -> float:
     """Chance of explaining a share of the squares, by the beta law: few residuals tell no noise."""
     q = signature.basis.shape[1]
-    free = np.count_nonzero(mode.whitened_residual()) - np.linalg.matrix_rank(mode.jacobian) - q
+    free = np.count_nonzero(mode.whitened_residual) - np.linalg.matrix_rank(mode.jacobian) - q
     if q == 0 or free < 1 or share <= 0.0:
         return 1.0
     return float(min(1.0, signature.candidate.looks * beta.sf(share, q / 2, free / 2)))

@@ -75,7 +75,7 @@ def correlation_tests(
         For a picture.
     """
     noise = mode.problem.trajectory_noise
-    white, seen = mode.whitened_residual(), noise.seen
+    white, seen = mode.whitened_residual, noise.seen
     number = np.cumsum(noise.first.astype(np.intp))
     share = innovations_over_steps(mode)
     scene, places = mode.problem.scene, noise.cells.places

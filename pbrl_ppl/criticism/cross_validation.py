@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm, t, wilcoxon
 
 from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.likelihood import robust
+from pbrl_ppl.likelihood import TransitionLikelihood, robust
 from pbrl_ppl.modes import Mode, profile_sigma
 from pbrl_ppl.parameters import box, differentiate, inside, prior_residual, prior_slopes
 
@@ -222,11 +222,11 @@ def _linearised(
     parameters in units of ``scale``. Under Eq. 11 the noise stays.
     """
     problem, phi, p = mode.problem, mode.phi, len(mode.phi)
-    if problem.trajectories is None:
+    if isinstance(problem.likelihood, TransitionLikelihood):
         z = problem.robust(phi, mode.sigma)
         jacobian = mode.jacobian.reshape(*z.shape, p) * scale
         return lambda own: (mode.sigma, z, jacobian)
-    noise = problem.trajectories
+    noise = problem.trajectory_noise
     nu = noise.of_cells(problem.nu(phi), residual.shape)
     slopes = _residual_slopes(mode, scale)
     nothing = np.zeros_like(noise.begin)
@@ -234,7 +234,7 @@ def _linearised(
 
     def without(own: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
         hidden = replace(noise, seen=noise.seen & ~own[:, None], sigma=mode.sigma)
-        sigma = profile_sigma(problem.with_noise(trajectories=hidden), residual, phi)
+        sigma = profile_sigma(problem.along(hidden), residual, phi)
         z = noise.whiten(residual, sigma)
         white = still.filtered(slopes, sigma)[0]
         weight = (robust(z + _NEAR, nu) - robust(z - _NEAR, nu)) / (2 * _NEAR)

@@ -85,4 +85,4 @@ def _drifting(mode: Mode, memory: float) -> Problem:
     medians = every[cells.drift_parameters]
     sigma = np.concatenate([mode.sigma, mode.sigma[: len(medians)]])
     prior = (*problem.noise_prior[0].tolist(), *medians.tolist()), problem.noise_prior[1]
-    return problem.with_noise(trajectories=replace(noise, cells=cells, sigma=sigma), prior=prior)
+    return problem.along(replace(noise, cells=cells, sigma=sigma), prior=prior)

@@ -146,7 +146,7 @@ def _where(mode: Mode, left: Left, places: NDArray[np.intp]) -> tuple[str, str]:
     worst = int(np.argmax(left.relative))
     d = STATE.index(left.names[worst])
     own = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
-    size = (mode.whitened_residual()[:, own] ** 2).mean(axis=0)
+    size = (mode.whitened_residual[:, own] ** 2).mean(axis=0)
     body = int(places[own[int(np.argmax(size))]] // len(STATE))
     return mode.problem.scene.moving[body].name, left.names[worst]
 

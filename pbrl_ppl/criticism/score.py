@@ -14,6 +14,7 @@ from pbrl_ppl.criticism.detectable import caps, smallest, smallest_of_looks
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import Look, looks
 from pbrl_ppl.effects import Attached, Noise
+from pbrl_ppl.likelihood import TrajectoryLikelihood
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 
@@ -146,7 +147,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
         return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
     derivative, _ = posterior_steps(predict, null[new], lower, upper, begin)
-    residual = np.concatenate([mode.whitened_residual().ravel(), -prior_residual(priors, mode.phi)])
+    residual = np.concatenate([mode.whitened_residual.ravel(), -prior_residual(priors, mode.phi)])
     jacobian = np.vstack([derivative[:, :p], np.diag(prior_slopes(priors, mode.phi))])
     derivative = np.vstack([derivative[:, p:], np.zeros((p, len(new) - p))])
     edges = np.cumsum([0, *map(len, columns)])
@@ -288,8 +289,10 @@ def _tail_score(mode: Mode, attached: Attached, left: Array, n_candidates: int) 
     (z^4 - 2 z^2 - 1) / 4; without its projection on sigma's score it is the fourth Hermite
     polynomial over 4, of variance 3/2.
     """
-    noise = mode.problem.trajectories
-    seen = mode.problem.observations.measured if noise is None else noise.seen
+    likelihood = mode.problem.likelihood
+    seen = mode.problem.observations.measured
+    if isinstance(likelihood, TrajectoryLikelihood):
+        seen = likelihood.noise.seen
     whitened = left[: seen.size].reshape(seen.shape)
     # what never moves has no noise, and would make that of all others look heavy
     loud = seen & (np.abs(whitened).max(axis=0) > _SHOWS)

@@ -314,7 +314,7 @@ def _share(before: Mode, after: Mode) -> float:
     """Share by which one model's innovations exceed another's, in units of the latter's noise."""
     physics = before.problem.physics
     model = after.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
-    worse, better = model.whitened(before.phi, after.sigma), after.whitened_residual()
+    worse, better = model.whitened(before.phi, after.sigma), after.whitened_residual
     return 1.0 - float(np.sqrt((better**2).sum() / (worse**2).sum()))
 
 

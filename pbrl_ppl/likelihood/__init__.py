@@ -3,6 +3,15 @@
 from pbrl_ppl.likelihood.cells import ACCELERATION, DRIFT, JOLT, Cells, check_moves
 from pbrl_ppl.likelihood.data import Data
 from pbrl_ppl.likelihood.declared import declared_problem
+from pbrl_ppl.likelihood.likelihood import (
+    GAUSSIAN,
+    Likelihood,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
+    log_norm,
+    next_state_random,
+    robust,
+)
 from pbrl_ppl.likelihood.log_posterior import (
     exponential,
     log_noise_prior,
@@ -11,8 +20,8 @@ from pbrl_ppl.likelihood.log_posterior import (
     noise_law,
     noise_prior_slope,
 )
-from pbrl_ppl.likelihood.noise import Noise, estimate_sigma, sigma_prior
 from pbrl_ppl.likelihood.noise_scales import bodies_acceleration, noise_medians, ranges
+from pbrl_ppl.likelihood.observations import Observations, estimate_sigma, sigma_prior
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.likelihood.recorded_cells import cells_of
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
@@ -26,15 +35,6 @@ from pbrl_ppl.likelihood.smoothing import (
 )
 from pbrl_ppl.likelihood.tails import sum_tails
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
-from pbrl_ppl.likelihood.transitions import (
-    GAUSSIAN,
-    Observations,
-    log_density,
-    log_norm,
-    next_state_random,
-    robust,
-    whiten,
-)
 
 __all__ = [
     "ACCELERATION",
@@ -43,11 +43,13 @@ __all__ = [
     "JOLT",
     "Cells",
     "Data",
-    "Noise",
+    "Likelihood",
     "Observations",
     "Problem",
     "Sensitivity",
+    "TrajectoryLikelihood",
     "TrajectoryNoise",
+    "TransitionLikelihood",
     "along_trajectories",
     "bodies_acceleration",
     "cells_of",
@@ -56,7 +58,6 @@ __all__ = [
     "estimate_sigma",
     "exponential",
     "linearised",
-    "log_density",
     "log_noise_prior",
     "log_norm",
     "log_posterior",
@@ -72,7 +73,6 @@ __all__ = [
     "single_transitions",
     "smoothed",
     "sum_tails",
-    "whiten",
     "with_measurements",
     "with_sensitivity",
 ]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, Segments
-from pbrl_ppl.likelihood.transitions import Observations
+from pbrl_ppl.likelihood.observations import Observations
 from pbrl_ppl.physics import check_history
 from pbrl_ppl.scene import Scene
 

@@ -9,7 +9,7 @@ import numpy as np
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, check_start, measured_alone
-from pbrl_ppl.likelihood.noise import Noise
+from pbrl_ppl.likelihood.likelihood import TransitionLikelihood
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.likelihood.smoothing import along_trajectories
 from pbrl_ppl.parameters import ParameterLibrary
@@ -64,7 +64,7 @@ def declared_problem(
         horizon=horizon,
         substeps=substeps,
         threads=threads,
-        noise=Noise(scalar=sigma == "scalar", nu=nu),
+        likelihood=TransitionLikelihood(scalar=sigma == "scalar", nu=nu),
         library=library,
     )
     if trajectories:

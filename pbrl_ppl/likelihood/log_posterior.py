@@ -31,8 +31,7 @@ def noise_law(problem: Problem) -> tuple[Array, float]:
         Standard deviation of log sigma where it is log-normal.
     """
     median, spread = problem.noise_prior
-    centre = np.log(median)
-    return (centre.mean(keepdims=True) if problem.noise.scalar else centre), spread
+    return problem.likelihood.centre(median), spread
 
 
 def exponential(problem: Problem) -> NDArray[np.bool_]:
@@ -40,32 +39,30 @@ def exponential(problem: Problem) -> NDArray[np.bool_]:
 
     They are the unexplained accelerations, and correlated errors of measuring.
     """
-    mask = np.zeros(len(problem.noise_prior[0]), dtype=bool)
-    if problem.trajectories is not None:
-        cells = problem.trajectories.cells
-        mask[[*cells.accelerations, *cells.drift_parameters]] = True
-    return mask
+    return problem.likelihood.exponential(len(problem.noise_prior[0]))
 
 
 def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
     """Log-density of log sigma, shape (...), at (..., state), or (..., 1) for a scalar sigma."""
     centre, spread = noise_law(problem)
     normal = -0.5 * ((log_sigma - centre) / spread) ** 2 - np.log(spread) - 0.5 * np.log(2 * np.pi)
-    if problem.trajectories is None:
-        return np.asarray(normal.sum(axis=-1))
-    # of sigma / scale, whose density is exp(-sigma / scale)
-    u = log_sigma - centre + np.log(np.log(2.0))
-    return np.asarray(np.where(exponential(problem), u - np.exp(u), normal).sum(axis=-1))
+    mask = exponential(problem)
+    if mask.any():
+        # of sigma / scale, whose density is exp(-sigma / scale)
+        u = log_sigma - centre + np.log(np.log(2.0))
+        normal = np.where(mask, u - np.exp(u), normal)
+    return np.asarray(normal.sum(axis=-1))
 
 
 def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
     """Derivative of :func:`log_noise_prior` by log sigma, same shape."""
     centre, spread = noise_law(problem)
     normal = (centre - log_sigma) / spread**2
-    if problem.trajectories is None:
+    mask = exponential(problem)
+    if not mask.any():
         return np.asarray(normal)
     u = log_sigma - centre + np.log(np.log(2.0))
-    return np.where(exponential(problem), 1.0 - np.exp(u), normal)
+    return np.where(mask, 1.0 - np.exp(u), normal)
 
 
 def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = None) -> Array:
@@ -88,7 +85,7 @@ def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = 
     ndarray
         Shape (...), normalised; of sigma, not of its logarithm, as PyMC's before transforms.
     """
-    log_sigma = np.log(sigma[..., :1] if problem.noise.scalar else sigma)
+    log_sigma = np.log(problem.likelihood.free(sigma))
     of_noise = log_noise_prior(problem, log_sigma) - log_sigma.sum(axis=-1)
     if problem.library is None:
         return np.asarray(of_noise + problem.layout.log_prior(phi).sum(axis=-1))

@@ -14,17 +14,14 @@ from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.likelihood.data import Data
-from pbrl_ppl.likelihood.noise import Noise, sigma_prior
+from pbrl_ppl.likelihood.likelihood import (
+    Likelihood,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
+)
+from pbrl_ppl.likelihood.observations import Observations, sigma_prior
 from pbrl_ppl.likelihood.tails import degrees_of_freedom, tail_places
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
-from pbrl_ppl.likelihood.transitions import (
-    Observations,
-    cells,
-    log_density,
-    next_state_random,
-    robust,
-    whiten,
-)
 from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Physics
 from pbrl_ppl.scene import Scene
@@ -50,15 +47,15 @@ class Problem:
         Measured segments.
     physics : Physics
         What predicts them.
-    noise : Noise
-        How they scatter about the predictions.
+    likelihood : Likelihood
+        How measurements scatter about the predictions.
     library : ParameterLibrary, optional
         Parameter sets of which each body has one, in place of Table 1.
     """
 
     data: Data
     physics: Physics
-    noise: Noise
+    likelihood: Likelihood
     library: ParameterLibrary | None = None
 
     @classmethod
@@ -72,7 +69,7 @@ class Problem:
         substeps: int | None = None,
         threads: int = 1,
         columns: tuple[int, ...] | None = None,
-        noise: Noise | None = None,
+        likelihood: Likelihood | None = None,
         library: ParameterLibrary | None = None,
         together: tuple[str, ...] = (),
     ) -> Problem:
@@ -86,7 +83,7 @@ class Problem:
         return cls(
             Data(scene, history, horizon, columns),
             physics.in_parts(history),
-            Noise() if noise is None else noise,
+            likelihood or TransitionLikelihood(),
             library,
         )
 
@@ -103,23 +100,28 @@ class Problem:
         physics = self.physics
         if data.history is not self.data.history:
             physics = physics.in_parts(data.history)
-        return replace(
-            self, data=data, physics=physics, noise=replace(self.noise, trajectories=None)
-        )
+        return replace(self, data=data, physics=physics, likelihood=self.likelihood.of_data())
 
     def with_physics(self, **changes: Any) -> Problem:
         """The same problem with other physics; arguments are fields of :class:`Physics`."""
-        physics, noise = self.physics.changed(**changes), self.noise
+        physics, likelihood = self.physics.changed(**changes), self.likelihood
         if "scene" in changes or "together" in changes:
             physics = physics.in_parts(self.data.history)
-        if noise.trajectories is not None and physics.layout.labels != self.layout.labels:
-            still = replace(noise.trajectories, sensitivity=None)  # it is by other parameters
-            noise = replace(noise, trajectories=still)
-        return replace(self, physics=physics, noise=noise)
+        if physics.layout.labels != self.layout.labels:
+            likelihood = likelihood.of_parameters()
+        return replace(self, physics=physics, likelihood=likelihood)
 
-    def with_noise(self, **changes: Any) -> Problem:
-        """The same problem with other noise; arguments are fields of :class:`Noise`."""
-        return replace(self, noise=replace(self.noise, **changes))
+    def with_likelihood(self, **changes: Any) -> Problem:
+        """Return the same problem with other noise; arguments are fields of its likelihood."""
+        return replace(self, likelihood=replace(self.likelihood, **changes))
+
+    def along(self, noise: TrajectoryNoise, **changes: Any) -> Problem:
+        """Return the same problem with the likelihood of whole trajectories.
+
+        ``changes`` are other fields of :class:`TrajectoryLikelihood`.
+        """
+        settings = {"nu": self.likelihood.nu, "prior": self.likelihood.prior, **changes}
+        return replace(self, likelihood=TrajectoryLikelihood(noise=noise, **settings))
 
     @property
     def coarse(self) -> Problem:
@@ -147,8 +149,8 @@ class Problem:
             return self
         apart = self.simulator(phi, segments.start, self.inputs)
         off = abs(self.observations.wrapped((states - apart)[..., columns]))
-        if self.trajectories is not None:  # the noise of measuring; what is not measured has none
-            sensors, every = self.trajectories.cells.sensors, sigma
+        if isinstance(self.likelihood, TrajectoryLikelihood):  # errors of measurement alone
+            sensors, every = self.likelihood.noise.cells.sensors, sigma
             stated = dict(self.scene.noise)
             sigma = np.full((len(phi), len(columns)), np.inf)
             for i, d in enumerate(columns):
@@ -206,28 +208,23 @@ class Problem:
     @cached_property
     def noise_prior(self) -> tuple[Array, float]:
         """Medians of sigma's prior, shape (state,), and its log-scale; given, or from the data."""
-        if self.noise.prior is None:
+        if self.likelihood.prior is None:
             return sigma_prior(self.observations, self.segments)
-        median, spread = self.noise.prior
+        median, spread = self.likelihood.prior
         return np.array(median), spread
 
     @property
-    def trajectories(self) -> TrajectoryNoise | None:
-        """The noise along whole trajectories, if the likelihood is of those."""
-        return self.noise.trajectories
-
-    @property
     def trajectory_noise(self) -> TrajectoryNoise:
-        """The same where it must be of those.
+        """The noise along whole trajectories.
 
         Raises
         ------
         TypeError
             If the likelihood is of single transitions.
         """
-        if self.trajectories is None:
-            raise TypeError("the problem is one of single transitions, expected whole trajectories")
-        return self.trajectories
+        if isinstance(self.likelihood, TrajectoryLikelihood):
+            return self.likelihood.noise
+        raise TypeError("the problem is one of single transitions, expected whole trajectories")
 
     def quiet(self, sigma: Array, share: float) -> Array:
         """Noise of trajectories, a step's no larger than a share of its prior's median."""
@@ -238,24 +235,33 @@ class Problem:
     @property
     def noise_variables(self) -> dict[str, tuple[str, ...]]:
         """Variables of the noise, and the state dimensions of each, in the order of sigma."""
-        if self.trajectories is None:
-            return {"sigma": self.observations.names}
-        return self.trajectories.cells.variables
+        return self.likelihood.variables(self.observations)
 
     def named(self, phi: Array, sigma: Array) -> dict[str, Array]:
         """The model's variables at phi, shape (..., p), and sigma, shape (..., parameter)."""
-        if self.noise.scalar:
+        if self.scalar_sigma:
             return self.layout.to_dict(phi) | {"sigma": sigma[..., 0]}
         ends = np.cumsum([len(own) for own in self.noise_variables.values()])[:-1]
         noise = dict(zip(self.noise_variables, np.split(sigma, ends, axis=-1), strict=True))
         return self.layout.to_dict(phi) | noise
 
     @property
+    def scalar_sigma(self) -> bool:
+        """Whether one sigma serves all state dimensions."""
+        return isinstance(self.likelihood, TransitionLikelihood) and self.likelihood.scalar
+
+    @property
+    def noise_labels(self) -> tuple[str, ...]:
+        """Return labels of the inferred noise parameters, such as ``sigma[x]``."""
+        if self.scalar_sigma:
+            return ("sigma",)
+        return tuple(f"{name}[{of}]" for name, own in self.noise_variables.items() for of in own)
+
+    @property
     def measured(self) -> Array:
         """Measured next states, shape (transition, H, body, state), NaN where missing."""
-        values = self.observations.values
-        if self.trajectories is None:
-            return values
+        if isinstance(self.likelihood, TransitionLikelihood):
+            return self.observations.values
         segments = self.segments
         observed = self.data.history.dataset["observed"].to_numpy()
         raw = observed[segments.trajectory, segments.step + 1][:, None]
@@ -264,9 +270,8 @@ class Problem:
     def predict(self, phi: Array, engine: Engine | None = None) -> Array:
         """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""
         engine, given = engine or self.simulator, (phi, self.segments.start, self.inputs)
-        if self.trajectories is None or self.trajectories.sensitivity is None:
-            return engine(*given)
-        return self.trajectories.sensitivity.predicted(engine, *given)
+        sensitivity = self.likelihood.sensitivity
+        return engine(*given) if sensitivity is None else sensitivity.predicted(engine, *given)
 
     def residual(self, phi: Array, engine: Engine | None = None) -> Array:
         """Measured minus predicted, shape (..., transition, H, body, state)."""
@@ -274,7 +279,7 @@ class Problem:
 
     def whitened(self, phi: Array, sigma: Array, engine: Engine | None = None) -> Array:
         """Residuals in units of their noise, shape (..., transition, cell)."""
-        return whiten(self.residual(phi, engine), sigma, self.trajectories)
+        return self.likelihood.whiten(self.residual(phi, engine), sigma)
 
     @cached_property
     def tails(self) -> tuple[int, ...]:
@@ -292,22 +297,17 @@ class Problem:
             If they depend on phi, and there is none.
         """
         if not self.tails:
-            return self.noise.nu
+            return self.likelihood.nu
         if phi is None:
             raise ParameterError("the noise's tails depend on the parameters; give phi")
-        return degrees_of_freedom(self.physics, phi, self.noise.nu)
+        return degrees_of_freedom(self.physics, phi, self.likelihood.nu)
 
     def robust(self, phi: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
         """Least-squares residuals: half their squares are the negative log-density but a constant.
 
         Shape (..., transition, cell).
         """
-        residual = self.residual(phi, engine)
-        z = whiten(residual, sigma, self.trajectories)
-        nu = self.nu(phi)
-        if self.trajectories is not None:
-            return robust(z, self.trajectories.of_cells(nu, residual.shape))
-        return robust(z, cells(nu, residual.shape))
+        return self.likelihood.robust(self.residual(phi, engine), sigma, self.nu(phi))
 
     def log_density(self, residual: Array, sigma: Array, phi: Array | None = None) -> Array:
         """Log-likelihood of each transition, shape (..., transition); see `likelihood`.
@@ -321,14 +321,13 @@ class Problem:
         phi : ndarray, optional
             Shape (..., p); needed where the noise's tails are inferred.
         """
-        seen = self.observations.measured
-        return log_density(residual, sigma, self.trajectories, seen, self.nu(phi))
+        measured = self.observations.measured
+        return self.likelihood.log_density(residual, sigma, measured, self.nu(phi))
 
     def next_states(
         self, states: Array, sigma: Array, rng: np.random.Generator, phi: Array | None = None
     ) -> Array:
         """Draw measured next states by Eq. 13 about predictions (..., transition, H, body, 6)."""
         predicted = states[..., self.observations.columns]
-        if self.trajectories is not None:
-            return self.trajectories.random(predicted, self.observations.values, sigma, rng)
-        return next_state_random(predicted, sigma, rng, nu=self.nu(phi))
+        values = self.observations.values
+        return self.likelihood.random(predicted, values, sigma, rng, self.nu(phi))

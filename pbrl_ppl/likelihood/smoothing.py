@@ -56,7 +56,7 @@ def along_trajectories(
     Returns
     -------
     Problem
-        Of horizon 1, its noise a :class:`TrajectoryNoise`.
+        Of horizon 1, with a :class:`TrajectoryLikelihood`.
 
     Raises
     ------
@@ -71,13 +71,14 @@ def along_trajectories(
         cells = cells_of(problem.scene, history)
         check_moves(cells, problem.scene)
         medians = tuple(noise_medians(cells, history, states).tolist())
-        problem = problem.with_noise(prior=(medians, SPREAD), scalar=False, trajectories=None)
+        eq_11 = replace(problem.likelihood.of_data(), scalar=False, prior=(medians, SPREAD))
+        problem = replace(problem, likelihood=eq_11)
     data = replace(problem.data, horizon=1, states=states, columns=cells.columns)
     problem = problem.on(data)
     begin = _guess(problem, cells, phi)
     sigma = begin if sigma is None else sigma
     noise = _sloped(problem, cells, phi, begin, _steps(problem, cells, begin))
-    problem = smoothed(problem.with_noise(trajectories=noise), phi, begin)
+    problem = smoothed(problem.along(noise), phi, begin)
     if sigma is not begin:  # what the physics alone make of far-off states may be far off, too
         for share in _SHARES:
             problem = smoothed(problem, phi, _between(begin, sigma, share, cells))
@@ -86,7 +87,7 @@ def along_trajectories(
         steps = list(cells.accelerations)
         least = problem.noise_prior[0].copy()
         least[steps] = np.minimum(least[steps], moved[steps])
-        problem = problem.with_noise(prior=(tuple(least.tolist()), SPREAD))
+        problem = problem.with_likelihood(prior=(tuple(least.tolist()), SPREAD))
     return problem
 
 
@@ -94,7 +95,7 @@ def single_transitions(problem: Problem) -> Problem:
     """The problem with the likelihood of single transitions (Eq. 11), as a search begins with."""
     horizon = longest_gap(problem.data.history)
     data = replace(problem.data, horizon=horizon, states=None, columns=None)
-    return problem.on(data).with_noise(prior=None)
+    return problem.on(data).with_likelihood(prior=None)
 
 
 def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
@@ -117,7 +118,7 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
             break  # no motion fits such data: stay where it was linearised last
         problem = replace(problem, data=replace(problem.data, states=states))
         problem = replace(problem, data=replace(problem.data, states=foreseen(problem, phi)))
-        problem = problem.with_noise(trajectories=_sloped(problem, cells, phi, sigma, spread))
+        problem = problem.along(_sloped(problem, cells, phi, sigma, spread))
         shown = after[noise.seen.any(axis=1)]
         if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
             break
@@ -150,7 +151,7 @@ def with_sensitivity(problem: Problem, phi: Array, sigma: Array) -> Problem:
         return problem
     origin = np.tile(phi, (segments.n, 1))
     follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
-    return problem.with_noise(trajectories=replace(noise, sensitivity=follow))
+    return problem.along(replace(noise, sensitivity=follow))
 
 
 def foreseen(problem: Problem, phi: Array) -> Array:

@@ -12,6 +12,7 @@ from pbrl_ppl.likelihood.cells import Cells
 from pbrl_ppl.likelihood.extended import Extended
 from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
+from pbrl_ppl.physics import Memory
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -53,7 +54,12 @@ class TrajectoryNoise:
     touching : ndarray of bool
         Whether bodies touch in a transition, shape (transition,).
     sensitivity : Sensitivity, optional
-        How the states that were linearised at follow the parameters; without it they stay.
+        Derivative of the states that were linearised at by phi; without it they stay.
+
+    Attributes
+    ----------
+    memory : Memory
+        The filter's gains at the last few noise parameters.
     """
 
     cells: Cells
@@ -66,9 +72,7 @@ class TrajectoryNoise:
     sigma: Array
     touching: Bools
     sensitivity: Sensitivity | None = None
-    _known: dict[bytes, tuple[Array, Array, Array, Array]] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    memory: Memory = field(default_factory=Memory, init=False, repr=False)
 
     @cached_property
     def _extended(self) -> Extended:
@@ -80,18 +84,15 @@ class TrajectoryNoise:
 
         The first three are as of :func:`kalman.gains`; the last is summed, shape (transition,).
         """
-        key = np.ascontiguousarray(sigma).tobytes()
-        known = self._known.get(key)
-        if known is None:
-            if len(self._known) > 3:
-                self._known.clear()
-            own = self._extended
-            gain, scale, after = gains(
-                own.slope, self.first, own.seen, self._begin(sigma),
-                own.padded(self.cells.white(sigma) ** 2), own.steps(sigma), self.kind,
-            )  # fmt: skip
-            known = self._known[key] = gain, scale, after, np.log(scale).sum(axis=1)
-        return known
+        return self.memory.recall((sigma,), self._filter_gains)
+
+    def _filter_gains(self, sigma: Array) -> tuple[Array, Array, Array, Array]:
+        own = self._extended
+        gain, scale, after = gains(
+            own.slope, self.first, own.seen, self._begin(sigma),
+            own.padded(self.cells.white(sigma) ** 2), own.steps(sigma), self.kind,
+        )  # fmt: skip
+        return gain, scale, after, np.log(scale).sum(axis=1)
 
     def scale(self, sigma: Array) -> Array:
         """Standard deviation of each innovation, shape (transition, cell); 1 where not seen."""

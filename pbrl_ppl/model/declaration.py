@@ -15,10 +15,11 @@ from pbrl_ppl.likelihood import (
     ACCELERATION,
     DRIFT,
     JOLT,
+    Likelihood,
     Observations,
     Problem,
-    TrajectoryNoise,
-    next_state_random,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
 )
 from pbrl_ppl.model.density import difference, next_state_logp, tail_tensor
 from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
@@ -33,13 +34,26 @@ _NOISE_DIMS = {
 }  # fmt: skip
 
 
-def build_model(problem: Problem) -> pm.Model:
+class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
+    """The pm.Model of an inference problem; see :func:`pbrl_ppl.physics_model`.
+
+    Parameters
+    ----------
+    problem : Problem
+        Data, physics, likelihood and prior, which samplers evaluate in numpy.
+    """
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(coords=_coords(problem))
+        self.problem = problem
+
+
+def build_model(problem: Problem) -> PhysicsModel:
     """Declare the pm.Model of a problem; see :func:`pbrl_ppl.physics_model`."""
-    observations, segments, layout = problem.observations, problem.segments, problem.layout
-    physics, noise = problem.physics, problem.noise
-    sensitivity = getattr(noise.trajectories, "sensitivity", None)
-    simulate = SimulatorOp(physics, sensitivity)
-    with pm.Model(coords=_coords(problem)) as model:
+    observations, segments, physics = problem.observations, problem.segments, problem.physics
+    sensitivity = problem.likelihood.sensitivity
+    model = PhysicsModel(problem)
+    with model:
         start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
         actions = pm.Data("actions", problem.inputs, dims=("transition", "step", "body", "wrench"))
         # Table 1
@@ -47,8 +61,8 @@ def build_model(problem: Problem) -> pm.Model:
         if problem.library is not None:
             table1 = _chosen(problem, problem.library)
         else:
-            for block in layout.blocks:
-                index = _index(block, layout, table1)
+            for block in physics.layout.blocks:
+                index = _index(block, physics.layout, table1)
                 table1[block.name] = random_variable(
                     block.name, block.priors, _dim(problem, block), block.conditional, index
                 )
@@ -57,27 +71,25 @@ def build_model(problem: Problem) -> pm.Model:
         sigma = _noise(problem)
         # Eq. 7: s' = f(s, a; Phi) + eps, and Eq. 11
         columns = list(observations.columns)
-        predicted = simulate(phi, start, actions)[..., columns]
+        predicted = SimulatorOp(physics, sensitivity)(phi, start, actions)[..., columns]
         # the likelihood takes bodies apart that were apart in the data; in draws they may meet
         whole = predicted
         if len(problem.simulator.parts) > 1:
             whole = OneWorldOp(physics, sensitivity)(phi, start, actions)[..., columns]
-        shape: dict[str, Any] = {"noise": noise.trajectories, "nu": noise.nu}
-        shape["linearised"] = np.nan_to_num(observations.values)
-        tail = [tail_tensor(physics, table1, noise.nu)] if problem.tails else []
+        nu = problem.likelihood.nu
+        tail = [tail_tensor(physics, table1, nu)] if problem.tails else []
         pm.CustomDist(
             "next_state",
             predicted,
             whole,
             sigma,
             *tail,
-            logp=partial(_log_density, observations=observations, **shape),
-            random=partial(_random, **shape),
+            logp=partial(_log_density, problem.likelihood, observations),
+            random=partial(_random, problem.likelihood, np.nan_to_num(observations.values)),
             signature=_signature(problem),
             observed=np.nan_to_num(problem.measured),
             dims=("transition", "step", "body", "state"),
         )
-    model.problem = problem
     return model
 
 
@@ -127,10 +139,10 @@ def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
 def _noise(problem: Problem) -> Any:
     """The noise parameters, shape (parameter,)."""
     median, spread = problem.noise_prior
-    if problem.noise.scalar:
+    if problem.scalar_sigma:
         scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
         return pt.ones(len(median)) * scalar
-    if problem.trajectories is None:
+    if isinstance(problem.likelihood, TransitionLikelihood):
         return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
     parts, mu = [pt.zeros(0)], np.log(median)
     for name, own in problem.noise_variables.items():
@@ -157,52 +169,49 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
 def _signature(problem: Problem) -> str:
     """Core dimensions: of one transition, or of all where they depend on each other."""
     tail = ",(k)" * bool(problem.tails)
-    if problem.trajectories is not None:
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
         return f"(n,h,k,d),(n,h,k,d),(m){tail}->(n,h,k,d)"
     return f"(h,k,d),(h,k,d),(d){tail}->(h,k,d)"
 
 
 def _log_density(
+    likelihood: Likelihood,
+    observations: Observations,
     value: Any,
     predicted: Any,
     whole: Any,
     sigma: Any,
-    *tail: Any,
-    observations: Observations,
-    noise: TrajectoryNoise | None,
-    nu: float | None,
-    linearised: NDArray[np.float64] | None = None,
+    tail: Any = None,
 ) -> Any:
     """Log-density of the measurements about the predictions in parts; ``whole`` is for draws."""
-    if noise is None:
-        own = tail[0] if tail else None
-        return next_state_logp(value, predicted, sigma, observations, nu, own)
-    bodies = observations.values.shape[2]
-    tails = tail[0] if tail else np.full(bodies, 0.0 if nu is None else 1.0 / nu)
-    deviation = difference(value, pt.as_tensor(linearised), observations)
-    residual = difference(pt.as_tensor(linearised), predicted, observations)
-    return TrajectoryDensityOp(noise)(deviation, residual, sigma, tails)
+    nu = likelihood.nu
+    if not isinstance(likelihood, TrajectoryLikelihood):
+        return next_state_logp(value, predicted, sigma, observations, nu, tail)
+    if tail is None:
+        tail = np.full(observations.values.shape[2], 0.0 if nu is None else 1.0 / nu)
+    linearised = pt.as_tensor(np.nan_to_num(observations.values))
+    deviation = difference(value, linearised, observations)
+    residual = difference(linearised, predicted, observations)
+    return TrajectoryDensityOp(likelihood)(deviation, residual, sigma, tail)
 
 
 def _random(
+    likelihood: Likelihood,
+    linearised: NDArray[np.float64],
     predicted: Any,
     whole: Any,
     sigma: Any,
     *tail: Any,
-    noise: TrajectoryNoise | None,
-    nu: float | None,
-    linearised: NDArray[np.float64] | None = None,
     rng: np.random.Generator | None = None,
     size: Any = None,
 ) -> Any:
+    """Draw measurements about the predictions of one world."""
+    nu: Any = likelihood.nu
+    if tail:
+        with np.errstate(divide="ignore"):
+            nu = 1.0 / np.asarray(tail[0], dtype=float)[..., :, None]
     rng = rng or np.random.default_rng()
-    if noise is not None and linearised is not None:
-        return noise.random(whole, linearised, sigma, rng)
-    if not tail:
-        return next_state_random(whole, sigma, rng, size, nu)
-    with np.errstate(divide="ignore"):
-        own = 1.0 / np.asarray(tail[0], dtype=float)[..., :, None]
-    return next_state_random(whole, sigma, rng, size, own)
+    return likelihood.random(whole, linearised, sigma, rng, nu)
 
 
 def _coords(problem: Problem) -> dict[str, Any]:
@@ -225,7 +234,7 @@ def _coords(problem: Problem) -> dict[str, Any]:
 
 
 def _noise_coords(problem: Problem) -> dict[str, Any]:
-    if problem.trajectories is None:
+    if isinstance(problem.likelihood, TransitionLikelihood):
         return {}
     return {_NOISE_DIMS[name]: list(own) for name, own in problem.noise_variables.items()}
 

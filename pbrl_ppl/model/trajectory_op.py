@@ -14,7 +14,7 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_funcify
 
-from pbrl_ppl.likelihood import TrajectoryNoise, log_density
+from pbrl_ppl.likelihood import TrajectoryLikelihood
 
 Array = NDArray[np.float64]
 
@@ -30,17 +30,18 @@ class _DensityOp(Op):
     one a body (body,).
     """
 
-    __props__ = ("noise",)
+    __props__ = ("likelihood",)
 
-    def __init__(self, noise: TrajectoryNoise) -> None:
-        self.noise = noise
-        self._given = noise
+    def __init__(self, likelihood: TrajectoryLikelihood) -> None:
+        self.likelihood = likelihood
+        self._given = likelihood
 
-    def given(self, deviation: Array) -> TrajectoryNoise:
-        """The noise with these measurements; the last one is kept, with the gains it knows."""
-        measured = self.noise.cells.of_residual(deviation)
-        if not np.array_equal(measured, self._given.measured):
-            self._given = replace(self.noise, measured=measured)
+    def given(self, deviation: Array) -> TrajectoryLikelihood:
+        """Return the likelihood of these measurements; the last one is kept with its gains."""
+        noise = self.likelihood.noise
+        measured = noise.cells.of_residual(deviation)
+        if not np.array_equal(measured, self._given.noise.measured):
+            self._given = replace(self.likelihood, noise=replace(noise, measured=measured))
         return self._given
 
     def density(self, deviation: Array, residual: Array, sigma: Array, tail: Array) -> Array:
@@ -52,7 +53,7 @@ class _DensityOp(Op):
             with np.errstate(divide="ignore"):
                 nu = 1.0 / np.maximum(tail, 0.0)[:, None]
         measured = np.ones(residual.shape, dtype=bool)
-        return log_density(residual, sigma, self.given(deviation), measured, nu)
+        return self.given(deviation).log_density(residual, sigma, measured, nu)
 
 
 class TrajectoryDensityOp(_DensityOp):
@@ -60,8 +61,8 @@ class TrajectoryDensityOp(_DensityOp):
 
     Parameters
     ----------
-    noise : TrajectoryNoise
-        The linearised trajectories.
+    likelihood : TrajectoryLikelihood
+        Of the linearised trajectories.
     """
 
     def make_node(self, deviation: Any, residual: Any, sigma: Any, tail: Any) -> Apply:
@@ -82,7 +83,7 @@ class TrajectoryDensityOp(_DensityOp):
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
     ) -> list[Any]:
         """Vector-Jacobian product: by the filter's adjoint, and by differences for the noise."""
-        return list(_DerivativeOp(self.noise)(*inputs, cotangents[0], return_list=True))
+        return list(_DerivativeOp(self.likelihood)(*inputs, cotangents[0], return_list=True))
 
     L_op = pullback  # its name in pytensor 2
 
@@ -107,7 +108,7 @@ class _DerivativeOp(_DensityOp):
         self, deviation: Array, residual: Array, sigma: Array, tail: Array, weights: Array
     ) -> tuple[Array, Array, Array, Array]:
         """Derivatives by the inputs, in their order."""
-        noise = self.given(deviation)
+        noise = self.given(deviation).noise
         white = noise.filtered(noise.cells.of_residual(residual)[None], sigma)[0][0]
         pull = white
         if tail.any():

@@ -63,10 +63,9 @@ class Coordinates:
         priors = self.problem.layout.priors
         self._laws = [_Law(prior, x) for prior, x in zip(priors, mode.phi, strict=True)]
         self._centre, self._spread = noise_law(self.problem)
-        sigma = np.log(mode.sigma)
-        self._counts = self.problem.observations.measured.sum((0, 1, 2))
-        if self.problem.noise.scalar:
-            sigma, self._counts = sigma[:1], self._counts.sum(keepdims=True)
+        likelihood = self.problem.likelihood
+        sigma = likelihood.free(np.log(mode.sigma))
+        self._counts = likelihood.pooled(self.problem.observations.measured.sum((0, 1, 2)))
         z = [float(law.standard(x)) for law, x in zip(self._laws, mode.phi, strict=True)]
         #: The mode, shape (d,).
         self.origin = np.concatenate([z, (sigma - self._centre) / self._spread])

@@ -3,27 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from pbrl_ppl.likelihood import Problem, log_posterior
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, noise_gaussian, profile_sigma
 from pbrl_ppl.modes.tails import best_tails, tail_precision
 from pbrl_ppl.parameters import box, differentiate, inside, likeliest, prior_residual
 from pbrl_ppl.physics import PartedSimulator
 
 Array = NDArray[np.float64]
-#: Where a climb ended: phi, sigma and the log-posterior there.
-Peak = tuple[Array, Array, float]
-
 #: Gain in log-posterior that is not worth another round.
 STALLED = 0.02
 #: Precision of an angle of which nothing is known, as if it were normal: 1 / variance (1/rad^2).
 _CIRCLE = 3.0 / np.pi**2
+
+
+class Peak(NamedTuple):
+    """The end of a climb."""
+
+    phi: Array
+    sigma: Array
+    log_posterior: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +61,6 @@ class Mode:
     covariance: Array
     log_posterior: float
     others: tuple[Mode, ...] = ()
-    _residual: list[Array] = field(default_factory=list, init=False, repr=False)
 
     @property
     def values(self) -> dict[str, Array]:
@@ -73,7 +78,7 @@ class Mode:
 
         Shapes (parameter,) and (parameter, parameter).
         """
-        if self.problem.trajectories is not None:
+        if isinstance(self.problem.likelihood, TrajectoryLikelihood):
             residual = self.problem.residual(self.phi)
             return noise_gaussian(self.problem, residual, self.sigma, self.phi)
         # half the inverse of the number of measurements
@@ -85,13 +90,12 @@ class Mode:
         moved = self.phi + rng.standard_normal((n, len(self.phi))) @ self.factor.T
         return inside(self.problem.layout.priors, moved)
 
+    @cached_property
     def whitened_residual(self) -> Array:
-        """Residuals in units of noise, shape (transition, cell); the engine runs once for it."""
-        if not self._residual:
-            residual = self.problem.whitened(self.phi, self.sigma)
-            residual.setflags(write=False)
-            self._residual.append(residual)
-        return self._residual[0]
+        """Residuals in units of noise, shape (transition, coordinate); read-only."""
+        residual = self.problem.whitened(self.phi, self.sigma)
+        residual.setflags(write=False)
+        return residual
 
 
 def posterior_steps(
@@ -121,7 +125,7 @@ def climb(
     lower, upper = box(priors)
     sigma, value = _at(problem, phi)
     if not priors:
-        return phi, sigma, value
+        return Peak(phi, sigma, value)
     steps = 1e-3 * problem.layout.scale(phi)
     tails = list(problem.tails)
 
@@ -156,7 +160,7 @@ def climb(
             break
         size = np.sqrt((result.jac**2).sum(axis=0))
         steps = np.clip(1.0 / np.maximum(size, 1e-12), 1e-6, 0.1)
-    return phi, sigma, value
+    return Peak(phi, sigma, value)
 
 
 def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
@@ -168,16 +172,15 @@ def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
 
 
 def described(problem: Problem, peak: Peak) -> Peak:
-    """A peak with each wheel in its most probable description; the predictions are the same."""
-    phi, sigma, value = peak
-    better = likeliest(problem.layout, phi)
-    gain = problem.layout.log_prior(better) - problem.layout.log_prior(phi)
-    return better, sigma, value + float(gain.sum())
+    """Return a peak with each wheel in its most probable description; it predicts the same."""
+    better = likeliest(problem.layout, peak.phi)
+    gain = problem.layout.log_prior(better) - problem.layout.log_prior(peak.phi)
+    return Peak(better, peak.sigma, peak.log_posterior + float(gain.sum()))
 
 
-def finish(problem: Problem, phi: Array, sigma: Array, log_posterior: float) -> Mode:
-    """Take the Jacobian at the posterior's own scale, wheels in their likeliest description."""
-    phi, sigma, log_posterior = described(problem, (phi, sigma, log_posterior))
+def finish(problem: Problem, peak: Peak) -> Mode:
+    """Return the mode at a peak, with the Jacobian taken at the posterior's scale."""
+    phi, sigma, log_posterior = described(problem, peak)
     priors = problem.layout.priors
     if not priors:
         cells = problem.observations.values.size

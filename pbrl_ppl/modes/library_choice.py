@@ -12,7 +12,7 @@ from scipy.optimize import minimize
 from scipy.special import logsumexp, softmax
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import Observations, Problem, estimate_sigma, log_density, log_noise_prior
+from pbrl_ppl.likelihood import Observations, Problem, estimate_sigma, log_noise_prior
 from pbrl_ppl.physics import Part
 
 Array = NDArray[np.float64]
@@ -44,6 +44,7 @@ class _Combinations:
                 f" parameter sets are to be summed over; give some probability 0 for some bodies,"
                 " record the bodies apart, or walk among them with method='paper'"
             )
+        self.likelihood = problem.likelihood
         self.observations = Observations(measured, problem.observations.columns)
         self.indices = np.array(list(product(*possible)), dtype=np.intp).reshape(count, -1)
         self.log_prior = np.sum(
@@ -65,8 +66,8 @@ class _Combinations:
         size = max(1, _NUMBERS // max(self.residual.size, 1))
         for begin in range(0, len(sigma), size):
             part = sigma[begin : begin + size, None]
-            log_likelihood = log_density(self.residual[None], part, None, seen, nu).sum(axis=-1)
-            result[begin : begin + size] = log_likelihood
+            each = self.likelihood.log_density(self.residual[None], part, seen, nu)
+            result[begin : begin + size] = each.sum(axis=-1)
         return np.asarray(result + self.log_prior)
 
 
@@ -115,17 +116,14 @@ def choose_from_library(
     parts = [_Combinations(problem, part, table) for part in problem.simulator.parts]
     median, spread = problem.noise_prior
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
-    ones = np.ones(len(median))
-    if problem.noise.scalar:
-        counts = counts.sum(keepdims=True)
+    counts, ones = problem.likelihood.pooled(counts), np.ones(len(median))
 
     def density(log_sigma: Array) -> Array:
         sigma = np.exp(log_sigma) * ones
         log_sums = [logsumexp(part.log_joint(sigma, problem.nu()), axis=1) for part in parts]
         return np.asarray(np.sum(log_sums, axis=0) + log_noise_prior(problem, log_sigma))
 
-    begin = np.log(_rough_sigma(problem, parts, median))
-    begin = begin.mean(keepdims=True) if problem.noise.scalar else begin
+    begin = problem.likelihood.centre(_rough_sigma(problem, parts, median))
     found = minimize(lambda x: -float(density(x[None])[0]), begin, method="L-BFGS-B").x
     # log sigma of n residuals has about this precision; wider, for combinations that mix
     shape = _WIDER**2 / (2.0 * counts + spread**-2.0)

@@ -12,6 +12,7 @@ from scipy.special import wrightomega
 
 from pbrl_ppl.likelihood import (
     Problem,
+    TrajectoryLikelihood,
     TrajectoryNoise,
     exponential,
     log_noise_prior,
@@ -52,8 +53,8 @@ def profile_sigma(
     held : dict of int to float, optional
         Noise parameters of whole trajectories that are given.
     """
-    if problem.trajectories is not None:
-        return _of_trajectories(problem, problem.trajectories, residual, phi, held or {})
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
+        return _of_trajectories(problem, problem.likelihood.noise, residual, phi, held or {})
     residual = np.nan_to_num(residual, nan=FAR_OFF)
     ones = np.ones(residual.shape[-1])
     begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
@@ -97,7 +98,7 @@ def _of_trajectories(
 
 def _cost(problem: Problem, residual: Array, phi: Array | None, log_sigma: Array) -> float:
     """Minus the log-density of data and the logarithm of noise parameters."""
-    sigma = np.exp(log_sigma) * np.ones(residual.shape[-1] if problem.trajectories is None else 1)
+    sigma = np.exp(log_sigma) * np.ones(len(problem.noise_prior[0]))
     likelihood = problem.log_density(residual, sigma, phi).sum()
     return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
 
@@ -131,9 +132,8 @@ def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
         Log sigma, shape (..., state), or (..., 1) for a scalar sigma.
     """
     centre, spread = noise_law(problem)
-    count = problem.observations.measured.sum((0, 1, 2))
-    if problem.noise.scalar:
-        square, count = square.sum(axis=-1, keepdims=True), count.sum(keepdims=True)
+    count = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
+    square = problem.likelihood.pooled(square)
     a = spread**2 * (count + 1)
     with np.errstate(divide="ignore"):  # an exact fit
         y = 0.5 * wrightomega(np.log(2 * spread**2 * square) + 2 * (a - centre))

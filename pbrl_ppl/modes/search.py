@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import Problem, estimate_sigma
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, estimate_sigma
 from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, gaussian_profile
 from pbrl_ppl.modes.threads import one_blas_thread
@@ -83,11 +83,11 @@ def find_modes(
     if initial is not None:
         if rounds is not None:
             first = climb(problem, inside(priors, initial), problem.coarse.simulator, rounds)
-            return [finish(problem, *first)]
+            return [finish(problem, first)]
         near = climb(problem, inside(priors, initial), problem.coarse.simulator)
-        return [finish(problem, *_polish(problem, near))]
+        return [finish(problem, _polish(problem, near))]
     if not priors:  # everything is known but the noise
-        return [finish(problem, *climb(problem, np.zeros(0), problem.coarse.simulator))]
+        return [finish(problem, climb(problem, np.zeros(0), problem.coarse.simulator))]
     few = problem.segments.n <= _FEW
     starts = (16 if few else 4) if starts is None else starts
     screened = (1000 if few else 48) if screened is None else screened
@@ -107,13 +107,13 @@ def find_modes(
     if few and len(priors) <= _MOST_EVOLVED and steps * _POPULATION * _GENERATIONS < _AFFORDED:
         begin = np.vstack([begin, _evolve(problem, rng)])
     rough = [described(part, climb(part, phi, part.simulator)) for phi in begin]
-    rough.sort(key=lambda result: -result[2])
+    rough.sort(key=lambda peak: -peak.log_posterior)
     found = _distinct(part, rough)
     if not few:
-        found = [climb(problem, phi, problem.coarse.simulator) for phi, _, _ in found[:_POLISHED]]
-    found.sort(key=lambda result: -result[2])
+        found = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in found[:_POLISHED]]
+    found.sort(key=lambda peak: -peak.log_posterior)
     best = _polish(problem, found[0])
-    return [finish(problem, *result) for result in (best, *found[1:])]
+    return [finish(problem, peak) for peak in (best, *found[1:])]
 
 
 def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
@@ -150,14 +150,14 @@ def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
     A wheel's other description is, and so is what differs where the data are silent. A mirror image
     is not: it predicts the same, but what is linear in between would not.
     """
-    folded = likeliest(problem.layout, np.array([phi for phi, _, _ in found]))
-    z = problem.whitened(folded, found[0][1])
+    folded = likeliest(problem.layout, np.array([peak.phi for peak in found]))
+    z = problem.whitened(folded, found[0].sigma)
     z = np.nan_to_num(z, nan=FAR_OFF)
     kept: dict[int, Array] = {}
     for i in range(len(found)):
         same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < _SAME]
         if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < _FAR for j in same):
-            kept[i] = finish(problem, *found[i]).jacobian
+            kept[i] = finish(problem, found[i]).jacobian
     return [found[i] for i in kept]
 
 
@@ -166,7 +166,7 @@ def _part(problem: Problem, transitions: int) -> Problem:
     history = problem.data.history
     share = transitions / max(problem.segments.n, 1)
     count = max(2, math.ceil(share * history.n_trajectories))
-    if problem.trajectories is not None or count >= history.n_trajectories:
+    if isinstance(problem.likelihood, TrajectoryLikelihood) or count >= history.n_trajectories:
         return problem.coarse
     chosen = np.linspace(0, history.n_trajectories - 1, count).astype(int)
     part = problem.coarse.with_data(history=history.select(chosen))
@@ -192,7 +192,7 @@ def _polish(problem: Problem, found: Peak) -> Peak:
     if not problem.layout.size:
         return found
     found = described(problem, found)
-    exact = climb(problem, found[0], problem.simulator, rounds=1, tries=2)
-    if exact[2] < found[2] + _WORTHWHILE:
-        return max(found, exact, key=lambda result: result[2])
-    return climb(problem, exact[0], problem.simulator)
+    exact = climb(problem, found.phi, problem.simulator, rounds=1, tries=2)
+    if exact.log_posterior < found.log_posterior + _WORTHWHILE:
+        return max(found, exact, key=lambda peak: peak.log_posterior)
+    return climb(problem, exact.phi, problem.simulator)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import (
     Problem,
+    TrajectoryLikelihood,
     along_trajectories,
     log_posterior,
     single_transitions,
@@ -73,13 +74,12 @@ def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) ->
     Returns
     -------
     Mode
-        Its problem's noise is a :class:`pbrl_ppl.model.TrajectoryNoise`.
+        Its problem has a :class:`pbrl_ppl.likelihood.TrajectoryLikelihood`.
     """
-    if problem.trajectories is None or sigma is None:
-        cells = None if problem.trajectories is None else problem.trajectories.cells
+    whole = isinstance(problem.likelihood, TrajectoryLikelihood)
+    if sigma is None or not whole:
+        cells = problem.trajectory_noise.cells if whole else None
         problem = along_trajectories(problem, phi, cells=cells)
-        sigma = None
-    if sigma is None:
         sigma = problem.trajectory_noise.sigma
     mode = nearby_mode(problem, phi, sigma)
     quiet = mode.problem.quiet(mode.sigma, _QUIET)

@@ -6,7 +6,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from itertools import combinations, product
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.physics.physics import Physics
 
 Bools = NDArray[np.bool_]
+R = TypeVar("R")
 Ints = NDArray[np.intp]
 #: Largest difference of one world's prediction from a part's that counts as rounding (SI units).
 _ROUNDING = 1e-6
@@ -31,14 +32,16 @@ class Memory:
     """The last few results of a function, by its arguments; they do not go into a pickle."""
 
     def __init__(self) -> None:
-        self._known: OrderedDict[Hashable, Array] = OrderedDict()
+        self._known: OrderedDict[Hashable, Any] = OrderedDict()
 
     def __getstate__(self) -> dict[str, object]:
         """Nothing."""
         return {"_known": OrderedDict()}
 
-    def recall(self, arguments: tuple[Array, ...], compute: Callable[..., Array]) -> Array:
-        """``compute(*arguments)``, or what it gave for equal arguments a moment ago.
+    def recall(self, arguments: tuple[Array, ...], compute: Callable[..., R]) -> R:
+        """Return ``compute(*arguments)``, from memory for equal arguments.
+
+        The first argument is compared as a whole, others by a hash.
 
         Examples
         --------
@@ -54,7 +57,8 @@ class Memory:
             self._known[key] = compute(*arguments)
             if len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
-        return self._known[key]
+        result: R = self._known[key]
+        return result
 
 
 @dataclass(eq=False)

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.likelihood import Cells, Problem, next_state_random
+from pbrl_ppl.likelihood import Cells, Problem, TrajectoryLikelihood, next_state_random
 
 Array = NDArray[np.float64]
 
@@ -88,6 +88,6 @@ class AccelerationNoise:
 
 def step_noise(problem: Problem, phi: Array, sigma: Array) -> StepNoise:
     """Noise of a step under draws of phi (draw, p) and noise parameters (draw, parameter)."""
-    if problem.trajectories is not None:
-        return AccelerationNoise(sigma, problem.trajectories.cells)
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
+        return AccelerationNoise(sigma, problem.trajectory_noise.cells)
     return StateNoise(sigma, problem.observations.columns, problem.nu(phi))

@@ -11,7 +11,7 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, attach, catalogue
-from pbrl_ppl.likelihood import Observations, whiten
+from pbrl_ppl.likelihood import Observations, TransitionLikelihood
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
 from pbrl_ppl.physics import Physics, build_layout
@@ -336,7 +336,7 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array,
 
     def residual(points: Array) -> Array:
         states = physics.predict(points, data["start"].to_numpy(), data["actions"].to_numpy())
-        z = whiten(observations.residual(states), sigma, None)
+        z = TransitionLikelihood().whiten(observations.residual(states), sigma)
         return np.nan_to_num(z.reshape(len(points), -1))
 
     jacobian, _ = posterior_steps(residual, phi, *layout.bounds, 1e-3 * layout.scale(phi))

@@ -21,9 +21,10 @@ from pbrl_ppl.effects import (
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.likelihood import (
-    Noise,
     Observations,
     Problem,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
     along_trajectories,
     sigma_prior,
     with_sensitivity,
@@ -60,7 +61,7 @@ def origin(problem: Problem, seed: int) -> dict[str, Any]:
         effects=[[attached.effect.name, attached.body] for attached in problem.physics.effects],
         seed=seed,
         horizon=problem.data.horizon,
-        **({} if problem.noise.nu is None else {"nu": problem.noise.nu}),
+        **({} if problem.likelihood.nu is None else {"nu": problem.likelihood.nu}),
         **({} if problem.library is None else {"library": problem.library.to_json()}),
         **dict(
             (LEARNED_REMAINDER, attached.effect.table)
@@ -104,7 +105,7 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
     """
     given, posterior = group(idata, "constant_data"), group(idata, "posterior")
     of = {True: "whole trajectories", False: "single transitions"}
-    whole = problem.trajectories is not None
+    whole = isinstance(problem.likelihood, TrajectoryLikelihood)
     if (SMOOTHED in given) != whole:
         raise PosteriorError(
             f"posterior: it is of {of[not whole]}, expected {of[whole]} as the model; make"
@@ -128,7 +129,7 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
         return problem
     median, spread = json.loads(str(idata.attrs["sigma_prior"]))
     problem = with_recording(problem, given, problem.data.history.data_sha256)
-    return problem.with_noise(prior=(tuple(map(float, median)), float(spread)))
+    return problem.with_likelihood(prior=(tuple(map(float, median)), float(spread)))
 
 
 def problem_of(
@@ -167,7 +168,7 @@ def problem_of(
         none = np.zeros(len(start), dtype=np.int64)
         segments = Segments(start, actions, observed, none, none, actions)
         median, spread = sigma_prior(Observations(values, columns), segments)
-    noise = Noise(
+    likelihood = TransitionLikelihood(
         scalar=has_one_sigma(idata),
         nu=float(attrs["nu"]) if "nu" in attrs else None,
         prior=(tuple(float(value) for value in median), float(spread)),
@@ -185,18 +186,17 @@ def problem_of(
         horizon=int(attrs["horizon"]),
         substeps=int(attrs["substeps"]),
         columns=columns,
-        noise=noise,
+        likelihood=likelihood,
         library=ParameterLibrary.from_json(str(attrs["library"])) if "library" in attrs else None,
         together=tuple(json.loads(str(attrs.get("together", "[]")))),
     )
     recorded = with_recording(problem, given, str(attrs["data_sha256"]))
-    trajectories = recorded.trajectories
-    if not other or trajectories is None:
+    if not other or isinstance(recorded.likelihood, TransitionLikelihood):
         return recorded
     # linearised where the posterior is
     named = draws(idata)
     phi = problem.layout.to_vectors(named, len(next(iter(named.values()))))
     sigma = np.hstack([named[name].reshape(len(phi), -1) for name in recorded.noise_variables])
     best = likeliest_draw(idata)
-    problem = along_trajectories(problem, phi[best], sigma[best], trajectories.cells)
+    problem = along_trajectories(problem, phi[best], sigma[best], recorded.trajectory_noise.cells)
     return with_sensitivity(problem, phi[best], sigma[best])

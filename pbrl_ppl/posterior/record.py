@@ -17,7 +17,7 @@ from pbrl_ppl.errors import (
     LinearisationWarning,
     UninformedWarning,
 )
-from pbrl_ppl.likelihood import ACCELERATION, DRIFT, JOLT, Problem
+from pbrl_ppl.likelihood import ACCELERATION, DRIFT, JOLT, Problem, TrajectoryLikelihood
 from pbrl_ppl.modes import ATTRIBUTE, doubts
 from pbrl_ppl.parameters import fold_draws, redescribed
 from pbrl_ppl.posterior.identifiability import uninformed
@@ -124,7 +124,7 @@ def complete(
         idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
     if mode is not None:
         idata.attrs[MODE] = mode_text(problem, mode, phi, sigma, likelihood.sum(axis=1))
-    if problem.trajectories is not None and len(phi) > 1:
+    if isinstance(problem.likelihood, TrajectoryLikelihood) and len(phi) > 1:
         idata.attrs[LINEARISATION] = json.dumps(linearisation(problem, phi, sigma))
     return checked(problem, idata, asked)
 
@@ -204,7 +204,7 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
         posterior[block.name].attrs["units"] = block.unit
     if "sigma" in posterior:  # it is not where the errors of measuring are all stated
         posterior["sigma"].attrs["units"] = "the unit of each state dimension"
-    if problem.trajectories is not None:
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
         for name in {ACCELERATION, JOLT} & set(problem.noise_variables):
             posterior[name].attrs["units"] = "m/s^2, of omega rad/s^2"
         if DRIFT in problem.noise_variables:

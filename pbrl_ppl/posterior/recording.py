@@ -9,7 +9,14 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, Sensitivity, TrajectoryNoise, cells_of, linearised
+from pbrl_ppl.likelihood import (
+    Problem,
+    Sensitivity,
+    TrajectoryNoise,
+    TransitionLikelihood,
+    cells_of,
+    linearised,
+)
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
@@ -26,9 +33,9 @@ _PREFIX = "recorded_"
 
 def recording(problem: Problem) -> xr.Dataset:
     """What a problem of whole trajectories needs beside its segments; empty for other ones."""
-    noise = problem.trajectories
-    if noise is None:
+    if isinstance(problem.likelihood, TransitionLikelihood):
         return xr.Dataset()
+    noise = problem.trajectory_noise
     dataset = problem.data.history.dataset
     kept = dataset.rename(
         {name: f"{_PREFIX}{name}" for name in (*dataset.dims, *dataset.data_vars)}
@@ -64,7 +71,7 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
         origin, before = given[_ORIGIN].to_numpy(), given[_SENSITIVITY].to_numpy()
         follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
         noise = replace(noise, sensitivity=follow)
-    return problem.on(data).with_noise(trajectories=noise, scalar=False)
+    return problem.on(data).along(noise)
 
 
 def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:

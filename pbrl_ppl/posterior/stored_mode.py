@@ -85,7 +85,7 @@ def _packed(problem: Problem, mode: Point, height: float, phi: Array) -> str:
     sigma = mode.sigma.tolist()
     held: dict[str, Any] = {
         "parameters": dict(zip(problem.layout.labels, own.tolist(), strict=True)),
-        "noise": dict(zip(_noise_labels(problem), sigma, strict=False)),  # a scalar is repeated
+        "noise": dict(zip(problem.noise_labels, sigma, strict=False)),  # a scalar is repeated
         "log_posterior": height,
     }
     if problem.library is not None and mode.choice is not None:
@@ -121,7 +121,7 @@ def stored_mode(problem: Problem, idata: Any) -> Point | None:
     if MODE not in idata.attrs:
         return None
     held = json.loads(str(idata.attrs[MODE]))
-    labels = _noise_labels(problem)
+    labels = problem.noise_labels
     missing = [label for label in problem.layout.labels if label not in held["parameters"]]
     missing += [label for label in labels if label not in held["noise"]]
     if missing:
@@ -133,10 +133,3 @@ def stored_mode(problem: Problem, idata: Any) -> Point | None:
         names = [held["sets"][owner] for owner in problem.scene.owners]
         choice = np.array([problem.library.names.index(name) for name in names], dtype=np.intp)
     return Point(phi, np.broadcast_to(sigma, len(problem.noise_prior[0])).copy(), choice)
-
-
-def _noise_labels(problem: Problem) -> list[str]:
-    """``sigma[x]`` and the like, in the order of sigma; ``sigma`` for a scalar."""
-    if problem.noise.scalar:
-        return ["sigma"]
-    return [f"{name}[{of}]" for name, own in problem.noise_variables.items() for of in own]

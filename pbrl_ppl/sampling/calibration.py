@@ -23,7 +23,7 @@ from rich.progress import track
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History, write_atomically
-from pbrl_ppl.likelihood import Problem, declared_problem
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, declared_problem
 from pbrl_ppl.posterior import versions
 from pbrl_ppl.sampling.ranks import Calibration
 from pbrl_ppl.sampling.replication import Record, draw_truths, labels, replicate
@@ -130,7 +130,7 @@ def calibrate(
         )
     # a prior that looked at the simulated data would not be the one they were simulated from
     median, spread = design.noise_prior
-    design = design.with_noise(prior=(tuple(median.tolist()), spread))
+    design = design.with_likelihood(prior=(tuple(median.tolist()), spread))
     settings = {"draws": draws, "tune": tune, "chains": chains, **options}
     about = _about(design, seed, settings)
     store = None if folder is None else _opened(Path(folder), about)
@@ -207,10 +207,10 @@ def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str,
                     for attached in design.physics.effects],
         "horizon": design.data.horizon,
         "substeps": design.physics.substeps,
-        "scalar_sigma": design.noise.scalar,
-        "nu": design.noise.nu,
-        "trajectories": design.trajectories is not None,
-        "sigma_prior": design.noise.prior,
+        "scalar_sigma": design.scalar_sigma,
+        "nu": design.likelihood.nu,
+        "trajectories": isinstance(design.likelihood, TrajectoryLikelihood),
+        "sigma_prior": design.likelihood.prior,
         "seed": seed,
         "settings": dict(settings),
         "versions": versions(),

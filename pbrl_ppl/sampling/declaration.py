@@ -9,7 +9,7 @@ import pymc as pm
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, declared_problem
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, declared_problem
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_trajectory_mode, following, trajectory_mode
 from pbrl_ppl.parameters import ParameterLibrary
@@ -114,7 +114,7 @@ def physics_model(
     mode = None
     if around is not None and not isinstance(around, Mode):
         problem = linearised_as(problem, around)
-    elif problem.trajectories is not None and not problem.layout.discrete.any():
+    elif isinstance(problem.likelihood, TrajectoryLikelihood) and not problem.layout.discrete.any():
         mode = find_trajectory_mode(problem, seed) if around is None else climbed(problem, around)
         problem = mode.problem
     model = build_model(problem)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
 
 Array = NDArray[np.float64]
 
@@ -60,11 +60,12 @@ class Pieces:
         moving = problem.scene.moving
         met = np.zeros(problem.segments.n, dtype=bool)
         own: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
+        whole = isinstance(problem.likelihood, TrajectoryLikelihood)
         for part in problem.simulator.parts:
-            if len(part.bodies) == 1 or problem.trajectories is None or part.physics.scene.joints:
+            if not whole or len(part.bodies) == 1 or part.physics.scene.joints:
                 own.append((part.places, part.bodies))
                 continue
-            met = problem.trajectories.touching
+            met = problem.trajectory_noise.touching
             for body in part.bodies:
                 kept = moving[body].name, moving[body].owner
                 chosen = problem.layout.subset(kept).labels
@@ -79,8 +80,8 @@ def _engine(problem: Problem, rows: NDArray[np.intp]) -> Callable[[Array], Array
     """Residuals of some transitions by the engine, as a function of phi."""
     start, inputs = problem.segments.start[rows], problem.inputs[rows]
     observed = replace(problem.observations, values=problem.observations.values[rows])
-    noise = problem.trajectories
-    followed = noise.sensitivity.at(rows) if noise and noise.sensitivity else None
+    sensitivity = problem.likelihood.sensitivity
+    followed = None if sensitivity is None else sensitivity.at(rows)
 
     def residual(phi: Array) -> Array:
         if followed is None:

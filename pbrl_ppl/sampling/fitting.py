@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pymc as pm
 
+from pbrl_ppl.likelihood import TrajectoryLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_mode, find_trajectory_mode, following, weigh
 from pbrl_ppl.posterior import Point, complete, group, stored_mode
@@ -171,9 +172,10 @@ def fit(
         point = stored_mode(problem, resume)
     else:
         held: Mode | None = getattr(model, "mode", None)  # of physics_model
-        search = find_mode if problem.trajectories is None else find_trajectory_mode
+        whole = isinstance(problem.likelihood, TrajectoryLikelihood)
+        search = find_trajectory_mode if whole else find_mode
         mode = start or held or search(problem, seed=seed)
-        if mode.problem.trajectories is not None and mode is not held:  # linearised at it by now
+        if whole and mode is not held:  # linearised at it by now
             mode = mode if start is None else following(start)
             problem = mode.problem
             model = build_model(problem)

@@ -31,14 +31,14 @@ def summed(model: pm.Model, draws: int, chains: int, seed: int) -> tuple[Any, Po
     problem = model.problem
     phi, sigma, index, accepted, best = choose_from_library(problem, draws, chains, seed)
     values: dict[str, Any] = problem.layout.to_dict(phi)
-    values |= {"library_index": index, "sigma": sigma[..., 0] if problem.noise.scalar else sigma}
+    values |= {"library_index": index, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
     return as_trace(model, values, {"accept": accepted}), _point(problem, best)
 
 
 def prior_starts(problem: Problem, rng: np.random.Generator, chains: int) -> list[dict[str, Any]]:
     """Starts of chains: each owner's set drawn from the prior, sigma at its prior's median."""
     library, median = _library(problem), problem.noise_prior[0]
-    sigma = np.exp(np.log(median).mean()) if problem.noise.scalar else median
+    sigma = np.exp(np.log(median).mean()) if problem.scalar_sigma else median
     laws = [library.prior(owner) for owner in problem.scene.owners]
     return [
         {"library_index": np.array([rng.choice(len(p), p=p) for p in laws]), "sigma": sigma}

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.likelihood import Problem, log_density, log_noise_prior
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, log_noise_prior
 from pbrl_ppl.parameters import evened, gathered, inside
 from pbrl_ppl.sampling.metropolis import TARGET_ACCEPTANCE, Gaussian
 from pbrl_ppl.sampling.starts import constrain, unconstrain
@@ -90,11 +90,9 @@ class _Mover:
         phi = inside(self.priors, gathered(problem.layout, phi))
         pairs = [unconstrain(prior, x) for prior, x in zip(self.priors, phi.T, strict=True)]
         self.u = np.array([u for u, _ in pairs]).reshape(-1, len(phi)).T.copy()
-        self.noise = np.log(sigma)
-        if problem.noise.scalar:
-            self.noise = self.noise[:, :1].copy()
+        self.noise = problem.likelihood.free(np.log(sigma)).copy()
         self.parts = problem.simulator.parts
-        if problem.trajectories is not None:  # it mixes the bodies' residuals
+        if isinstance(problem.likelihood, TrajectoryLikelihood):  # it mixes the bodies' residuals
             self.parts = problem.physics.changed(parts=None).simulator.parts
         self.blocks = [
             Gaussian(part.places, self.u[:, part.places].mean(axis=0), _spread(self.u, part.places))
@@ -130,8 +128,7 @@ class _Mover:
     def likelihood(self, residual: Array, noise: Array, u: Array) -> Array:
         """Log-likelihood of each part, shape (particle, part), for log sigma (particle, state)."""
         problem, sigma = self.problem, np.exp(noise)
-        if problem.noise.scalar:
-            sigma = sigma * np.ones(residual.shape[-1])
+        sigma = sigma * np.ones(len(problem.noise_prior[0]))
         measured, phi = problem.observations.measured, self.phi(u)
         nu = problem.nu(phi)
         if len(self.parts) == 1:
@@ -140,9 +137,8 @@ class _Mover:
         for j, part in enumerate(self.parts):
             own = residual[..., part.bodies, :]
             seen = measured[..., part.bodies, :]
-            result[:, j] = log_density(own, sigma, None, seen, _of_bodies(nu, part.bodies)).sum(
-                axis=-1
-            )
+            each = problem.likelihood.log_density(own, sigma, seen, _of_bodies(nu, part.bodies))
+            result[:, j] = each.sum(axis=-1)
         return result
 
     def exact(self, u: Array, noise: Array) -> tuple[Array, Array]:

@@ -19,7 +19,12 @@ from pbrl_ppl.errors import (
     UninformedWarning,
 )
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.likelihood import Problem, simulated_trajectories, with_measurements
+from pbrl_ppl.likelihood import (
+    Problem,
+    TrajectoryLikelihood,
+    simulated_trajectories,
+    with_measurements,
+)
 from pbrl_ppl.model import build_model, prior_predictive_draws
 from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
@@ -86,7 +91,7 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
         If too few draws can be simulated.
     """
     model = build_model(design)
-    whole = design.trajectories is not None
+    whole = isinstance(design.likelihood, TrajectoryLikelihood)
     names = [*(block.name for block in design.layout.blocks), *design.noise_variables]
     names += [] if whole else ["next_state"]
     total = n
@@ -131,7 +136,7 @@ def simulated(design: Problem, values: Array) -> Problem:
         Next states, shape (transition, H, body, state), SI units; of whole trajectories all
         measured states, shape (trajectory, time, body, 6).
     """
-    if design.trajectories is not None:
+    if isinstance(design.likelihood, TrajectoryLikelihood):
         measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
         return with_measurements(design, np.where(measured, values, np.nan))
     segments, observations = design.segments, design.observations
@@ -204,14 +209,10 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
 
 def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
     """Ranked quantities, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
-    if problem.noise.scalar:
-        sigma = sigma[:, :1]
+    sigma = problem.likelihood.free(sigma)
     return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])
 
 
 def labels(problem: Problem) -> tuple[str, ...]:
     """Names of the ranked quantities, such as ``mass[cart]``."""
-    sigma: tuple[str, ...] = ("sigma",)
-    if not problem.noise.scalar:
-        sigma = tuple(f"{v}[{name}]" for v, own in problem.noise_variables.items() for name in own)
-    return (*problem.layout.labels, *sigma, "log_likelihood")
+    return (*problem.layout.labels, *problem.noise_labels, "log_likelihood")

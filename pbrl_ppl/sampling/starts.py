@@ -11,7 +11,7 @@ from scipy.linalg import block_diag
 from scipy.special import expit
 
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import Prior, gathered, inside
 from pbrl_ppl.posterior import group, parameter_draws
@@ -43,8 +43,9 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
             blocks.append(Gaussian(where[own], mean[own], covariance[np.ix_(own, own)]))
     own = np.concatenate([places[name] for name in problem.noise_variables])
     noise = own, *_sigma_laplace(problem, mode)
-    # along trajectories another noise costs a filter's gains
-    if len(blocks) == 1 and problem.trajectories is None:  # then the noise may as well move along
+    # along trajectories another noise costs a filter's gains; of Eq. 11 it may move with phi
+    independent = isinstance(problem.likelihood, TransitionLikelihood)
+    if len(blocks) == 1 and independent:
         only = blocks[0]
         return [
             Gaussian(
@@ -53,7 +54,7 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
                 block_diag(only.covariance, noise[2]),
             )
         ]
-    cheap = _CHEAP if problem.trajectories is None else _CHEAP_ALONG
+    cheap = _CHEAP if independent else _CHEAP_ALONG
     return [*blocks, Gaussian(*noise, cheap=cheap)]
 
 
@@ -64,7 +65,7 @@ def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
     """
     shapes: dict[str, tuple[int, ...]] = {b.name: (len(b.owners),) for b in problem.layout.blocks}
     shapes |= {name: (len(own),) for name, own in problem.noise_variables.items()}
-    if problem.noise.scalar:
+    if problem.scalar_sigma:
         shapes["sigma"] = ()
     return {
         value.name: np.zeros(shapes[model.values_to_rvs[value].name])
@@ -158,12 +159,10 @@ def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
 
 def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     """Mean and covariance of log sigma: the latter half the inverse of the measurements."""
-    if problem.trajectories is not None:
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
         return mode.noise_gaussian()
-    counts = problem.observations.measured.sum((0, 1, 2))
-    mean = np.log(mode.sigma)
-    if problem.noise.scalar:
-        counts, mean = counts.sum(keepdims=True), mean[:1]
+    counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
+    mean = problem.likelihood.free(np.log(mode.sigma))
     return mean, np.diag(0.5 / np.maximum(counts, 1))
 
 
@@ -173,7 +172,7 @@ def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[st
     low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
     factor, starts = mode.factor, []
     centre, wide = np.log(mode.sigma), np.full(len(mode.sigma), 0.1)
-    if problem.trajectories is not None:
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
         centre, covariance = mode.noise_gaussian()
         wide = np.minimum(2.0 * np.sqrt(np.diag(covariance)), 2.0)
     for _ in range(chains):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
 
-from pbrl_ppl.likelihood import Problem, whiten
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.sampling.emulator import Emulator
 from pbrl_ppl.sampling.equal_wheels import evened_logp
 from pbrl_ppl.sampling.starts import blank_point
@@ -77,7 +77,7 @@ class Surrogate:
     def __init__(self, problem: Problem, unpack: Unpack, emulator: Emulator) -> None:
         self.problem, self.unpack, self.emulator = problem, unpack, emulator
         # white residuals are then linear in the polynomials' terms, given the noise
-        gaussian = problem.noise.nu is None and not problem.tails
+        gaussian = problem.likelihood.nu is None and not problem.tails
         self._linear = gaussian and emulator.linear
         self._noise, self._form, self._first = b"", np.zeros((0, 0)), (np.zeros(0), 0.0)
 
@@ -95,9 +95,10 @@ class Surrogate:
             phi_before, before = self._first
             if not self._form.size:
                 basis = self.emulator.basis
-                white = whiten(basis, sigma, self.problem.trajectories)
-                if self.problem.trajectories is not None:  # what was measured is in each of them
-                    white[1:] -= whiten(0.0 * basis[0], sigma, self.problem.trajectories)
+                likelihood = self.problem.likelihood
+                white = likelihood.whiten(basis, sigma)
+                # along trajectories what was measured is in each of them
+                white[1:] -= likelihood.whiten(0.0 * basis[0], sigma)
                 flat = white.reshape(len(white), -1)
                 self._form = flat @ flat.T
             told, told_before = (self.emulator.terms(x, 0) for x in (phi, phi_before))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
-from pbrl_ppl.likelihood import Problem, cells_of
+from pbrl_ppl.likelihood import Problem, TransitionLikelihood, cells_of
 from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, recorded, scene_of
 from pbrl_ppl.state import STATE
 
@@ -121,7 +121,7 @@ def check_engine(idata: Any, problem: Problem) -> None:
 
 def more_noise(problem: Problem, data: Mapping[str, xr.Dataset]) -> list[str]:
     """Noise parameters of whole trajectories that all data have and the posterior has not."""
-    if problem.trajectories is None:
+    if isinstance(problem.likelihood, TransitionLikelihood):
         return []
     history = recorded(problem.scene, data["constant_data"])
     cells, own = cells_of(problem.scene, history), problem.noise_variables

@@ -55,7 +55,7 @@ def by_quadrature(mode: Mode, fold: np.ndarray) -> np.ndarray:
 def by_refits(mode: Mode, scene: Scene, fold: np.ndarray) -> np.ndarray:
     """The same by a fit without each trajectory, noise and all, and draws of its posterior."""
     rng = np.random.default_rng(5)
-    history, cells = mode.problem.data.history, mode.problem.trajectories.cells
+    history, cells = mode.problem.data.history, mode.problem.trajectory_noise.cells
     result = []
     for f in range(fold.max() + 1):
         rest = history.select([t for t in range(fold.max() + 1) if t != f])

@@ -107,7 +107,7 @@ def test_a_mode_is_judged_by_other_data_at_the_same_noise(frames) -> None:
     mode = fitted(BOX, frames[0])
     problem = HeldOut(history(frames[1]), 1).problem(mode)
     assert problem.data.history.n_trajectories == 4
-    assert problem.trajectories.cells is mode.problem.trajectories.cells
+    assert problem.trajectory_noise.cells is mode.problem.trajectory_noise.cells
     np.testing.assert_array_equal(problem.noise_prior[0], mode.problem.noise_prior[0])
 
 

@@ -48,7 +48,7 @@ def test_what_is_not_scanned_is_differentiated(mode) -> None:
 def test_a_signature_is_what_the_effect_does(mode) -> None:
     """The change that a look at the truth predicts is what brings the residual down."""
     thresholds = looks(mode, EFFECTS["force_cutoff"].on("puck"))
-    residual = mode.whitened_residual().ravel()
+    residual = mode.whitened_residual.ravel()
 
     def left(look) -> float:
         return float(((residual - look.signature[:, 0]) ** 2).sum())

@@ -38,7 +38,7 @@ def pucks() -> Problem:
 
 
 def test_its_score_is_that_of_differences(pucks) -> None:
-    noise, residual = pucks.trajectories, pucks.residual(PHI)
+    noise, residual = pucks.trajectory_noise, pucks.residual(PHI)
     assert 0.1 < noise.touching.mean() < 0.9
     at = np.log(NOISE)
     slope = noise.score(residual, NOISE)[1]
@@ -62,7 +62,7 @@ def test_both_kinds_of_noise_are_told_apart(pucks) -> None:
         sigma = profile_sigma(made, made.residual(PHI), PHI)
         made = smoothed(made, PHI, sigma)
     sigma = profile_sigma(made, made.residual(PHI), PHI)
-    looks = 2 * made.trajectories.touching.sum()  # at each of two bodies
+    looks = 2 * made.trajectory_noise.touching.sum()  # at each of two bodies
     assert looks > 100
     assert (np.abs(np.log(sigma / NOISE)[9:]) < 4 / np.sqrt(2 * looks)).all()
     assert (np.abs(np.log(sigma / NOISE)[:6]) < 0.4).all()

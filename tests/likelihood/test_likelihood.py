@@ -13,10 +13,15 @@ from scipy import stats
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import Segments
-from pbrl_ppl.likelihood.noise import estimate_sigma
-from pbrl_ppl.likelihood.transitions import Observations, log_density, next_state_random, whiten
+from pbrl_ppl.likelihood import (
+    Observations,
+    TransitionLikelihood,
+    estimate_sigma,
+    next_state_random,
+)
 from pbrl_ppl.model.density import next_state_logp
 
+EQ_11 = TransitionLikelihood()
 N, H, K = 7, 2, 2
 COLUMNS = (0, 2, 5)  # x, theta, omega
 D = len(COLUMNS)
@@ -46,7 +51,7 @@ def compiled(observations: Observations):
 def test_plain_equals_scipy() -> None:
     observations, predicted = case()
     residual = observations.residual(predicted)
-    ours = log_density(residual, SIGMA, None, observations.measured)
+    ours = EQ_11.log_density(residual, SIGMA, observations.measured)
     # the difference of angles is at most a few sigma here: wrapping it into (-pi, pi] is a no-op
     cells = stats.norm(predicted[..., COLUMNS], SIGMA).logpdf(observations.values)
     np.testing.assert_allclose(ours, np.nansum(cells, axis=(1, 2, 3)))
@@ -61,10 +66,10 @@ def test_leading_axes_of_draws() -> None:
     moved = predicted + np.linspace(-0.1, 0.1, 4)[:, None, None, None, None]
     sigmas = SIGMA * np.array([0.5, 1.0, 1.5, 2.0])[:, None]
     seen = observations.measured
-    together = log_density(observations.residual(moved), sigmas, None, seen)
+    together = EQ_11.log_density(observations.residual(moved), sigmas, seen)
     assert together.shape == (4, N)
     for i in range(4):
-        alone = log_density(observations.residual(moved[i]), sigmas[i], None, seen)
+        alone = EQ_11.log_density(observations.residual(moved[i]), sigmas[i], seen)
         np.testing.assert_allclose(together[i], alone)
 
 
@@ -82,8 +87,8 @@ def test_full_turns_of_measured_angles_change_nothing(fixed, turns) -> None:
     shifted = observations.values.copy()
     shifted[..., COLUMNS.index(2)] += 2 * math.pi * turns
     turned = Observations(shifted, COLUMNS)
-    before = log_density(observations.residual(predicted), SIGMA, None, observations.measured)
-    after = log_density(turned.residual(predicted), SIGMA, None, turned.measured)
+    before = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured)
+    after = EQ_11.log_density(turned.residual(predicted), SIGMA, turned.measured)
     np.testing.assert_allclose(after, before, rtol=1e-9)
     np.testing.assert_allclose(
         logp(np.nan_to_num(shifted), predicted[..., COLUMNS], SIGMA), before, rtol=1e-9
@@ -119,7 +124,7 @@ def test_missing_cells_take_no_part() -> None:
     # the prediction of an unmeasured state dimension is not looked at
     moved[..., [1, 3, 4]] = np.nan
     np.testing.assert_array_equal(observations.residual(moved), residual)
-    z = whiten(residual, SIGMA, None)
+    z = EQ_11.whiten(residual, SIGMA)
     np.testing.assert_array_equal(z.reshape(seen.shape)[~seen], 0.0)
 
 
@@ -128,14 +133,14 @@ def test_a_transition_with_nothing_measured_says_nothing() -> None:
     values = observations.values.copy()
     values[3] = np.nan
     observations = Observations(values, COLUMNS)
-    logp = log_density(observations.residual(predicted), SIGMA, None, observations.measured)
+    logp = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured)
     assert logp[3] == pytest.approx(0.0, abs=1e-12)
 
 
 def test_a_diverged_transition_is_impossible() -> None:
     observations, predicted = case()
     predicted[2] = np.nan
-    ours = log_density(observations.residual(predicted), SIGMA, None, observations.measured)
+    ours = EQ_11.log_density(observations.residual(predicted), SIGMA, observations.measured)
     assert ours[2] == -np.inf
     assert np.isfinite(np.delete(ours, 2)).all()
     logp = compiled(observations)
@@ -168,7 +173,7 @@ def test_whitened_draws_are_standard_normal() -> None:
     _, predicted = case(missing=False)
     tiled = np.broadcast_to(predicted[..., COLUMNS], (2000, N, H, K, D))
     drawn = next_state_random(tiled, SIGMA, np.random.default_rng(4))
-    z = whiten(drawn - predicted[..., COLUMNS], SIGMA, None)
+    z = EQ_11.whiten(drawn - predicted[..., COLUMNS], SIGMA)
     assert z.shape == (2000, N, CELLS)
     # a false alarm once in 10 000 seeds
     assert stats.kstest(z.ravel(), "norm").pvalue > 1e-4

@@ -66,8 +66,8 @@ def test_it_is_pymc_s(history, name) -> None:
     problem, rng, n = model.problem, np.random.default_rng(1), 4
     logp = remove_value_transforms(model).compile_logp(mode="FAST_COMPILE")
     median, _ = problem.noise_prior
-    typical = median.mean() * np.ones(6) if problem.noise.scalar else median
-    moved = rng.normal(0.0, 1.0, (n, 1 if problem.noise.scalar else 6))
+    typical = median.mean() * np.ones(6) if problem.scalar_sigma else median
+    moved = rng.normal(0.0, 1.0, (n, 1 if problem.scalar_sigma else 6))
     sigma = typical * np.exp(moved)
     choice = None
     if problem.library is None:
@@ -209,4 +209,4 @@ def test_pucks_without_unknowns_have_the_noise_s_prior_alone() -> None:
     found = log_prior(problem, np.zeros(0), median)
     expected = (-np.log(spread * np.sqrt(2 * np.pi)) - np.log(median)).sum()
     assert found == pytest.approx(expected)
-    assert problem.with_noise(scalar=True).noise_prior[1] == spread
+    assert problem.with_likelihood(scalar=True).noise_prior[1] == spread

@@ -11,7 +11,7 @@ from pbrl_ppl.criticism import prior_predictive_check
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.history import from_segments
-from pbrl_ppl.likelihood import ACCELERATION, Problem, along_trajectories
+from pbrl_ppl.likelihood import ACCELERATION, Problem, TrajectoryLikelihood, along_trajectories
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, Simulator
@@ -77,7 +77,7 @@ def posterior_of(model, phi):
     """Draws (n, 1) of the mass, each with the recorded noise."""
     variables = {"mass": (("chain", "draw", "mass_body"), phi.reshape(1, -1, 1))}
     dims = {"sigma": "state"}
-    if model.problem.trajectories is not None:
+    if isinstance(model.problem.likelihood, TrajectoryLikelihood):
         dims = {"sigma": "sensor", ACCELERATION: "velocity"}
     for name, dim in dims.items():
         of = len(model.problem.noise_variables[name])
@@ -126,7 +126,7 @@ def test_calibration_s_data_collide(model) -> None:
 def test_held_out_errors_are_of_one_world(model) -> None:
     phi = np.array([TOO_LIGHT])
     whole = along_trajectories(model.problem, np.array([TRUE]))
-    sigma = np.full(len(whole.trajectories.sigma), 0.002)
+    sigma = np.full(len(whole.trajectory_noise.sigma), 0.002)
     mode = Mode(whole, phi, sigma, np.zeros((0, 1)), np.eye(1), log_posterior=0.0)
     held = HeldOut(model.problem.data.history, seed=1)
     expected = of_one_world(model.problem, phi)
@@ -143,7 +143,7 @@ def test_held_out_errors_are_of_one_world(model) -> None:
 def test_whole_trajectories_are_joined_where_they_collide(model) -> None:
     """At noise parameters of which there are more than state dimensions."""
     whole = along_trajectories(model.problem, np.array([TRUE]))
-    sigma = np.full((1, len(whole.trajectories.sigma)), 0.002)
+    sigma = np.full((1, len(whole.trajectory_noise.sigma)), 0.002)
     assert whole.joined(np.array([[TRUE]]), sigma) is whole
     assert whole.joined(np.array([[TOO_LIGHT]]), sigma).physics.together == ("a", "b")
 

@@ -6,7 +6,13 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach, catalogue
-from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
+from pbrl_ppl.likelihood import (
+    Problem,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
+    along_trajectories,
+    single_transitions,
+)
 from pbrl_ppl.likelihood import data as data_module
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
@@ -37,7 +43,10 @@ def problem() -> Problem:
 
 def test_other_noise_keeps_the_engine_and_the_checked_data(problem, checks) -> None:
     engine, rough, segments = problem.simulator, problem.coarse.simulator, problem.segments
-    for other in (problem.with_noise(prior=((1.0,) * 6, 2.0)), problem.with_noise(nu=4.0)):
+    for other in (
+        problem.with_likelihood(prior=((1.0,) * 6, 2.0)),
+        problem.with_likelihood(nu=4.0),
+    ):
         assert other.simulator is engine
         assert other.coarse.simulator is rough
         assert other.segments is segments
@@ -55,7 +64,7 @@ def test_other_physics_keep_the_checked_data(problem, checks) -> None:
         problem.with_physics(substeps=10),
     ):
         assert other.segments is segments
-        assert other.noise is problem.noise
+        assert other.likelihood is problem.likelihood
         assert other.simulator is not engine
     assert problem.with_physics(substeps=5, threads=1).simulator is engine
     assert checks == [segments.n]
@@ -75,17 +84,17 @@ def test_other_data_keep_the_engine_where_its_parts_are_the_same(problem) -> Non
 
 def test_noise_along_trajectories_is_of_its_own_data(problem) -> None:
     phi = problem.layout.to_vector(TRUTH)
-    whole = along_trajectories(problem.with_noise(nu=4.0), phi)
-    assert whole.trajectories is not None
+    whole = along_trajectories(problem.with_likelihood(nu=4.0), phi)
+    assert isinstance(whole.likelihood, TrajectoryLikelihood)
     assert whole.simulator is problem.simulator
     for other in (whole.with_data(states=None), whole.with_data(history=problem.data.history)):
-        assert other.trajectories is None
-        assert other.noise.nu == 4.0
+        assert isinstance(other.likelihood, TransitionLikelihood)
+        assert other.likelihood.nu == 4.0
     # other noise and other physics keep it, with the smoothed states that it is about
-    for other in (whole.with_noise(nu=None), whole.with_physics(substeps=10)):
-        assert other.trajectories is whole.trajectories
+    for other in (whole.with_likelihood(nu=None), whole.with_physics(substeps=10)):
+        assert other.trajectory_noise is whole.trajectory_noise
         assert other.segments is whole.segments
-    assert single_transitions(whole).trajectories is None
+    assert isinstance(single_transitions(whole).likelihood, TransitionLikelihood)
     np.testing.assert_array_equal(single_transitions(whole).segments.start, problem.segments.start)
 
 

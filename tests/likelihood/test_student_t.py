@@ -8,7 +8,7 @@ from scipy.stats import kstest
 from scipy.stats import t as student
 
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood.transitions import log_density, next_state_random, robust
+from pbrl_ppl.likelihood import TransitionLikelihood, next_state_random, robust
 from pbrl_ppl.model.density import next_state_logp
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.posterior import draws
@@ -17,6 +17,7 @@ from pbrl_ppl.state import STATE
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history
 
+EQ_11 = TransitionLikelihood()
 NU = 4.0
 
 
@@ -50,7 +51,7 @@ def test_density() -> None:
     measured[0, 0, 0, 0] = False
     residual[~measured] = 0.0
     expected = np.where(measured, student.logpdf(residual, NU, scale=sigma), 0.0).sum((1, 2, 3))
-    np.testing.assert_allclose(log_density(residual, sigma, None, measured, NU), expected)
+    np.testing.assert_allclose(EQ_11.log_density(residual, sigma, measured, NU), expected)
 
 
 def test_the_model_s_density_is_the_same(scene, clean) -> None:
@@ -96,7 +97,7 @@ def test_scalar_sigma_is_allowed(scene, clean) -> None:
     mode = find_mode(problem, seed=1)
     assert np.ptp(mode.sigma) == 0
     assert np.isfinite(mode.log_posterior)
-    assert problem.with_noise(nu=None).noise.nu is None
+    assert problem.with_likelihood(nu=None).likelihood.nu is None
 
 
 @pytest.mark.one_stack

@@ -6,8 +6,7 @@ from scipy import stats
 
 from pbrl_ppl.effects import Effect, EffectParameter, Noise, catalogue
 from pbrl_ppl.errors import ParameterError
-from pbrl_ppl.likelihood import log_posterior
-from pbrl_ppl.likelihood.transitions import log_norm, robust
+from pbrl_ppl.likelihood import log_norm, log_posterior, robust
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.sampling import physics_model

@@ -66,7 +66,7 @@ def dense(noise, sigma) -> tuple[np.ndarray, np.ndarray]:
 
 def test_whitening_is_that_of_the_whole_covariance(problem) -> None:
     """DESIGN section 7: R + F R F' + Q with itself, -R F' with its successor."""
-    noise = problem.trajectories
+    noise = problem.trajectory_noise
     covariance, own = dense(noise, NOISE)
     residual = noise.cells.of_residual(problem.residual(PHI))[own]
     begin = np.where(
@@ -86,8 +86,8 @@ def test_what_was_not_measured_is_left_out(problem) -> None:
     observed[:, 2, 0, [0, 3]] = np.nan
     dataset["observed"] = dataset["observed"].copy(data=observed)
     gaps = problem.with_data(history=History(dataset), states=None)
-    gaps = along_trajectories(gaps, PHI, NOISE, problem.trajectories.cells)
-    noise, whole = gaps.trajectories, problem.trajectories
+    gaps = along_trajectories(gaps, PHI, NOISE, problem.trajectory_noise.cells)
+    noise, whole = gaps.trajectory_noise, problem.trajectory_noise
     assert (~noise.seen).sum() == 6
     covariance, own = dense(whole, NOISE)
     vague = covariance.copy()
@@ -107,7 +107,7 @@ def test_what_was_not_measured_is_left_out(problem) -> None:
     expected += np.log(huge**2 * 2 * np.pi)
     seen = np.where(noise.seen, whole.measured, 0.0)
     fixed = replace(whole, seen=noise.seen, measured=seen)
-    gaps = problem.with_noise(trajectories=fixed)
+    gaps = problem.along(fixed)
     value = gaps.log_density(problem.residual(PHI), NOISE)[own].sum()
     np.testing.assert_allclose(value, expected, rtol=1e-6)
 
@@ -115,13 +115,13 @@ def test_what_was_not_measured_is_left_out(problem) -> None:
 @pytest.mark.parametrize("missing", [False, True])
 def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
     """By the logarithm of every noise parameter; the first states are measured, or not at all."""
-    noise = problem.trajectories
+    noise = problem.trajectory_noise
     if missing:
         seen, wide = noise.seen.copy(), noise.wide.copy()
         seen[1, 2:4] = seen[5] = False
         wide[:, 4] = 3.0
         noise = replace(noise, seen=seen, wide=wide)
-        problem = problem.with_noise(trajectories=noise)
+        problem = problem.along(noise)
     residual, at = problem.residual(PHI * 1.2), np.log(NOISE * np.linspace(0.5, 2.0, len(NOISE)))
     value, slope = noise.score(residual, np.exp(at))
 
@@ -137,7 +137,7 @@ def test_score_of_the_noise_is_that_of_differences(problem, missing) -> None:
 def test_smoothed_states_are_the_likeliest(problem) -> None:
     """No state is moved once the smoother has settled, and the fit of all is a minimum there."""
     settled = smoothed(problem, PHI, NOISE)
-    noise = settled.trajectories
+    noise = settled.trajectory_noise
     before, after = noise.smoothed(noise.cells.of_residual(settled.residual(PHI)), NOISE)
     assert np.abs(np.vstack([before[noise.first], after]) / noise.cells.errors(NOISE)).max() < 0.05
     # a puck with drag is linear: there is one answer, wherever smoothing began
@@ -157,10 +157,9 @@ def test_smoothing_stops_where_no_motion_fits(problem) -> None:
 
 
 def test_derivative_is_that_of_differences(problem) -> None:
-    noise = problem.trajectories
     given = [pt.tensor4("deviation"), pt.tensor4("residual"), pt.vector("sigma"), pt.vector("tail")]
     weights = np.random.default_rng(2).normal(size=problem.segments.n)
-    total = (TrajectoryDensityOp(noise)(*given) * weights).sum()
+    total = (TrajectoryDensityOp(problem.likelihood)(*given) * weights).sum()
     value = function(given, total)
     slopes = function(given, pt.grad(total, given[:3]))
     deviation = problem.measured - problem.observations.values
@@ -216,9 +215,9 @@ def test_the_data_are_in_the_model_s_graph(problem) -> None:
     found = model.compile_fn(moved)(
         {model.rvs_to_values[v].name: np.log(point[v.name]) for v in model.free_RVs}
     )
-    noise = gappy.trajectories
+    noise = gappy.trajectory_noise
     deviation = noise.cells.of_residual(np.nan_to_num(other) - gappy.observations.values)
-    there = gappy.with_noise(trajectories=replace(noise, measured=deviation))
+    there = gappy.along(replace(noise, measured=deviation))
     np.testing.assert_allclose(found, there.log_density(there.residual(PHI), NOISE))
     assert abs(found.sum() - gappy.log_density(gappy.residual(PHI), NOISE).sum()) > 0.1
 
@@ -240,7 +239,7 @@ def test_the_model_is_the_problem_where_a_body_turns_by_more_than_half_a_turn() 
 
 def test_draws_of_the_model_have_its_covariance(problem) -> None:
     """Posterior predictive draws: mean and covariance of a measurement, given those before."""
-    noise = problem.trajectories
+    noise = problem.trajectory_noise
     rng = np.random.default_rng(4)
     drawn = np.array([problem.next_states(problem.predict(PHI), NOISE, rng) for _ in range(4000)])
     mean, covariance = noise.foreseen(noise.cells.of_residual(problem.residual(PHI)), NOISE)
@@ -292,12 +291,12 @@ def test_a_stated_noise_is_not_inferred(problem, stated) -> None:
     free = [name for name in truth if name not in stated]
     assert list(known.noise_variables.get("sigma", ())) == free
     sigma = np.array([*(truth[name] for name in free), *NOISE[6:]])
-    np.testing.assert_array_equal(known.trajectories.cells.errors(sigma), NOISE[:6])
+    np.testing.assert_array_equal(known.trajectory_noise.cells.errors(sigma), NOISE[:6])
     # linearised where all are inferred, the density is the same
-    same = known.trajectories.cells
-    states = replace(problem, noise=replace(problem.noise, trajectories=problem.trajectories))
-    noise = replace(states.trajectories, cells=same)
-    there = states.with_noise(trajectories=noise)
+    same = known.trajectory_noise.cells
+    states = problem
+    noise = replace(states.trajectory_noise, cells=same)
+    there = states.along(noise)
     residual = problem.residual(PHI)
     np.testing.assert_allclose(
         there.log_density(residual, sigma), problem.log_density(residual, NOISE), rtol=1e-12

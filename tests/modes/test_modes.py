@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Noise, Problem
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import search, trajectory_mode
 from pbrl_ppl.modes.laplace import climb
 from pbrl_ppl.modes.search import find_mode, find_modes
@@ -90,13 +90,13 @@ def test_modes_are_sorted_and_describe_themselves(problem, modes) -> None:
     assert np.linalg.eigvalsh(mode.covariance).min() > 0
     assert mode.values["mass"] == pytest.approx(mode.phi[:1])
     # where sigma is the most probable, the slope of the log-posterior by its logarithm vanishes
-    z = mode.whitened_residual().reshape(problem.observations.values.shape)
+    z = mode.whitened_residual.reshape(problem.observations.values.shape)
     n, (median, spread) = problem.segments.n, problem.noise_prior
     square = n + 1 + np.log(mode.sigma / median) / spread**2
     np.testing.assert_allclose((z**2).sum(axis=(0, 1, 2)), square, rtol=1e-6)
-    assert mode.whitened_residual() is mode.whitened_residual()
+    assert mode.whitened_residual is mode.whitened_residual
     other = replace(mode, problem=problem.with_physics(substeps=2))
-    assert not np.array_equal(other.whitened_residual(), mode.whitened_residual())
+    assert not np.array_equal(other.whitened_residual, mode.whitened_residual)
 
 
 def test_same_seed_same_modes(problem, modes) -> None:
@@ -126,7 +126,9 @@ def test_a_search_takes_one_thread_of_linear_algebra(problem, modes, monkeypatch
 
 
 def test_scalar_sigma(history) -> None:
-    problem = Problem.of(cart_scene(**KNOWN_CONTACT), history, noise=Noise(scalar=True))
+    problem = Problem.of(
+        cart_scene(**KNOWN_CONTACT), history, likelihood=TransitionLikelihood(scalar=True)
+    )
     mode = find_mode(problem, initial=problem.layout.to_vector(CART))
     assert np.ptp(mode.sigma) == 0.0
     residual = problem.residual(mode.phi)
@@ -206,7 +208,7 @@ def test_whole_trajectories_tell_the_sensor_s_noise(problem, modes) -> None:
     """
     mode = modes[0]
     again = trajectory_mode(problem, mode.phi)
-    assert again.problem.trajectories is not None
+    assert again.isinstance(problem.likelihood, TrajectoryLikelihood)
     sensors, steps = np.split(again.sigma, [6])
     # sqrt(1 / 2N) each, twice as much for what the states and the fitted parameters take: 4 such
     # for 6 numbers, false alarm below 1e-3
@@ -221,7 +223,7 @@ def test_whole_trajectories_tell_the_sensor_s_noise(problem, modes) -> None:
 
 def test_whole_trajectories_do_not_change_the_problem_otherwise(problem, modes) -> None:
     whole = trajectory_mode(problem, modes[0].phi).problem
-    assert problem.trajectories is None
+    assert isinstance(problem.likelihood, TransitionLikelihood)
     assert whole.physics is problem.physics
     assert whole.data.history is problem.data.history
 

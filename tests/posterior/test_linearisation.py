@@ -24,7 +24,7 @@ def test_linear_motion_has_no_error() -> None:
     history = simulated_history(scene, {"mass": 2.0}, seed=1, trajectories=3, intervals=4)
     problem = pp.physics_model(scene, history, trajectories=True).problem
     rng = np.random.default_rng(1)
-    sigma = problem.trajectories.sigma * np.exp(0.3 * rng.normal(size=(5, 9)))
+    sigma = problem.trajectory_noise.sigma * np.exp(0.3 * rng.normal(size=(5, 9)))
     errors = linearisation_errors(problem, rng.uniform(1.9, 2.1, (5, 1)), sigma)
     assert errors.shape == (5, 3)
     np.testing.assert_allclose(errors, 0.0, atol=1e-5)

@@ -14,7 +14,7 @@ from scipy import stats
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Noise, Problem, declared_problem
+from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem
 from pbrl_ppl.model import build_model
 from pbrl_ppl.report import plot_calibration, png
 from pbrl_ppl.sampling import calibrate, calibration, physics_model, replication
@@ -255,7 +255,9 @@ def test_sigma_s_prior_is_the_design_s(puck: tuple[Scene, History]) -> None:
     """Whatever is simulated, sigma has the prior that it was drawn from."""
     scene, history = puck
     design = design_of(history, scene)
-    fixed = Problem.of(scene, history, substeps=2, noise=Noise(prior=((0.5,) * 6, 1.5)))
+    fixed = Problem.of(
+        scene, history, substeps=2, likelihood=TransitionLikelihood(prior=((0.5,) * 6, 1.5))
+    )
     point = {"mass_log__": np.zeros(1), "sigma_log__": np.linspace(-1.0, 1.0, 6)}
     densities = []
     for problem in (fixed, simulated(fixed, 7.0 * design.observations.values)):

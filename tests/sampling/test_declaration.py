@@ -93,7 +93,7 @@ def test_the_same_seed_gives_the_same_model(model, history) -> None:
     again = pp.physics_model(SCENE, history, trajectories=True, seed=0)
     np.testing.assert_array_equal(again.mode.phi, model.mode.phi)
     np.testing.assert_array_equal(
-        again.problem.trajectories.slope, model.problem.trajectories.slope
+        again.problem.trajectory_noise.slope, model.problem.trajectory_noise.slope
     )
 
 
@@ -140,7 +140,7 @@ def test_pymc_s_predictions_are_of_the_filter(model, half) -> None:
         drawn = pm.sample_posterior_predictive(many, random_seed=1, progressbar=False)
         prior = pm.sample_prior_predictive(draws=3, random_seed=1)
     drawn = group(drawn, "posterior_predictive")["next_state"].to_numpy()[0]
-    noise, problem = model.problem.trajectories, model.problem
+    noise, problem = model.problem.trajectory_noise, model.problem
     mean, covariance = noise.foreseen(noise.cells.of_residual(problem.residual(phi)), sigma)
     off = (drawn - problem.observations.values)[:, :, 0, 0]
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))

@@ -75,7 +75,7 @@ def test_bodies_that_meet_are_emulated_apart_and_the_engine_predicts_their_conta
     problem = Problem.of(pair, history, attach(pair))
     truth = problem.layout.to_vector({"mass": 1.0, "r": 0.5})
     problem = along_trajectories(problem, truth)
-    met = problem.trajectories.touching
+    met = problem.trajectory_noise.touching
     assert 0.1 < met.mean() < 0.9
     found = Pieces.of(problem)
     np.testing.assert_array_equal(found.rows, np.flatnonzero(met))

@@ -263,8 +263,8 @@ def test_old_files_have_no_prior_of_the_noise(parts, first, one) -> None:
     np.testing.assert_array_equal(draws(again)["mass"], draws(one)["mass"])
     problem = problem_of(from_groups(groups(first), attrs))
     median, spread = json.loads(first.attrs["sigma_prior"])
-    np.testing.assert_allclose(problem.noise.prior[0], median)
-    assert problem.noise.prior[1] == spread
+    np.testing.assert_allclose(problem.likelihood.prior[0], median)
+    assert problem.likelihood.prior[1] == spread
 
 
 @pytest.mark.long
@@ -464,7 +464,7 @@ def test_trajectories_join_the_parts_that_are_moved(parts) -> None:
     noisy = along_trajectories(problem, phi)
     rng = np.random.default_rng(1)
     phis = phi * np.exp(0.01 * rng.normal(size=(40, len(phi))))
-    sigma = noisy.trajectories.sigma * np.exp(0.01 * rng.normal(size=(40, 9)))
+    sigma = noisy.trajectory_noise.sigma * np.exp(0.01 * rng.normal(size=(40, 9)))
     assert len(problem.simulator.parts) == 2
     (whole,) = _Mover(noisy, phis, sigma).parts
     np.testing.assert_array_equal(whole.places, np.arange(problem.layout.size))

@@ -9,7 +9,12 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import along_trajectories, declared_problem, simulated_trajectories
+from pbrl_ppl.likelihood import (
+    TrajectoryLikelihood,
+    along_trajectories,
+    declared_problem,
+    simulated_trajectories,
+)
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import convergence, group, parameter_draws, problem_of
 from pbrl_ppl.posterior.store import scalars
@@ -82,7 +87,7 @@ def test_a_file_holds_the_problem(first, tmp_path) -> None:
     pp.save_posterior(first, tmp_path / "puck.nc")
     idata = pp.load_posterior(tmp_path / "puck.nc")
     problem, here = problem_of(idata), problem_of(first)
-    assert problem.trajectories is not None
+    assert isinstance(problem.likelihood, TrajectoryLikelihood)
     assert problem.noise_variables == here.noise_variables
     np.testing.assert_array_equal(problem.noise_prior[0], here.noise_prior[0])
     stored = group(idata, "log_likelihood")["next_state"].values.reshape(600, -1)[::150]
@@ -92,7 +97,7 @@ def test_a_file_holds_the_problem(first, tmp_path) -> None:
     # what was measured, not what was smoothed
     np.testing.assert_array_equal(group(idata, "observed_data")["next_state"].values, here.measured)
     # and it can be smoothed anew elsewhere
-    again = along_trajectories(problem, PHI, NOISE, problem.trajectories.cells)
+    again = along_trajectories(problem, PHI, NOISE, problem.trajectory_noise.cells)
     assert again.segments.n == 12 * 5 - 4 * 2
     assert np.isfinite(again.log_density(again.residual(PHI), NOISE)).all()
 

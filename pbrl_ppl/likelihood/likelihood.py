@@ -1,0 +1,326 @@
+"""Likelihoods: of single transitions (Eqs. 11 and 12), and of whole trajectories."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, replace
+from typing import Any, Self, final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import gammaln
+
+from pbrl_ppl.likelihood.observations import Observations
+from pbrl_ppl.likelihood.sensitivity import Sensitivity
+from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
+
+Array = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+#: Medians of the noise parameters' prior, and the standard deviation of their logarithm.
+NoisePrior = tuple[tuple[float, ...], float]
+
+#: Degrees of freedom from which on a Student-t counts as Gaussian.
+GAUSSIAN = 1e7
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Likelihood(ABC):
+    """How measured next states scatter about predictions; one of two final classes.
+
+    Arguments ``sigma`` hold all noise parameters, shape (..., parameter), and ``nu`` the degrees of
+    freedom of Student-t noise, broadcasting against residuals; None or infinite for a Gaussian.
+
+    Parameters
+    ----------
+    nu : float, optional
+        Degrees of freedom of Student-t noise; Gaussian without it.
+    prior : tuple, optional
+        Medians of the noise parameters' prior, and its log-scale; by default :func:`sigma_prior`
+        takes them from the data.
+    """
+
+    nu: float | None = None
+    prior: NoisePrior | None = None
+
+    @property
+    def sensitivity(self) -> Sensitivity | None:
+        """Derivative of the start states by phi, where they follow the parameters."""
+        return None
+
+    @abstractmethod
+    def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
+        """Return the noise variables with the state dimensions of each, in the order of sigma."""
+
+    def free(self, sigma: Array) -> Array:
+        """Return the noise parameters that are inferred, shape (..., free)."""
+        return sigma
+
+    def pooled(self, counts: Array) -> Array:
+        """Return sums over the dimensions that share a noise parameter, shape (..., free)."""
+        return counts
+
+    def centre(self, medians: Array) -> Array:
+        """Return the logarithm of the prior's medians, shape (free,)."""
+        return np.asarray(np.log(medians))
+
+    def exponential(self, n: int) -> Bools:
+        """Return which of n noise parameters have an exponential prior, shape (n,)."""
+        return np.zeros(n, dtype=bool)
+
+    @abstractmethod
+    def of_data(self) -> TransitionLikelihood:
+        """Return the likelihood for other data, without what was linearised along these."""
+
+    def of_parameters(self) -> Self:
+        """Return the likelihood for other parameters, without what follows from these."""
+        return self
+
+    @abstractmethod
+    def whiten(self, residual: Array, sigma: Array) -> Array:
+        """Return residuals in units of their noise, independent if the model is right.
+
+        Parameters
+        ----------
+        residual : ndarray
+            Shape (..., transition, H, body, state).
+        sigma : ndarray
+            Shape (parameter,) or (..., parameter) with the same leading axes.
+
+        Returns
+        -------
+        ndarray
+            Shape (..., transition, coordinate), dimensionless; 0 where nothing was measured.
+        """
+
+    @abstractmethod
+    def robust(self, residual: Array, sigma: Array, nu: float | Array | None) -> Array:
+        """Return least-squares residuals, shape as of :meth:`whiten`; see :func:`robust`."""
+
+    @abstractmethod
+    def log_density(
+        self, residual: Array, sigma: Array, measured: Bools, nu: float | Array | None = None
+    ) -> Array:
+        """Return the log-likelihood of each transition, shape (..., transition).
+
+        Minus infinity where the engine diverged. ``measured`` has shape (transition, H, body,
+        state).
+        """
+
+    @abstractmethod
+    def random(
+        self,
+        predicted: Array,
+        linearised: Array,
+        sigma: Array,
+        rng: np.random.Generator,
+        nu: float | Array | None = None,
+    ) -> Array:
+        """Draw measured next states by Eq. 13, shape of ``predicted``.
+
+        Parameters
+        ----------
+        predicted, linearised : ndarray
+            Predicted states and those of the observations, shape (transition, H, body, state).
+        sigma : ndarray
+            Shape (parameter,).
+        rng : Generator
+            Source of randomness.
+        nu : float or ndarray, optional
+            Degrees of freedom.
+        """
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TransitionLikelihood(Likelihood):
+    """Eq. 11: measured start states are exact, and transitions independent of each other.
+
+    Parameters
+    ----------
+    scalar : bool
+        One sigma for all state dimensions, as in the paper; one a dimension by default.
+    nu, prior
+        As of :class:`Likelihood`.
+    """
+
+    scalar: bool = False
+
+    def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
+        """Return ``sigma`` with the measured dimensions."""
+        return {"sigma": observations.names}
+
+    def free(self, sigma: Array) -> Array:
+        """Return the first of equal ones where sigma is a scalar."""
+        return sigma[..., :1] if self.scalar else sigma
+
+    def pooled(self, counts: Array) -> Array:
+        """Return the sum over all dimensions where sigma is a scalar."""
+        return counts.sum(axis=-1, keepdims=True) if self.scalar else counts
+
+    def centre(self, medians: Array) -> Array:
+        """Return the mean logarithm where sigma is a scalar."""
+        logs = np.log(medians)
+        return np.asarray(logs.mean(keepdims=True) if self.scalar else logs)
+
+    def of_data(self) -> TransitionLikelihood:
+        """Return the same."""
+        return self
+
+    def whiten(self, residual: Array, sigma: Array) -> Array:
+        """Return residuals over sigma, shape (..., transition, H * body * state)."""
+        scaled = residual / np.asarray(sigma)[..., None, None, None, :]
+        return np.asarray(scaled.reshape(*scaled.shape[:-3], -1))
+
+    def robust(self, residual: Array, sigma: Array, nu: float | Array | None) -> Array:
+        """Return least-squares residuals."""
+        if isinstance(nu, np.ndarray) and nu.ndim:
+            nu = np.broadcast_to(nu, residual.shape).reshape(*residual.shape[:-3], -1)
+        return robust(self.whiten(residual, sigma), nu)
+
+    def log_density(
+        self, residual: Array, sigma: Array, measured: Bools, nu: float | Array | None = None
+    ) -> Array:
+        """Return the log-likelihood of each transition (Eq. 11)."""
+        axes = (-1, -2, -3)
+        log_sigma = np.where(measured, np.log(sigma)[..., None, None, None, :], 0.0).sum(axes)
+        norm = np.where(measured, log_norm(nu), 0.0).sum(axes)
+        square = (self.robust(residual, sigma, nu) ** 2).sum(-1)
+        return _finite(-0.5 * square - log_sigma + norm)
+
+    def random(
+        self,
+        predicted: Array,
+        linearised: Array,
+        sigma: Array,
+        rng: np.random.Generator,
+        nu: float | Array | None = None,
+    ) -> Array:
+        """Draw next states by Eq. 13."""
+        return next_state_random(predicted, sigma, rng, nu=nu)
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class TrajectoryLikelihood(Likelihood):
+    """Likelihood of whole trajectories, whose residuals share measured states.
+
+    Parameters
+    ----------
+    noise : TrajectoryNoise
+        The linearised trajectories.
+    nu, prior
+        As of :class:`Likelihood`.
+    """
+
+    noise: TrajectoryNoise
+
+    @property
+    def sensitivity(self) -> Sensitivity | None:
+        """Derivative of the smoothed start states by phi."""
+        return self.noise.sensitivity
+
+    def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
+        """Return errors of measurement and unexplained accelerations."""
+        return self.noise.cells.variables
+
+    def exponential(self, n: int) -> Bools:
+        """Return a mask of the unexplained accelerations and the correlated errors."""
+        mask = super().exponential(n)
+        mask[[*self.noise.cells.accelerations, *self.noise.cells.drift_parameters]] = True
+        return mask
+
+    def of_data(self) -> TransitionLikelihood:
+        """Return Eq. 11 with the same tails and prior."""
+        return TransitionLikelihood(nu=self.nu, prior=self.prior)
+
+    def of_parameters(self) -> TrajectoryLikelihood:
+        """Return the same with smoothed states that do not follow the parameters."""
+        return replace(self, noise=replace(self.noise, sensitivity=None))
+
+    def whiten(self, residual: Array, sigma: Array) -> Array:
+        """Return the innovations over their standard deviations."""
+        return self.noise.whiten(residual, sigma)
+
+    def robust(self, residual: Array, sigma: Array, nu: float | Array | None) -> Array:
+        """Return least-squares residuals."""
+        return robust(self.whiten(residual, sigma), self.noise.of_cells(nu, residual.shape))
+
+    def log_density(
+        self, residual: Array, sigma: Array, measured: Bools, nu: float | Array | None = None
+    ) -> Array:
+        """Return the log-density of each transition's measurements given those before."""
+        z, log_scale = self.noise.whitened(residual, sigma)
+        nu = self.noise.of_cells(nu, residual.shape)
+        norm = np.where(self.noise.seen, log_norm(nu), 0.0).sum(axis=-1)
+        return _finite(norm - 0.5 * (robust(z, nu) ** 2).sum(-1) - log_scale)
+
+    def random(
+        self,
+        predicted: Array,
+        linearised: Array,
+        sigma: Array,
+        rng: np.random.Generator,
+        nu: float | Array | None = None,
+    ) -> Array:
+        """Draw measured next states, given those before."""
+        return self.noise.random(predicted, linearised, sigma, rng)
+
+
+def _finite(log_density: Array) -> Array:
+    """Return log-densities with minus infinity where the engine diverged."""
+    return np.where(np.isnan(log_density), -np.inf, log_density)
+
+
+def robust(z: Array, nu: float | Array | None) -> Array:
+    """Return residuals whose half squares are the negative log-density up to a constant.
+
+    Parameters
+    ----------
+    z : ndarray
+        Residuals in units of their noise, any shape.
+    nu : float, ndarray or None
+        Degrees of freedom; None or infinite for a Gaussian, whose residuals stay as they are.
+
+    Examples
+    --------
+    >>> robust(np.array([0.1, 30.0]), 4.0).round(2)
+    array([0.11, 5.21])
+    """
+    if nu is None:
+        return z
+    heavy = np.less(nu, GAUSSIAN)
+    nu = np.where(heavy, nu, 1.0)
+    return np.asarray(np.where(heavy, np.sign(z) * np.sqrt((nu + 1) * np.log1p(z**2 / nu)), z))
+
+
+def log_norm(nu: float | Array | None) -> Array:
+    """Return the logarithm of a standard Student-t density (or normal one) at zero."""
+    normal = np.asarray(-0.5 * math.log(2 * math.pi))
+    if nu is None:
+        return normal
+    heavy = np.less(nu, GAUSSIAN)
+    nu = np.where(heavy, nu, 1.0)
+    norm = gammaln((nu + 1) / 2) - gammaln(nu / 2) - 0.5 * np.log(nu * np.pi)
+    return np.asarray(np.where(heavy, norm, normal))
+
+
+def next_state_random(
+    predicted: Any,
+    sigma: Any,
+    rng: np.random.Generator,
+    size: Any = None,
+    nu: float | Array | None = None,
+) -> Array:
+    """Draw next states by Eq. 13, shape as ``predicted``: (..., transition, H, body, state)."""
+    predicted = np.asarray(predicted)
+    shape = predicted.shape
+    if nu is None:
+        z = rng.standard_normal(shape)
+    elif np.ndim(nu) == 0:
+        z = rng.standard_t(nu, shape)
+    else:
+        heavy = np.less(nu, GAUSSIAN)
+        heavy_z = rng.standard_t(np.where(heavy, nu, 1.0), shape)
+        z = np.where(heavy, heavy_z, rng.standard_normal(shape))
+    return np.asarray(predicted + z * np.asarray(sigma))
