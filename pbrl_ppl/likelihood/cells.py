@@ -1,4 +1,4 @@
-"""Cells: unknown coordinates of the bodies' states, and which noise each is subject to."""
+"""Coordinates of the bodies' states that trajectories are filtered over, with their noises."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from pbrl_ppl.history import fill_hinges, hung_bodies
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA, wrapped
 
-#: The variable of what a step adds: an acceleration that nothing in the model explains.
+#: Variable of the process noise: the unexplained acceleration.
 ACCELERATION = "unexplained_acceleration"
-#: And the one of what comes on top of it where bodies touch.
+#: Variable of the process noise that contacts add.
 JOLT = "contact_acceleration"
-#: Errors of measuring that last: those of a tracker, say, beside errors of single rows.
+#: Variable of measurement noise that is correlated from row to row, as of a tracker.
 DRIFT = "correlated_error"
 
 Array = NDArray[np.float64]
@@ -27,7 +27,7 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Cells:
-    """Unknown coordinates of the bodies' states, and which noise parameter each is subject to.
+    """Unknown coordinates of the bodies' states, with the noise parameters of each.
 
     Parameters
     ----------
@@ -36,19 +36,19 @@ class Cells:
     columns : tuple of int
         State dimensions that occur.
     sensor : ndarray of int
-        Which noise parameter is the error of measuring a cell; -1 where ``fixed`` is.
+        Place of the noise parameter that is a cell's measurement noise; -1 where ``fixed`` is it.
     fixed : ndarray
         Standard deviation of measuring a cell where it is no parameter, shape (cell,).
     push : ndarray
-        What a unit of an unexplained acceleration adds to the cells in a step, one row a body and
+        Change of the cells in a step by a unit unexplained acceleration, one row a body and
         velocity, shape (push, cell).
     pushed : ndarray of int
-        Which noise parameter is the acceleration of each row, shape (push,).
+        Place of the noise parameter that scales each row, shape (push,).
     sensors, rates, jolts, drifts : tuple of int
-        State dimensions that the noise parameters are about: of measurements, of accelerations, of
-        what bodies that touch add to those, of errors of measuring that are correlated.
+        State dimensions of the noise parameters: measurement noise, unexplained accelerations,
+        accelerations that contacts add, correlated measurement noise.
     memory : float
-        Correlation of the latter from one row to the next.
+        Correlation of the last from one row to the next.
     """
 
     places: Ints
@@ -65,7 +65,7 @@ class Cells:
 
     @property
     def variables(self) -> dict[str, tuple[str, ...]]:
-        """Variables of the noise, and the state dimensions of each, in the order of sigma."""
+        """Noise variables with their state dimensions, in the order of sigma."""
         own = {
             "sigma": self.sensors, ACCELERATION: self.rates, JOLT: self.jolts, DRIFT: self.drifts,
         }  # fmt: skip
@@ -78,17 +78,17 @@ class Cells:
 
     @property
     def drift_parameters(self) -> range:
-        """Places of the noise parameters that are correlated errors of measuring."""
+        """Places of the noise parameters of correlated measurement noise."""
         first = len(self.sensors) + len(self.rates) + len(self.jolts)
         return range(first, first + len(self.drifts))
 
     def drifting(self, memory: float) -> Cells:
-        """The same with correlated errors of measuring positions."""
+        """Return the same with correlated measurement noise of positions."""
         return replace(self, drifts=tuple(d for d in self.sensors if d <= THETA), memory=memory)
 
     @cached_property
     def drifted(self) -> tuple[Ints, Ints]:
-        """Cells with correlated errors, and which noise parameter each one's is."""
+        """Cells with correlated measurement noise, and the place of its noise parameter."""
         dimension = self.places % len(STATE)
         cells = np.flatnonzero(np.isin(dimension, self.drifts) & (self.sensor >= 0))
         order = np.searchsorted(self.drifts, dimension[cells])
@@ -96,18 +96,18 @@ class Cells:
 
     @cached_property
     def always(self) -> Bools:
-        """Which rows act in every step, and not only where bodies touch, shape (push,)."""
+        """Mask of the rows that act in every step, not only in contact, shape (push,)."""
         return self.pushed < self.accelerations.stop
 
     def steps(self, sigma: Array) -> Array:
-        """Covariance of what a step adds where no bodies touch, and where some do.
+        """Return the process noise of a step without and with contact.
 
         Shape (2, cell, cell).
         """
         return step_covariances(self.push, sigma[self.pushed], self.always)
 
     def pushes(self, sigma: Array, touching: Bools, rng: np.random.Generator) -> Array:
-        """Draw what steps add to the cells, shape (..., cell), as ``touching`` has its axes.
+        """Draw process noise of the cells, shape (*touching.shape, cell).
 
         The leading axes of ``sigma``, shape (..., parameter), go with those.
         """
@@ -115,22 +115,22 @@ class Cells:
         return np.where(self.always | touching[..., None], drawn, 0.0) @ self.push
 
     def white(self, sigma: Array) -> Array:
-        """Standard deviation of a row's own error of measuring each cell, shape (cell,)."""
+        """Return the uncorrelated measurement noise of each cell, shape (cell,)."""
         return np.where(self.sensor >= 0, sigma[self.sensor], self.fixed)
 
     def errors(self, sigma: Array) -> Array:
-        """Standard deviation of measuring each cell, correlated or not, shape (cell,)."""
+        """Return the measurement noise of each cell, correlated and not, shape (cell,)."""
         square = self.white(sigma) ** 2
         cells, parameters = self.drifted
         square[cells] += sigma[parameters] ** 2
         return np.sqrt(square)
 
     def of(self, values: Array) -> Array:
-        """The cells of values of shape (..., body, 6), shape (..., cell)."""
+        """Return the cells of values (..., body, 6), shape (..., cell)."""
         return np.asarray(values.reshape(*values.shape[:-2], -1)[..., self.places])
 
     def completed(self, scene: Scene, states: Array) -> Array:
-        """Put hung bodies of states (..., body, 6) where their hinges hold them, in place."""
+        """Place hinged bodies of states (..., body, 6) by their hinges, in place."""
         if len(self.places) == 6 * len(scene.moving):  # none is hung
             return states
         free = np.zeros((len(scene.moving), 6), dtype=bool)
@@ -143,12 +143,12 @@ class Cells:
         return states
 
     def wrapped(self, difference: Array) -> Array:
-        """Differences of cells, shape (..., cell), angles wrapped to (-pi, pi]."""
+        """Return differences of cells, shape (..., cell), angles wrapped to (-pi, pi]."""
         angle = self.places % 6 == THETA
         return np.where(angle, wrapped(difference), difference)
 
     def of_residual(self, residual: Array) -> Array:
-        """The cells of a residual (..., transition, 1, body, state): (..., transition, cell)."""
+        """Return the cells of a residual (..., transition, 1, body, state)."""
         body, place = self.in_residual
         return np.ascontiguousarray(residual[..., 0, body, place])
 
@@ -160,12 +160,12 @@ class Cells:
 
 
 def step_covariances(push: Array, size: Array, always: Bools) -> Array:
-    """Covariance of what a step adds where no bodies touch, and where some do.
+    """Return the process noise of a step without and with contact.
 
     Parameters
     ----------
     push : ndarray
-        What a unit of each row adds, shape (push, coordinate).
+        Change by a unit of each row, shape (push, coordinate).
     size : ndarray
         Standard deviation of each row, shape (push,).
     always : ndarray of bool
@@ -182,7 +182,7 @@ def step_covariances(push: Array, size: Array, always: Bools) -> Array:
 
 
 def check_moves(cells: Cells, scene: Scene) -> None:
-    """Refuse a recording in which nothing moves, which has no noise to infer either.
+    """Refuse a recording in which nothing moves.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Data of a model: a history cut into segments, and the observations along them."""
+"""Data of a model: segments of a history and their observations."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Data:
-    """A history and how far ahead it is predicted.
+    """A history and the horizon of its predictions.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ class Data:
     horizon : int
         Intervals predicted from one measured state; 1 is the paper's Eq. 11.
     columns : tuple of int, optional
-        State dimensions that the likelihood is over; those measured anywhere by default.
+        Observed state dimensions; those measured anywhere by default.
     states : ndarray, optional
         Smoothed states, shape (trajectory, time, body, 6), SI units, which take the measured ones'
         place; see :func:`pbrl_ppl.model.along_trajectories`.
@@ -43,12 +43,12 @@ class Data:
     states: Array | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        """State to pickle: the fields, without what was computed from them."""
+        """Return the fields to pickle, without computed values."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def segments(self) -> Segments:
-        """Measured segments of the horizon's length, their start states checked.
+        """Measured segments of the horizon's length, with checked start states.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Coordinates of the filter: cells as a noiseless sensor has them, and correlated errors."""
+"""The Kalman filter's state: observed coordinates, extended by correlated errors."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Ints = NDArray[np.intp]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Extended:
-    """Linear model of the filter: of cells plus their correlated errors, followed by those errors.
+    """Linear model of the filter: cells plus their correlated errors, then those errors.
 
     A correlated error e follows ``e' = rho e + u`` (Harvey, Forecasting, Structural Time Series
     Models and the Kalman Filter, 1989, section 3.2). With ``z = x + e`` and ``x' = F x + w``,
@@ -45,7 +45,7 @@ class Extended:
 
     @classmethod
     def of(cls, cells: Cells, slope: Array, seen: Bools) -> Extended:
-        """Extend the linear model of the cells; arguments as of `TrajectoryNoise`."""
+        """Return the extended model of the cells; arguments as of `TrajectoryNoise`."""
         at, parameters = cells.drifted
         if not len(at):
             return cls(slope, seen, cells.push, cells.pushed, cells.always)
@@ -67,19 +67,19 @@ class Extended:
         )
 
     def steps(self, sigma: Array) -> Array:
-        """Covariance of what a step adds where no bodies touch, and where some do.
+        """Return the process noise of a step without and with contact.
 
         Shape (2, coordinate, coordinate).
         """
         return step_covariances(self.push, sigma[self.pushed], self.always)
 
     def padded(self, values: Array) -> Array:
-        """Values of cells, shape (..., cell), with zeros for the errors."""
+        """Return values of cells (..., cell), padded with zeros for the errors."""
         more = self.slope.shape[1] - values.shape[-1]
         return np.pad(values, (*[(0, 0)] * (values.ndim - 1), (0, more))) if more else values
 
     def states(self, cells: Cells, coordinates: Array) -> Array:
-        """Cells without their errors, shape (..., cell), of coordinates (..., coordinate)."""
+        """Return cells without their errors, shape (..., cell)."""
         at, d = cells.drifted[0], len(cells.places)
         if not len(at):
             return coordinates
@@ -88,6 +88,6 @@ class Extended:
         return result
 
     def covariance(self, cells: Cells, whole: Array) -> Array:
-        """Covariance of the cells without their errors, shape (transition, cell, cell)."""
+        """Return the covariance of cells without errors, shape (transition, cell, cell)."""
         half = self.states(cells, whole)
         return self.states(cells, half.swapaxes(-1, -2))

@@ -31,7 +31,7 @@ def gains(
     step: Array,
     kind: Ints,
 ) -> tuple[Array, Array, Array]:
-    """Gain and standard deviation of every innovation; they do not depend on what was measured.
+    """Return the gain and standard deviation of every innovation.
 
     Parameters
     ----------
@@ -110,7 +110,7 @@ def innovations(
     begin: Array,
     measured: Array,
 ) -> tuple[Array, Array]:
-    """Innovations over their standard deviations, and filtered deviations.
+    """Return the whitened innovations and filtered deviations.
 
     Parameters
     ----------
@@ -155,7 +155,7 @@ def innovations(
 def adjoint(
     slope: Array, last: Ints, seen: Bools, gain: Array, scale: Array, weighted: Array
 ) -> tuple[Array, Array, Array]:
-    """Reverse pass: what a sum of innovations says of each step before it.
+    """Return the adjoint of the filter: derivatives of a sum of innovations.
 
     With ``weighted = white``, it is Bierman's smoother: the smoothed deviation after a transition
     is ``filtered - covariance @ after``.
@@ -208,7 +208,7 @@ def score(
     white: Array,
     kind: Ints,
 ) -> tuple[Array, Array, Array, Array]:
-    """Derivative of the log-likelihood by the variances, half the expectation of a quadratic form.
+    """Return the derivative of the log-likelihood by the variances.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""The log-posterior in numpy: the one definition that searches, samplers and planners share."""
+"""The log-posterior in numpy, which searches, samplers and planners share."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ Ints = NDArray[np.intp]
 
 
 def noise_law(problem: Problem) -> tuple[Array, float]:
-    """P(sigma): log of each sigma's median, and the standard deviation of log sigma.
+    """Return the prior of sigma: log medians, and the standard deviation of log sigma.
 
-    Errors of measuring are log-normal. An unexplained acceleration and a correlated error are
-    exponential, whatever the spread says: penalised-complexity priors (Simpson et al., Statistical
+    Measurement noise is log-normal. Unexplained accelerations and correlated errors are
+    exponential, for which the spread is not used: penalised-complexity priors (Simpson et al., Statistical
     Science 32, 2017), under which motion follows the physics unless the data say otherwise.
 
     Parameters
@@ -35,15 +35,12 @@ def noise_law(problem: Problem) -> tuple[Array, float]:
 
 
 def exponential(problem: Problem) -> NDArray[np.bool_]:
-    """Which noise parameters have an exponential prior, not a log-normal one, shape (state,).
-
-    They are the unexplained accelerations, and correlated errors of measuring.
-    """
+    """Return the mask of noise parameters with an exponential prior, shape (parameter,)."""
     return problem.likelihood.exponential(len(problem.noise_prior[0]))
 
 
 def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
-    """Log-density of log sigma, shape (...), at (..., state), or (..., 1) for a scalar sigma."""
+    """Return the log-density of log sigma, shape (...), at (..., free)."""
     centre, spread = noise_law(problem)
     normal = -0.5 * ((log_sigma - centre) / spread) ** 2 - np.log(spread) - 0.5 * np.log(2 * np.pi)
     mask = exponential(problem)
@@ -55,7 +52,7 @@ def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
 
 
 def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
-    """Derivative of :func:`log_noise_prior` by log sigma, same shape."""
+    """Return the derivative of :func:`log_noise_prior` by log sigma, same shape."""
     centre, spread = noise_law(problem)
     normal = (centre - log_sigma) / spread**2
     mask = exponential(problem)
@@ -66,7 +63,7 @@ def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
 
 
 def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = None) -> Array:
-    """Log-density of parameters and sigma under the declared prior.
+    """Return the log-density of parameters and sigma under the declared prior.
 
     Parameters
     ----------
@@ -105,7 +102,7 @@ def log_posterior(
     *,
     log_likelihood: Array | None = None,
 ) -> Array:
-    """Log-posterior up to the evidence: what PyMC's model says, without transforms.
+    """Return the log-posterior up to the evidence, as PyMC's without transforms.
 
     Parameters
     ----------

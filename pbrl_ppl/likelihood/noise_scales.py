@@ -1,4 +1,4 @@
-"""Scales of the noise along trajectories, from what bodies do: medians of its priors."""
+"""Medians of the noise priors along trajectories, from the bodies' motion."""
 
 from __future__ import annotations
 
@@ -28,10 +28,7 @@ _RATE = 3
 
 
 def noise_medians(cells: Cells, history: History, states: Array) -> Array:
-    """Medians of the noise parameters' priors, from how much the states change.
-
-    Errors of measuring are scaled by the change from one row that shows the bodies to the next.
-    """
+    """Return the medians of the noise priors, shape (parameter,), from changes of the states."""
     real = np.isfinite(history.dataset["clock"].to_numpy())
     shown = real & ~unseen(history).any(axis=-1)
     each, seen = (
@@ -47,7 +44,7 @@ def noise_medians(cells: Cells, history: History, states: Array) -> Array:
 
 
 def ranges(cells: Cells, history: History, states: Array) -> Array:
-    """Largest distance between values of each dimension that has correlated errors, shape (drift,).
+    """Return the range of each dimension with correlated errors, shape (drift,).
 
     Of x and y the larger one: a sensor of places is as far off in both.
 
@@ -70,7 +67,7 @@ def ranges(cells: Cells, history: History, states: Array) -> Array:
 
 
 def _typical(cells: Cells, changes: list[Array]) -> Array:
-    """Root mean square of changes (row, body, 6) of each dimension's cells, shape (6,)."""
+    """Return the root mean square change of each state dimension, shape (6,)."""
     square = np.concatenate([own.reshape(len(own), -1) for own in changes]) ** 2
     own = square.mean(axis=0)[cells.places]
     of = cells.places % len(STATE)
@@ -78,14 +75,14 @@ def _typical(cells: Cells, changes: list[Array]) -> Array:
 
 
 def _vectors(each: Array, rates: tuple[int, ...]) -> Array:
-    """Sizes (6,) of velocities' changes, those of x and y as one vector, shape (rate,)."""
+    """Return sizes of velocity changes, x and y as one vector, shape (rate,)."""
     plane = [d for d in rates if d % _RATE != THETA]
     size = float(np.sqrt((each[plane] ** 2).sum()))
     return np.array([each[d] if d % _RATE == THETA else size for d in rates])
 
 
 def bodies_acceleration(problem: Problem) -> Array:
-    """Root mean square acceleration of the bodies along smoothed trajectories, shape (velocity,).
+    """Return the root mean square acceleration along smoothed trajectories, shape (velocity,).
 
     Of x and y it is that of the vector, whatever the axes' directions (m/s^2); of omega in rad/s^2.
     """

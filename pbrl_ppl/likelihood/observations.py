@@ -1,4 +1,4 @@
-"""Measured next states of segments, and what they say of their noise."""
+"""Measured next states of segments, and estimates of their noise."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Bools = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Observations:
-    """Measured next states of segments, with the state dimensions that were measured at all.
+    """Measured next states of segments.
 
     Parameters
     ----------
@@ -32,7 +32,7 @@ class Observations:
 
     @classmethod
     def of(cls, segments: Segments, columns: tuple[int, ...] | None = None) -> Observations:
-        """Take the dimensions that were measured anywhere, or these.
+        """Return the observations of segments, of all measured or these dimensions.
 
         Raises
         ------
@@ -54,23 +54,23 @@ class Observations:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The measured dimensions' names."""
+        """Names of the measured dimensions."""
         return tuple(STATE[d] for d in self.columns)
 
     @property
     def measured(self) -> Bools:
-        """Whether a cell was measured, shape as ``values``."""
+        """Mask of measured values, shape as ``values``."""
         return np.isfinite(self.values)
 
     def wrapped(self, difference: Array) -> Array:
-        """Differences of states, shape (..., state), with angles wrapped in place to (-pi, pi]."""
+        """Wrap the angles of state differences (..., state) to (-pi, pi], in place."""
         for i, d in enumerate(self.columns):
             if d == THETA:
                 difference[..., i] = wrapped(difference[..., i])
         return difference
 
     def residual(self, predicted: Array) -> Array:
-        """Measured minus predicted, angles wrapped to (-pi, pi], 0 where missing.
+        """Return measured minus predicted states, angles wrapped, 0 where missing.
 
         Parameters
         ----------
@@ -88,7 +88,7 @@ class Observations:
 
 
 def sigma_prior(observations: Observations, segments: Segments) -> tuple[Array, float]:
-    """Median and log-scale of the weak prior of sigma: a tenth of how much the state changes.
+    """Return median and log-scale of a weak prior of sigma: a tenth of the states' change.
 
     Returns
     -------
@@ -105,7 +105,7 @@ def sigma_prior(observations: Observations, segments: Segments) -> tuple[Array, 
 
 
 def estimate_sigma(residual: Array, measured: Bools) -> Array:
-    """Maximum-likelihood noise of each state dimension under Eq. 11, shape (state,).
+    """Return the maximum-likelihood sigma of each dimension under Eq. 11, shape (state,).
 
     Parameters
     ----------

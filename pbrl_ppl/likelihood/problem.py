@@ -1,4 +1,4 @@
-"""An inference problem in numpy: data, physics and noise, and the likelihood they make."""
+"""An inference problem in numpy: data, physics and likelihood."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ _SAME = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """An inference problem in plain numpy: what a model of :func:`physics_model` is made of.
+    """An inference problem in numpy, from which :func:`physics_model` declares a PyMC model.
 
-    A change of one of its parts keeps the others, with the worlds and segments they have made.
+    A change of one part keeps the others, with their engines and segments.
 
     Parameters
     ----------
@@ -73,7 +73,7 @@ class Problem:
         library: ParameterLibrary | None = None,
         together: tuple[str, ...] = (),
     ) -> Problem:
-        """Build one from a scene and a history; by default all is as in the paper.
+        """Return the problem of a scene and a history; the defaults are the paper's.
 
         Arguments are those of :class:`Data`, :class:`Physics` and of the problem itself;
         ``substeps`` are the scene's by default.
@@ -88,14 +88,13 @@ class Problem:
         )
 
     def with_data(self, **changes: Any) -> Problem:
-        """The same problem of other data; arguments are fields of :class:`Data`."""
+        """Return the same problem of other data; arguments are fields of :class:`Data`."""
         return self.on(replace(self.data, **changes))
 
     def on(self, data: Data) -> Problem:
-        """The same problem of other data.
+        """Return the same problem of other data, with the likelihood of single transitions.
 
-        The noise along trajectories, which is of these, is left out. Bodies that have to do with
-        each other in another history are found anew; where they are the same, the physics stay.
+        Independent parts are found anew for another history; equal ones keep their engines.
         """
         physics = self.physics
         if data.history is not self.data.history:
@@ -103,7 +102,7 @@ class Problem:
         return replace(self, data=data, physics=physics, likelihood=self.likelihood.of_data())
 
     def with_physics(self, **changes: Any) -> Problem:
-        """The same problem with other physics; arguments are fields of :class:`Physics`."""
+        """Return the same problem with other physics; arguments are fields of :class:`Physics`."""
         physics, likelihood = self.physics.changed(**changes), self.likelihood
         if "scene" in changes or "together" in changes:
             physics = physics.in_parts(self.data.history)
@@ -130,16 +129,16 @@ class Problem:
 
     @property
     def rough(self) -> Problem:
-        """The same problem with few engine steps where it has more: for a change, or a slope."""
+        """The same problem with fewer engine steps, for derivatives and changes."""
         return replace(self, physics=self.physics.rough)
 
     def joined(self, phi: Array, sigma: Array) -> Problem:
-        """The same problem with the bodies in one part that meet in one world; itself if none do.
+        """Return the problem with bodies that meet at these draws in one part; itself if none do.
 
         Parameters
         ----------
         phi, sigma : ndarray
-            Draws at which to look, shapes (n, p) and (n, state).
+            Draws, shapes (n, p) and (n, parameter).
         """
         if len(self.simulator.parts) == 1:
             return self
@@ -193,7 +192,7 @@ class Problem:
 
     @property
     def inputs(self) -> Array:
-        """What acts in the segments' intervals, as far as the effects look at it.
+        """Inputs of the segments' intervals; see :meth:`Physics.inputs`.
 
         Shape (transition, H, body, 3), or (transition, H, body, 9) as in
         :data:`pbrl_ppl.state.INPUT`.
@@ -207,7 +206,7 @@ class Problem:
 
     @cached_property
     def noise_prior(self) -> tuple[Array, float]:
-        """Medians of sigma's prior, shape (state,), and its log-scale; given, or from the data."""
+        """Medians of sigma's prior, shape (parameter,), and its log-scale."""
         if self.likelihood.prior is None:
             return sigma_prior(self.observations, self.segments)
         median, spread = self.likelihood.prior
@@ -227,18 +226,18 @@ class Problem:
         raise TypeError("the problem is one of single transitions, expected whole trajectories")
 
     def quiet(self, sigma: Array, share: float) -> Array:
-        """Noise of trajectories, a step's no larger than a share of its prior's median."""
+        """Return sigma with unexplained accelerations of at most a share of their prior median."""
         steps, sigma = self.trajectory_noise.cells.accelerations, sigma.copy()
         sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])
         return sigma
 
     @property
     def noise_variables(self) -> dict[str, tuple[str, ...]]:
-        """Variables of the noise, and the state dimensions of each, in the order of sigma."""
+        """Noise variables with their state dimensions, in the order of sigma."""
         return self.likelihood.variables(self.observations)
 
     def named(self, phi: Array, sigma: Array) -> dict[str, Array]:
-        """The model's variables at phi, shape (..., p), and sigma, shape (..., parameter)."""
+        """Return the model's variables by name at phi (..., p) and sigma (..., parameter)."""
         if self.scalar_sigma:
             return self.layout.to_dict(phi) | {"sigma": sigma[..., 0]}
         ends = np.cumsum([len(own) for own in self.noise_variables.values()])[:-1]
@@ -252,7 +251,7 @@ class Problem:
 
     @property
     def noise_labels(self) -> tuple[str, ...]:
-        """Return labels of the inferred noise parameters, such as ``sigma[x]``."""
+        """Labels of the inferred noise parameters, such as ``sigma[x]``."""
         if self.scalar_sigma:
             return ("sigma",)
         return tuple(f"{name}[{of}]" for name, own in self.noise_variables.items() for of in own)
@@ -268,26 +267,26 @@ class Problem:
         return np.asarray(raw[..., self.observations.columns])
 
     def predict(self, phi: Array, engine: Engine | None = None) -> Array:
-        """Predicted states, shape (..., transition, H, body, 6), for phi of shape (..., p)."""
+        """Return predicted states, shape (..., transition, H, body, 6), for phi (..., p)."""
         engine, given = engine or self.simulator, (phi, self.segments.start, self.inputs)
         sensitivity = self.likelihood.sensitivity
         return engine(*given) if sensitivity is None else sensitivity.predicted(engine, *given)
 
     def residual(self, phi: Array, engine: Engine | None = None) -> Array:
-        """Measured minus predicted, shape (..., transition, H, body, state)."""
+        """Return measured minus predicted states, shape (..., transition, H, body, state)."""
         return self.observations.residual(self.predict(phi, engine))
 
     def whitened(self, phi: Array, sigma: Array, engine: Engine | None = None) -> Array:
-        """Residuals in units of their noise, shape (..., transition, cell)."""
+        """Return the whitened residuals, shape (..., transition, coordinate)."""
         return self.likelihood.whiten(self.residual(phi, engine), sigma)
 
     @cached_property
     def tails(self) -> tuple[int, ...]:
-        """Where phi holds parameters of the noise's tails."""
+        """Places in phi of the parameters of the noise's tails."""
         return tuple(tail_places(self.physics))
 
     def nu(self, phi: Array | None = None) -> float | Array | None:
-        """Degrees of freedom of the noise at phi; None for a Gaussian.
+        """Return the degrees of freedom of the noise at phi; None for a Gaussian.
 
         Shape (..., 1, 1, body, 1) where an effect of the noise stage says so.
 
@@ -303,14 +302,14 @@ class Problem:
         return degrees_of_freedom(self.physics, phi, self.likelihood.nu)
 
     def robust(self, phi: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
-        """Least-squares residuals: half their squares are the negative log-density but a constant.
+        """Return residuals whose half squares are the negative log-density up to a constant.
 
         Shape (..., transition, cell).
         """
         return self.likelihood.robust(self.residual(phi, engine), sigma, self.nu(phi))
 
     def log_density(self, residual: Array, sigma: Array, phi: Array | None = None) -> Array:
-        """Log-likelihood of each transition, shape (..., transition); see `likelihood`.
+        """Return the log-likelihood of each transition, shape (..., transition).
 
         Parameters
         ----------

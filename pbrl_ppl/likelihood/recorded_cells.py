@@ -1,4 +1,4 @@
-"""Coordinates that a recording has, and states as measured to begin with."""
+"""Coordinates that a recording observes, and first estimates of its states."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RATE = 3
 
 
 def cells_of(scene: Scene, history: History) -> Cells:
-    """Unknown coordinates of a scene's bodies, and the noise parameters of a recording."""
+    """Return the unknown coordinates of a scene's bodies with the noise of a recording."""
     observed = history.dataset["observed"].to_numpy()
     # what was measured of first states alone is given with them
     measured = np.isfinite(observed[:, 1:]).any(axis=(0, 1))
@@ -78,12 +78,12 @@ def cells_of(scene: Scene, history: History) -> Cells:
 
 
 def _uncoupled(scene: Scene) -> bool:
-    """Whether no coordinate of a body has to do with another, as far as is declared."""
+    """Return whether the scene couples no coordinate of a body with another."""
     return not (scene.walls or scene.joints or len(scene.bodies) > 1 or scene.bodies[0].wheel)
 
 
 def first_states(history: History) -> Array:
-    """States as measured, gaps interpolated, shape (trajectory, time, body, 6); no angle jumps.
+    """Return measured states, gaps interpolated, shape (trajectory, time, body, 6).
 
     Velocities that do not count as measured are estimated from measured positions.
     """

@@ -1,4 +1,4 @@
-"""Sensitivity of smoothed states to the parameters: where trajectories are linearised moves too.
+"""Sensitivity of the linearisation point of trajectories to the parameters.
 
 A parameter and the states are often known together far better than each alone, such as a wheel's
 angle and a heading. With the states held fast, another angle would be judged by motions that no
@@ -31,7 +31,7 @@ Engine = Callable[[Array, Array, Array], Array]
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivity:
-    """Derivative by the parameters of the states before transitions.
+    """Derivative of the start states of transitions by the parameters.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ class Sensitivity:
 
     @cached_property
     def _sets(self) -> list[tuple[Array, Bools, Array]]:
-        """Each set of parameters of phi, the transitions it is of, and their derivatives.
+        """Parameter sets of phi, the transitions of each, and their derivatives.
 
         The latter have the shape (transition * cell, p).
         """
@@ -68,11 +68,11 @@ class Sensitivity:
         return list(zip(sets, rows, own, strict=True))
 
     def at(self, rows: NDArray[np.intp]) -> Sensitivity:
-        """That of these transitions alone."""
+        """Return the sensitivity of these transitions alone."""
         return replace(self, slope=self.slope[rows], phi=self.phi[rows], before=self.before[rows])
 
     def moved(self, phi: Array) -> Array:
-        """How far the states are from where they were smoothed, shape (..., transition, cell)."""
+        """Return the change of the states with phi, shape (..., transition, cell)."""
         result = np.empty((*phi.shape[:-1], *self.before.shape[:2]))
         for own, rows, by_phi in self._sets:
             change = change_from(self.layout, phi, own) @ by_phi.T
@@ -80,12 +80,12 @@ class Sensitivity:
         return result
 
     def begun(self, moved: Array, start: Array) -> Array:
-        """States before the transitions, shape (..., transition, body, 6), moved from a start."""
+        """Return moved start states, shape (..., transition, body, 6)."""
         states = np.broadcast_to(start, (*moved.shape[:-2], *start.shape))
         return self.cells.completed(self.scene, self._added(states, moved))
 
     def predicted(self, engine: Engine, phi: Array, start: Array, inputs: Array) -> Array:
-        """Next states as if from the smoothed ones, shape (..., transition, 1, body, 6).
+        """Return next states, corrected to the smoothed starts, shape (..., transition, 1, body, 6).
 
         Parameters
         ----------
@@ -105,7 +105,7 @@ class Sensitivity:
         return self._added(states, -back[..., None, :])
 
     def _added(self, states: Array, change: Array) -> Array:
-        """States (..., body, 6) with their cells changed by as much, shape (..., cell)."""
+        """Return states (..., body, 6) with changed cells (..., cell)."""
         states = np.array(states, order="C")  # so that what is reshaped is a view of it
         flat = states.reshape(*states.shape[:-2], -1)
         flat[..., self.cells.places] += change

@@ -1,4 +1,4 @@
-"""Simulated trajectories with both noises: of every step, and of measuring."""
+"""Simulated trajectories with process and measurement noise."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 def simulated_trajectories(
     problem: Problem, phi: Array, sigma: Array, rng: np.random.Generator
 ) -> Array:
-    """Measured states of whole trajectories, from the recorded first states and commands.
+    """Return simulated measurements from the recorded first states and commands.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ def simulated_trajectories(
 
 
 def with_measurements(problem: Problem, observed: Array) -> Problem:
-    """The problem of whole trajectories with other measurements of the same cells.
+    """Return the problem of whole trajectories with other measurements.
 
     Parameters
     ----------

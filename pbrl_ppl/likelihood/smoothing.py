@@ -1,4 +1,4 @@
-"""Smoothed states of trajectories, where transitions are linearised: an iterated Kalman smoother.
+"""Iterated Kalman smoother: the linearisation point of whole trajectories.
 
 See B. M. Bell, The iterated Kalman smoother as a Gauss-Newton method (1994).
 """
@@ -23,14 +23,13 @@ from pbrl_ppl.state import STATE
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-#: A state that was not measured may be this many times as large as any that is estimated.
+#: Prior scale of an unmeasured state, as a multiple of the largest estimated one.
 _FAR = 10.0
-#: Smoothing ends with a round that moves no state by more than this, in standard deviations.
+#: Largest change of states in the last round (in standard deviations), and most rounds.
 _SETTLED, _ROUNDS = 0.05, 4
-#: Share of the median of an unexplained acceleration's prior that is a little.
+#: Least unexplained acceleration to smooth with, as a share of its prior median.
 _LITTLE = 0.1
-#: States are smoothed with unexplained accelerations that fall to those given by so much, one after
-#: the other.
+#: Steps (of the logarithm) by which unexplained accelerations fall to the given ones.
 _SHARES = (0.5, 1.0)
 #: A position's velocity is so many places on.
 _RATE = 3
@@ -39,7 +38,7 @@ _RATE = 3
 def along_trajectories(
     problem: Problem, phi: Array, sigma: Array | None = None, cells: Cells | None = None
 ) -> Problem:
-    """The problem with the likelihood of whole trajectories, linearised at smoothed states.
+    """Return the problem with the likelihood of whole trajectories, linearised at smoothed states.
 
     Parameters
     ----------
@@ -79,7 +78,7 @@ def along_trajectories(
     sigma = begin if sigma is None else sigma
     noise = _sloped(problem, cells, phi, begin, _steps(problem, cells, begin))
     problem = smoothed(problem.along(noise), phi, begin)
-    if sigma is not begin:  # what the physics alone make of far-off states may be far off, too
+    if sigma is not begin:  # the physics alone may diverge from rough states
         for share in _SHARES:
             problem = smoothed(problem, phi, _between(begin, sigma, share, cells))
     if not given:  # the noise of measurements adds to the changes of states as measured
@@ -92,17 +91,17 @@ def along_trajectories(
 
 
 def single_transitions(problem: Problem) -> Problem:
-    """The problem with the likelihood of single transitions (Eq. 11), as a search begins with."""
+    """Return the problem with the likelihood of single transitions (Eq. 11)."""
     horizon = longest_gap(problem.data.history)
     data = replace(problem.data, horizon=horizon, states=None, columns=None)
     return problem.on(data).with_likelihood(prior=None)
 
 
 def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
-    """The same problem, linearised anew about the states smoothed at phi and sigma.
+    """Return the problem linearised about states smoothed at phi and sigma.
 
-    With next to no unexplained acceleration states are smoothed as if there were a little: where
-    bodies stick and slip, no start leads to what physics alone make of it.
+    Near-zero unexplained accelerations are raised to a small value: with stick and slip, smoothing
+    by the physics alone does not converge.
     """
     steps = list(problem.trajectory_noise.cells.accelerations)
     sigma = sigma.copy()
@@ -115,7 +114,7 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
         spread = np.sqrt(np.median(np.diagonal(noise.covariance(sigma), axis1=1, axis2=2), axis=0))
         states = _moved(problem, cells, noise.first, before, after)
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
-            break  # no motion fits such data: stay where it was linearised last
+            break  # diverged: keep the last linearisation
         problem = replace(problem, data=replace(problem.data, states=states))
         problem = replace(problem, data=replace(problem.data, states=foreseen(problem, phi)))
         problem = problem.along(_sloped(problem, cells, phi, sigma, spread))
@@ -126,7 +125,7 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
 
 
 def with_sensitivity(problem: Problem, phi: Array, sigma: Array) -> Problem:
-    """The same problem, its smoothed states following the parameters to first order.
+    """Return the problem with smoothed states that follow phi to first order.
 
     Parameters
     ----------
@@ -155,9 +154,9 @@ def with_sensitivity(problem: Problem, phi: Array, sigma: Array) -> Problem:
 
 
 def foreseen(problem: Problem, phi: Array) -> Array:
-    """Linearised states; in a sparse recording what no row shows as predicted from the row before.
+    """Return linearised states, unobserved rows of a sparse recording predicted from the row before.
 
-    What a body meets on its way is nowhere near a straight line between far apart rows.
+    Interpolation between rows that are far apart would miss contacts.
 
     Parameters
     ----------
@@ -186,7 +185,7 @@ def foreseen(problem: Problem, phi: Array) -> Array:
 
 
 def _steps(problem: Problem, cells: Cells, sigma: Array) -> Array:
-    """How well cells are known from a row and the next, shape (cell,): steps of slopes."""
+    """Return the steps of finite differences by the cells, shape (cell,)."""
     error = cells.errors(sigma)
     known = {place: error[i] / problem.scene.time_step for i, place in enumerate(cells.places)}
     below = np.array([known.get(place - _RATE, 0.0) for place in cells.places])
@@ -195,7 +194,7 @@ def _steps(problem: Problem, cells: Cells, sigma: Array) -> Array:
 
 
 def _between(begin: Array, end: Array, share: float, cells: Cells) -> Array:
-    """Noise parameters, the accelerations on their way from one to the other, by factors."""
+    """Return noise parameters with accelerations between two sets, in the logarithm."""
     sigma, steps = end.copy(), list(cells.accelerations)
     larger = np.maximum(begin, end)[steps]
     sigma[steps] = larger ** (1.0 - share) * end[steps] ** share
@@ -203,7 +202,7 @@ def _between(begin: Array, end: Array, share: float, cells: Cells) -> Array:
 
 
 def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
-    """Noise parameters to begin with, from the residuals of single steps at measured states."""
+    """Return first noise parameters, from residuals of single steps."""
     residual = cells.of_residual(problem.residual(phi))
     size = np.sqrt(np.nanmedian(residual**2, axis=0)) / 0.67
     by_dimension = {
@@ -217,7 +216,7 @@ def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
 
 
 def _moved(problem: Problem, cells: Cells, first: Bools, before: Array, after: Array) -> Array:
-    """Linearised states, moved by the smoothed deviations."""
+    """Return the states moved by the smoothed deviations."""
     segments = problem.segments
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
@@ -241,14 +240,14 @@ def _sloped(
         flat[2 * i + 1, :, place] -= steps[i]
     moved = cells.completed(problem.scene, moved).reshape(2 * d * n, *segments.start.shape[1:])
     inputs = np.tile(problem.inputs, (2 * d, 1, 1, 1))
-    # the slope of what a fine engine does is that of what a coarse one does, all but exactly
+    # a coarse engine's slope agrees with a fine one's
     ends = cells.of(problem.rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
     slope = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
     return linearised(problem, cells, np.nan_to_num(slope), sigma)
 
 
 def linearised(problem: Problem, cells: Cells, slope: Array, sigma: Array) -> TrajectoryNoise:
-    """The noise along a problem's trajectories, from the slopes at its states.
+    """Return the noise along a problem's trajectories from given slopes.
 
     Parameters
     ----------
@@ -281,7 +280,7 @@ def linearised(problem: Problem, cells: Cells, slope: Array, sigma: Array) -> Tr
 
 
 def _touching(problem: Problem, cells: Cells) -> Bools:
-    """In which transitions bodies touch, where that has noise of its own, shape (transition,)."""
+    """Return the mask of transitions with contact, shape (transition,)."""
     segments, states = problem.segments, problem.data.smoothed_states
     if not cells.jolts:
         return np.zeros(segments.n, dtype=bool)

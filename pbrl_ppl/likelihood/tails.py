@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def tail_places(physics: Physics) -> list[int]:
-    """Where phi holds parameters of the noise stage."""
+    """Return the places in phi of the parameters of the noise stage."""
     labels = physics.layout.labels
     return [
         labels.index(label)
@@ -24,7 +24,7 @@ def tail_places(physics: Physics) -> list[int]:
 
 
 def degrees_of_freedom(physics: Physics, phi: Array, nu: float | None) -> Array:
-    """Degrees of freedom of each body's noise.
+    """Return the degrees of freedom of each body's noise.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def degrees_of_freedom(physics: Physics, phi: Array, nu: float | None) -> Array:
 
 
 def sum_tails(physics: Physics, value: Any, zero: Any) -> list[Any]:
-    """Sum of the effects' tails for each body; ``value`` gives a parameter."""
+    """Return the sum of the effects' tails of each body; ``value`` gives a parameter."""
     acting = at_stage(physics.effects, Noise)
     result = []
     for body in physics.scene.moving:

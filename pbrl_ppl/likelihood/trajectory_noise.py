@@ -1,4 +1,4 @@
-"""Noise along trajectories: errors of measured states, and what a step adds, told apart."""
+"""Measurement and process noise along linearised trajectories."""
 
 from __future__ import annotations
 
@@ -113,7 +113,7 @@ class TrajectoryNoise:
         return self.touching.astype(np.int64)
 
     def whiten(self, residual: Array, sigma: Array) -> Array:
-        """Innovations over their standard deviations.
+        """Return the whitened innovations.
 
         Parameters
         ----------
@@ -130,7 +130,7 @@ class TrajectoryNoise:
         return self.whitened(residual, sigma)[0]
 
     def whitened(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
-        """As :meth:`whiten`, with the logarithm of the standard deviations.
+        """Return whitened innovations with the log of their standard deviations.
 
         The latter is summed over the cells, shape (..., transition) as that of sigma leads.
         """
@@ -148,13 +148,13 @@ class TrajectoryNoise:
         return white.reshape(cells.shape), log_scale.reshape(cells.shape[:-1])
 
     def filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
-        """White innovations and filtered deviations of cells' residuals (set, transition, cell)."""
+        """Return whitened innovations and filtered deviations for residuals (set, transition, cell)."""
         white, state = self._filtered(residual, sigma)
         cells = self.cells
         return white[..., : len(cells.places)], self._extended.states(cells, state)
 
     def _filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
-        """As :meth:`filtered`, of the filter's coordinates."""
+        """Return the same as :meth:`filtered` in the filter's extended state."""
         own, (gain, scale, *_) = self._extended, self._gains(sigma)
         rows = np.ascontiguousarray(own.padded(residual))  # another layout would be compiled, too
         white, state = innovations(
@@ -164,17 +164,17 @@ class TrajectoryNoise:
         return white, state
 
     def of_cells(self, nu: float | Array | None, shape: tuple[int, ...]) -> float | Array | None:
-        """Degrees of freedom of each innovation, of those of residuals of this shape."""
+        """Return the degrees of freedom of each innovation, from those of residuals."""
         if not isinstance(nu, np.ndarray) or nu.ndim == 0:
             return nu
         return self.cells.of_residual(np.broadcast_to(nu, shape))
 
     def log_scale(self, sigma: Array) -> Array:
-        """Logarithm of the innovations' standard deviations, summed, shape (transition,)."""
+        """Return the summed log standard deviations of innovations, shape (transition,)."""
         return self._gains(sigma)[3]
 
     def smoothed(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
-        """Smoothed deviations before and after each transition, shape (transition, cell) each."""
+        """Return smoothed deviations before and after transitions, (transition, cell) each."""
         own, cells = self._extended, self.cells
         white, filtered = self._filtered(residual[None], sigma)
         before, _, after = self._pulled(white[0], sigma)
@@ -183,12 +183,12 @@ class TrajectoryNoise:
         return own.states(cells, begin), own.states(cells, end)
 
     def pulled(self, weighted: Array, sigma: Array) -> Array:
-        """Derivative of a sum of white innovations by the predictions, shape (transition, cell)."""
+        """Return the derivative of weighted innovations by the predictions, (transition, cell)."""
         padded = self._extended.padded(weighted)
         return self._pulled(padded, sigma)[1][:, : weighted.shape[1]]
 
     def _pulled(self, weighted: Array, sigma: Array) -> tuple[Array, Array, Array]:
-        """As of :func:`kalman.adjoint`."""
+        """Return :func:`kalman.adjoint` of weighted innovations."""
         own, (gain, scale, *_) = self._extended, self._gains(sigma)
         pulled: tuple[Array, Array, Array] = adjoint(
             own.slope, self.last, own.seen, gain, scale, weighted
@@ -196,7 +196,7 @@ class TrajectoryNoise:
         return pulled
 
     def score(self, residual: Array, sigma: Array) -> tuple[float, Array]:
-        """Gaussian log-likelihood, and its derivative by the logarithm of the noise parameters.
+        """Return the Gaussian log-likelihood and its derivative by the log noise parameters.
 
         Parameters
         ----------
@@ -225,7 +225,7 @@ class TrajectoryNoise:
         return value, sigma**2 * slope
 
     def auxiliary(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
-        """Residual of each measurement given all others, in standard deviations.
+        """Return standardised residuals of each measurement given all others.
 
         Parameters
         ----------
@@ -247,7 +247,7 @@ class TrajectoryNoise:
         return end, np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0)
 
     def foreseen(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
-        """Mean and covariance of each measurement, as deviations, given those before it.
+        """Return the one-step predictive mean and covariance of each measurement, as deviations.
 
         Parameters
         ----------
@@ -275,7 +275,7 @@ class TrajectoryNoise:
     def random(
         self, predicted: Array, linearised: Array, sigma: Array, rng: np.random.Generator
     ) -> Array:
-        """Draw measured next states, given those before (Eq. 13), shape of ``predicted``.
+        """Draw measured next states given those before (Eq. 13), shape of ``predicted``.
 
         Parameters
         ----------
@@ -293,7 +293,7 @@ class TrajectoryNoise:
         return result
 
     def _begin(self, sigma: Array) -> Array:
-        """Variance of the filter's state before each transition that is its trajectory's first."""
+        """Return the variance of the filter's first state of each trajectory."""
         state = np.where(self.wide > 0, self.wide, self.cells.white(sigma) ** 2)
         error = np.broadcast_to(
             sigma[self.cells.drifted[1]] ** 2, (len(state), len(self.cells.drifted[1]))

@@ -55,11 +55,16 @@ def test_inferred_joint_is_the_known_one(path, kind, first, second) -> None:
     expected = known(np.zeros(0), start, actions)
 
     held = simulator(Joint(kind, (first, second), known=False), engine=path)
-    assert held.layout.labels == ("a_x[joint1]", "a_y[joint1]", "b_x[joint1]", "b_y[joint1]")
+    assert held.physics.layout.labels == (
+        "a_x[joint1]",
+        "a_y[joint1]",
+        "b_x[joint1]",
+        "b_y[joint1]",
+    )
     np.testing.assert_array_equal(held(np.array(anchors), start, actions), expected)
 
     free = simulator(Joint(kind, known=False), engine=path)
-    assert free.layout.labels[:2] == ("i_a[joint1]", "i_b[joint1]")
+    assert free.physics.layout.labels[:2] == ("i_a[joint1]", "i_b[joint1]")
     phi = np.array([index[first], index[second], *anchors])
     np.testing.assert_array_equal(free(phi, start, actions), expected)
     # and it does something
