@@ -19,8 +19,8 @@ from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
 Array = NDArray[np.float64]
 
 _KIND = "episode"
-#: Variables of a file, and their dimensions.
-_DIMS = {
+#: Variables of an episode, and their dimensions.
+VARIABLES = {
     "states": ("time", "body", "state"),
     "observed": ("interval", "body", "state"),
     "action": ("interval", "body", "wrench"),
@@ -69,7 +69,7 @@ class Episode:
     """
 
     def __init__(self, dataset: xr.Dataset) -> None:
-        for name, dims in _DIMS.items():
+        for name, dims in VARIABLES.items():
             got = dataset[name].dims if name in dataset else None
             if got != dims:
                 raise EpisodeError(
@@ -97,21 +97,21 @@ class Episode:
         """
         labels = list(dict.fromkeys(label for each in rows["estimate"] for label in each))
         estimates = [[each.get(label, np.nan) for label in labels] for each in rows["estimate"]]
-        coords = {
-            "time": ("time", scene.time_step * np.arange(len(rows["states"])), {"units": "s"}),
+        times = scene.time_step * np.arange(len(rows["states"]))
+        coords: dict[str, Any] = {
+            "time": ("time", times, {"units": "s"}),
             "body": [body.name for body in scene.moving],
             "state": list(STATE),
             "wrench": list(WRENCH),
             "parameter": np.array(labels, dtype=object),
         }
-        sizes = {name: len(coord) for name, coord in coords.items()}
-        sizes |= {"time": len(rows["states"]), "interval": len(rows["action"])}
         variables = {}
-        for name, dims in _DIMS.items():
+        for name, dims in VARIABLES.items():
             dtype = bool if name in ("bumped", "planned") else float
             values = np.array({**rows, "estimate": estimates}[name], dtype=dtype)
             units = {"units": _UNITS[name]} if name in _UNITS else {}
-            variables[name] = (dims, values.reshape([sizes[dim] for dim in dims]), units)
+            shape = len(values), *(len(coords[dim]) for dim in dims[1:])
+            variables[name] = (dims, values.reshape(shape), units)
         about = {"pbrl_ppl": _KIND, "scene": scene.to_toml(), **attrs}
         return cls(xr.Dataset(variables, coords, about))
 

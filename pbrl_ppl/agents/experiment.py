@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import Agent
-from pbrl_ppl.agents.episode import Episode
+from pbrl_ppl.agents.episode import VARIABLES, Episode
 from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.agents.world import Outcome, Task
 from pbrl_ppl.errors import EpisodeError
@@ -96,9 +96,9 @@ def run_episode(
     task = world.task
     state = check_state(task, world.reset(seed), "reset")
     reached = task.reached(state)
-    rows: dict[str, list[Any]] = {"states": [state], "reward": [task.reward(state)]} | {
-        name: [] for name in ("action", "observed", "bumped", "planned", "seconds", "estimate")
-    }
+    rows: dict[str, list[Any]] = {name: [] for name in VARIABLES}
+    rows["states"].append(state)
+    rows["reward"].append(task.reward(state))
     while not reached and len(rows["action"]) < steps:
         begin = time.monotonic()
         action = np.asarray(agent.act(state), dtype=float)
