@@ -104,9 +104,9 @@ def act(
     goal.check(scene)
     states, plans = [start_state(scene, start)], 0
     played: list[Array] = []
-    while len(played) < intervals and not _there(scene, goal, states[-1]):
-        last = played[-1] if played else None
-        ahead = plan(idata, states[-1], goal, actions, before=last, **options)
+    while len(played) < intervals and not _is_reached(scene, goal, states[-1]):
+        before = played[-1] if played else None
+        ahead = plan(idata, states[-1], goal, actions, before=before, **options)
         plans += 1
         for wrench in ahead.wrenches[: intervals - len(played)][:every]:
             state = np.asarray(world(wrench), dtype=float)
@@ -117,16 +117,17 @@ def act(
                 )
             states.append(state)
             played.append(wrench)
-            if every is not None and _there(scene, goal, state):
+            if every is not None and _is_reached(scene, goal, state):
                 break
         if every is None or not len(ahead.wrenches):
             break
     wrenches = np.array(played).reshape(-1, len(states[0]), 3)
     distance = float(goal.distance(scene, states[-1]))
     return Acted(
-        scene, np.array(states), wrenches, _there(scene, goal, states[-1]), distance, plans
+        scene, np.array(states), wrenches, _is_reached(scene, goal, states[-1]), distance, plans
     )
 
 
-def _there(scene: Scene, goal: Goal, state: Array) -> bool:
+def _is_reached(scene: Scene, goal: Goal, state: Array) -> bool:
+    """Return whether a state (body, 6) is within the goal's tolerances."""
     return bool(goal.shortfall(scene, state) <= 1.0)
