@@ -1,4 +1,4 @@
-"""Acting on plans: play some of one, look where that led, plan again."""
+"""Receding-horizon control of a user's world: plan, play, measure, plan again."""
 
 from __future__ import annotations
 
@@ -20,22 +20,22 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Acted:
-    """Record of acting: measured states, wrenches played, and how near the goal they led.
+    """Record of :func:`act`: measured states, wrenches played, and distance from the goal.
 
     Attributes
     ----------
     scene : Scene
         Orders the bodies.
     states : ndarray
-        As the world returned them, the start first, shape (time + 1, body, 6), SI units.
+        Measured states, the start first, shape (time + 1, body, 6), SI units.
     wrenches : ndarray
-        As they were played, shape (time, body, 3), N and N m.
+        Wrenches played, shape (time, body, 3), N and N m.
     reached : bool
         Whether the last state is within the goal's tolerances.
     distance : float
         L2 distance of the last state from the goal (m).
     plans : int
-        How many were made.
+        Number of plans made.
     """
 
     scene: Scene
@@ -46,7 +46,7 @@ class Acted:
     plans: int
 
     def history(self) -> History:
-        """As a history of one trajectory: for :func:`pbrl_ppl.update`, say."""
+        """Return a history of one trajectory, for example for :func:`pbrl_ppl.update`."""
         return from_segments(
             self.scene, self.states[:1], self.wrenches[None], self.states[None, 1:]
         )
@@ -63,7 +63,7 @@ def act(
     intervals: int = 200,
     **options: Any,
 ) -> Acted:
-    """Plan, play the beginning of the plan, look, and plan again, until the goal is reached.
+    """Plan, play the start of the plan, measure, and plan again, until the goal is reached.
 
     Parameters
     ----------
@@ -71,14 +71,13 @@ def act(
         Plays one sampling interval: takes wrenches, shape (body, 3), world frame, N and N m, and
         returns the measured states after it, shape (body, 6), SI units.
     idata, start, goal, actions
-        As of :func:`pbrl_ppl.plan`.
+        See :func:`pbrl_ppl.plan`.
     every : int, optional
-        Intervals of a plan that are played before the next one is made; without it, the whole plan
-        is played, and that is all.
+        Intervals to play before the next plan; by default one plan is played to its end.
     intervals : int
-        The most that are played.
+        Largest number of intervals to play.
     **options
-        Of :func:`pbrl_ppl.plan`.
+        Options of :func:`pbrl_ppl.plan`.
 
     Returns
     -------
@@ -105,9 +104,9 @@ def act(
     goal.check(scene)
     states, plans = [start_state(scene, start)], 0
     played: list[Array] = []
-    while len(played) < intervals and not _there(scene, goal, states[-1]):
-        last = played[-1] if played else None
-        ahead = plan(idata, states[-1], goal, actions, before=last, **options)
+    while len(played) < intervals and not _is_reached(scene, goal, states[-1]):
+        before = played[-1] if played else None
+        ahead = plan(idata, states[-1], goal, actions, before=before, **options)
         plans += 1
         for wrench in ahead.wrenches[: intervals - len(played)][:every]:
             state = np.asarray(world(wrench), dtype=float)
@@ -118,16 +117,17 @@ def act(
                 )
             states.append(state)
             played.append(wrench)
-            if every is not None and _there(scene, goal, state):
+            if every is not None and _is_reached(scene, goal, state):
                 break
         if every is None or not len(ahead.wrenches):
             break
     wrenches = np.array(played).reshape(-1, len(states[0]), 3)
     distance = float(goal.distance(scene, states[-1]))
     return Acted(
-        scene, np.array(states), wrenches, _there(scene, goal, states[-1]), distance, plans
+        scene, np.array(states), wrenches, _is_reached(scene, goal, states[-1]), distance, plans
     )
 
 
-def _there(scene: Scene, goal: Goal, state: Array) -> bool:
+def _is_reached(scene: Scene, goal: Goal, state: Array) -> bool:
+    """Return whether a state (body, 6) is within the goal's tolerances."""
     return bool(goal.shortfall(scene, state) <= 1.0)

@@ -1,51 +1,53 @@
-"""Agents: observe a transition, update a model, plan with it, act."""
+"""Agents that plan with a transition model, and the paper's baselines."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.agents.revision import Revision
-from pbrl_ppl.agents.task import Task
-from pbrl_ppl.planning import TransitionModel, plan, rollout
+from pbrl_ppl.agents.world import Task
+from pbrl_ppl.oomdp import LWR, OOLWR
+from pbrl_ppl.planning import Dynamics, TransitionModel, plan, rollout
+from pbrl_ppl.state import THETA, wrapped
 
 Array = NDArray[np.float64]
 
 
 class Agent(ABC):
-    """Agent that plans with its model of transitions; subclasses say how the model is learned.
+    """Agent that plans with a transition model; subclasses define how the model is learned.
 
-    A plan is kept for as long as the model of today says that it leads from the state of today to
-    the goal; otherwise a new one is made. With a plan that ends elsewhere, the nearest place to the
-    goal that the search found, one action is taken. Where there is no plan at all, because nothing
-    is known yet, the model has no answer, or it leads nowhere nearer, an action is taken at random.
+    A plan is kept as long as the current model predicts that it leads from the current state to the
+    goal; otherwise a new one is made. Of a plan that does not reach the goal, only the first action
+    is taken. Without a plan, because nothing was observed yet, the model has no prediction, or no
+    state nearer to the goal was found, an action is taken at random.
 
     Parameters
     ----------
     task : Task
         Scene, goal and actions.
     seed : int
-        Of the random actions.
+        Seed of the random actions.
     nodes : int
-        States that a search for a plan generates at most.
+        Largest number of states that a search generates.
     **options
-        Of :func:`pbrl_ppl.plan`.
+        Options of :func:`pbrl_ppl.plan`.
 
     Attributes
     ----------
     planned : bool
         Whether the last action was planned rather than random.
     posterior : InferenceData or DataTree or None
-        What it believes in, as :func:`pbrl_ppl.fit` made it; None where there is none.
+        Current posterior, as made by :func:`pbrl_ppl.fit`, or None.
     added : tuple of Revision
-        Effects that it found missing from its model.
+        Effects added to the model.
     """
 
-    #: What episodes and figures call it.
+    #: Name in episodes and figures.
     name: ClassVar[str]
     posterior: Any = None
     added: tuple[Revision, ...] = ()
@@ -55,36 +57,36 @@ class Agent(ABC):
         self._options = {"nodes": nodes, **options}
         self._rng = np.random.default_rng([seed, 0])  # [seed, 1] is the world's
         self._ahead = np.empty((0, len(task.scene.moving), 3))
-        self._last = np.zeros((len(task.scene.moving), 3))  # an actuator may remember it
+        self._last = np.zeros((len(task.scene.moving), 3))  # for actuators with memory
         self.planned = False
 
     @property
     @abstractmethod
     def model(self) -> TransitionModel | None:
-        """What it plans with; None before it knows anything."""
+        """Model to plan with; None before anything was learned."""
 
     @abstractmethod
     def observe(self, state: Array, action: Array, next_state: Array) -> None:
-        """Take note of a transition.
+        """Observe a transition.
 
         Parameters
         ----------
         state, next_state : ndarray
-            At the ends of one sampling interval, shape (body, 6), SI units.
+            States at the ends of one sampling interval, shape (body, 6), SI units.
         action : ndarray
             Held in between, shape (body, 3), world frame, N and N m.
         """
 
     def update(self) -> None:  # noqa: B027 - regression learns as it observes
-        """Bring the model up to date with what was observed."""
+        """Update the model with the observed transitions."""
 
     @property
     def estimates(self) -> Mapping[str, float]:
-        """Physical parameters that it believes in now, by label; none by default."""
+        """Current estimates of physical parameters by label; none by default."""
         return {}
 
     def act(self, state: Array) -> Array:
-        """The next action: planned, or at random where there is no plan.
+        """Return the next action: planned, or random without a plan.
 
         Parameters
         ----------
@@ -101,27 +103,175 @@ class Agent(ABC):
         KeyboardInterrupt
             If the search was interrupted.
         """
-        every = self.task.wrenches(state)
+        wrenches = self.task.wrenches(state)
         model = self.model
         self._ahead = self._ahead[:0] if model is None else self._planned(model, state)
         self.planned = len(self._ahead) > 0
         if self.planned:
             wanted, self._ahead = self._ahead[0], self._ahead[1:]
-            # a body's heading is not quite what the plan foretold, and with it the wrench
-            chosen = int(np.argmin(((every - wanted) ** 2).sum(axis=(1, 2))))
+            # the heading, and with it the wrench, differs a little from the plan's
+            chosen = int(np.argmin(((wrenches - wanted) ** 2).sum(axis=(1, 2))))
         else:
-            chosen = int(self._rng.integers(len(every)))
-        self._last = every[chosen]
+            chosen = int(self._rng.integers(len(wrenches)))
+        self._last = wrenches[chosen]
         return self._last.copy()
 
     def _planned(self, model: TransitionModel, state: Array) -> Array:
-        """Wrenches ahead, shape (time, body, 3): those of before if they still lead to the goal."""
+        """Return a plan's wrenches, shape (time, body, 3): the old ones if they still do."""
         task = self.task
         if len(self._ahead):
             end = rollout(model.after(self._last), state, self._ahead)[:, -1]
-            if float(task.goal.shortfall(task.scene, end).mean()) <= 1.0:  # not where NaN
+            if float(task.goal.shortfall(task.scene, end).mean()) <= 1.0:  # false for NaN
                 return self._ahead
         found = plan(model, state, task.goal, task.actions, before=self._last, **self._options)
-        if found.stopped == "interrupted":  # the search keeps it to itself
+        if found.stopped == "interrupted":  # the search catches it
             raise KeyboardInterrupt
         return found.wrenches if found.reached else found.wrenches[:1]
+
+
+class PhysicsAgent(Agent):
+    """Agent whose model is :class:`pbrl_ppl.Dynamics` of estimated parameters."""
+
+    _dynamics: Dynamics | None = None
+
+    @property
+    def model(self) -> Dynamics | None:
+        """Eq. 7 with the estimated parameters; None before the first estimate."""
+        return self._dynamics
+
+    @property
+    def estimates(self) -> Mapping[str, float]:
+        """Parameters by label, SI units: the mode, or of draws the nearest to their mean."""
+        if self._dynamics is None:
+            return {}
+        middle = self._dynamics.single()
+        return dict(zip(middle.layout.labels, middle.phi[0].tolist(), strict=True))
+
+
+def prediction_errors(
+    dynamics: Dynamics, state: Array, action: Array, after: Array, previous: Array | None = None
+) -> Array:
+    """Return the absolute errors of the mean prediction of each transition, shape (n, body, 6).
+
+    Parameters
+    ----------
+    dynamics : Dynamics
+        Model.
+    state, after : ndarray
+        States at the ends of the intervals, shape (n, body, 6), SI units.
+    action, previous : ndarray
+        Wrenches in the intervals, and before them, shape (n, body, 3), N and N m.
+    """
+    states = np.repeat(state[None], dynamics.draws, 0)
+    error = abs(after - dynamics.step(states, action, previous).mean(axis=0))
+    error[..., THETA] = abs(wrapped(error[..., THETA]))
+    return np.asarray(error)
+
+
+class _RegressionAgent(Agent):
+    """Agent that learns a regression as it observes."""
+
+    _regression: ClassVar[type[LWR] | type[OOLWR]]
+
+    def __init__(
+        self, task: Task, *, learner: Mapping[str, Any] | None = None, **options: Any
+    ) -> None:
+        super().__init__(task, **options)
+        self._learner = self._regression(task.scene, **(learner or {}))
+
+    @property
+    def model(self) -> LWR | OOLWR | None:
+        """Regression; None before it has any data."""
+        return self._learner if self._learner.transitions else None
+
+    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+        """Learn from a transition; arguments as for :meth:`Agent.observe`."""
+        self._learner.observe(state, action, next_state)
+
+
+@final
+class OOLWRAgent(_RegressionAgent):
+    """Agent with object-oriented LWR (section 3.1).
+
+    As in the paper, bodies of one class share their models, and a condition is the set of sectors
+    in contact. ``learner={"relations": (SectorContacts(by_object=True),)}`` distinguishes the
+    objects in contact, and ``learner={"share_classes": False}`` learns each body separately.
+
+    Parameters
+    ----------
+    task : Task
+        Scene, goal and actions.
+    learner : mapping, optional
+        Options of :class:`pbrl_ppl.OOLWR`; Table 2's by default.
+    **options
+        Options of :class:`Agent`.
+
+    Raises
+    ------
+    FitError
+        If an option of the learner is invalid.
+    """
+
+    name: ClassVar[str] = "OO-LWR"
+    _regression = OOLWR
+
+
+@final
+class LWRAgent(_RegressionAgent):
+    """Agent with LWR (section 3.1.2): it does not perceive walls.
+
+    Parameters
+    ----------
+    task : Task
+        Scene, goal and actions.
+    learner : mapping, optional
+        Options of :class:`pbrl_ppl.LWR`; Table 2's by default.
+    **options
+        Options of :class:`Agent`.
+
+    Raises
+    ------
+    FitError
+        If an option of the learner is invalid.
+    """
+
+    name: ClassVar[str] = "LWR"
+    _regression = LWR
+
+
+@final
+class TrueModelAgent(Agent):
+    """Agent with the true parameters: the upper bound.
+
+    Parameters
+    ----------
+    task : Task
+        Scene, goal and actions.
+    parameters : mapping
+        True parameters by name, as for :meth:`pbrl_ppl.Dynamics.known`.
+    effects : iterable of Effect or Attached
+        True effects in addition to those that the scene declares.
+    **options
+        Options of :class:`Agent`.
+
+    Raises
+    ------
+    ParameterError
+        If a parameter is missing, unknown or invalid.
+    """
+
+    name: ClassVar[str] = "true model"
+
+    def __init__(
+        self, task: Task, parameters: Mapping[str, object], effects: Any = (), **options: Any
+    ) -> None:
+        super().__init__(task, **options)
+        self._dynamics = Dynamics.known(task.scene, parameters, effects, threads=1)
+
+    @property
+    def model(self) -> Dynamics:
+        """True dynamics."""
+        return self._dynamics
+
+    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+        """Do nothing: there is nothing to learn."""

@@ -1,4 +1,4 @@
-"""A world that runs in Box2D, so that the agent's engine is not the world's."""
+"""World simulated by Box2D: another engine than the agent's."""
 
 from __future__ import annotations
 
@@ -11,8 +11,7 @@ from typing import Any, final
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.agents.task import Task
-from pbrl_ppl.agents.world import World
+from pbrl_ppl.agents.world import Task, World
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.physics import scenery
 from pbrl_ppl.scene import WORLD
@@ -21,47 +20,47 @@ try:
     with warnings.catch_warnings():  # its generated wrapper warns on import under newer Pythons
         warnings.simplefilter("ignore", DeprecationWarning)
         import Box2D
-except ImportError as error:  # an extra: the package has an engine of its own
+except ImportError as error:  # an optional dependency
     raise EpisodeError(
         f"Box2D world: {error}; install Box2D: pip install 'pbrl_ppl[agents]'"
     ) from None
 
 Array = NDArray[np.float64]
 
-#: Box2D's tolerances are compiled in, for metres: below 1 length unit a second nothing bounces, and
-#: 0.005 units of overlap are let be. With the centimetre as unit they are 1 cm/s and 0.05 mm.
+#: Box2D's tolerances are compiled in: nothing bounces below 1 length unit per second, and overlaps
+#: up to 0.005 units remain. With the centimetre as unit they are 1 cm/s and 0.05 mm.
 _CM = 100.0
-#: Corners that a polygon of Box2D has at most.
+#: Largest number of corners of a polygon in Box2D.
 _CORNERS = 8
-#: Rounds of the solvers: the engine's, for velocities and positions, and the wheel's.
-_ROUNDS, _WHEEL_ROUNDS = (20, 10), 10
+#: Iterations of the engine's velocity and position solvers, and of the wheel's solver.
+_ITERATIONS, _WHEEL_ITERATIONS = (20, 10), 10
 
 
 @final
 class Box2DWorld(World):
-    """The true dynamics of a task by Box2D, with the floor's friction on wheels added to it.
+    """True dynamics of a task by Box2D, with the floor's friction on wheels added.
 
-    The paper's worlds are of this kind. Wrenches and wheels act here, contacts and hinges are the
-    engine's, which rounds to single precision. Friction and restitution of two that touch are the
-    products of theirs, and walls carry 1, as in the package's own engine.
+    The paper's worlds are of this kind. Wrenches and wheels are computed here, contacts and hinges
+    by Box2D, in single precision. As in the package's engine, friction and restitution of a contact
+    are products of the two bodies' values, and walls have 1.
 
     Parameters
     ----------
     task, parameters, sigma, spread
-        As of :class:`World`.
+        See :class:`World`.
     step : float
-        About what a step of the engine is (s).
+        Approximate step of the engine (s).
     acting : callable, optional
-        What acts in place of the commanded wrenches (body, 3): an effect that no agent is told of.
-        Its ``repr`` describes it in the files of episodes.
+        Maps the commanded wrenches (body, 3) to those that act: an effect unknown to agents. Its
+        ``repr`` describes it in the files of episodes.
 
     Raises
     ------
     EpisodeError
-        As :class:`World`; if the scene declares effects, a joint that is no known hinge, a
-        kinematic body, or a convex part of more than eight corners, which there are not here.
+        As :class:`World`; if the scene has declared effects, a joint that is no known hinge, a
+        kinematic body, or a convex part of more than eight corners.
     ParameterError
-        If a parameter is missing, unknown or impossible.
+        If a parameter is missing, unknown or invalid.
 
     Examples
     --------
@@ -118,46 +117,42 @@ class Box2DWorld(World):
 
     @property
     def description(self) -> str:
-        """Engine, true parameters and what acts in place of the command, as JSON."""
-        said = json.loads(super().description)
-        return json.dumps(said if self._acting is None else said | {"acting": repr(self._acting)})
+        """Engine, true parameters and ``acting``, as JSON."""
+        acting = {} if self._acting is None else {"acting": repr(self._acting)}
+        return json.dumps(json.loads(super().description) | acting)
 
     def _play(self, state: Array, action: Array) -> Array:
         action = action if self._acting is None else self._acting(action)
         engine, rigid = self._engine(state)
         step = self.task.scene.time_step / self._steps
         for i in range(self._steps):
-            # kick half, drift, kick half: of second order
+            # half a kick, drift, half a kick: second order
             self._kick(rigid, action, step if i else 0.5 * step)
-            engine.Step(step, *_ROUNDS)
+            engine.Step(step, *_ITERATIONS)
         self._kick(rigid, action, 0.5 * step)
-        out = np.array(
-            [
-                (*body.position, body.angle, *body.linearVelocity, body.angularVelocity)
-                for body in rigid
-            ]
-        )
-        out[:, [0, 1, 3, 4]] /= _CM
-        return out
+        after = [
+            (*body.position, body.angle, *body.linearVelocity, body.angularVelocity)
+            for body in rigid
+        ]
+        return np.array(after) / [_CM, _CM, 1.0, _CM, _CM, 1.0]
 
     def _engine(self, state: Array) -> tuple[Any, list[Any]]:
-        """A world of the engine in a state, and its moving bodies."""
+        """Return a Box2D world in a state, and its moving bodies."""
         scene = self.task.scene
-        rub = _Products()
+        listener = _Products()
         engine = Box2D.b2World(
-            gravity=tuple(_CM * g for g in scene.gravity), doSleep=False, contactListener=rub,
+            gravity=tuple(_CM * g for g in scene.gravity), doSleep=False, contactListener=listener,
             continuousPhysics=False,
         )  # fmt: skip
-        engine.rub = rub  # the engine keeps no reference of its own
+        engine.listener = listener  # Box2D keeps no reference
         ground = engine.CreateStaticBody()
         rigid, by_name = [], {WORLD: ground}
         for i, solid in enumerate(self._scenery.solids):
             if i < len(state):
                 values = self._values[i]
-                place = {"position": tuple(_CM * state[i, :2]), "angle": float(state[i, 2])}
                 body = engine.CreateDynamicBody(
-                    **place, linearVelocity=tuple(_CM * state[i, 3:5]),
-                    angularVelocity=float(state[i, 5]),
+                    position=tuple(_CM * state[i, :2]), angle=float(state[i, 2]),
+                    linearVelocity=tuple(_CM * state[i, 3:5]), angularVelocity=float(state[i, 5]),
                 )  # fmt: skip
                 rigid.append(body)
             else:
@@ -169,33 +164,29 @@ class Box2DWorld(World):
             by_name[solid.name] = body
             _add_parts(body, solid, values)
             if i < len(state):
-                moment = values["mass"] * scene.moving[i].shape.unit_moment
-                body.massData = Box2D.b2MassData(
-                    mass=values["mass"], center=(0, 0), I=moment * _CM**2
-                )
+                mass = values["mass"]
+                moment = mass * scene.moving[i].shape.unit_moment
+                body.massData = Box2D.b2MassData(mass=mass, center=(0, 0), I=moment * _CM**2)
         for joint in scene.joints:
             first, second = (by_name[name] for name in joint.bodies or ())
-            anchors = [
-                tuple(_CM * a for a in point or ()) for point in (joint.anchor_a, joint.anchor_b)
-            ]
             engine.CreateRevoluteJoint(
-                bodyA=first, bodyB=second, localAnchorA=anchors[0], localAnchorB=anchors[1],
+                bodyA=first, localAnchorA=tuple(_CM * a for a in joint.anchor_a or ()),
+                bodyB=second, localAnchorB=tuple(_CM * a for a in joint.anchor_b or ()),
                 collideConnected=False,
             )  # fmt: skip
         return engine, rigid
 
     def _kick(self, rigid: list[Any], action: Array, step: float) -> None:
-        """Change velocities by the wrenches and the floor's friction on the wheels."""
+        """Apply the wrenches and the floor's friction on the wheels to the velocities."""
         scene = self.task.scene
-        for body, wrench, values, own in zip(
-            rigid, action, self._values, scene.moving, strict=True
-        ):
+        bodies = zip(rigid, action, self._values, scene.moving, strict=True)
+        for body, wrench, values, declared in bodies:
             v = complex(*body.linearVelocity) / _CM
             omega = body.angularVelocity
             if not (v or omega or wrench.any()):
-                continue  # at rest: nothing to resist
+                continue  # at rest
             mass = values["mass"]
-            inertia = mass * own.shape.unit_moment
+            inertia = mass * declared.shape.unit_moment
             v += complex(*wrench[:2]) / mass * step
             omega += float(wrench[2]) / inertia * step
             limit = mass * scene.normal_gravity * step
@@ -205,7 +196,7 @@ class Box2DWorld(World):
 
 
 class _Products(Box2D.b2ContactListener):
-    """Mixes friction and restitution as products; the engine would take the root and the larger."""
+    """Takes products for friction and restitution; Box2D's default is the root and the maximum."""
 
     def PreSolve(self, contact: Any, manifold: Any) -> None:
         pair = contact.fixtureA.userData, contact.fixtureB.userData
@@ -214,7 +205,7 @@ class _Products(Box2D.b2ContactListener):
 
 
 def _add_parts(body: Any, solid: Any, values: dict[str, float]) -> None:
-    """Give a body of the engine its convex parts."""
+    """Add the convex parts of a solid to a Box2D body."""
     for corners, radius in solid.parts:
         points = [(float(x), float(y)) for x, y in _CM * corners]
         if len(points) == 1:
@@ -235,16 +226,16 @@ def _rolled(
     v: complex,
     omega: float,
 ) -> tuple[complex, float]:
-    """Velocities after the floor's friction on the wheel: along each axis at most mu times a limit.
+    """Return velocities after the floor's friction on the wheel, at most mu times a limit per axis.
 
-    The impulses that stop the wheel's point, clipped, round by round; the plane is the complex one.
+    Projected Gauss-Seidel for the impulses that stop the wheel's point; vectors are complex.
     """
     arm = turn * complex(values["w_x"], values["w_y"])
     along = turn * cmath.exp(1j * values["w_theta"])
     axes = [(along, values["mu_x"]), (1j * along, values["mu_y"])]
     levers = [(arm.conjugate() * axis).imag for axis, _ in axes]
     impulse = [0.0, 0.0]
-    for _ in range(_WHEEL_ROUNDS):
+    for _ in range(_WHEEL_ITERATIONS):
         for k, ((axis, mu), lever) in enumerate(zip(axes, levers, strict=True)):
             speed = (v.conjugate() * axis).real + omega * lever
             wanted = impulse[k] - speed / (1 / mass + lever**2 / inertia)

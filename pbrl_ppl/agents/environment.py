@@ -7,14 +7,14 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.agents.online import AnyWorld, checked
+from pbrl_ppl.agents.experiment import AnyWorld, check_state
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.state import STATE
 
 try:
     import gymnasium
     from gymnasium import spaces
-except ImportError as error:  # an extra: most users bring no agent of their own
+except ImportError as error:  # an optional dependency
     raise EpisodeError(
         f"environment: {error}; install Gymnasium: pip install 'pbrl_ppl[agents]'"
     ) from None
@@ -23,19 +23,19 @@ Array = NDArray[np.float64]
 
 
 class Environment(gymnasium.Env[Array, np.int64]):
-    """A world as a ``gymnasium.Env``.
+    """World as a ``gymnasium.Env``.
 
-    An action is the number of one of the task's, which are wrenches in the bodies' frames. An
-    observation is the state of every body, with the world's noise; :meth:`reset` gives the exact
-    start. ``info`` has the exact ``state`` and whether a body ``bumped`` into something. The
-    episode ends (``terminated``) where the goal is reached.
+    An action is the index of one of the task's actions, which are wrenches in the bodies' frames.
+    An observation is the state of every body, with the world's noise; :meth:`reset` returns the
+    exact start. ``info`` has the exact ``state`` and whether a body ``bumped`` into something. The
+    episode ends (``terminated``) when the goal is reached.
 
     Parameters
     ----------
     world : World
-        Or another with ``task``, ``reset(seed)`` and ``step(action)``.
+        Or another object with ``task``, ``reset(seed)`` and ``step(action)``.
     steps : int, optional
-        Actions after which an episode is ``truncated``; never by default.
+        Number of actions after which an episode is ``truncated``; never by default.
 
     Attributes
     ----------
@@ -44,14 +44,13 @@ class Environment(gymnasium.Env[Array, np.int64]):
     observation_space : gymnasium.spaces.Box
         States, shape (body, 6), SI units.
     action_space : gymnasium.spaces.Discrete
-        Numbers of the task's actions.
+        Indices of the task's actions.
 
     Raises
     ------
     EpisodeError
-        If ``steps`` is below 1, an action is not in the action space, none can be taken because the
-        episode has not begun or has ended, or the world returns states of another shape or that are
-        not finite.
+        If ``steps`` is below 1, an action is not in the action space, the episode has not begun or
+        has ended, or the world returns states of another shape or that are not finite.
 
     Examples
     --------
@@ -83,26 +82,26 @@ class Environment(gymnasium.Env[Array, np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Array, dict[str, Any]]:
-        """Back to the start.
+        """Go back to the start.
 
         Parameters
         ----------
         seed : int, optional
-            That of the world, as of :func:`pbrl_ppl.run_episode`; drawn from the environment's
-            generator without it.
+            Seed of the world, as for :func:`pbrl_ppl.run_episode`; drawn from the environment's
+            generator by default.
         options : dict, optional
-            There are none.
+            Ignored.
 
         Returns
         -------
         observation : ndarray
             Exact states, shape (body, 6), SI units.
         info : dict
-            As of :meth:`step`.
+            See :meth:`step`.
         """
         super().reset(seed=seed)
-        of_world = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._state = checked(self.world.task, self.world.reset(of_world), "reset")
+        seed = int(self.np_random.integers(2**31)) if seed is None else seed
+        self._state = check_state(self.world.task, self.world.reset(seed), "reset")
         self._taken = 0
         return self._state.copy(), {"state": self._state.copy(), "bumped": False}
 
@@ -112,7 +111,7 @@ class Environment(gymnasium.Env[Array, np.int64]):
         Parameters
         ----------
         action : int
-            Number of one of the task's actions.
+            Index of one of the task's actions.
 
         Returns
         -------
@@ -121,13 +120,13 @@ class Environment(gymnasium.Env[Array, np.int64]):
         reward : float
             Minus the L2 distance from the goal (m), as in the paper's section 5.
         terminated, truncated : bool
-            Whether the goal is reached, and whether the limit of steps is.
+            Whether the goal, or the limit of steps, is reached.
         info : dict
-            ``state``, exact, and ``bumped``.
+            Exact ``state``, and ``bumped``.
         """
         if self._state is None:
             raise EpisodeError("environment: no episode is under way; call reset first")
-        # a number of another type is no member of the space, and numpy's floats are none either
+        # the space contains no numbers of other types, such as Python's int
         whole = isinstance(action, int | np.integer) and not isinstance(action, bool)
         if not whole or not self.action_space.contains(int(action)):
             raise EpisodeError(
@@ -136,11 +135,11 @@ class Environment(gymnasium.Env[Array, np.int64]):
             )
         task = self.world.task
         outcome = self.world.step(task.wrenches(self._state)[int(action)])
-        state = checked(task, outcome.state, "step")
-        observed = checked(task, outcome.observed, "step")
+        state = check_state(task, outcome.state, "step")
+        observed = check_state(task, outcome.observed, "step")
         self._taken += 1
         reached = bool(outcome.reached)
-        over = self._limit is not None and self._taken >= self._limit
-        self._state = None if reached or over else state
+        truncated = not reached and self._limit is not None and self._taken >= self._limit
+        self._state = None if reached or truncated else state
         info = {"state": state.copy(), "bumped": bool(outcome.bumped)}
-        return observed.copy(), float(outcome.reward), reached, over and not reached, info
+        return observed.copy(), float(outcome.reward), reached, truncated, info

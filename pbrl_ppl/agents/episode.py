@@ -1,4 +1,4 @@
-"""An episode: what an agent did in a world, as a record and as a NetCDF file."""
+"""Record of an episode of an agent in a world, and its NetCDF file."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
 Array = NDArray[np.float64]
 
 _KIND = "episode"
-#: Variables of a file, and their dimensions.
-_DIMS = {
+#: Variables of an episode, and their dimensions.
+VARIABLES = {
     "states": ("time", "body", "state"),
     "observed": ("interval", "body", "state"),
     "action": ("interval", "body", "wrench"),
@@ -47,20 +47,20 @@ class Episode:
     dataset : xarray.Dataset
         With the variables
 
-        - ``states`` (time, body, state): where the bodies were, the start first (SI units);
-        - ``observed`` (interval, body, state): the ends of the intervals as the agent observed
-          them, with the world's noise;
+        - ``states`` (time, body, state): exact states, the start first (SI units);
+        - ``observed`` (interval, body, state): states at the ends of the intervals as the agent
+          observed them, with the world's noise;
         - ``action`` (interval, body, wrench): held in the interval (N, N, N m);
         - ``reward`` (time,): minus the L2 distance from the goal (m);
         - ``bumped``, ``planned`` (interval,): whether a body touched something, and whether the
           action was planned rather than random;
-        - ``seconds`` (interval,): what choosing the action and the update after it took (s);
-        - ``estimate`` (interval, parameter): physical parameters that the agent believed in after
-          the interval; NaN before it did.
+        - ``seconds`` (interval,): time to choose the action and to update the agent (s);
+        - ``estimate`` (interval, parameter): the agent's estimates of physical parameters after the
+          interval; NaN before the first.
 
         In ``attrs``: the scene as TOML, the agent's name, the seed, ``sigma`` of the world, the
         limit of steps, and whether the goal was reached; ``world``, its description, if it has one,
-        and ``added``, as JSON, the effects that the agent added to its model.
+        and ``added``, the effects that the agent added to its model, as JSON.
 
     Raises
     ------
@@ -69,7 +69,7 @@ class Episode:
     """
 
     def __init__(self, dataset: xr.Dataset) -> None:
-        for name, dims in _DIMS.items():
+        for name, dims in VARIABLES.items():
             got = dataset[name].dims if name in dataset else None
             if got != dims:
                 raise EpisodeError(
@@ -82,51 +82,38 @@ class Episode:
         self.dataset = dataset
 
     @classmethod
-    def of(
-        cls,
-        scene: Scene,
-        states: Array,
-        estimates: Sequence[Mapping[str, float]],
-        recorded: Mapping[str, Any],
-        **attrs: Any,
-    ) -> Episode:
-        """Make an episode of arrays.
+    def of(cls, scene: Scene, rows: Mapping[str, Sequence[Any]], **attrs: Any) -> Episode:
+        """Make an episode from its rows.
 
         Parameters
         ----------
         scene : Scene
             Orders the bodies.
-        states : ndarray
-            The start first, shape (time + 1, body, 6), SI units.
-        estimates : sequence of mapping
-            What the agent believed after each interval, by label.
-        recorded : mapping
-            The other variables by name.
+        rows : mapping
+            The variables by name, ``states`` and ``reward`` from the start on; ``estimate`` as
+            mappings by label.
         **attrs
             ``agent``, ``seed``, ``sigma``, ``limit``, ``reached``, ``world``, ``added``.
         """
-        labels = list(dict.fromkeys(label for each in estimates for label in each))
-        believed = [[each.get(label, np.nan) for label in labels] for each in estimates]
-        n, k = len(states) - 1, len(scene.moving)
-        variables: dict[str, Any] = {
-            **recorded,
-            "states": states,
-            "observed": np.reshape(recorded["observed"], (n, k, len(STATE))),
-            "action": np.reshape(recorded["action"], (n, k, len(WRENCH))),
-            "estimate": np.reshape(np.array(believed, dtype=float), (n, len(labels))),
-        }
-        coords = {
-            "time": ("time", scene.time_step * np.arange(n + 1), {"units": "s"}),
+        labels = list(dict.fromkeys(label for each in rows["estimate"] for label in each))
+        estimates = [[each.get(label, np.nan) for label in labels] for each in rows["estimate"]]
+        times = scene.time_step * np.arange(len(rows["states"]))
+        coords: dict[str, Any] = {
+            "time": ("time", times, {"units": "s"}),
             "body": [body.name for body in scene.moving],
             "state": list(STATE),
             "wrench": list(WRENCH),
             "parameter": np.array(labels, dtype=object),
         }
-        given = {
-            name: (dims, np.asarray(variables[name]), _units(name)) for name, dims in _DIMS.items()
-        }
-        said = {"pbrl_ppl": _KIND, "scene": scene.to_toml(), **attrs}
-        return cls(xr.Dataset(given, coords, said))
+        variables = {}
+        for name, dims in VARIABLES.items():
+            dtype = bool if name in ("bumped", "planned") else float
+            values = np.array({**rows, "estimate": estimates}[name], dtype=dtype)
+            units = {"units": _UNITS[name]} if name in _UNITS else {}
+            shape = len(values), *(len(coords[dim]) for dim in dims[1:])
+            variables[name] = (dims, values.reshape(shape), units)
+        about = {"pbrl_ppl": _KIND, "scene": scene.to_toml(), **attrs}
+        return cls(xr.Dataset(variables, coords, about))
 
     @classmethod
     def load(cls, path: str | Path, scene: Scene | None = None) -> Episode:
@@ -137,12 +124,12 @@ class Episode:
         path : str or Path
             A file that :meth:`save` wrote.
         scene : Scene, optional
-            The scene that is expected.
+            Expected scene.
 
         Raises
         ------
         EpisodeError
-            If it is missing, is no episode, or is one of another scene.
+            If it is missing, no episode file, or of another scene.
         """
         path = Path(path)
         if not path.is_file():
@@ -150,7 +137,7 @@ class Episode:
         try:
             with xr.open_dataset(path, engine="h5netcdf", decode_times=False) as stored:
                 dataset = stored.load()
-        except Exception as error:  # HDF5 raises many kinds on a damaged file
+        except Exception as error:  # HDF5 raises many kinds for a damaged file
             raise EpisodeError(f"{path}: this is not a NetCDF file: {error}") from None
         if dataset.attrs.get("pbrl_ppl") != _KIND:
             raise EpisodeError(f"{path}: this is no episode file; save one with Episode.save")
@@ -159,14 +146,16 @@ class Episode:
         except EpisodeError as error:
             raise EpisodeError(f"{path}: {error}") from None
         if scene is not None and episode.scene != scene:
+            fields = vars(episode.scene).items()
+            differ = (name for name, value in fields if value != vars(scene).get(name))
             raise EpisodeError(
-                f"{path}: this is an episode of another scene ({_differences(episode.scene, scene)}"
-                " differ); give its own scene, or another folder"
+                f"{path}: this is an episode of another scene ({', '.join(differ)} differ); give"
+                " its own scene, or another folder"
             )
         return episode
 
     def save(self, path: str | Path) -> None:
-        """Write a NetCDF file, whole or not at all.
+        """Write a NetCDF file atomically.
 
         Raises
         ------
@@ -177,17 +166,17 @@ class Episode:
 
     @property
     def scene(self) -> Scene:
-        """Where it took place."""
+        """Scene of the episode."""
         return Scene.from_toml(self.dataset.attrs["scene"])
 
     @property
     def agent(self) -> str:
-        """The agent's name."""
+        """Name of the agent."""
         return str(self.dataset.attrs["agent"])
 
     @property
     def seed(self) -> int:
-        """The world's and the agent's."""
+        """Seed of the world and the agent."""
         return int(self.dataset.attrs["seed"])
 
     @property
@@ -197,29 +186,29 @@ class Episode:
 
     @property
     def steps(self) -> int:
-        """Actions taken."""
+        """Number of actions."""
         return int(self.dataset.sizes["interval"])
 
     @property
     def bumps(self) -> int:
-        """Intervals in which a body touched a wall or another."""
+        """Number of intervals in which a body touched a wall or another body."""
         return int(self.dataset["bumped"].sum())
 
     @property
     def added(self) -> list[dict[str, Any]]:
-        """Effects added to the model and kept: ``effect``, ``body``, after how many transitions."""
+        """Effects added to the model and kept: ``effect``, ``body`` and ``transitions`` before."""
         return list(json.loads(self.dataset.attrs.get("added", "[]")))
 
     def rewards(self, steps: int) -> Array:
-        """Reward at each of so many steps and the start, shape (steps + 1,), m.
+        """Return the rewards at the start and so many steps, shape (steps + 1,), m.
 
-        After the goal is reached, the bodies stay, and so does the reward.
+        The last reward is repeated after the end of the episode.
         """
-        own = self.dataset["reward"].to_numpy()[: steps + 1]
-        return np.concatenate([own, np.full(steps + 1 - len(own), own[-1])])
+        rewards = self.dataset["reward"].to_numpy()[: steps + 1]
+        return np.pad(rewards, (0, steps + 1 - len(rewards)), mode="edge")
 
     def history(self) -> History:
-        """The transitions as the agent observed them: each from its own state, one interval long.
+        """Return the transitions as the agent observed them: separate, one interval each.
 
         Raises
         ------
@@ -229,13 +218,3 @@ class Episode:
         states = self.dataset["states"].to_numpy()
         action, observed = self.dataset["action"].to_numpy(), self.dataset["observed"].to_numpy()
         return from_segments(self.scene, states[:-1], action[:, None], observed[:, None])
-
-
-def _units(name: str) -> dict[str, str]:
-    return {"units": _UNITS[name]} if name in _UNITS else {}
-
-
-def _differences(found: Scene, expected: Scene) -> str:
-    """Names of the fields in which two scenes differ."""
-    own = vars(expected)
-    return ", ".join(name for name, value in vars(found).items() if value != own.get(name))

@@ -1,24 +1,138 @@
-"""Many episodes: agents by seeds, over any executor; what is finished is kept."""
+"""Episodes: an agent acts in a world and learns; many agents and seeds over an executor."""
 
 from __future__ import annotations
 
+import json
 import pickle
+import time
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor, as_completed
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import Agent
-from pbrl_ppl.agents.episode import Episode
-from pbrl_ppl.agents.online import AnyWorld, described, run_episode
+from pbrl_ppl.agents.episode import VARIABLES, Episode
 from pbrl_ppl.agents.processes import processes, processors
+from pbrl_ppl.agents.world import Outcome, Task
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.posterior import save_posterior
+from pbrl_ppl.state import STATE
 
-#: Makes an agent of a seed.
+Array = NDArray[np.float64]
+
+#: Makes an agent from a seed.
 MakeAgent = Callable[[int], Agent]
+
+
+class AnyWorld(Protocol):
+    """Interface of a world; :class:`World` is one.
+
+    A string ``description`` is optional; an episode file is not reused in a world with another one.
+    """
+
+    sigma: float
+
+    @property
+    def task(self) -> Task:
+        """Scene, goal and actions."""
+
+    def reset(self, seed: int) -> Array:
+        """Go back to the start and return the state, shape (body, 6), SI units."""
+
+    def step(self, action: Array) -> Outcome:
+        """Hold an action, shape (body, 3), over one sampling interval."""
+
+
+def run_episode(
+    agent: Agent,
+    world: AnyWorld,
+    *,
+    steps: int = 100,
+    seed: int = 0,
+    progress: Callable[[str], None] | None = None,
+) -> Episode:
+    """Let an agent act in a world, and learn, until the goal or the limit of steps is reached.
+
+    Parameters
+    ----------
+    agent : Agent
+        Keeps what it has learned: pass a new one for an independent episode.
+    world : World
+        Is reset first.
+    steps : int
+        Largest number of actions.
+    seed : int
+        Seed of the world's noise. With an agent of the same seed, the episode is reproducible.
+    progress : callable, optional
+        Called with a message after each action.
+
+    Returns
+    -------
+    Episode
+        States, actions, observations, rewards and estimates.
+
+    Raises
+    ------
+    EpisodeError
+        If ``steps`` is below 1, the agent's task is not the world's, the world returns states of
+        another shape or that are not finite, or an action is none of the task's.
+
+    Examples
+    --------
+    ::
+
+        episode = pp.run_episode(pp.PBRLAgent(task, seed=1), world, seed=1)
+        episode.steps, episode.bumps
+        idata = pp.fit(pp.physics_model(task.scene, episode.history()))
+    """
+    if steps < 1:
+        raise EpisodeError(f"episode: steps is {steps}, expected at least 1")
+    if agent.task != world.task:
+        raise EpisodeError("episode: the agent and the world have different tasks; give both one")
+    task = world.task
+    state = check_state(task, world.reset(seed), "reset")
+    reached = task.reached(state)
+    rows: dict[str, list[Any]] = {name: [] for name in VARIABLES}
+    rows["states"].append(state)
+    rows["reward"].append(task.reward(state))
+    while not reached and len(rows["action"]) < steps:
+        begin = time.monotonic()
+        action = np.asarray(agent.act(state), dtype=float)
+        task.check_action(state, action)
+        chosen = time.monotonic() - begin
+        outcome = world.step(action)
+        after = check_state(task, outcome.state, "step")
+        observed = check_state(task, outcome.observed, "step")
+        begin = time.monotonic()
+        agent.observe(state, action, observed)
+        agent.update()
+        row = {
+            "seconds": chosen + time.monotonic() - begin,
+            "action": action,
+            "observed": observed,
+            "bumped": outcome.bumped,
+            "planned": agent.planned,
+            "estimate": agent.estimates,
+            "states": after,
+            "reward": outcome.reward,
+        }
+        for name, value in row.items():
+            rows[name].append(value)
+        state, reached = after, outcome.reached
+        if progress is not None:
+            progress(f"step {len(rows['action'])}, {-outcome.reward:.2f} m from the goal")
+    added = [
+        {"effect": each.effect, "body": each.body, "transitions": each.transitions}
+        for each in agent.added
+    ]
+    return Episode.of(
+        task.scene, rows, agent=agent.name, seed=seed, sigma=world.sigma, limit=steps,
+        reached=int(reached), world=_description(world), added=json.dumps(added),
+    )  # fmt: skip
 
 
 def run_episodes(
@@ -37,26 +151,26 @@ def run_episodes(
     Parameters
     ----------
     agents : mapping
-        What makes an agent of a seed, by the name of its files: ``{"pbrl": make_pbrl}``. Other
-        processes need functions that can be pickled, such as ``functools.partial`` of one in a
-        module.
+        Functions that make an agent from a seed, by the name of their files:
+        ``{"pbrl": make_pbrl}``. Other processes need functions that can be pickled, such as
+        ``functools.partial`` of one in a module.
     world : World
         Each episode resets it, or a copy of it.
     seeds : iterable of int
         One episode each.
     folder : str or Path
-        Of the files, ``<name>-<seed>.nc``, and ``<name>-<seed>.posterior.nc`` of agents that have a
-        posterior: the last, for :func:`pbrl_ppl.load_posterior`. Made if it is not there.
+        Folder of the files ``<name>-<seed>.nc``, and of ``<name>-<seed>.posterior.nc``, the last
+        posterior of agents that have one, for :func:`pbrl_ppl.load_posterior`. Made if missing.
     steps : int
-        The most actions of an episode.
+        Largest number of actions of an episode.
     workers : int, optional
-        Processes that are started for the episodes, as many as there are processors by default. A
-        script must then call this under ``if __name__ == "__main__":``, for each process imports
-        it. With 1, or one episode to run, they run here, one after the other.
+        Processes to start for the episodes; as many as there are processors by default. A script
+        must then call this under ``if __name__ == "__main__":``, because each process imports it.
+        With 1, or a single episode to run, episodes run in this process, one after the other.
     executor : Executor, optional
-        Where the episodes run instead: threads, Dask.
+        Runs the episodes instead: threads, Dask.
     progress : callable, optional
-        Told of each episode that is finished.
+        Called with a message after each episode.
 
     Returns
     -------
@@ -66,13 +180,14 @@ def run_episodes(
     Raises
     ------
     EpisodeError
-        If a file there is of another scene, world, start, noise or limit of steps, what makes an
-        agent cannot be sent to another process, one ended too early, or as :func:`run_episode`.
+        If a file in the folder is of another scene, world, start, noise or limit of steps, a
+        function cannot be sent to another process, a process ended too early, or as
+        :func:`run_episode`.
     OutputError
         If a file cannot be written.
     KeyboardInterrupt
-        If it is interrupted: the files of finished episodes stay, and the same call goes on. It
-        says so.
+        If it is interrupted, with a message: the files of finished episodes stay, and the same call
+        continues.
 
     Examples
     --------
@@ -92,32 +207,39 @@ def run_episodes(
         raise EpisodeError(f"episodes: workers is {workers}, expected at least 1")
     folder, seeds = Path(folder), list(seeds)
     folder.mkdir(parents=True, exist_ok=True)
-    tell = progress or (lambda _: None)
+    report = progress or (lambda _: None)
     paths = {(name, seed): folder / f"{name}-{seed}.nc" for name in agents for seed in seeds}
     found = {
-        key: _same(path, world, steps, key[1]) for key, path in paths.items() if path.is_file()
+        key: _stored(path, world, steps, key[1]) for key, path in paths.items() if path.is_file()
     }
-    count = len(found)
-    if count:
-        tell(f"{count} of {len(paths)} episodes are in {folder}")
+    if found:
+        report(f"{len(found)} of {len(paths)} episodes are in {folder}")
+    waiting = {
+        (name, seed): (agents[name], world, seed, steps, path)
+        for (name, seed), path in paths.items()
+        if (name, seed) not in found
+    }
 
     def finished(key: tuple[str, int], episode: Episode) -> None:
         found[key] = episode
-        tell(f"{len(found)}/{len(paths)} {in_words(episode)}")
+        how = "reached the goal" if episode.reached else "did not reach the goal"
+        report(
+            f"{len(found)}/{len(paths)} {episode.agent}, seed {episode.seed}: {how} in"
+            f" {episode.steps} steps, {episode.bumps} with bumps"
+        )
 
-    left = [key for key in paths if key not in found]
-    at_once = min(processors() if workers is None else workers, len(left))
+    at_once = min(processors() if workers is None else workers, len(waiting))
     try:
         if executor is None and at_once < 2:
-            for key in left:
-                finished(key, _played(agents[key[0]], world, key[1], steps, paths[key]))
+            for key, arguments in waiting.items():
+                finished(key, _run_and_save(*arguments))
         else:
             if executor is None:
                 _check_pickled(agents, world)
             with processes(at_once) if executor is None else nullcontext(executor) as pool:
                 futures = {
-                    pool.submit(_played, agents[key[0]], world, key[1], steps, paths[key]): key
-                    for key in left
+                    pool.submit(_run_and_save, *arguments): key
+                    for key, arguments in waiting.items()
                 }
                 try:
                     for future in as_completed(futures):
@@ -126,35 +248,26 @@ def run_episodes(
                     for future in futures:
                         future.cancel()
     except KeyboardInterrupt:
-        said = f"{len(found)} of {len(paths)} episodes are in {folder}; run it again"
-        raise KeyboardInterrupt(said) from None
+        message = f"{len(found)} of {len(paths)} episodes are in {folder}; run it again"
+        raise KeyboardInterrupt(message) from None
     return {name: [found[name, seed] for seed in seeds] for name in agents}
 
 
-def in_words(episode: Episode) -> str:
-    """One line: who, and how it went."""
-    how = "reached the goal" if episode.reached else "did not reach the goal"
-    return (
-        f"{episode.agent}, seed {episode.seed}: {how} in {episode.steps} steps,"
-        f" {episode.bumps} with bumps"
-    )
-
-
 def _check_pickled(agents: Mapping[str, MakeAgent], world: AnyWorld) -> None:
-    """Refuse what cannot be sent to another process."""
+    """Check that agents' functions and the world can be sent to another process."""
     given = {f"what makes agent {name!r}": make for name, make in agents.items()}
     for what, each in {**given, "the world": world}.items():
         try:
             pickle.dumps(each)
-        except Exception as error:  # classes raise what they like
+        except Exception as error:  # classes may raise anything
             raise EpisodeError(
                 f"episodes: {what} cannot be sent to another process ({error}); use functions and"
                 " classes of a module, or give workers=1"
             ) from None
 
 
-def _played(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path: Path) -> Episode:
-    """Run one episode and save it, where it ran; its own file last, for that says it is done."""
+def _run_and_save(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path: Path) -> Episode:
+    """Run one episode and save it, the episode's file last: it marks a finished episode."""
     agent = make(seed)
     episode = run_episode(agent, world, steps=steps, seed=seed)
     if agent.posterior is not None:
@@ -163,8 +276,8 @@ def _played(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path: Path)
     return episode
 
 
-def _same(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
-    """An episode that was run before, of the same experiment."""
+def _stored(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
+    """Return the episode of a file, after a check that it belongs to this experiment."""
     episode = Episode.load(path, world.task.scene)
     expected = {"seed": seed, "sigma": world.sigma, "limit": steps}
     for name, value in expected.items():
@@ -173,7 +286,7 @@ def _same(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
                 f"{path}: this is an episode with {name} {got}, expected {value}; give another"
                 " folder"
             )
-    if episode.dataset.attrs.get("world", "") != described(world):
+    if episode.dataset.attrs.get("world", "") != _description(world):
         raise EpisodeError(
             f"{path}: this is an episode in another world: its engine, true parameters or effects"
             " are not these; give another folder"
@@ -181,3 +294,28 @@ def _same(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
     if not np.array_equal(episode.dataset["states"][0], world.reset(seed)):
         raise EpisodeError(f"{path}: this episode starts elsewhere; give another folder")
     return episode
+
+
+def _description(world: AnyWorld) -> str:
+    """Return a world's description for an episode's file; empty if it has none."""
+    return str(getattr(world, "description", ""))
+
+
+def check_state(task: Task, given: Any, method: str) -> Array:
+    """Return a state that a world's method returned, shape (body, 6), after a check.
+
+    Raises
+    ------
+    EpisodeError
+        If it has another shape, or is not finite.
+    """
+    state, expected = np.asarray(given, dtype=float), (len(task.scene.moving), len(STATE))
+    if state.shape != expected or not np.isfinite(state).all():
+        found = f"states of shape {state.shape}"
+        if state.shape == expected:
+            found = "a state that is not finite"
+        raise EpisodeError(
+            f"world: {method} returned {found}, expected finite ones of shape {expected}:"
+            f" {', '.join(STATE)} of {', '.join(body.name for body in task.scene.moving)}"
+        )
+    return state

@@ -1,50 +1,48 @@
-"""PBRL with a categorical prior: each body is like one of those that were learned before."""
+"""PBRL agent with a categorical prior: each body has one of a library's parameter sets."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
 from typing import Any, ClassVar, final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pbrl_ppl.agents.agent import Agent
-from pbrl_ppl.agents.task import Task
+from pbrl_ppl.agents.agent import PhysicsAgent, prediction_errors
+from pbrl_ppl.agents.world import Task
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.likelihood import Problem, TransitionLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import choose_from_library
-from pbrl_ppl.parameters import ParameterLibrary
+from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import build_layout, touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA, wrapped
 
 Array = NDArray[np.float64]
 
-#: Draws of the paper's schedule: 5000 iterations, 1000 burnt in, each tenth kept, one chain.
+#: Draws of the paper's schedule: 5000 iterations, 1000 burn-in, thinning 10, one chain.
 _DRAWS = 400
-#: The share by which a body's data grow before it is looked at again, and errors that are foretold
-#: well enough (SI units).
-_GROWTH, _FORETOLD = 0.2, 1e-4
+#: Share by which a body's data grow before its choice is updated, and prediction errors that need
+#: no update (SI units).
+_GROWTH, _NEGLIGIBLE = 0.2, 1e-4
 
 
 @final
-class LibraryAgent(Agent):
-    """PBRL agent of the paper's apartment (section 5.2): a choice among parameter sets a body.
+class LibraryAgent(PhysicsAgent):
+    """PBRL agent of the paper's apartment (section 5.2): one parameter set per body.
 
-    A body is judged by the transitions in which it moves or is pushed and touches no other moving
-    one, each by itself with a noise of its own: given the noise, bodies apart are independent.
-    Bodies of one class with equal attributes share parameters, and so one choice and noise. The
-    paper walks among the choices; here the sum over them is exact, and as many draws are kept, or
-    with ``method="paper"`` PyMC walks on the schedule of Table 2, which takes seconds a body. The
-    most frequent choice (MAP) is planned with; a body of which nothing was seen is like a set drawn
-    from the prior.
+    The data of a body are the transitions in which it moves or is pushed and touches no other
+    moving body. Each body has its noise; given the noise, bodies apart are independent. Bodies of
+    one class with equal attributes share parameters, and so the choice and the noise. The paper
+    samples the choices by Metropolis; here the sum over them is exact and as many draws are taken,
+    or with ``method="paper"`` PyMC samples on the schedule of Table 2, which takes seconds a body.
+    The agent plans with the most frequent choice (MAP); a body without data has a set drawn from
+    the prior.
 
     Parameters
     ----------
@@ -53,14 +51,14 @@ class LibraryAgent(Agent):
     library : ParameterLibrary
         The sets, and their probabilities.
     method : str
-        ``exact``: the sum over the sets; ``paper``: Metropolis, as of :func:`pbrl_ppl.fit`.
+        ``exact``: the sum over the sets; ``paper``: Metropolis, see :func:`pbrl_ppl.fit`.
     **options
-        As of :class:`Agent`.
+        Options of :class:`Agent`.
 
     Attributes
     ----------
     fits : int
-        How often a body, or those of a class, were looked at.
+        Number of updates of a body's or class's choice.
 
     Raises
     ------
@@ -69,7 +67,7 @@ class LibraryAgent(Agent):
     ParameterError
         If the library does not fit the scene's bodies.
     ValueError
-        If ``method`` is neither.
+        If ``method`` is another.
 
     References
     ----------
@@ -95,35 +93,22 @@ class LibraryAgent(Agent):
         names = [body.name for body in scene.moving]
         self._probability = {owner: library.prior(owner) for owner in scene.owners}
         self._choice = {name: int(rng.choice(len(p), p=p)) for name, p in self._probability.items()}
-        self._own = {owner: scene.subset(own) for owner, own in scene.owners.items()}
+        self._scenes = {owner: scene.subset(bodies) for owner, bodies in scene.owners.items()}
         self._pairs = {
             (a, b): scene.subset([a, b]).replace(walls=())
             for i, a in enumerate(names)
             for b in names[i + 1 :]
         }
-        self._seen: dict[str, list[tuple[Array, Array, Array]]] = {name: [] for name in self._own}
-        self._fitted = dict.fromkeys(self._own, 0)
-        self._dynamics: Dynamics | None = None
-
-    @property
-    def model(self) -> Dynamics | None:
-        """Eq. 7 at the most probable choice; None before anything was observed."""
-        return self._dynamics
-
-    @property
-    def estimates(self) -> Mapping[str, float]:
-        """Parameters of the most probable choice, by label; SI units."""
-        if self._dynamics is None:
-            return {}
-        return dict(zip(self._layout.labels, self._dynamics.phi[0].tolist(), strict=True))
+        self._seen: dict[str, list[tuple[Array, Array, Array]]] = {key: [] for key in scene.owners}
+        self._fitted = dict.fromkeys(scene.owners, 0)
 
     @property
     def probabilities(self) -> pd.DataFrame:
-        """Posterior probability of every set: one row a body or class, one column a set."""
+        """Posterior probabilities: one row per body or class, one column per set."""
         return pd.DataFrame(self._probability, index=list(self.library.names)).T
 
     def observe(self, state: Array, action: Array, next_state: Array) -> None:
-        """Keep what a transition says of each body; arguments as of :meth:`Agent.observe`."""
+        """Store a transition of each body that it informs; see :meth:`Agent.observe`."""
         moved = action.any(axis=1) | state[:, 3:].any(axis=1) | (next_state != state).any(axis=1)
         names = [body.name for body in self.task.scene.moving]
         alone = moved.copy()
@@ -133,16 +118,16 @@ class LibraryAgent(Agent):
                 both = [i, j]
                 if touching(scene, state[None, both], next_state[None, both])[0]:
                     alone[both] = False
-        for owner, own in self.task.scene.owners.items():
-            of = [names.index(name) for name in own]
-            judged = alone[of, None]
-            if judged.any():  # the others of its class stand still, and were not measured
-                begin = np.where(judged | (np.arange(state.shape[1]) < 3), state[of], 0.0)
-                push, after = judged * action[of], np.where(judged, next_state[of], np.nan)
+        for owner, bodies in self.task.scene.owners.items():
+            rows = [names.index(name) for name in bodies]
+            used = alone[rows, None]
+            if used.any():  # other bodies of the class are at rest and count as not measured
+                begin = np.where(used | (np.arange(state.shape[1]) < 3), state[rows], 0.0)
+                push, after = used * action[rows], np.where(used, next_state[rows], np.nan)
                 self._seen[owner].append((begin, push, after))
 
     def update(self) -> None:
-        """Choose anew for each body or class whose data grew by a fifth and were not foretold."""
+        """Update the choice of bodies and classes whose data grew and were not predicted."""
         before = self.fits
         for name, seen in self._seen.items():
             fitted = self._fitted[name]
@@ -153,35 +138,31 @@ class LibraryAgent(Agent):
             self._dynamics = Dynamics(self.task.scene, self._phi(self._layout), threads=1)
 
     def _surprised(self, name: str) -> bool:
-        state, action, after = (np.array(each) for each in zip(*self._seen[name], strict=True))
-        scene = self._own[name]
-        own = Dynamics(scene, self._phi(build_layout(scene)), threads=1)
-        error = abs(after - own.step(state[None], action)[0])
-        error[..., THETA] = abs(wrapped(error[..., THETA]))
-        return bool((error > _FORETOLD).any())
+        scene, (state, action, after) = self._scenes[name], self._data(name)
+        dynamics = Dynamics(scene, self._phi(build_layout(scene)), threads=1)
+        return bool((prediction_errors(dynamics, state, action, after) > _NEGLIGIBLE).any())
 
-    def _phi(self, layout: Any) -> Array:
-        """Chosen parameters in a layout's order."""
+    def _data(self, name: str) -> tuple[Array, Array, Array]:
+        """Return states, wrenches and next states of a body or class."""
+        state, action, after = (np.array(each) for each in zip(*self._seen[name], strict=True))
+        return state, action, after
+
+    def _phi(self, layout: Layout) -> Array:
+        """Return the chosen parameters in a layout's order."""
         known = {
-            label: self._table[i, self._choice[self._owner(label)]]
+            label: self._table[i, self._choice[label.partition("[")[2].rstrip("]")]]
             for i, label in enumerate(self._layout.labels)
         }
         return np.array([known[label] for label in layout.labels])
 
-    @staticmethod
-    def _owner(label: str) -> str:
-        return label.partition("[")[2].rstrip("]")
-
     def _choose(self, name: str) -> None:
-        scene, seen = self._own[name], self._seen[name]
-        state, action, after = (np.array(each) for each in zip(*seen, strict=True))
+        scene, (state, action, after) = self._scenes[name], self._data(name)
         history = from_segments(scene, state, action[:, None], after[:, None])
-        among = _of_one(self.library, scene, name)
-        problem = Problem.of(
-            scene, history, likelihood=TransitionLikelihood(scalar=True), library=among
-        )
+        among = _restricted(self.library, scene, name)
+        noise = TransitionLikelihood(scalar=True)
+        problem = Problem.of(scene, history, likelihood=noise, library=among)
         if self.method == "paper":
-            with warnings.catch_warnings():  # of one chain, as the paper has it
+            with warnings.catch_warnings():  # one chain, as in the paper
                 warnings.simplefilter("ignore", ConvergenceWarning)
                 idata = fit(build_model(problem), method="paper", seed=self.seed, progress=False)
             index = group(idata, "posterior")["library_index"].to_numpy()
@@ -191,11 +172,11 @@ class LibraryAgent(Agent):
         found = dict(zip(among.names, share.tolist(), strict=True))
         self._probability[name] = np.array([found.get(each, 0.0) for each in self.library.names])
         self._choice[name] = int(self._probability[name].argmax())
-        self._fitted[name], self.fits = len(seen), self.fits + 1
+        self._fitted[name], self.fits = len(state), self.fits + 1
 
 
-def _of_one(library: ParameterLibrary, scene: Scene, name: str) -> ParameterLibrary:
-    """The sets that are possible for one body or class, with the parameters that it has."""
+def _restricted(library: ParameterLibrary, scene: Scene, name: str) -> ParameterLibrary:
+    """Return the sets that one body or class may have, with its parameters only."""
     wanted = {block.name for block in build_layout(scene).blocks}
     prior = dict(zip(library.names, library.prior(name).tolist(), strict=True))
     sets = {

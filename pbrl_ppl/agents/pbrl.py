@@ -1,9 +1,9 @@
-"""PBRL: the agent whose model is the posterior of a physics engine's parameters."""
+"""PBRL agent: its model is the posterior of a physics engine's parameters."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import combinations
 from typing import Any, ClassVar, final
@@ -11,9 +11,9 @@ from typing import Any, ClassVar, final
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.agents.agent import Agent
+from pbrl_ppl.agents.agent import PhysicsAgent, prediction_errors
 from pbrl_ppl.agents.revision import select_effects
-from pbrl_ppl.agents.task import Task
+from pbrl_ppl.agents.world import Task
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import BoundWarning, FitError, UninformedWarning
@@ -24,51 +24,49 @@ from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit, physics_model
-from pbrl_ppl.state import THETA, wrapped
 
 Array = NDArray[np.float64]
 
-#: A transition that the model foretells so well teaches it nothing (SI units).
-_FORETOLD = 1e-4
-#: Errors of this many sigma are a surprise.
+#: Prediction errors up to this (SI units) carry no information: they are the engine's.
+_NEGLIGIBLE = 1e-4
+#: Prediction errors above this many sigma cause a refit.
 _SURPRISE = 4.0
-#: Transitions that a model is criticised with at least, and the chance of trying an effect in all
-#: of a clean episode.
+#: Fewest transitions for criticism, and the significance level over a whole episode.
 _LEAST, _LEVEL = 3, 0.01
 
 
 @final
-class PBRLAgent(Agent):
-    """Agent that infers the physics of what it pushes, and plans with the posterior.
+class PBRLAgent(PhysicsAgent):
+    """Agent that infers the physics of the bodies it pushes, and plans with the posterior.
 
-    Before any data it acts at random: a plan at the centre of Table 1's prior, where the wheel
-    rolls as badly along as across, is no better than that, and costs a search.
+    Before any data it acts at random: a plan at the centre of Table 1's prior, where the wheel's
+    friction is the same along and across, is no better, and costs a search.
 
-    The posterior is fitted anew, for ``update`` reweights draws, which a few transitions without
-    noise leave next to nothing of, and a fit's search for the mode takes a second or two; but only
-    when there is something to learn: not while the model foretells what comes exactly, and within
-    its noise only when the data have grown by a share, ``growth``. Each transition is one by
-    itself: an effect of the scene that remembers the command before sees none.
+    The posterior is refitted (reweighting draws, as ``update`` does, degenerates after a few
+    transitions without noise; a fit takes a second or two). There is no refit while predictions are
+    exact; while errors are within the noise, a refit follows when the data have grown by the share
+    ``growth``. Transitions are fitted separately: effects with memory of the previous command see
+    none.
 
     Parameters
     ----------
     task : Task
         Scene, goal and actions.
     draws : int, optional
-        Posterior draws to plan with, from the Gaussian at the mode; without it, the mode (MAP), as
+        Posterior draws to plan with, from the Gaussian at the mode; by default the mode (MAP), as
         in the paper.
     growth : float
-        By what share the data grow before a fit where nothing surprised it.
+        Share by which the data grow before a refit while errors are within the noise.
     sigma : str
         ``scalar``, as in Eq. 11, or ``per_dimension``.
     effects : iterable of Effect or Attached
-        Effects that it knows of, beside those that the scene declares.
+        Effects of its model in addition to those that the scene declares.
     revise : bool
-        Whether it looks for what its model lacks.
+        Whether to criticise the model and add missing effects.
     catalogue : iterable of Effect
-        Where it looks.
+        Candidates for missing effects.
     **options
-        As of :class:`Agent`.
+        Options of :class:`Agent`.
 
     Raises
     ------
@@ -80,14 +78,14 @@ class PBRLAgent(Agent):
     Attributes
     ----------
     posterior : InferenceData or DataTree or None
-        As :func:`pbrl_ppl.fit` made it last.
+        Latest posterior, as made by :func:`pbrl_ppl.fit`.
     fits : int
-        How often it was fitted.
+        Number of fits.
     looks : int
-        How often it looked for what its model lacks.
+        Number of criticisms.
     added : tuple of Revision
-        Effects that it found missing and plans with, each with when it was added and how sure that
-        was; their parameters are among the estimates from then on.
+        Effects added to the model, with the evidence for each; their parameters are among the
+        estimates.
     """
 
     name: ClassVar[str] = "PBRL"
@@ -114,51 +112,34 @@ class PBRLAgent(Agent):
         self._catalogue = tuple(catalogue)
         self._declared = attach(task.scene, effects, self._catalogue)
         self._transitions: list[tuple[Array, Array, Array]] = []
-        self._dynamics: Dynamics | None = None
         self._sigma = np.empty(0)
         self.fits = self._fitted = self.looks = self._looked = 0
 
-    @property
-    def model(self) -> Dynamics | None:
-        """Eq. 7 at the mode or at draws; None before the first fit."""
-        return self._dynamics
-
-    @property
-    def estimates(self) -> Mapping[str, float]:
-        """The mode, or the draw in the middle of those that it plans with, by label; SI units."""
-        if self._dynamics is None:
-            return {}
-        middle = self._dynamics.single()
-        return dict(zip(middle.layout.labels, middle.phi[0].tolist(), strict=True))
-
     def observe(self, state: Array, action: Array, next_state: Array) -> None:
-        """Keep a transition; arguments as of :meth:`Agent.observe`."""
+        """Store a transition; arguments as for :meth:`Agent.observe`."""
         self._transitions.append((state, action, next_state))
 
     def update(self) -> None:
-        """Fit the posterior, if there is something to learn."""
-        if self._due():
+        """Refit the posterior if new transitions are informative."""
+        if self._is_informed():
             self._fit()
 
-    def _due(self) -> bool:
+    def _is_informed(self) -> bool:
         if len(self._transitions) == self._fitted or self._dynamics is None:
             return len(self._transitions) > self._fitted
         state, inputs, after = (each[self._fitted :] for each in self._data())
         action, previous = inputs[..., :3], inputs[..., 3:6]
-        states = np.repeat(state[None], self._dynamics.draws, 0)
-        foretold = self._dynamics.step(states, action, previous)
-        error = abs(after - foretold.mean(axis=0))
-        error[..., THETA] = abs(wrapped(error[..., THETA]))
-        if (error <= _FORETOLD).all():
+        error = prediction_errors(self._dynamics, state, action, after, previous)
+        if (error <= _NEGLIGIBLE).all():
             return False
-        surprised = not (error <= np.maximum(_SURPRISE * self._sigma, _FORETOLD)).all()
+        surprised = not (error <= np.maximum(_SURPRISE * self._sigma, _NEGLIGIBLE)).all()
         return self._grown(self._fitted) or surprised
 
     def _grown(self, since: int) -> bool:
         return len(self._transitions) >= (1.0 + self.growth) * since
 
     def _data(self) -> tuple[Array, Array, Array]:
-        """States, what acted from them, as in `pbrl_ppl.state.INPUT`, and where that led."""
+        """Return states, inputs as in `pbrl_ppl.state.INPUT`, and next states."""
         state, action, after = (np.array(each) for each in zip(*self._transitions, strict=True))
         before = np.concatenate([np.zeros_like(action[:1]), action[:-1]])
         begin = self.task.scene.time_step * np.arange(len(action))
@@ -167,14 +148,14 @@ class PBRLAgent(Agent):
         return state, np.concatenate([action, before, clock], axis=2), after
 
     def _model(self, effects: tuple[Attached, ...], chosen: Any = slice(None)) -> Any:
-        """The model of the transitions chosen."""
+        """Return the PyMC model of chosen transitions."""
         state, inputs, after = (each[chosen] for each in self._data())
         history = from_segments(self.task.scene, state, inputs[:, None], after[:, None])
         extra = effects[len(attach(self.task.scene, (), self._catalogue)) :]
         return physics_model(self.task.scene, history, extra, sigma=self._noise)
 
     def _revised(self) -> Mode | None:
-        """Look for what the declared model lacks; the mode found, if it is one of all data."""
+        """Criticise the declared model; return the mode found if it is of all data."""
         state, _, after = self._data()
         free = ~touching(self.task.scene, state, after)
         if free.sum() < _LEAST or not self._grown(self._looked):
@@ -186,7 +167,7 @@ class PBRLAgent(Agent):
         self.looks, self._looked = self.looks + 1, len(free)
         level = _LEVEL / (self.looks * (self.looks + 1))
         found, mode = select_effects(
-            search, self._declared, self.added, self._catalogue, level=level, floor=_FORETOLD
+            search, self._declared, self.added, self._catalogue, level=level, floor=_NEGLIGIBLE
         )
         known = {revision.attached: revision.transitions for revision in self.added}
         self.added = tuple(
@@ -194,8 +175,8 @@ class PBRLAgent(Agent):
         )
         return mode if free.all() else None
 
-    def _climbed(self, effects: tuple[Attached, ...], whole: Problem) -> Mode | None:
-        """Mode climbed to from that of the bodies that moved; None where all of them did.
+    def _start(self, effects: tuple[Attached, ...], whole: Problem) -> Mode | None:
+        """Return the mode found from that of the bodies that moved; None if all moved.
 
         Bodies that nothing moved or touched keep their prior. Those that moved are fitted first to
         the transitions without contact, whose likelihood is smooth, then to all.
@@ -211,8 +192,8 @@ class PBRLAgent(Agent):
         if moved.all() or not moved.any():
             return None
         part = scene.subset([name for name, each in zip(every, moved, strict=True) if each])
-        own = {body.name for body in part.moving}
-        extra = tuple(each for each in effects if each.body in own)
+        inside = {body.name for body in part.moving}
+        extra = tuple(each for each in effects if each.body in inside)
         extra = extra[len(attach(part, (), self._catalogue)) :]
 
         def fitted(rows: Any, initial: Array | None = None) -> Mode:
@@ -229,10 +210,10 @@ class PBRLAgent(Agent):
         start = self._revised() if self.revise else None
         effects = (*self._declared, *(each.attached for each in self.added))
         model = self._model(effects)
-        start = start or self._climbed(effects, model.problem)
+        start = start or self._start(effects, model.problem)
         method = "map" if self.draws is None else "laplace"
         with warnings.catch_warnings():
-            # that the data do not say everything yet is why it is still learning
+            # early in an episode the data do not inform all parameters
             warnings.simplefilter("ignore", UninformedWarning)
             warnings.simplefilter("ignore", BoundWarning)
             self.posterior = fit(model, seed=self.seed, method=method, start=start, progress=False)

@@ -1,4 +1,4 @@
-"""Fresh processes to run episodes in, which an interrupt or an error ends at once."""
+"""Spawned processes to run episodes in; an interrupt or an error ends them at once."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pbrl_ppl.errors import EpisodeError
 
 @contextmanager
 def processes(workers: int | None = None) -> Iterator[Executor]:
-    """Run calls in spawned processes: PyMC's threads do not survive a fork.
+    """Return a context with an executor of spawned processes: PyMC's threads do not survive a fork.
 
-    Ctrl-C reaches the caller alone, who keeps what is finished.
+    Only the caller receives Ctrl-C, and keeps finished results.
 
     Parameters
     ----------
     workers : int, optional
-        How many; as many as there are processors by default.
+        Number of processes; as many as there are processors by default.
 
     Raises
     ------
@@ -41,10 +41,8 @@ def processes(workers: int | None = None) -> Iterator[Executor]:
     if workers < 1:
         raise EpisodeError(f"workers is {workers}, expected at least 1")
     others = set(active_children())
-    deaf = (signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes
-    pool = ProcessPoolExecutor(
-        workers, get_context("spawn"), initializer=signal.signal, initargs=deaf
-    )
+    ignored = (signal.SIGINT, signal.SIG_IGN)  # a terminal sends Ctrl-C to all processes
+    pool = ProcessPoolExecutor(workers, get_context("spawn"), signal.signal, ignored)
     try:
         yield pool
     except BaseException as error:
@@ -62,7 +60,7 @@ def processes(workers: int | None = None) -> Iterator[Executor]:
 
 
 def processors() -> int:
-    """How many this process may use."""
-    if hasattr(os, "sched_getaffinity"):
+    """Return the number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):  # on Linux
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

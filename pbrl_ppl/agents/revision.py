@@ -1,9 +1,10 @@
-"""Criticism in the middle of an episode: which effects a model of few transitions lacks."""
+"""Criticism during an episode: stepwise selection of effects from few transitions."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import beta
@@ -22,38 +23,38 @@ from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.parameters import inside, prior_slopes
 
-#: Finds the mode of a model with these effects.
+#: Returns the mode of a model with these effects.
 Search = Callable[[tuple[Attached, ...]], Mode]
 
-#: Effects added at most: an episode is short.
-MOST_ADDED = 3
-#: Log-likelihoods of few transitions that differ by less choose between no effects: the catalogue's
-#: order does, in which the simpler goes first (nats; a score of 10, as in `inseparable`).
+#: Largest number of added effects: an episode is short.
+_MOST_ADDED = 3
+#: Log-likelihoods of few transitions that differ by less do not decide between effects; the
+#: catalogue's order does, simpler effects first (nats; a score of 10, as in `inseparable`).
 _TIE = 5.0
-#: Up to so many transitions all candidates are refitted, whatever their scores; a refit counts
-#: where it explains so much of the squared residuals, for the declared model's own fit may be poor.
+#: Up to this many transitions all candidates are refitted, whatever their scores, because the
+#: declared model may fit badly; a refit counts if it explains this share of the squared residuals.
 _FEW, _DECISIVE = 16, 0.99
-#: Precision of an angle of which nothing is known, as if it were normal (1/rad^2).
+#: Precision of a uniform angle, as if it were normal (1/rad^2).
 _CIRCLE = 3.0 / np.pi**2
 
 
 @dataclass(frozen=True)
 class Revision:
-    """An effect that an agent added to its model in the middle of an episode.
+    """Effect that an agent added to its model during an episode.
 
     Parameters
     ----------
     attached : Attached
         The effect, and the body that it acts on.
     transitions : int
-        How many the agent had observed when it first added it.
+        Number of transitions observed when it was first added.
     p_value : float
-        Of the score test, or of the share of the misfit that a refit explains, corrected for the
-        candidates and for the looks at each.
+        p-value of the score test, or of the share of the misfit that a refit explains, corrected
+        for the candidates and for their grid points.
     elpd_difference, elpd_difference_se : float
         Gain in cross-validated log predictive density, and its standard error (nats).
     not_separable_from : tuple of str
-        Effects that the data could not tell from it.
+        Effects that the data cannot separate from it.
     """
 
     attached: Attached
@@ -83,10 +84,10 @@ def select_effects(
     level: float,
     floor: float,
 ) -> tuple[tuple[Revision, ...], Mode]:
-    """Effects that a declared model lacks, stepwise from those added before, and the mode.
+    """Return the effects that a declared model lacks, and the mode with them.
 
-    Each of those added before has to be earned again: it goes, or another takes its place, when
-    later data speak for that.
+    Stepwise selection starts from the effects added before. Each of these is tested again with the
+    later data, and is dropped or replaced if they say so.
 
     Parameters
     ----------
@@ -97,157 +98,158 @@ def select_effects(
     added : tuple of Revision
         Effects added before.
     catalogue : iterable of Effect
-        Candidates. What adds to the scene takes too long a search, and the noise's shape would let
-        misfit pass for noise: neither is tried.
+        Candidates. Effects of the structure stage, whose search takes too long, and of the noise
+        stage, which would take misfit for noise, are not tried.
     level : float
-        Chance of trying a candidate where nothing is missing.
+        Significance level, corrected for the candidates.
     floor : float
-        Errors up to this are of the engine, and say nothing (SI units).
+        Errors up to this (SI units) are the engine's, and carry no information.
 
     Returns
     -------
     tuple of Revision
         In the order in which they were added.
     Mode
-        Of the model with them.
+        Mode of the model with them.
     """
-    step = _Step(
-        search,
-        tuple(each for each in catalogue if not isinstance(each.stage, Structure | Noise)),
-        level,
-        floor,
-    )
+    tried = tuple(each for each in catalogue if not isinstance(each.stage, Structure | Noise))
+    step = _Step(search, tried, level, floor)
     mode, found = search((*declared, *(each.attached for each in added))), added
     for each in added:
         others = tuple(other for other in found if other is not each)
         lacking = _without(mode, each.attached)
         better = step.addition(lacking, {each.attached: mode})
-        if better is not None and better[0].attached != each.attached:
-            found, mode = (*others, better[0]), better[1]
-        elif not _worth_it(step.gain(mode, lacking)):
-            found = others
-            mode = search((*declared, *(other.attached for other in others)))
-    while len(found) < MOST_ADDED and not _foretold(mode, floor):
+        if better is not None and better.revision.attached != each.attached:
+            found, mode = (*others, better.revision), better.mode
+        elif not _is_worth_adding(step.gain(mode, lacking)):
+            found, mode = others, search((*declared, *(other.attached for other in others)))
+    while len(found) < _MOST_ADDED and not _is_exact(mode, floor):
         more = step.addition(mode, {})
         if more is None:
             break
-        found, mode = (*found, more[0]), more[1]
+        found, mode = (*found, more.revision), more.mode
     return found, mode
 
 
-def _foretold(mode: Mode, floor: float) -> bool:
-    """Whether a model predicts what it was fitted to up to the engine's own error."""
+def _is_exact(mode: Mode, floor: float) -> bool:
+    """Return whether a model predicts its data up to the engine's error."""
     residual = mode.problem.residual(mode.phi)[..., list(mode.problem.observations.columns)]
     return bool((np.nan_to_num(abs(residual), nan=np.inf) <= floor).all())
 
 
+class _Addition(NamedTuple):
+    """An effect added, and the mode with it."""
+
+    revision: Revision
+    mode: Mode
+
+
+class _Refit(NamedTuple):
+    """A mode with a candidate, and the p-value of the share of the misfit that it explains."""
+
+    mode: Mode
+    p_value: float
+
+
 @dataclass(frozen=True)
 class _Step:
-    """A step of the selection; arguments as of :func:`select_effects`."""
+    """Step of the selection; fields as the arguments of :func:`select_effects`."""
 
     search: Search
     catalogue: tuple[Effect, ...]
     level: float
     floor: float
 
-    def addition(self, mode: Mode, known: Mapping[Attached, Mode]) -> tuple[Revision, Mode] | None:
-        """The best of the leading candidates that cross-validation confirms, and the mode with it.
+    def addition(self, mode: Mode, known: Mapping[Attached, Mode]) -> _Addition | None:
+        """Return the best candidate that cross-validation confirms, or None.
 
-        ``known`` are modes with a candidate that were found before.
+        ``known`` has modes with a candidate from earlier searches.
         """
         missing = candidates(mode.problem.scene, mode.problem.physics.effects, self.catalogue)
         ranked = rank_candidates(mode, missing)
-        leading = _significant(mode, ranked, missing, self.level)[:TRIED]
-        fits = {each: known.get(each.attached) or _climbed(mode, each) for each in leading}
-        chances = {each: _p_value(mode, each) for each in ranked}
-        if mode.problem.segments.n <= _FEW:  # a score far from the truth says little of so few
-            for each, (refit, chance) in _refitted(mode, ranked, missing, self.level).items():
-                chances[each] = min(chances[each], chance)
-                fits[each] = max(fits.get(each, refit), refit, key=lambda one: one.log_posterior)
+        order = {each: missing.index(each.attached) for each in ranked}
+        by_name = sorted(ranked, key=order.__getitem__)
+        p_values = {each: _p_value(mode, each) for each in ranked}
+        significant: list[Signature] = []  # of equal ones, the first in the catalogue
+        for each in by_name:
+            p_value = p_values[each] * len(ranked)
+            if p_value < self.level and not any(twins(each, other) for other in significant):
+                significant.append(each)
+        leading = sorted(significant, key=ranked.index)[:TRIED]
+        fits = {each: known.get(each.attached) or _fit_with(mode, each) for each in leading}
+        if mode.problem.segments.n <= _FEW:  # scores far from the mode are unreliable
+            for each, refit in self._decisive_refits(mode, by_name).items():
+                p_values[each] = min(p_values[each], refit.p_value)
+                fits[each] = _higher(fits.get(each, refit.mode), refit.mode)
             leading = sorted(fits, key=lambda each: -fits[each].log_posterior)[:TRIED]
-            fits = {each: fits[each] for each in leading}
         if not leading:
             return None
-
-        def rank(signature: Signature) -> int:
-            return missing.index(signature.attached)
-
-        sure = {each for each in leading if each.attached in known}
+        searched = {each for each in leading if each.attached in known}
 
         def search(signature: Signature) -> None:
-            """Look for the top elsewhere than where the climb led."""
-            if signature not in sure:
-                sure.add(signature)
+            """Search for a higher mode than the one found from the score's estimate."""
+            if signature not in searched:
+                searched.add(signature)
                 whole = self.search((*mode.problem.physics.effects, signature.attached))
-                fits[signature] = max(fits[signature], whole, key=lambda each: each.log_posterior)
+                fits[signature] = _higher(fits[signature], whole)
 
-        # a climb that ends short of the top must not choose another name than the score's, nor
-        # than the simplest of those that the data cannot tell from that
+        # a local mode must not decide against the best score, or the simplest effect that the data
+        # cannot separate from it
         alike = {leading[0].attached.effect.name, *inseparable(leading[0], leading)}
         search(leading[0])
-        search(min((each for each in leading if each.attached.effect.name in alike), key=rank))
-        heights = {each: _height(fits[each], each, self.floor) for each in leading}
-        while heights:
-            top = max(heights.values())
-            tied = [each for each, height in heights.items() if height > top - _TIE]
-            best = min(tied, key=rank)
-            del heights[best]
+        search(min((x for x in leading if x.attached.effect.name in alike), key=order.__getitem__))
+        scores = {each: _score(fits[each], each, self.floor) for each in leading}
+        while scores:
+            top = max(scores.values())
+            tied = [each for each, score in scores.items() if score > top - _TIE]
+            best = min(tied, key=order.__getitem__)
+            del scores[best]
             gained = self.gain(fits[best], mode)
-            if _worth_it(gained):
+            if _is_worth_adding(gained):
                 revision = Revision(
                     best.attached,
                     mode.problem.segments.n,
-                    min(1.0, chances[best] * len(missing)),
+                    min(1.0, p_values[best] * len(missing)),
                     gained.total,
                     gained.error,
                     inseparable(best, ranked),
                 )
                 search(best)
-                return revision, fits[best]
+                return _Addition(revision, fits[best])
         return None
 
+    def _decisive_refits(self, mode: Mode, by_name: list[Signature]) -> dict[Signature, _Refit]:
+        """Return significant refits that explain nearly all of the misfit; of equal ones, one."""
+        before = float((mode.whitened_residual**2).sum())
+        found: dict[Signature, _Refit] = {}
+        for signature in by_name:
+            if not any(twins(signature, earlier) for earlier in found):
+                refit = _fit_with(mode, signature, estimate=False)
+                after = float((refit.problem.whitened(refit.phi, mode.sigma) ** 2).sum())
+                share = 1.0 - after / before
+                p_value = _p_value_of_share(mode, signature, share)
+                if share > _DECISIVE and p_value * len(by_name) < self.level:
+                    found[signature] = _Refit(refit, p_value)
+        return found
+
     def gain(self, mode: Mode, without: Mode) -> Change:
-        """Gain in cross-validated log predictive density."""
+        """Return the gain in cross-validated log predictive density."""
         return gain(_floored(without, self.floor), _floored(mode, self.floor))
 
 
-def _significant(
-    mode: Mode, ranked: list[Signature], missing: tuple[Attached, ...], level: float
-) -> list[Signature]:
-    """Significant candidates, best first; of twins, the earlier in the catalogue."""
-    kept: list[Signature] = []
-    for signature in sorted(ranked, key=lambda each: missing.index(each.attached)):
-        chance = _p_value(mode, signature) * len(ranked)
-        if chance < level and not any(twins(signature, earlier) for earlier in kept):
-            kept.append(signature)
-    return sorted(kept, key=ranked.index)
-
-
-def _refitted(
-    mode: Mode, ranked: list[Signature], missing: tuple[Attached, ...], level: float
-) -> dict[Signature, tuple[Mode, float]]:
-    """Refits that explain nearly all of the misfit, and the chance of that; of twins, the first."""
-    before = float((mode.whitened_residual**2).sum())
-    found: dict[Signature, tuple[Mode, float]] = {}
-    for signature in sorted(ranked, key=lambda each: missing.index(each.attached)):
-        if not any(twins(signature, earlier) for earlier in found):
-            refit = _climbed(mode, signature, estimate=False)
-            after = float((refit.problem.whitened(refit.phi, mode.sigma) ** 2).sum())
-            share = 1.0 - after / before
-            chance = _chance(mode, signature, share)
-            if share > _DECISIVE and chance * len(ranked) < level:
-                found[signature] = refit, chance
-    return found
+def _higher(first: Mode, second: Mode) -> Mode:
+    """Return the mode with the higher log-posterior; of equal ones, the first."""
+    return max(first, second, key=lambda mode: mode.log_posterior)
 
 
 def _p_value(mode: Mode, signature: Signature) -> float:
-    """Chance of a score statistic where nothing is missing."""
+    """Return the p-value of a score statistic."""
     total = float((mode.whitened_residual**2).sum())
-    return _chance(mode, signature, min(signature.candidate.statistic / total, 1.0))
+    return _p_value_of_share(mode, signature, min(signature.candidate.statistic / total, 1.0))
 
 
-def _chance(mode: Mode, signature: Signature, share: float) -> float:
-    """Chance of explaining a share of the squares, by the beta law: few residuals tell no noise."""
+def _p_value_of_share(mode: Mode, signature: Signature, share: float) -> float:
+    """Return the p-value of an explained share of squares (beta distribution: noise is unknown)."""
     q = signature.basis.shape[1]
     free = np.count_nonzero(mode.whitened_residual) - np.linalg.matrix_rank(mode.jacobian) - q
     if q == 0 or free < 1 or share <= 0.0:
@@ -255,8 +257,8 @@ def _chance(mode: Mode, signature: Signature, share: float) -> float:
     return float(min(1.0, signature.candidate.looks * beta.sf(share, q / 2, free / 2)))
 
 
-def _climbed(mode: Mode, signature: Signature, *, estimate: bool = True) -> Mode:
-    """Mode with the candidate, climbed to from the score's estimate or from its prior's centre."""
+def _fit_with(mode: Mode, signature: Signature, *, estimate: bool = True) -> Mode:
+    """Return the mode with the candidate, from the score's estimate or its prior's centre."""
     attached, old = signature.attached, mode.problem
     problem = old.with_physics(effects=(*old.physics.effects, attached))
     phi = problem.layout.from_layout(old.layout, mode.phi)
@@ -267,25 +269,25 @@ def _climbed(mode: Mode, signature: Signature, *, estimate: bool = True) -> Mode
 
 
 def _without(mode: Mode, attached: Attached) -> Mode:
-    """Mode of the model that lacks an effect, climbed to from the one that has it."""
+    """Return the mode of the model without an effect, from the mode with it."""
     kept = tuple(each for each in mode.problem.physics.effects if each != attached)
     problem = mode.problem.with_physics(effects=kept)
     return find_mode(problem, initial=problem.layout.from_layout(mode.problem.layout, mode.phi))
 
 
-def _height(mode: Mode, signature: Signature, floor: float) -> float:
-    """Log-likelihood, less half the logarithm of the number of transitions a parameter."""
+def _score(mode: Mode, signature: Signature, floor: float) -> float:
+    """Return the log-likelihood minus half the log number of transitions per parameter (BIC)."""
     problem, sigma = mode.problem, np.maximum(mode.sigma, floor)
     likelihood = problem.log_density(problem.residual(mode.phi), sigma, mode.phi).sum()
     return float(likelihood - 0.5 * signature.candidate.dof * np.log(problem.segments.n))
 
 
-def _worth_it(gained: Change) -> bool:
+def _is_worth_adding(gained: Change) -> bool:
     return gained.total >= DEFAULT.min_elpd and gained.certain(DEFAULT.min_elpd_se)
 
 
 def _floored(mode: Mode, floor: float) -> Mode:
-    """A mode with no less noise than the engine's own: without any it would be certain of all."""
+    """Return a mode whose noise is at least the engine's error, which bounds its certainty."""
     sigma = np.maximum(mode.sigma, floor)
     if (sigma == mode.sigma).all():
         return mode

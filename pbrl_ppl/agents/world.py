@@ -1,4 +1,4 @@
-"""A world to act in: true dynamics, reward, bumps, and noise on what is observed."""
+"""Task of an agent, and the world to act in: true dynamics, reward, collisions and noise."""
 
 from __future__ import annotations
 
@@ -10,12 +10,99 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.agents.task import Task
-from pbrl_ppl.errors import EpisodeError
+from pbrl_ppl.errors import EpisodeError, GoalError
 from pbrl_ppl.physics import touching
-from pbrl_ppl.planning import Dynamics, start_state
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal, start_state
+from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
+
+#: Largest difference of an action from one of the set, for rounding (N and N m).
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True)
+class Task:
+    """What an agent is given: a scene, a goal, and actions; not the dynamics.
+
+    Attributes
+    ----------
+    scene : Scene
+        Known geometry. Its bodies start at rest at their ``pose``.
+    goal : Goal
+        An episode ends when it is reached.
+    actions : ActionSet
+        One is held over each sampling interval: one duration, the scene's ``time_step``.
+
+    Raises
+    ------
+    GoalError
+        If the goal or the actions do not fit the scene, an action is longer than an interval, or a
+        body has no pose.
+
+    Examples
+    --------
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> scene = Scene(time_step=0.2, bodies=(Body("puck", Shape.circle(0.2), pose=(0, 0, 0)),))
+    >>> pushes = ActionSet.box("puck", forces=(-4.0, 0.0, 4.0))
+    >>> task = Task(scene, Goal.of({"puck": (2.0, 0.0, None)}), pushes)
+    >>> task.reward(task.start)
+    -2.0
+    """
+
+    scene: Scene
+    goal: Goal
+    actions: ActionSet
+
+    def __post_init__(self) -> None:
+        self.goal.check(self.scene)
+        self.actions.check(self.scene)
+        if self.actions.intervals(self.scene) != (1,):
+            raise GoalError(
+                f"task: actions last {self.actions.durations} s, expected one sampling interval of"
+                f" {self.scene.time_step:g} s; an agent chooses anew after each"
+            )
+        start_state(self.scene, {})
+
+    @property
+    def start(self) -> Array:
+        """State at which an episode begins, shape (body, 6), SI units."""
+        return start_state(self.scene, {})
+
+    def reward(self, state: Array) -> float:
+        """Return minus the L2 distance of the bodies from their goal (m), as in section 5."""
+        return -float(self.goal.distance(self.scene, state))
+
+    def reached(self, state: Array) -> bool:
+        """Return whether a state (body, 6) is within the goal's tolerances."""
+        return bool(self.goal.shortfall(self.scene, state) <= 1.0)
+
+    def wrenches(self, state: Array) -> Array:
+        """Return all actions in a state (body, 6), shape (action, body, 3), world frame, N, N m."""
+        count = len(self.actions.actions)
+        heading = np.repeat(state[None, :, 2], count, axis=0)
+        return self.actions.wrenches(self.scene, np.arange(count), heading)
+
+    def check_action(self, state: Array, action: Array) -> None:
+        """Check that an action is one of the set in this state.
+
+        Raises
+        ------
+        EpisodeError
+            If it is not.
+        """
+        every = self.wrenches(state)
+        if action.shape != every.shape[1:]:
+            raise EpisodeError(
+                f"action: its shape is {action.shape}, expected {every.shape[1:]}: force_x, force_y"
+                f" and torque on {', '.join(body.name for body in self.scene.moving)}"
+            )
+        size = max(1.0, float(abs(every).max()))
+        if not (abs(every - action).max(axis=(1, 2)) <= _ROUNDING * size).any():
+            raise EpisodeError(
+                f"action: {action.tolist()} (N, N, N m; world frame) is none of the task's"
+                f" {len(every)} actions; choose one of Task.wrenches(state)"
+            )
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,15 +112,15 @@ class Outcome:
     Attributes
     ----------
     state : ndarray
-        Where it led, shape (body, 6), SI units: the agent acts from there.
+        Exact next state, shape (body, 6), SI units: the agent acts from it.
     observed : ndarray
-        The same as an agent observes it to learn from, with noise.
+        Next state with noise: the agent learns from it.
     reward : float
         Minus the L2 distance from the goal (m).
     bumped : bool
-        Whether a body touched a wall or another.
+        Whether a body touched a wall or another body.
     reached : bool
-        Whether the goal is reached: the episode ends.
+        Whether the goal is reached, which ends the episode.
     """
 
     state: Array
@@ -44,33 +131,33 @@ class Outcome:
 
 
 class World:
-    """The true dynamics of a task, by the package's own engine.
+    """True dynamics of a task, simulated by the package's engine.
 
-    Noise is on the next state that an agent learns from, Eq. 7's epsilon, as the paper's "training
-    observations corrupted by Gaussian noise" (section 5.1). The state that it acts from is exact:
-    with 0.25 m of noise on it, bodies would start inside walls.
+    Noise is added to the next state that an agent learns from, Eq. 7's epsilon: the paper's
+    "training observations corrupted by Gaussian noise" (section 5.1). The state that it acts from
+    is exact: with 0.25 m of noise, bodies would start inside walls.
 
     Parameters
     ----------
     task : Task
         Scene, goal and actions.
     parameters : mapping
-        True parameters by name, as of :meth:`pbrl_ppl.Dynamics.known`.
+        True parameters by name, as for :meth:`pbrl_ppl.Dynamics.known`.
     effects : iterable of Effect or Attached
-        True effects beside those that the scene declares.
+        True effects in addition to those that the scene declares.
     sigma : float
         Noise of each observed state dimension (m, rad, m/s, rad/s).
     spread : float
-        How far an episode's start may be from the task's, either way (m, m, rad): episodes without
-        noise differ by it alone.
+        Largest offset of an episode's start from the task's, either way (m, m, rad). Without noise,
+        episodes of a deterministic agent differ only by it.
     substeps : int, optional
-        Engine steps an interval; the scene's by default.
+        Engine steps per interval; the scene's by default.
 
     Raises
     ------
     EpisodeError
-        If ``sigma`` or ``spread`` is negative or not finite, or a start is to be varied of bodies
-        that joints hold.
+        If ``sigma`` or ``spread`` is negative or not finite, or ``spread`` is given for a scene
+        with joints.
     ParameterError
         If a parameter is missing, unknown or impossible.
 
@@ -108,13 +195,13 @@ class World:
 
     @property
     def description(self) -> str:
-        """Engine and true parameters, those of effects too, as JSON; an episode's file keeps it."""
+        """Engine and true parameters, those of effects included, as JSON for an episode's file."""
         truth = self._truth
         values = dict(zip(truth.layout.labels, truth.phi[0].tolist(), strict=True))
         return json.dumps({"engine": type(self).__name__, **values})
 
     def reset(self, seed: int) -> Array:
-        """Back to the start; the seed is that of the noise and the start.
+        """Go back to the start; the seed is that of the noise and the start.
 
         Returns
         -------
@@ -124,10 +211,10 @@ class World:
         Raises
         ------
         GoalError
-            If bodies lie inside each other there.
+            If bodies overlap there.
         """
         self._rng = np.random.default_rng([seed, 1])  # [seed, 0] is the agent's
-        state = self.task.start.copy()
+        state = self.task.start
         state[:, :3] += self._rng.uniform(-self.spread, self.spread, state[:, :3].shape)
         self._state, self._last = start_state(self.task.scene, state), self._truth.before
         return self._state.copy()
@@ -143,7 +230,7 @@ class World:
         Raises
         ------
         EpisodeError
-            If it is none of the task's actions.
+            If it is not one of the task's actions.
         """
         action = np.asarray(action, dtype=float)
         self.task.check_action(self._state, action)
@@ -160,6 +247,6 @@ class World:
         )
 
     def _play(self, state: Array, action: Array) -> Array:
-        """State (body, 6) after an interval from another."""
+        """Return the state (body, 6) after an interval."""
         after = self._truth.step(state[None, None], action[None], self._last[None])
         return np.asarray(after[0, 0])

@@ -1,9 +1,8 @@
-"""Effects: the stages at which they act, the catalogue (one effect, one file), their attachment."""
+"""Physical effects: stages at which they act, catalogue by kind, attachment to bodies."""
 
-from pbrl_ppl.effects.attachment import attach, candidates
-from pbrl_ppl.effects.catalogue import catalogue
+from pbrl_ppl.effects.bodies import hanging_body
+from pbrl_ppl.effects.catalogue import attach, candidates, catalogue
 from pbrl_ppl.effects.effect import Attached, Effect, EffectParameter, at_stage, needs_inputs
-from pbrl_ppl.effects.hinge import hanging_body
 from pbrl_ppl.effects.learned_remainder import (
     LEARNED_REMAINDER,
     LearnedRemainder,

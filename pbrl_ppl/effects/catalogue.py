@@ -1,74 +1,131 @@
-"""The catalogue: every effect of the package, in the order in which they are named."""
+"""Catalogue of all effects, and their attachment to the bodies of a scene."""
 
-from pbrl_ppl.effects.actuator_delay import actuator_delay
-from pbrl_ppl.effects.actuator_rotation import actuator_rotation
-from pbrl_ppl.effects.angular_drag import angular_drag
-from pbrl_ppl.effects.anisotropic_gain import anisotropic_gain
-from pbrl_ppl.effects.body_force import body_force
-from pbrl_ppl.effects.com_offset import com_offset
-from pbrl_ppl.effects.constant_force import constant_force
-from pbrl_ppl.effects.constant_torque import constant_torque
-from pbrl_ppl.effects.dead_zone import dead_zone
-from pbrl_ppl.effects.distance_joint import distance_joint
-from pbrl_ppl.effects.effect import Effect
-from pbrl_ppl.effects.force_cutoff import force_cutoff
-from pbrl_ppl.effects.force_gain import force_gain
-from pbrl_ppl.effects.frame_rotation import frame_rotation
-from pbrl_ppl.effects.gravity_tilt import gravity_tilt
-from pbrl_ppl.effects.heavy_tails import heavy_tails
-from pbrl_ppl.effects.hidden_obstacle import hidden_obstacle
-from pbrl_ppl.effects.inertia_scale import inertia_scale
-from pbrl_ppl.effects.linear_drag import linear_drag
-from pbrl_ppl.effects.magnus_force import magnus_force
-from pbrl_ppl.effects.mass_change import mass_change
-from pbrl_ppl.effects.pivot_damping import pivot_damping
-from pbrl_ppl.effects.pivot_friction import pivot_friction
-from pbrl_ppl.effects.point_attractor import point_attractor
-from pbrl_ppl.effects.push_offset import push_offset
-from pbrl_ppl.effects.quadratic_drag import quadratic_drag
-from pbrl_ppl.effects.saturation import saturation
-from pbrl_ppl.effects.sensor_bias import sensor_bias
-from pbrl_ppl.effects.sensor_scale import sensor_scale
-from pbrl_ppl.effects.sliding_friction import sliding_friction
-from pbrl_ppl.effects.spring import spring
-from pbrl_ppl.effects.torque_gain import torque_gain
-from pbrl_ppl.effects.torsion_spring import torsion_spring
-from pbrl_ppl.effects.wheel import wheel
+from __future__ import annotations
 
-#: Where two effects cannot be told apart, the earlier one is named: a hinge's own friction before
+import difflib
+from collections.abc import Iterable
+
+from pbrl_ppl.effects import actuators, drag, forces, friction, mass, obstacles, sensors, springs
+from pbrl_ppl.effects.effect import Attached, Effect
+from pbrl_ppl.errors import EffectError
+from pbrl_ppl.scene import Scene
+
+#: Of effects that the data cannot separate, the earlier one is named: friction of a hinge before
 #: drag on a body, which looks the same on a single pendulum, and the simpler before the richer.
 catalogue: tuple[Effect, ...] = (
-    pivot_damping,
-    pivot_friction,
-    linear_drag,
-    quadratic_drag,
-    angular_drag,
-    gravity_tilt,
-    constant_force,
-    body_force,
-    constant_torque,
-    push_offset,
-    actuator_rotation,
-    inertia_scale,
-    com_offset,
-    force_gain,
-    torque_gain,
-    anisotropic_gain,
-    sliding_friction,
-    wheel,
-    actuator_delay,
-    dead_zone,
-    force_cutoff,
-    saturation,
-    magnus_force,
-    spring,
-    torsion_spring,
-    point_attractor,
-    mass_change,
-    hidden_obstacle,
-    distance_joint,
-    sensor_bias,
-    sensor_scale,
-    frame_rotation,
-    heavy_tails,
+    friction.pivot_damping,
+    friction.pivot_friction,
+    drag.linear_drag,
+    drag.quadratic_drag,
+    drag.angular_drag,
+    forces.gravity_tilt,
+    forces.constant_force,
+    forces.body_force,
+    forces.constant_torque,
+    forces.push_offset,
+    actuators.actuator_rotation,
+    mass.inertia_scale,
+    mass.com_offset,
+    actuators.force_gain,
+    actuators.torque_gain,
+    actuators.anisotropic_gain,
+    friction.sliding_friction,
+    friction.wheel,
+    actuators.actuator_delay,
+    actuators.dead_zone,
+    actuators.force_cutoff,
+    actuators.saturation,
+    drag.magnus_force,
+    springs.spring,
+    springs.torsion_spring,
+    springs.point_attractor,
+    mass.mass_change,
+    obstacles.hidden_obstacle,
+    springs.distance_joint,
+    sensors.sensor_bias,
+    sensors.sensor_scale,
+    sensors.frame_rotation,
+    sensors.heavy_tails,
 )
+
+
+def attach(
+    scene: Scene,
+    extra: Iterable[Effect | Attached] = (),
+    effects: Iterable[Effect] = catalogue,
+) -> tuple[Attached, ...]:
+    """Return all effects of a model: those that the scene declares, then the extra ones.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its bodies name declared effects.
+    extra : iterable of Effect or Attached
+        More effects; a bare Effect acts on every dynamic body it applies to.
+    effects : iterable of Effect
+        Where declared names are looked up.
+
+    Raises
+    ------
+    EffectError
+        If a name is unknown, a body is not in the scene, an effect does not apply to its body, or
+        an effect would be attached twice.
+
+    Examples
+    --------
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> cart = Body("cart", Shape.box(1.0, 0.6), effects=("linear_drag",))
+    >>> [a.effect.name for a in attach(Scene(time_step=0.1, bodies=(cart,)))]
+    ['linear_drag']
+    """
+    extra = tuple(extra)
+    bodies = {body.name: body for body in scene.dynamic}
+    # a user's effect that is given may also be declared by name, as in a saved scene
+    given = (item.effect if isinstance(item, Attached) else item for item in extra)
+    by_name = {effect.name: effect for effect in (*effects, *given)}
+    result: list[Attached] = []
+    for body in scene.dynamic:
+        for name in body.effects:
+            if name not in by_name:
+                near = difflib.get_close_matches(name, by_name, n=1)
+                hint = f"; did you mean {near[0]!r}?" if near else ""
+                raise EffectError(
+                    f"body {body.name!r} declares the effect {name!r}, which is not in the"
+                    f" catalogue{hint} (known: {', '.join(by_name)})"
+                )
+            result.append(by_name[name].on(body.name))
+    for item in extra:
+        if isinstance(item, Attached):
+            result.append(item)
+            continue
+        on = [item.on(body.name) for body in scene.dynamic if item.applies(scene, body)]
+        if not on:
+            raise EffectError(f"effect {item.name} applies to no body of this scene")
+        result.extend(on)
+    seen: set[tuple[str, str]] = set()
+    for attached in result:
+        name, on_body = attached.effect.name, attached.body
+        if on_body not in bodies:
+            raise EffectError(
+                f"effect {name} is put on {on_body!r}, which is not a moving body of the scene, or"
+                f" is kinematic (effects may be put on {', '.join(bodies)})"
+            )
+        if not attached.effect.applies(scene, bodies[on_body]):
+            raise EffectError(f"effect {name} does not apply to body {on_body!r}")
+        if (name, on_body) in seen:
+            raise EffectError(f"effect {name} is put on body {on_body!r} twice")
+        seen.add((name, on_body))
+    return tuple(result)
+
+
+def candidates(
+    scene: Scene, declared: Iterable[Attached], effects: Iterable[Effect] = catalogue
+) -> tuple[Attached, ...]:
+    """Return every applicable effect on every body that the model does not have yet."""
+    present = {(attached.effect.name, attached.body) for attached in declared}
+    return tuple(
+        effect.on(body.name)
+        for effect in effects
+        for body in scene.dynamic
+        if (effect.name, body.name) not in present and effect.applies(scene, body)
+    )

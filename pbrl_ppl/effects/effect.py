@@ -1,4 +1,4 @@
-"""An effect: a name, parameters with priors and units, and the stage at which it acts."""
+"""Physical effects as values: name, parameters with priors and units, stage."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
-#: ``scan(scene, history, body) -> (look, q)``: values of the parameters at which an effect is tried
-#: where its derivative at the null vanishes. NaN leaves a parameter at its null value, where the
-#: derivative is taken.
+#: ``scan(scene, history, body) -> (point, q)``: grid of parameter values at which an effect is
+#: tried if its derivative at the null vanishes. The derivative is taken by parameters that are
+#: NaN, at their null value.
 Scan = Callable[[Scene, History, Body], NDArray[np.float64]]
 
 
 def always(scene: Scene, body: Body) -> bool:
-    """Whether the effect makes sense on a body: here, on every one."""
+    """Return that an effect applies to a body."""
     return True
 
 
@@ -36,7 +36,7 @@ class EffectParameter:
     unit : str
         SI unit.
     prior : Prior
-        What is believed of its size once the effect is in the model.
+        Its prior once the effect is in the model.
     null : float
         The value at which the effect vanishes.
     """
@@ -60,14 +60,14 @@ class Effect:
     sentence : str
         What it means, for a reader who knows no statistics.
     reference : str
-        Where the law is from.
+        Source of the law.
     stage : Structure, Properties, Command, Force, Sensor or Noise
-        What it changes; see :mod:`pbrl_ppl.effects.stages`. Those of an earlier stage act first,
-        whatever the order of the effects.
+        What it changes; see :mod:`pbrl_ppl.effects.stages`. Effects of an earlier stage act first,
+        whatever their order.
     applies : callable
         ``applies(scene, body) -> bool``.
     scan : callable, optional
-        Where to look for it if its derivative at the null vanishes; see :data:`Scan`.
+        Grid of parameters to try if the derivative at the null vanishes; see :data:`Scan`.
     force : callable, optional
         Short for ``stage=Force(force)``.
 
@@ -102,7 +102,7 @@ class Effect:
     force: InitVar[Law | None] = None
 
     def __post_init__(self, force: Law | None) -> None:
-        """Refuse an effect that cannot do anything."""
+        """Check the fields."""
         if not self.name.isidentifier():
             raise EffectError(f"effect name {self.name!r} is not an identifier; use letters and _")
         if not self.parameters:
@@ -124,16 +124,16 @@ class Effect:
                 )
 
     def on(self, body: str) -> Attached:
-        """Attach the effect to a body by its name."""
+        """Return the effect attached to the body of this name."""
         return Attached(self, body)
 
     @property
     def null(self) -> tuple[float, ...]:
-        """The parameters' values at which the effect vanishes."""
+        """Values of the parameters at which the effect vanishes."""
         return tuple(parameter.null for parameter in self.parameters)
 
     def variable(self, parameter: EffectParameter) -> str:
-        """Name of a parameter's random variable in a model."""
+        """Return the name of a parameter's random variable in a model."""
         return f"{self.name}_{parameter.name}"
 
 
@@ -146,7 +146,7 @@ class Attached:
 
     @property
     def variables(self) -> tuple[str, ...]:
-        """Names of its parameters' random variables in a model."""
+        """Names of the random variables of its parameters in a model."""
         return tuple(self.effect.variable(parameter) for parameter in self.effect.parameters)
 
     @property
@@ -156,12 +156,12 @@ class Attached:
 
 
 def at_stage(effects: tuple[Attached, ...], stage: type) -> list[Attached]:
-    """Effects that act at a stage, in their order."""
+    """Return the effects that act at a stage, in their order."""
     return [attached for attached in effects if isinstance(attached.effect.stage, stage)]
 
 
 def needs_inputs(effects: tuple[Attached, ...]) -> bool:
-    """Whether any effect needs the previous command or the clock."""
+    """Return whether any effect needs the previous command or the clock."""
     stages = [attached.effect.stage for attached in effects]
     return any(
         (isinstance(stage, Command) and stage.memory)

@@ -1,4 +1,4 @@
-"""A force that was learned from what no law explains: a sum of bumps, and no physics."""
+"""A learned force for the unexplained residual: a sum of Gaussian bumps over the velocity."""
 
 from __future__ import annotations
 
@@ -15,35 +15,35 @@ from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.parameters import Prior
 
-#: The name that every one of them has: it is what it is, and no effect.
+#: Name of every learned remainder.
 LEARNED_REMAINDER = "learned_remainder"
 
 
 @final
 @dataclass(frozen=True)
 class LearnedRemainder(Effect):
-    """An effect of the force stage whose law is a table; see :func:`learned_remainder`.
+    """Effect of the force stage with a tabulated law; see :func:`learned_remainder`.
 
     Parameters
     ----------
     table : str
-        The table as JSON: what a posterior file holds of it.
+        The table as JSON, as posterior files store it.
     """
 
     table: str = ""
 
     def __reduce__(self) -> tuple[Callable[[str], LearnedRemainder], tuple[str]]:
-        """Pickle the table: a law that is made of one cannot be."""
+        """Return the table to pickle: the law is a closure, which cannot be pickled."""
         return learned_remainder, (self.table,)
 
 
 @lru_cache(maxsize=64)
 def learned_remainder(table: str) -> LearnedRemainder:
-    """The effect of a table; the same one for the same table.
+    """Return the effect of a table; the same object for the same table.
 
-    The force is a sum of forms, each times a parameter with a standard normal prior, so that
-    together they are a Gaussian process; each form is a sum of Gaussian bumps over the body's
-    velocity in its own frame.
+    The force is a sum of basis functions ("forms"), each times a parameter with a standard normal
+    prior: a Gaussian process. Each form is a sum of Gaussian bumps over the body's velocity in its
+    frame.
 
     Parameters
     ----------
@@ -72,9 +72,9 @@ def learned_remainder(table: str) -> LearnedRemainder:
 
 
 def _law_of(centre: Any, sharpness: Any, output: Any, forms: Any) -> Callable[..., None]:
-    """The law, with the table's numbers compiled into it."""
+    """Return the law, a closure over the table's arrays."""
     bumps = len(centre)
-    # a bump has a part in the forms of one process alone, which stand one after the other
+    # a bump is part of the forms of one process only, which are consecutive
     begin = np.argmax(forms != 0, axis=0)
     end = len(forms) - np.argmax(forms[::-1] != 0, axis=0)
 

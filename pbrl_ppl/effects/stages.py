@@ -1,4 +1,4 @@
-"""Stages: what an effect changes, as a closed set of final classes in the order of application."""
+"""Stages at which effects act: a closed set of final classes, in the order of application."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-#: Values of an effect's parameters by name; arrays that broadcast, one entry a proposal.
+#: Values of an effect's parameters by name: arrays that broadcast, one entry per proposal.
 Values = Mapping[str, Array]
 
 #: ``law(state, command, parameters, wrench)``, all arrays of floats: one body's state (6,), its
@@ -23,12 +23,12 @@ Law = Callable[[Any, Any, Any, Any], None]
 @final
 @dataclass(frozen=True)
 class Disc:
-    """A static disc; each an array that broadcasts over proposals. No radius is no disc.
+    """A static disc; arrays broadcast over proposals. There is none where the radius is zero.
 
     Parameters
     ----------
     x, y : ndarray
-        Its middle (m).
+        Its centre (m).
     radius : ndarray
         Its radius (m).
     """
@@ -39,7 +39,7 @@ class Disc:
 
 
 class Rod(NamedTuple):
-    """A rod between a body and a place; each an array that broadcasts over proposals.
+    """A rod from a body to a place; arrays broadcast over proposals. None where length is zero.
 
     Attributes
     ----------
@@ -48,7 +48,7 @@ class Rod(NamedTuple):
     b_x, b_y : ndarray
         Its end in the world (m).
     length : ndarray
-        Its length (m). No length is no rod.
+        Its length (m).
     """
 
     a_x: Array
@@ -65,12 +65,13 @@ def _no_discs(parameters: Values) -> tuple[Disc, ...]:
 @final
 @dataclass(frozen=True)
 class Structure:
-    """Adds to the scene: static discs, or a rod that ties the body to a place.
+    """Stage that adds static discs, or a rod from the body to a place, to the scene.
 
     Parameters
     ----------
     discs : callable
-        ``discs(parameters) -> tuple of Disc``, always as many; every moving body bounces off them.
+        ``discs(parameters) -> tuple of Disc``, always of one length; all moving bodies collide with
+        them.
     rod : callable, optional
         ``rod(parameters) -> Rod``.
     """
@@ -82,7 +83,7 @@ class Structure:
 @final
 @dataclass(frozen=True)
 class Clock:
-    """When intervals are, as arrays of shape (1, interval); infinite after the recording.
+    """Times of intervals, as arrays of shape (1, interval); infinite after the recording.
 
     Parameters
     ----------
@@ -97,7 +98,7 @@ class Clock:
     end: Array
 
     def after(self, time: Array) -> Array:
-        """Share of each interval that lies after a moment of its trajectory (s), 0 to 1."""
+        """Return the share of each interval after a time in its trajectory (s), 0 to 1."""
         known = np.isfinite(self.end)
         begin, end = np.where(known, self.begin, 0.0), np.where(known, self.end, 1.0)
         return np.where(known, np.clip((end - time) / (end - begin), 0.0, 1.0), 1.0)
@@ -106,17 +107,17 @@ class Clock:
 @final
 @dataclass(frozen=True)
 class Properties:
-    """Changes the engine's numbers of a body.
+    """Stage that changes the engine's properties of a body.
 
     Parameters
     ----------
     modify : callable
-        ``modify(properties, parameters, clock)`` changes a dict of arrays in place, keys as
-        :data:`pbrl_ppl.physics.properties.COLUMNS`, but that the moment of inertia follows after,
-        as mass times ``moment_per_mass``, and that ``gravity_x`` and ``gravity_y`` (m/s^2) are the
-        whole of gravity.
+        ``modify(properties, parameters, clock)`` changes a dict of arrays in place. Its keys are
+        :data:`pbrl_ppl.physics.properties.COLUMNS`, with two exceptions: ``moment_per_mass``, from
+        which the moment of inertia is computed afterwards, and ``gravity_x`` and ``gravity_y``
+        (m/s^2), the total gravity.
     timed : bool
-        Whether the numbers depend on the clock; shapes are then (proposal, interval), else
+        Whether the properties depend on the clock; shapes are then (proposal, interval), else
         (proposal, 1).
     """
 
@@ -127,17 +128,17 @@ class Properties:
 @final
 @dataclass(frozen=True)
 class Command:
-    """Changes the commanded wrench of a body before it acts.
+    """Stage that changes the commanded wrench of a body before it acts.
 
     Parameters
     ----------
     law : callable
-        See :data:`Law`. ``command`` (8,) is the wrench held over this interval and the one held
-        over the interval before (zero before the first), both as the effects before this one have
-        left them, then the share of the interval that has gone when the substep begins and ends.
-        ``wrench`` (3,) is the held one, to be changed.
+        See :data:`Law`. ``command`` (8,) has the wrench of this interval, the wrench of the
+        previous interval (zero before the first), both as earlier effects changed them, and the
+        shares of the interval that have passed when the substep begins and ends. ``wrench`` (3,),
+        that of this interval, is to be changed.
     memory : bool
-        Whether the law looks at the wrench before.
+        Whether the law uses the previous wrench.
     """
 
     law: Law
@@ -147,13 +148,13 @@ class Command:
 @final
 @dataclass(frozen=True)
 class Force:
-    """Adds to the wrench on a body.
+    """Stage that adds to the wrench on a body.
 
     Parameters
     ----------
     law : callable
-        See :data:`Law`. ``command`` (3,) is the wrench as the command stage left it; ``wrench`` is
-        what acts so far.
+        See :data:`Law`. ``command`` (3,) is the wrench after the command stage; ``wrench`` is the
+        sum so far.
     """
 
     law: Law
@@ -162,7 +163,7 @@ class Force:
 @final
 @dataclass(frozen=True)
 class Sensor:
-    """Changes what is measured of a body's state.
+    """Stage that changes the measurement of a body's state.
 
     Parameters
     ----------
@@ -180,13 +181,13 @@ class Sensor:
 @final
 @dataclass(frozen=True)
 class Noise:
-    """Changes the density of the whitened noise of a body's measured states.
+    """Stage that changes the density of the whitened noise of a body's measured states.
 
     Parameters
     ----------
     tail : callable
-        ``tail(parameters) -> ndarray``: the reciprocal of the degrees of freedom of a Student-t;
-        zero is a Gaussian.
+        ``tail(parameters) -> ndarray``: the reciprocal of a Student-t's degrees of freedom; zero
+        is a Gaussian.
     """
 
     tail: Callable[[Values], Array]

@@ -85,7 +85,7 @@ class Sensitivity:
         return self.cells.completed(self.scene, self._added(states, moved))
 
     def predicted(self, engine: Engine, phi: Array, start: Array, inputs: Array) -> Array:
-        """Return next states, corrected to the smoothed starts, shape (..., transition, 1, body, 6).
+        """Return next states from the smoothed starts, shape (..., transition, 1, body, 6).
 
         Parameters
         ----------

@@ -154,7 +154,7 @@ def with_sensitivity(problem: Problem, phi: Array, sigma: Array) -> Problem:
 
 
 def foreseen(problem: Problem, phi: Array) -> Array:
-    """Return linearised states, unobserved rows of a sparse recording predicted from the row before.
+    """Return linearised states, with unobserved rows predicted from the row before.
 
     Interpolation between rows that are far apart would miss contacts.
 

@@ -148,7 +148,7 @@ class TrajectoryNoise:
         return white.reshape(cells.shape), log_scale.reshape(cells.shape[:-1])
 
     def filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
-        """Return whitened innovations and filtered deviations for residuals (set, transition, cell)."""
+        """Return whitened innovations and filtered deviations of residuals."""
         white, state = self._filtered(residual, sigma)
         cells = self.cells
         return white[..., : len(cells.places)], self._extended.states(cells, state)

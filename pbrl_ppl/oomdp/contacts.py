@@ -1,4 +1,4 @@
-"""Sector contact predicates, by ray casting."""
+"""Sector contact predicates by ray casting."""
 
 from __future__ import annotations
 
@@ -6,17 +6,15 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError, HistoryError
-from pbrl_ppl.oomdp.frames import turned
-from pbrl_ppl.oomdp.rays import spans
-from pbrl_ppl.oomdp.relations import Condition, condition
+from pbrl_ppl.oomdp.relations import Array, Condition, Flags, condition
 from pbrl_ppl.physics import Scenery, circles, scenery
 from pbrl_ppl.scene import WORLD, Scene
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+#: A convex part of a solid: corners (k, 2) counter-clockwise, and a radius about them; one corner
+#: is a circle, two are a wall.
+Part = tuple[Array, float]
 
 
 @final
@@ -26,31 +24,31 @@ class SectorContacts:
 
     A :class:`pbrl_ppl.oomdp.Relation`. Walls and static bodies count as moving bodies do.
 
-    Rays go out from the body's origin. One is in contact with an object if, along it, the two
-    solids are no farther apart than the collision radius; a sector is if any of its rays is. So
-    hollows of concave bodies count too. What is narrower than the rays are apart, such as the end
-    of a wall seen from its end, may slip between them. Objects that a joint joins with the body do
-    not collide with it, and are left out.
+    Rays start at the body's origin. A ray is in contact with an object if the gap between the two
+    solids along it is at most the collision radius; a sector is in contact if any of its rays is.
+    Hollows of concave bodies count too. Objects narrower than the distance between rays, such as a
+    wall seen from its end, may be missed. Objects joined to the body by a joint do not collide with
+    it, and are left out.
 
-    The paper gives the collision radius as 20 without a unit, for figures whose scale it does not
-    give either; pixels are meant. Here it is 0.2 m: with 100 pixels a metre a cart of 0.9 m is 90
-    pixels long and an apartment of 10 m fits a screen. It is also how far a body of 2 m/s comes in
-    an interval of 0.1 s: with less, a body would hit what was not in its condition at the
-    interval's start. It is counted from the outline, for one value serves chairs and beds.
+    The paper gives the collision radius as 20, without a unit or the scale of its figures; pixels
+    are meant. Here it is 0.2 m: at 100 pixels per metre a cart of 0.9 m is 90 pixels long, and an
+    apartment of 10 m fits a screen. It is also the way of a body at 2 m/s in an interval of 0.1 s:
+    with less, a body would hit objects that are not in its condition at the interval's start. It
+    counts from the outline, so that one value serves chairs and beds.
 
     Attributes
     ----------
     sectors : int
-        Sectors of a body, n_s. The first is centred on the body's x axis (its front), the others
-        follow counter-clockwise: left, back and right.
+        Sectors of a body, n_s. The first is centred on the body's x axis (front), the others
+        follow counter-clockwise (left, back, right).
     rays : int
         Rays in a sector, n_tps.
     radius : float
         Collision radius epsilon_c (m).
     by_object : bool
-        Whether it is told apart what touches a sector: other moving bodies, static ones, walls
-        (all of them are one object, ``world``). The paper's conditions say which sectors are in
-        contact, and not with what: there is one object, ``anything``.
+        Whether predicates distinguish what touches a sector: each moving body, each static body,
+        and the walls (all walls are one object, ``world``). In the paper's conditions there is one
+        object, ``anything``.
 
     Raises
     ------
@@ -87,7 +85,7 @@ class SectorContacts:
             raise FitError(f"contacts: radius is {self.radius!r}, expected a length of 0 m or more")
 
     def objects(self, scene: Scene) -> tuple[str, ...]:
-        """Names of what a body may touch, in the order of the predicates."""
+        """Return the names of the objects that a body may touch, in the order of the predicates."""
         if not self.by_object:
             return ("anything",)
         static = (body.name for body in scene.bodies if body.static)
@@ -95,7 +93,7 @@ class SectorContacts:
         return (*(body.name for body in scene.moving), *walls, *static)
 
     def labels(self, scene: Scene) -> tuple[str, ...]:
-        """Names of a body's predicates: ``contact_0``, or ``contact_0(world)`` by object."""
+        """Return a body's predicates: ``contact_0``, or by object ``contact_0(world)``."""
         return tuple(
             f"contact_{sector}" + f"({name})" * self.by_object
             for name in self.objects(scene)
@@ -110,7 +108,7 @@ class SectorContacts:
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
     def of(self, scene: Scene, states: Array, wrenches: Array | None = None) -> Flags:
-        """Predicates contact_theta(obj) of every moving body.
+        """Return the predicates contact_theta(obj) of every moving body.
 
         Parameters
         ----------
@@ -119,7 +117,7 @@ class SectorContacts:
         states : ndarray
             States or poses, shape (n, body, 6 or 3), SI units, bodies as in ``scene.moving``.
         wrenches : ndarray, optional
-            No matter: contacts do not depend on the action.
+            Ignored: contacts do not depend on the action.
 
         Returns
         -------
@@ -155,30 +153,109 @@ class SectorContacts:
             for body, other in ((i, j), (j, i)):
                 if len(at) and body < count:
                     obj = names.index(world.solids[other].name) if self.by_object else 0
-                    flags[at, body, obj] |= self._meet(world, body, other, poses[at])
+                    flags[at, body, obj] |= self._sectors(world, body, other, poses[at])
         return flags
 
     def conditions(self, scene: Scene, states: Array) -> list[list[Condition]]:
-        """Contact predicates of every moving body that hold in each state.
+        """Return the contact predicates that hold, for each state a list over moving bodies.
 
-        Parameters and errors as of :meth:`of`. The outer list is over states, the inner one over
-        bodies.
+        Parameters and errors are those of :meth:`of`.
         """
         labels, flags = self.labels(scene), self.of(scene, states)
-        return [[condition(body, labels) for body in state] for state in flags]
+        return [[condition(body.ravel(), labels) for body in state] for state in flags]
 
-    def _meet(self, world: Scenery, body: int, other: int, poses: Array) -> Flags:
-        """Which sectors of a body are in contact with another solid, shape (n, sector)."""
+    def _sectors(self, world: Scenery, body: int, other: int, poses: Array) -> Flags:
+        """Return which sectors of a body are in contact with another solid, shape (n, sector)."""
         rays = self.directions[None]
-        own = [spans(part, np.zeros((1, 2)), rays) for part in world.solids[body].parts]
+        insides = [spans(part, np.zeros((1, 2)), rays) for part in world.solids[body].parts]
         turn = poses[:, body, 2] - poses[:, other, 2]
         origins = turned(poses[:, body, :2] - poses[:, other, :2], -poses[:, other, 2])
         directions = turned(rays, turn[:, None])
         touched = np.zeros(directions.shape[:2], dtype=bool)
         for part in world.solids[other].parts:
-            its = spans(part, origins, directions)
-            for mine in own:
-                # a gap of spans that overlap is negative, one of a ray that misses infinite
-                gap = np.maximum(its[..., 0] - mine[..., 1], mine[..., 0] - its[..., 1])
+            outside = spans(part, origins, directions)
+            for inside in insides:
+                # the gap is negative where spans overlap, and infinite where a ray misses
+                gap = np.maximum(outside[..., 0] - inside[..., 1], inside[..., 0] - outside[..., 1])
                 touched |= gap <= self.radius
         return np.asarray(touched.reshape(-1, self.sectors, self.rays).any(axis=-1))
+
+
+def spans(part: Part, origins: Array, directions: Array) -> Array:
+    """Return the distances at which rays enter and leave a convex part.
+
+    Parameters
+    ----------
+    part : tuple of ndarray and float
+        Part of a solid from :func:`pbrl_ppl.physics.scenery`, in the solid's frame (m).
+    origins : ndarray
+        Origins of the rays, shape (n, 2), m.
+    directions : ndarray
+        Unit vectors, shape (n, ray, 2).
+
+    Returns
+    -------
+    ndarray
+        Distances along the rays, shape (n, ray, 2), m. The first is 0 where the origin is inside;
+        a ray that misses has (inf, -inf). A wall has no width: a ray leaves it where it enters, and
+        a ray along it misses.
+
+    Examples
+    --------
+    >>> box = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
+    >>> spans((box, 0.0), np.array([[-3.0, 0.0]]), np.array([[[1.0, 0.0]]]))
+    array([[[2., 4.]]])
+    """
+    corners, radius = part
+    with np.errstate(over="ignore"):  # a ray almost parallel to an edge
+        if len(corners) == 1:
+            enter, leave = _circle(origins - corners[0], directions, radius)
+        elif len(corners) == 2:
+            enter, leave = _segment(corners, origins, directions)
+        else:
+            enter, leave = _polygon(corners, origins, directions)
+    enter = np.maximum(enter, 0.0)
+    hit = enter <= leave
+    return np.stack([np.where(hit, enter, np.inf), np.where(hit, leave, -np.inf)], axis=-1)
+
+
+def _circle(arm: Array, directions: Array, radius: float) -> tuple[Array, Array]:
+    """Return distances to a circle from origins at these positions from its centre."""
+    ahead = np.einsum("nrc,nc->nr", directions, arm)
+    square = ahead**2 - ((arm**2).sum(axis=-1) - radius**2)[:, None]
+    half = np.sqrt(np.where(square < 0, np.nan, square))
+    return -ahead - half, -ahead + half
+
+
+def _segment(ends: Array, origins: Array, directions: Array) -> tuple[Array, Array]:
+    """Return the distance to a wall, twice."""
+    edge, arm = ends[1] - ends[0], ends[0] - origins
+    across = directions[..., 0] * edge[1] - directions[..., 1] * edge[0]
+    across = np.where(across == 0, np.nan, across)
+    at = (arm[:, 0] * edge[1] - arm[:, 1] * edge[0])[:, None] / across
+    share = arm[:, None, 0] * directions[..., 1] - arm[:, None, 1] * directions[..., 0]
+    at = np.where((share / across >= 0) & (share / across <= 1), at, np.nan)
+    return at, at
+
+
+def _polygon(corners: Array, origins: Array, directions: Array) -> tuple[Array, Array]:
+    """Return the last entry and the first exit among the edges (Cyrus and Beck's clipping)."""
+    enter = np.full(directions.shape[:2], -np.inf)
+    leave = -enter
+    for corner, after in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        outward = np.array([after[1] - corner[1], corner[0] - after[0]])
+        depth = ((corner - origins) @ outward)[:, None]
+        rate = directions @ outward
+        at = depth / np.where(rate == 0, np.nan, rate)
+        enter = np.where(rate < 0, np.maximum(enter, at), enter)
+        leave = np.where(rate > 0, np.minimum(leave, at), leave)
+        # along the edge, and outside of it
+        leave = np.where((rate == 0) & (depth < 0), -np.inf, leave)
+    return enter, leave
+
+
+def turned(vectors: Array, angle: Array) -> Array:
+    """Return vectors (..., 2) turned by angles that broadcast with their leading axes."""
+    c, s = np.cos(angle), np.sin(angle)
+    x, y = vectors[..., 0], vectors[..., 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=-1)

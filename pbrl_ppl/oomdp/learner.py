@@ -1,4 +1,4 @@
-"""A learner of transitions to plan with: one regression for each body or class and condition."""
+"""Learner of transitions: one regression per body or class and condition."""
 
 from __future__ import annotations
 
@@ -6,20 +6,16 @@ from abc import ABC, abstractmethod
 from typing import Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pbrl_ppl.errors import FitError, HistoryError, SimulationError
 from pbrl_ppl.history import History, check_start
-from pbrl_ppl.oomdp.experience import Experience
-from pbrl_ppl.oomdp.frames import displaced, displacements, inputs
+from pbrl_ppl.oomdp.contacts import turned
+from pbrl_ppl.oomdp.regression import Array, Experience, Flags
 from pbrl_ppl.scene import Scene, nearest
-from pbrl_ppl.state import STATE, WRENCH
+from pbrl_ppl.state import STATE, THETA, WRENCH, wrapped
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
-
-
-#: Nothing is this far or this fast (SI units): steps that each extrapolate have run away.
+#: Positions and speeds beyond this (SI units) are of extrapolations that have diverged.
 _DIVERGED = 1e6
 
 
@@ -31,16 +27,16 @@ class Learner(ABC):
     Parameters
     ----------
     scene : Scene
-        Orders the bodies. A kinematic body goes where its action, a velocity, leads it.
+        Orders the bodies. The action of a kinematic body is its velocity.
     neighbours : int
-        Nearest transitions that count, k.
+        Number of nearest transitions used, k.
     bandwidth : float
-        Of the kernel, lambda.
+        Bandwidth of the kernel, lambda.
     ridge : float
-        As of :class:`pbrl_ppl.oomdp.Regression`.
+        See :class:`pbrl_ppl.oomdp.Regression`.
     standardise : bool
         Whether distances between inputs are in units of each input's standard deviation in the
-        data, so that lambda has no unit; the paper names none. Otherwise in SI units.
+        data, so that lambda has no unit, as in the paper; otherwise in SI units.
     pose_invariant : bool
         Whether a body's transitions are learned in its own frame, without its pose.
     share_classes : bool
@@ -54,7 +50,7 @@ class Learner(ABC):
     Attributes
     ----------
     transitions : int
-        Number of transitions that were observed.
+        Number of observed transitions.
     """
 
     def __init__(
@@ -76,19 +72,19 @@ class Learner(ABC):
             raise FitError(f"LWR: ridge is {ridge!r}, expected a number from 0 (Eq. 4) up")
         self.scene, self.pose_invariant = scene, pose_invariant
         options = {"neighbours": neighbours, "bandwidth": bandwidth, "ridge": ridge}
-        self._own: dict[int, Experience] = {}
+        self._experience: dict[int, Experience] = {}
         of_class: dict[str, Experience] = {}
         for i, body in enumerate(scene.moving):
             if not body.kinematic:
-                own = Experience(standardise=standardise, options=options)
+                experience = Experience(standardise=standardise, options=options)
                 if share_classes and body.object_class is not None:
-                    own = of_class.setdefault(body.object_class, own)
-                self._own[i] = own
+                    experience = of_class.setdefault(body.object_class, experience)
+                self._experience[i] = experience
         self.transitions = 0
 
     @abstractmethod
     def predicates(self, states: Array, wrenches: Array) -> Flags:
-        """Predicates of each moving body in states (n, body, 6) under wrenches (n, body, 3).
+        """Return predicates of moving bodies in states (n, body, 6) under wrenches (n, body, 3).
 
         Shape (n, body, predicate).
         """
@@ -103,7 +99,7 @@ class Learner(ABC):
         state, next_state : array_like
             States at the ends of one sampling interval, shape (body, 6) or (n, body, 6), SI units.
         action : array_like
-            Wrenches held in between, shape (body, 3) or (n, body, 3), world frame, N and N m; of a
+            Wrenches held in between, shape (body, 3) or (n, body, 3), world frame, N and N m; for a
             kinematic body its velocity.
 
         Raises
@@ -126,7 +122,7 @@ class Learner(ABC):
                 )
             arrays.append(values.reshape(-1, k, width))
             lost = ~np.isfinite(arrays[-1]).all(axis=-1)
-            lost[:, [i for i in range(k) if i not in self._own]] = False
+            lost[:, [i for i in range(k) if i not in self._experience]] = False
             if lost.any():
                 row, body = np.argwhere(lost)[0]
                 raise HistoryError(
@@ -140,19 +136,21 @@ class Learner(ABC):
             )
         begin, wrench, after = arrays
         flags = self.predicates(begin, wrench)
-        for i, own in self._own.items():
-            x = inputs(begin[:, i], wrench[:, i], pose_invariant=self.pose_invariant)
-            y = displacements(begin[:, i], after[:, i], pose_invariant=self.pose_invariant)
-            own.add(x, y, flags[:, i])
+        for i, experience in self._experience.items():
+            displacement = after[:, i] - begin[:, i]
+            displacement[:, THETA] = wrapped(displacement[:, THETA])
+            if self.pose_invariant:
+                displacement = _turned(displacement, -begin[:, i, THETA])
+            experience.add(self._inputs(begin[:, i], wrench[:, i]), displacement, flags[:, i])
         self.transitions += len(begin)
 
     def learn(self, history: History) -> None:
-        """Learn from the transitions of a history that were measured whole.
+        """Learn from the completely measured transitions of a history.
 
         Raises
         ------
         HistoryError
-            If it is of other bodies, or no transition was measured whole.
+            If its bodies are others, or no transition was measured completely.
         """
         names = tuple(body.name for body in self.scene.moving)
         if history.bodies != names:
@@ -163,10 +161,10 @@ class Learner(ABC):
         check_start(history, self.scene)
         every = history.transitions(history.dataset["start"].to_numpy())
         state, action, after = every.start, every.actions[:, 0], every.observed[:, 0]
-        own = list(self._own)
+        learned = list(self._experience)
         whole = np.asarray(np.isfinite(state).all(axis=(1, 2)))
         for values in (action, after):
-            whole &= np.isfinite(values[:, own]).all(axis=(1, 2))
+            whole &= np.isfinite(values[:, learned]).all(axis=(1, 2))
         if not whole.any():
             raise HistoryError(
                 f"learn: none of {len(whole)} transitions was measured whole; load the history with"
@@ -178,24 +176,24 @@ class Learner(ABC):
 
     @property
     def draws(self) -> int:
-        """1: a point estimate."""
+        """Number of draws: 1, a point estimate."""
         return 1
 
     @property
     def before(self) -> Array:
-        """Zeros, shape (body, 3): it remembers no wrench."""
+        """Wrench before the first interval: zeros, shape (body, 3)."""
         return np.zeros((len(self.scene.moving), len(WRENCH)))
 
     def single(self) -> Self:
-        """Itself."""
+        """Return itself."""
         return self
 
     def after(self, before: Array) -> Self:
-        """Itself: it remembers no wrench."""
+        """Return itself: the model has no memory of wrenches."""
         return self
 
     def noisy(self, states: Array, rng: np.random.Generator) -> Array:
-        """Refused: regression says nothing of noise.
+        """Raise an error: the regression has no noise model.
 
         Raises
         ------
@@ -205,10 +203,10 @@ class Learner(ABC):
         raise FitError("noise: LWR predicts a mean alone; plan without noise")
 
     def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
-        """What a push does to a body, shape (1,) each: m/s^2 and rad/s^2.
+        """Return the acceleration of a body under a push, shape (1,) each, m/s^2 and rad/s^2.
 
-        A linear fit to the transitions in its commonest condition, at the heading at which the push
-        does most.
+        From a linear fit to the transitions in its commonest condition, at the heading with the
+        largest acceleration.
 
         Raises
         ------
@@ -222,7 +220,7 @@ class Learner(ABC):
         return np.array([linear]), np.array([angular])
 
     def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
-        """States after one sampling interval (Eqs. 5 and 6).
+        """Return the states after one sampling interval (Eqs. 5 and 6).
 
         Parameters
         ----------
@@ -231,13 +229,13 @@ class Learner(ABC):
         wrenches : ndarray
             Shape (n, body, 3), world frame, N and N m.
         previous : ndarray, optional
-            No matter.
+            Ignored.
 
         Returns
         -------
         ndarray
-            Shape (1, n, body, 6); NaN for a body in a condition in which nothing was observed, for
-            it has no model there, and where what a few transitions taught has led beyond measure.
+            Shape (1, n, body, 6); NaN for a body in an unobserved condition, which has no model,
+            and where extrapolations have diverged.
 
         Raises
         ------
@@ -259,23 +257,24 @@ class Learner(ABC):
         flags = self.predicates(begin, pushes)
         out = np.full_like(states[0], np.nan)
         for i in range(k):
-            own, state, push = self._own.get(i), begin[:, i], pushes[:, i]
-            if own is None:  # kinematic: the push is its velocity
+            state, push = begin[:, i], pushes[:, i]
+            if i not in self._experience:  # kinematic: the push is its velocity
                 out[rows, i] = np.hstack([state[:, :3] + self.scene.time_step * push, push])
                 continue
-            x = inputs(state, push, pose_invariant=self.pose_invariant)
-            added = own.predict(x, flags[:, i])
-            out[rows, i] = displaced(state, added, pose_invariant=self.pose_invariant)
+            added = self._experience[i].predict(self._inputs(state, push), flags[:, i])
+            out[rows, i] = state + (
+                _turned(added, state[:, THETA]) if self.pose_invariant else added
+            )
         out[abs(out) > _DIVERGED] = np.nan
         return np.asarray(out[None])
 
     def experience(self, body: str) -> Experience:
-        """What was observed of a body, and of those of its class where they share models.
+        """Return the observed transitions of a body, or of its class if they share models.
 
         Raises
         ------
         FitError
-            If the scene has no such body that forces move.
+            If the scene has no such dynamic body.
         """
         names = [mover.name for mover in self.scene.dynamic]
         if body not in names:
@@ -283,8 +282,27 @@ class Learner(ABC):
                 f'LWR: the scene has no moving body "{body}" that can be pushed'
                 f"{nearest(body, names)}"
             )
-        return dict(zip(names, self._own.values(), strict=True))[body]
+        return dict(zip(names, self._experience.values(), strict=True))[body]
+
+    def _inputs(self, states: Array, wrenches: Array) -> Array:
+        """Return regression inputs X of states (n, 6) and wrenches (n, 3) of one body.
+
+        Velocity and wrench in the body's frame, shape (n, 6), if pose-invariant (Eq. 6); otherwise
+        pose, velocity and wrench, shape (n, 9) (Eq. 3).
+        """
+        if self.pose_invariant:
+            return _turned(np.concatenate([states[:, 3:], wrenches], axis=1), -states[:, THETA])
+        inputs = np.concatenate([states, wrenches], axis=1)
+        inputs[:, THETA] = wrapped(inputs[:, THETA])
+        return inputs
 
     def _check_data(self) -> None:
         if not self.transitions:
             raise FitError("LWR: nothing was observed yet; observe() a transition, or learn() some")
+
+
+def _turned(triples: Array, angle: Array) -> Array:
+    """Return planar vectors, each followed by a value that stays, (n, 3 k), turned by angles."""
+    split = triples.reshape(len(triples), triples.shape[1] // 3, 3)
+    planar = turned(split[..., :2], angle[:, None])
+    return np.concatenate([planar, split[..., 2:]], axis=-1).reshape(triples.shape)

@@ -1,41 +1,40 @@
-"""LWR and OO-LWR, the paper's baselines (section 3.1)."""
+"""LWR and OO-LWR, the baselines of the paper (section 3.1)."""
 
 from __future__ import annotations
 
+import math
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.oomdp.contacts import SectorContacts
-from pbrl_ppl.oomdp.experience import ungrouped
 from pbrl_ppl.oomdp.learner import Learner
-from pbrl_ppl.oomdp.relations import Attributes, Condition, Relation, all_labels, condition, flat
+from pbrl_ppl.oomdp.regression import Array, Flags
+from pbrl_ppl.oomdp.relations import Attributes, Condition, Relation, condition
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 
 @final
 class LWR(Learner):
-    """Locally weighted regression alone: one model a body, whatever touches it (Eqs. 3 to 6).
+    """Locally weighted regression: one model per body, without predicates (Eqs. 3 to 6).
 
-    The paper's LWR agent uses the pose-invariant model, and so cannot foresee collisions: it sees
-    no walls. With ``pose_invariant=False`` there is Eq. 3 with the pose among the inputs, which can
-    know walls by their place, and has to learn free motion anew at each.
+    The paper's LWR agent uses the pose-invariant model, and so cannot predict collisions with
+    walls. ``pose_invariant=False`` is Eq. 3 with the pose among the inputs: it can learn where
+    walls are, and must learn free motion anew at each place.
 
     Parameters
     ----------
     scene : Scene
         Orders the bodies.
     neighbours : int
-        Nearest transitions that count, k.
+        Number of nearest transitions used, k.
     bandwidth : float
-        Of the kernel, lambda.
+        Bandwidth of the kernel, lambda.
     ridge : float
-        As of :class:`pbrl_ppl.oomdp.Regression`; 0 is Eq. 4 as it stands.
+        See :class:`pbrl_ppl.oomdp.Regression`; 0 is Eq. 4.
     standardise : bool
         Whether distances are in units of each input's standard deviation; otherwise in SI units.
     pose_invariant : bool
@@ -78,7 +77,7 @@ class LWR(Learner):
         )  # fmt: skip
 
     def predicates(self, states: Array, wrenches: Array) -> Flags:
-        """None, shape (n, body, 0)."""
+        """Return no predicates, shape (n, body, 0)."""
         return np.zeros((*states.shape[:2], 0), dtype=bool)
 
 
@@ -86,30 +85,30 @@ class LWR(Learner):
 class OOLWR(Learner):
     """Object-oriented LWR: a pose-invariant model for each class in each condition (section 3.1).
 
-    A body without a class is one by itself. A condition, Cond(s, a), is the set of the predicates
+    A body without a class has its own models. A condition, Cond(s, a), is the set of the predicates
     that hold for the body.
 
-    Where a condition was never observed there is no model, and :meth:`step` gives NaN, through
-    which no plan leads. The paper does not say what its agent does there; it says that it had to
-    learn each contact anew, and that where conditions are too many it has no valid plan.
+    In a condition that was never observed there is no model: :meth:`step` returns NaN, and plans
+    avoid such states. The paper does not describe this case; it says that its agent had to learn
+    each contact anew, and that with too many conditions it has no valid plan.
 
     Parameters
     ----------
     scene : Scene
-        Orders the bodies; says their classes and attributes, and what they may touch.
+        Orders the bodies, and has their classes, their attributes and the objects they may touch.
     relations : sequence of Relation, optional
         Predicates that make the conditions: :class:`SectorContacts`, :class:`Pushed`,
-        :class:`Attributes`, or your own. By default the paper's sector contacts, and the attributes
+        :class:`Attributes`, or a user's. By default the paper's sector contacts, and the attributes
         if bodies of the scene have any.
     share_classes : bool
-        Whether bodies of one class share their models; otherwise each has its own.
+        Whether bodies of one class share their models.
     neighbours, bandwidth, ridge, standardise
-        As of :class:`LWR`.
+        See :class:`LWR`.
 
     Raises
     ------
     FitError
-        As :class:`LWR`, or if one of the relations is none, or two predicates have one name.
+        As :class:`LWR`, or if an object is no relation, or two predicates have one name.
 
     References
     ----------
@@ -147,25 +146,37 @@ class OOLWR(Learner):
             attributes = (Attributes(),) * any(body.attributes for body in scene.moving)
             relations = (SectorContacts(), *attributes)
         self.relations = tuple(relations)
-        self.labels = all_labels(self.relations, scene)
+        for relation in self.relations:
+            if not isinstance(relation, Relation):
+                raise FitError(
+                    f"OO-LWR: relations has {relation!r}, expected objects with labels() and of(),"
+                    " such as SectorContacts()"
+                )
+        self.labels = tuple(label for each in self.relations for label in each.labels(scene))
+        for label, count in Counter(self.labels).items():
+            if count > 1:
+                raise FitError(
+                    f'OO-LWR: {count} predicates are called "{label}"; drop a relation, or rename'
+                    " the attribute"
+                )
 
     def predicates(self, states: Array, wrenches: Array) -> Flags:
-        """Predicates as :attr:`labels` names them, shape (n, body, predicate)."""
-        every = [flat(relation.of(self.scene, states, wrenches)) for relation in self.relations]
-        none = np.zeros((*states.shape[:2], 0), dtype=bool)
-        return np.concatenate([none, *every], axis=-1)
+        """Return predicates in the order of :attr:`labels`, shape (n, body, predicate)."""
+        flags = [np.zeros((*states.shape[:2], 0), dtype=bool)]
+        for relation in self.relations:
+            found = relation.of(self.scene, states, wrenches)
+            flags.append(found.reshape(*found.shape[:2], math.prod(found.shape[2:])))
+        return np.concatenate(flags, axis=-1)
 
     def conditions(self, body: str) -> Mapping[Condition, int]:
-        """Conditions in which a body, or one of its class, was observed, and how often.
+        """Return the observed conditions of a body or its class, and their numbers of transitions.
 
-        Each has a model.
+        Each condition has a model.
 
         Raises
         ------
         FitError
-            If the scene has no such body that forces move.
+            If the scene has no such dynamic body.
         """
-        return {
-            condition(ungrouped(key, len(self.labels)), self.labels): count
-            for key, count in self.experience(body).counts.items()
-        }
+        counts = self.experience(body).counts
+        return {condition(key, self.labels): count for key, count in counts.items()}

@@ -1,6 +1,11 @@
-"""Locally weighted regression, Eqs. 3 to 5."""
+"""Locally weighted regression (Eqs. 3 to 5), and one regression per condition."""
 
 from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,38 +14,40 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+#: Predicates of a condition, one flag each.
+Key = tuple[bool, ...]
 
-#: Weights that are made at a time, to spare memory.
+#: Weights computed at a time, to limit memory.
 _WEIGHTS = 4_000_000
-#: Eigenvalue of X' W X, as a share of the largest, below which it is rounding.
+#: Share of the largest eigenvalue of X' W X below which eigenvalues are rounding errors.
 _SINGULAR = 1e-13
 
 
 class Regression:
     """Weighted least squares about each query: ``beta = (X' W X)^-1 X' W y`` (Eqs. 4 and 5).
 
-    The kernel is ``exp(-d^2 / bandwidth)``, of the distance d in units of each column's scale.
-    There is no constant term, as in the paper: where nothing acts, nothing is predicted.
+    The kernel is ``exp(-d^2 / bandwidth)`` of the distance d in units of each column's scale. As in
+    the paper, there is no constant term: the prediction at zero is zero.
 
-    A ridge settles what the weighted data leave open, as far from the data or where they are few.
-    It draws beta to the unweighted fit of all the data, for to draw it to nought would stop what
-    moves faster than anything seen; a linear system is reproduced with any ridge.
+    A ridge determines beta where the weighted data do not, as far from the data or where they are
+    few. It shrinks beta to the unweighted fit of all data, not to zero: that would stop bodies that
+    move faster than any in the data. A linear system is reproduced with any ridge.
 
     Parameters
     ----------
     x : ndarray
         Training inputs, shape (n, p).
     y : ndarray
-        What they led to, shape (n, q).
+        Training outputs, shape (n, q).
     neighbours : int
-        Nearest inputs that count, k.
+        Number of nearest inputs used, k.
     bandwidth : float
         Lambda, squared units of distance.
     ridge : float
-        As a share of the trace of ``X' W X``; 0 is Eq. 4 as it stands. Where ``X' W X`` is singular
-        (an eigenvalue below 1e-13 of the largest), that is its least-norm solution, of beta by
-        columns in units of ``scale``: directions in which the weighted data do not vary predict
-        nothing.
+        Share of the trace of ``X' W X``; 0 is Eq. 4. Where ``X' W X`` is then singular (an
+        eigenvalue below 1e-13 of the largest), beta is the least-norm solution, with columns in
+        units of ``scale``: directions in which the weighted data do not vary predict zero.
     scale : ndarray, optional
         Unit of distance of each column, shape (p,); 1 by default.
 
@@ -66,14 +73,14 @@ class Regression:
         self.neighbours, self.bandwidth, self.ridge = neighbours, bandwidth, ridge
         self._x = x / self.scale
         self._tree = cKDTree(self._x) if len(x) > neighbours else None
-        # the squares of singular values are what a ridge is added to
+        # a ridge is added to the squares of the singular values
         self._everywhere = np.linalg.lstsq(self._x, y, rcond=max(ridge, _SINGULAR) ** 0.5)[0]
-        # X' W X and X' W y are weighted sums of these, one row a training input
+        # X' W X and X' W y are weighted sums of these rows, one per training input
         columns = np.concatenate([self._x, y], axis=1)
         self._products = np.einsum("ni,nj->nij", self._x, columns).reshape(len(x), -1)
 
     def __call__(self, queries: Array) -> Array:
-        """Predictions, shape (m, q), at queries of shape (m, p)."""
+        """Return predictions, shape (m, q), at queries of shape (m, p)."""
         size = max(1, _WEIGHTS // len(self._x))
         parts = np.array_split(queries / self.scale, max(1, -(-len(queries) // size)))
         return np.concatenate([self._predict(part) for part in parts])
@@ -91,9 +98,9 @@ class Regression:
         return np.asarray(np.einsum("mp,mpq->mq", at, beta))
 
     def _weights(self, at: Array) -> Array | csr_array:
-        """Weights of the training inputs, shape (m, n); relative to the nearest's, which cancels.
+        """Return weights of the training inputs relative to the nearest's, shape (m, n).
 
-        Otherwise all would vanish for a query far from the data.
+        The factor cancels; without it all weights vanish for a query far from the data.
         """
         if self._tree is None:
             square = cdist(at, self._x, "sqeuclidean")
@@ -103,3 +110,83 @@ class Regression:
         weights = np.exp(-(distance**2 - distance[:, :1] ** 2) / self.bandwidth)
         ends = self.neighbours * np.arange(len(at) + 1)
         return csr_array((weights.ravel(), which.ravel(), ends), shape=(len(at), len(self._x)))
+
+
+class Experience:
+    """Observed transitions of a body or a class, with one regression per condition.
+
+    See section 3.1.3 of the paper.
+
+    Parameters
+    ----------
+    standardise : bool
+        Whether distances are in units of each input's standard deviation over all conditions;
+        otherwise in SI units.
+    options : mapping
+        Options of :class:`Regression`.
+    """
+
+    def __init__(self, *, standardise: bool, options: Mapping[str, Any]) -> None:
+        self._standardise, self._options = standardise, options
+        self._x: list[Array] = []
+        self._y: list[Array] = []
+        self._rows: dict[Key, list[int]] = {}
+        self._count = 0
+        self._models: dict[Key, Regression] = {}
+
+    def add(self, x: Array, y: Array, flags: Flags) -> None:
+        """Add inputs (n, p), outputs (n, q) and predicates (n, ...)."""
+        for key, rows in grouped(flags).items():
+            self._rows.setdefault(key, []).extend((rows + self._count).tolist())
+        self._x.append(x)
+        self._y.append(y)
+        self._count += len(x)
+        self._models.clear()
+
+    @property
+    def counts(self) -> dict[Key, int]:
+        """Number of transitions in each observed condition."""
+        return {key: len(rows) for key, rows in self._rows.items()}
+
+    def predict(self, x: Array, flags: Flags) -> Array:
+        """Return predictions (n, q) at inputs (n, p), predicates (n, ...); NaN if unobserved."""
+        out = np.full((len(x), self._y[0].shape[1]), np.nan)
+        for key, rows in grouped(flags).items():
+            if key in self._rows:
+                out[rows] = self._model(key)(x[rows])
+        return out
+
+    def gains(self) -> Array:
+        """Return the linear fit of outputs by inputs in the commonest condition, shape (p, q)."""
+        x, y = self._joined()
+        most = max(self._rows.values(), key=len)
+        return np.asarray(np.linalg.lstsq(x[most], y[most])[0])
+
+    def _model(self, key: Key) -> Regression:
+        if key not in self._models:
+            x, y = self._joined()
+            scale = x.std(axis=0) if self._standardise else np.ones(x.shape[1])
+            # a column that is constant, up to rounding errors, keeps its scale
+            scale = np.where(scale > 1e-9 * abs(x).max(), scale, 1.0)
+            rows = self._rows[key]
+            self._models[key] = Regression(x[rows], y[rows], scale=scale, **self._options)
+        return self._models[key]
+
+    def _joined(self) -> tuple[Array, Array]:
+        self._x, self._y = [np.concatenate(self._x)], [np.concatenate(self._y)]
+        return self._x[0], self._y[0]
+
+
+def grouped(flags: Flags) -> dict[Key, NDArray[np.intp]]:
+    """Return the rows of predicates (n, ...) that agree, by their flags.
+
+    Examples
+    --------
+    >>> list(grouped(np.array([[True], [False], [True]])).values())
+    [array([0, 2]), array([1])]
+    """
+    found: dict[Key, list[int]] = defaultdict(list)
+    rows = flags.reshape(len(flags), math.prod(flags.shape[1:])).tolist()
+    for i, row in enumerate(rows):
+        found[tuple(row)].append(i)
+    return {key: np.array(rows) for key, rows in found.items()}

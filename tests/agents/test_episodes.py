@@ -1,10 +1,14 @@
-"""Episodes and their files: saved, loaded, resumed, refused."""
+"""Episodes and their files, invalid worlds and actions, and processes for episodes."""
 
+import os
 import pickle
+import time
 import warnings
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
+from multiprocessing import active_children
 
 import numpy as np
 import pytest
@@ -12,18 +16,20 @@ import pytest
 from pbrl_ppl.agents import (
     Agent,
     Episode,
+    Outcome,
     Revision,
     TrueModelAgent,
     World,
     run_episode,
     run_episodes,
 )
+from pbrl_ppl.agents.processes import processes
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EpisodeError, UninformedWarning
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.posterior import group, load_posterior
 from pbrl_ppl.sampling import fit, physics_model
-from tests.helpers.tasks import PUCK, PUCK_TRUTH, puck_world
+from tests.helpers.tasks import CART, CART_TRUTH, PUCK, PUCK_TRUTH, puck_world
 
 
 def known(seed: int) -> Agent:
@@ -212,3 +218,86 @@ def test_what_an_agent_believed_is_kept(tmp_path) -> None:
     loaded = Episode.load(tmp_path / "pbrl-1.nc")
     assert loaded.added == [{"effect": "linear_drag", "body": "puck", "transitions": 1}]
     assert done["true"][0].added == []
+
+
+# -- invalid worlds and actions --------------------------------------------------------------------
+
+
+class Broken(World):
+    """Returns something else after the first action."""
+
+    def __init__(self, broken: np.ndarray) -> None:
+        super().__init__(PUCK, PUCK_TRUTH)
+        self.broken = broken
+
+    def step(self, action: np.ndarray) -> Outcome:
+        return replace(super().step(action), state=self.broken)
+
+
+@pytest.mark.parametrize(
+    ("broken", "said"),
+    [
+        (np.full((1, 6), np.nan), "step returned a state that is not finite"),
+        (np.zeros(6), r"step returned states of shape \(6,\), expected finite ones of shape"),
+    ],
+)
+def test_broken_worlds(broken, said) -> None:
+    with pytest.raises(EpisodeError, match=said):
+        run_episode(TrueModelAgent(PUCK, PUCK_TRUTH), Broken(broken))
+
+
+def test_actions_outside_the_set() -> None:
+    world = puck_world()
+    with pytest.raises(EpisodeError, match="none of the task's 9 actions"):
+        world.step([[4.0, 4.0, 0.1]])
+    with pytest.raises(EpisodeError, match=r"expected \(1, 3\): force_x, force_y and torque"):
+        world.step([4.0, 4.0, 0.0])
+    with pytest.raises(EpisodeError, match="none of the task's"):
+        world.step([[np.nan, 4.0, 0.0]])
+    with pytest.raises(EpisodeError, match="none of the task's"):
+        run_episode(_strong(), puck_world())
+
+
+def _strong() -> TrueModelAgent:
+    agent = TrueModelAgent(PUCK, PUCK_TRUTH)
+    agent.act = lambda state: 2.0 * TrueModelAgent.act(agent, state)
+    return agent
+
+
+def test_other_bad_requests() -> None:
+    with pytest.raises(EpisodeError, match="sigma is -1"):
+        World(PUCK, PUCK_TRUTH, sigma=-1.0)
+    with pytest.raises(EpisodeError, match="spread is nan"):
+        World(PUCK, PUCK_TRUTH, spread=np.nan)
+    with pytest.raises(EpisodeError, match="steps is 0"):
+        run_episode(TrueModelAgent(PUCK, PUCK_TRUTH), puck_world(), steps=0)
+    with pytest.raises(EpisodeError, match="different tasks"):
+        run_episode(TrueModelAgent(CART, CART_TRUTH), puck_world())
+
+
+# -- processes -------------------------------------------------------------------------------------
+
+
+@pytest.mark.one_stack
+def test_an_interrupt_ends_them_at_once() -> None:
+    """Of the caller alone, while one is busy for a minute."""
+    before, begin = set(active_children()), time.monotonic()
+    with pytest.raises(KeyboardInterrupt), processes(2) as executor:
+        pids = [executor.submit(os.getpid) for _ in range(2)]
+        waiting = [executor.submit(time.sleep, 60.0) for _ in range(4)]
+        wait(pids)
+        raise KeyboardInterrupt
+    for child in set(active_children()) - before:
+        child.join(10.0)
+    while not all(future.done() for future in waiting) and time.monotonic() - begin < 30.0:
+        time.sleep(0.01)  # the executor's own thread cancels what waits
+    assert all(future.done() for future in waiting) and time.monotonic() - begin < 30.0
+    assert os.getpid() not in {each.result() for each in pids}
+
+
+@pytest.mark.one_stack
+def test_a_process_that_dies() -> None:
+    with pytest.raises(EpisodeError, match="ended before its call"), processes(1) as executor:
+        executor.submit(os._exit, 1).result()
+    with pytest.raises(EpisodeError, match="workers is 0"), processes(0):
+        pass

@@ -6,7 +6,7 @@ import pytest
 from scipy import stats
 
 from pbrl_ppl.effects import attach
-from pbrl_ppl.effects.wheel import wheel
+from pbrl_ppl.effects.friction import wheel
 from pbrl_ppl.parameters import (
     Layout,
     evened,

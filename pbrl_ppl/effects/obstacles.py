@@ -1,4 +1,4 @@
-"""Static obstacle, a disc, that the scene does not show."""
+"""Obstacles that the scene does not show: static discs."""
 
 from itertools import combinations
 from typing import Any
@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.effects.bodies import is_pivoted
 from pbrl_ppl.effects.effect import Effect, EffectParameter
-from pbrl_ppl.effects.hinge import is_pivoted
 from pbrl_ppl.effects.stages import Disc, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
@@ -15,15 +15,15 @@ from pbrl_ppl.scene import Body, Scene, Shape
 
 Array = NDArray[np.float64]
 
-#: Intervals in which the velocity changes most that are looked at, and discs tried at most.
-_HITS, _LOOKS = 16, 60
-#: A hinge changes a velocity all the time: a hit changes it by more than so many times the median.
+#: Intervals with the largest velocity changes that are taken for hits, and discs tried at most.
+_HITS, _DISCS = 16, 60
+#: A hinge changes velocities all the time: there a hit exceeds this multiple of the median change.
 _STANDS_OUT = 3.0
-#: Radii of discs that a single hit suggests, as shares of the body's own.
+#: Radii of discs tried for a single hit, as shares of the body's radius.
 _SIZES = (0.25, 0.75, 2.0)
-#: Friction turns an impulse from the outline's normal: cosines and sines of what is tried.
+#: Friction turns an impulse off the outline's normal: cosine and sine of the angles tried.
 _TURNS = tuple((np.cos(turn), np.sin(turn)) for turn in (0.0, 0.3, -0.3))
-#: A hit agrees with a disc that is so near to where it took place (m, share of the body's radius).
+#: Distance from a disc within which a hit agrees with it, as a share of the body's radius.
 _NEAR = 0.1
 
 
@@ -32,11 +32,11 @@ def _discs(parameters: Any) -> tuple[Disc, ...]:
 
 
 def _scan(scene: Scene, history: History, body: Body) -> Any:
-    """Discs that several hits agree on, then those that single ones suggest.
+    """Return discs that several hits agree on, then discs of single hits.
 
-    Where the velocity changed by ``dv``, an impulse came along ``-dv``; the change of the angular
-    velocity says how far from the centre it passed, so the place on the outline is known, and the
-    disc's centre is a radius further on.
+    Where the velocity changed by ``dv``, the obstacle lies along ``-dv``. The change of the angular
+    velocity gives the distance of the impulse's line from the centre, and with it the point of the
+    outline that was hit; the disc's centre is one radius beyond.
     """
     start = history.dataset["start"].sel(body=body.name).to_numpy()
     begin, end = start[:, :-1].reshape(-1, 6), start[:, 1:].reshape(-1, 6)
@@ -62,28 +62,28 @@ def _scan(scene: Scene, history: History, body: Body) -> Any:
         off = np.linalg.norm(point + radius * inward - centre, axis=1)
         found.append((int((off < _NEAR * reach).sum()), (*centre, radius)))
     found.sort(key=lambda agreed: -agreed[0])
-    discs = [disc for count, disc in found[: _LOOKS // 4] if count > 1]
+    discs = [disc for count, disc in found[: _DISCS // 4] if count > 1]
     for at, way in zip(point, inward, strict=True):
         for size in _SIZES:
             for c, s in _TURNS:
                 discs.append((*(at + size * reach * _turned(way, c, s)), size * reach))
-    return np.array(discs[:_LOOKS]).reshape(-1, 3)
+    return np.array(discs[:_DISCS]).reshape(-1, 3)
 
 
 def _hits(shape: Shape, begin: Array, end: Array, time_step: float) -> tuple[Array, Array]:
-    """Where on a body's outline an impulse took it, and the direction into what gave it.
+    """Return the points of the outline that were hit, and the directions into the obstacle.
 
-    Shape (hit, 2) each, m, in the world.
+    Shape (hit, 2) each, in the world; points in m.
     """
     dv = end[:, 3:5] - begin[:, 3:5]
     size = np.linalg.norm(dv, axis=1)
     inward = -dv / size[:, None]
-    # between the rows it went on as before until the hit, and as after from there
+    # between two rows the body moves at its old velocity until the hit, then at its new one
     early = (end[:, :2] - begin[:, :2]) / time_step - end[:, 3:5]
     when = np.clip(-(early * dv).sum(axis=1) / size**2, 0.0, 1.0) * time_step
     place = begin[:, :2] + when[:, None] * begin[:, 3:5]
     theta = begin[:, 2] + when * begin[:, 5]
-    # r x J = I d(omega): the impulse's line passes the centre at this distance, to its left
+    # r x J = I d(omega): distance of the impulse's line from the centre, positive to its left
     offset = shape.unit_moment * (end[:, 5] - begin[:, 5]) / size
     point = np.empty_like(place)
     for i, turn in enumerate(theta):
@@ -94,12 +94,12 @@ def _hits(shape: Shape, begin: Array, end: Array, time_step: float) -> tuple[Arr
 
 
 def _turned(vector: Array, c: float, s: float) -> Array:
-    """A vector (2,) turned by an angle of this cosine and sine."""
+    """Return a vector (2,) turned by the angle with this cosine and sine."""
     return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
 def _exit(shape: Shape, direction: Array, offset: float) -> Array:
-    """Where a line through a body leaves its outline; it passes the centre at an offset."""
+    """Return where a line, at an offset from the body's centre, leaves the outline."""
     side = np.array([-direction[1], direction[0]])
     if shape.outline is None:
         radius = shape.bounding_radius

@@ -1,4 +1,4 @@
-"""Coulomb friction under a body: closed forms, sticking, and both paths alike."""
+"""Friction under a body and of a wheel: closed forms, sticking, and both paths alike."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from pbrl_ppl.history import from_segments
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.physics import Physics, Simulator, calls
 from pbrl_ppl.sampling import physics_model
-from pbrl_ppl.scene import Body, Scene, Shape
+from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
@@ -159,7 +159,7 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
 def test_paths_agree_and_nothing_is_remembered() -> None:
     sim, phi, start, actions = crowd()
     expected = sim(phi, start, actions)
-    plain = Simulator(sim.physics.changed(engine="python"))
+    plain = Simulator(Physics(sim.physics.changed(engine="python")))
     some = plain(phi, start[:8], actions[:8])
     np.testing.assert_allclose(some, expected[:, :8], rtol=1e-9, atol=1e-9)
     order = np.random.default_rng(6).permutation(len(start))
@@ -225,3 +225,43 @@ def test_nothing_is_solved_where_the_coefficient_is_zero() -> None:
     np.testing.assert_array_equal(both[0], sim(np.array([MU, RADIUS]), start, actions))
     np.testing.assert_allclose(both[1, 0, 0, 0], state(x=0.1, vx=1.0), atol=1e-15)
     assert len(sim._worlds) == 2
+
+
+# -- a wheel that the scene does not declare -------------------------------------------------------
+
+WHEEL = {"w_x": -0.25, "w_y": 0.05, "w_theta": 0.3, "mu_x": 0.05, "mu_y": 0.4}
+WALL = (Wall((1.0, -2.0), (1.0, 2.0)),)
+
+
+def wheeled(wheel: bool, walls: tuple[Wall, ...] = ()) -> Scene:
+    known = WHEEL if wheel else {}
+    box = body("box", BOX, wheel=wheel, mass=3.0, r=0.3, mu_c=0.3, **known)
+    return Scene(time_step=0.1, substeps=20, normal_gravity=G, bodies=(box,), walls=walls)
+
+
+@PATHS
+@pytest.mark.parametrize("walls", [(), WALL], ids=["alone", "wall"])
+def test_it_is_the_wheel_of_table_1(path, walls) -> None:
+    rng = np.random.default_rng(2)
+    start = rng.normal(0, [0.5, 0.5, 1, 1, 1, 2], (20, 1, 6))
+    actions = rng.normal(0, [10, 10, 2], (20, 3, 1, 3))
+    declared = simulator(wheeled(True, walls), engine=path)(np.zeros(0), start, actions)
+    own = simulator(wheeled(False, walls), (BY_NAME["wheel"],), engine=path)
+    added = own(np.array(list(WHEEL.values())), start, actions)
+    np.testing.assert_allclose(added, declared, rtol=0, atol=1e-12)
+    frictionless = own(np.zeros(5), start, actions)
+    assert np.abs(added - frictionless).max() > 0.01
+
+
+def test_a_body_has_one_wheel() -> None:
+    with pytest.raises(EffectError, match="does not apply to body 'box'"):
+        attach(wheeled(True), (BY_NAME["wheel"].on("box"),))
+
+
+def test_places_are_on_the_body_and_directions_within_a_right_angle() -> None:
+    grid = BY_NAME["wheel"].scan(wheeled(False), None, wheeled(False).bodies[0])
+    x_min, x_max, y_min, y_max = BOX.bounds
+    assert ((grid[:, 0] > x_min) & (grid[:, 0] < x_max)).all()
+    assert ((grid[:, 1] > y_min) & (grid[:, 1] < y_max)).all()
+    assert (grid[:, 2] < 0.5 * np.pi).all()
+    assert np.isnan(grid[:, 3:]).all()

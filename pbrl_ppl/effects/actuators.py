@@ -1,0 +1,175 @@
+"""Actuators: gains, rotation, delay, dead zone, cut-off and saturation of the command."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Command
+from pbrl_ppl.history import History
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.scene import Body, Scene
+
+_GAIN = Prior("log_normal", mu=0.0, sigma=0.5)
+_THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=10.0))
+#: Force levels that a scan tries. The likelihood jumps where the cut-off passes a commanded force,
+#: and an optimiser cannot follow it: more levels there.
+_LEVELS, _CUTOFF_LEVELS = 20, 200
+#: No actuator reaches this force (N).
+_UNREACHED = 1e9
+
+
+def _rotate(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    c, s = math.cos(parameters[0]), math.sin(parameters[0])
+    x = wrench[0]
+    wrench[0] = c * x - s * wrench[1]
+    wrench[1] = s * x + c * wrench[1]
+
+
+actuator_rotation = Effect(
+    "actuator_rotation",
+    (EffectParameter("angle", "rad", Prior("normal", sigma=0.5)),),
+    "the push points in another direction than commanded: the actuator is mounted askew",
+    "rotation of a vector in the plane",
+    Command(_rotate),
+)
+
+
+def _scale_force(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    wrench[0] *= parameters[0]
+    wrench[1] *= parameters[0]
+
+
+force_gain = Effect(
+    "force_gain",
+    (EffectParameter("factor", "1", _GAIN, null=1.0),),
+    "every push is stronger or weaker than commanded by the same factor: the actuator's scale is"
+    " off",
+    "gain of an actuator",
+    Command(_scale_force),
+)
+
+
+def _scale_torque(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    wrench[2] *= parameters[0]
+
+
+torque_gain = Effect(
+    "torque_gain",
+    (EffectParameter("factor", "1", _GAIN, null=1.0),),
+    "every torque is stronger or weaker than commanded by the same factor: the motor's scale is"
+    " off",
+    "gain of an actuator",
+    Command(_scale_torque),
+)
+
+
+def _scale_axes(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    wrench[0] *= parameters[0]
+    wrench[1] *= parameters[1]
+
+
+anisotropic_gain = Effect(
+    "anisotropic_gain",
+    (EffectParameter("x", "1", _GAIN, null=1.0), EffectParameter("y", "1", _GAIN, null=1.0)),
+    "pushes along one axis of the room are stronger or weaker than along the other: one of two"
+    " actuators is off",
+    "gains of two actuators at right angles",
+    Command(_scale_axes),
+)
+
+
+def _delay(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    # a delay that ends inside a substep is blended: the likelihood stays smooth in it
+    begin, end = command[6], command[7]
+    late = min(1.0, max(0.0, (parameters[0] - begin) / (end - begin)))
+    for i in range(3):
+        wrench[i] = late * command[3 + i] + (1.0 - late) * wrench[i]
+
+
+_SHARE = Prior("truncated_normal", mu=0.0, sigma=0.5, lower=0.0, upper=1.0)
+
+actuator_delay = Effect(
+    "actuator_delay",
+    (EffectParameter("share", "1", _SHARE),),
+    "the push arrives late, by this share of the sampling interval (actuator_delay), or what is"
+    " measured does (sensor_delay); with one clock in the log the two are the same data",
+    "pure time delay of a held input, u(t - share dt)",
+    Command(_delay, memory=True),
+)
+
+
+def _force_levels(history: History, body: Body, most: int) -> Any:
+    """Return at most so many forces between the sizes of those commanded, shape (level, 1), N."""
+    action = history.dataset["action"].sel(body=body.name).to_numpy()[..., :2]
+    size = np.unique(np.round(np.linalg.norm(action, axis=-1), 9))
+    size = size[size > 0]  # not NaN either
+    if len(size) > most + 1:
+        size = np.unique(np.quantile(size, np.linspace(0, 1, most + 1)))
+    return np.asarray(0.5 * (size[1:] + size[:-1]))[:, None]
+
+
+def _subtract_threshold(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    size = math.hypot(wrench[0], wrench[1])
+    share = 1.0 - parameters[0] / size if size > parameters[0] else 0.0
+    wrench[0] *= share
+    wrench[1] *= share
+
+
+def _scan_dead_zones(scene: Scene, history: History, body: Body) -> Any:
+    """Return the null value, where the derivative is taken, and thresholds to try."""
+    return np.vstack([[[np.nan]], _force_levels(history, body, _LEVELS)])
+
+
+dead_zone = Effect(
+    "dead_zone",
+    (_THRESHOLD,),
+    "only what exceeds a threshold of the push acts: the actuator has play or friction",
+    "dead zone of an actuator (G. Tao and P. V. Kokotovic, 1994)",
+    Command(_subtract_threshold),
+    scan=_scan_dead_zones,
+)
+
+
+def _cut_off(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    if math.hypot(wrench[0], wrench[1]) < parameters[0]:
+        wrench[0] = 0.0
+        wrench[1] = 0.0
+
+
+def _scan_cutoffs(scene: Scene, history: History, body: Body) -> Any:
+    """Return thresholds to try."""
+    return _force_levels(history, body, _CUTOFF_LEVELS)
+
+
+force_cutoff = Effect(
+    "force_cutoff",
+    (_THRESHOLD,),
+    "a push weaker than a threshold does nothing, a stronger one acts in full",
+    "threshold of an actuator",
+    Command(_cut_off),
+    scan=_scan_cutoffs,
+)
+
+
+def _saturate(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    size = math.hypot(wrench[0], wrench[1])
+    if size > parameters[0]:
+        wrench[0] *= parameters[0] / size
+        wrench[1] *= parameters[0] / size
+
+
+def _scan_limits(scene: Scene, history: History, body: Body) -> Any:
+    """Return limits to try."""
+    return _force_levels(history, body, _LEVELS)
+
+
+saturation = Effect(
+    "saturation",
+    (EffectParameter("limit", "N", Prior("log_normal", mu=2.5, sigma=1.5), null=_UNREACHED),),
+    "a push is never stronger than a limit, whatever is commanded: the actuator saturates",
+    "saturation of an actuator",
+    Command(_saturate),
+    scan=_scan_limits,
+)

@@ -1,0 +1,78 @@
+"""Mass, moment of inertia and centre of mass."""
+
+from typing import Any
+
+import numpy as np
+
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Properties
+from pbrl_ppl.history import History
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.scene import Body, Scene
+
+_SCALE = Prior("log_normal", mu=0.0, sigma=0.5)
+#: Trajectories, and times, of a change of mass that a scan tries at most.
+_BEGINS = 20
+
+
+def _scale_moment(properties: Any, parameters: Any, clock: Any) -> None:
+    properties["moment_per_mass"] = properties["moment_per_mass"] * parameters["scale"]
+
+
+inertia_scale = Effect(
+    "inertia_scale",
+    (EffectParameter("scale", "1", _SCALE, null=1.0),),
+    "the body is easier or harder to turn than its outline suggests: mass is not spread evenly",
+    "moment of inertia about the centroid as a free parameter",
+    Properties(_scale_moment),
+)
+
+
+def _shift_centre(properties: Any, parameters: Any, clock: Any) -> None:
+    properties["com_x"] = properties["com_x"] + parameters["x"]
+    properties["com_y"] = properties["com_y"] + parameters["y"]
+
+
+com_offset = Effect(
+    "com_offset",
+    (
+        EffectParameter("x", "m", Prior("normal", sigma=0.1)),
+        EffectParameter("y", "m", Prior("normal", sigma=0.1)),
+    ),
+    "the centre of mass is not in the middle of the outline: mass is not spread evenly",
+    "centre of mass of a rigid body, in the body's frame",
+    Properties(_shift_centre),
+)
+
+
+def _scale_mass(properties: Any, parameters: Any, clock: Any) -> None:
+    # the interval in which the mass changes is blended
+    loaded = clock.after(parameters["time"]) * (clock.trajectory > parameters["trajectory"] - 0.5)
+    properties["mass"] = properties["mass"] * (1.0 + (parameters["factor"] - 1.0) * loaded)
+
+
+def _scan_begins(scene: Scene, history: History, body: Body) -> Any:
+    """Return changes from some trajectory on, then in every trajectory from some time on."""
+    data = history.dataset
+    numbers = data["number"].to_numpy()
+    last = float(np.nanmax(data["clock"].to_numpy()))
+    grid = np.linspace(0, 1, _BEGINS)
+    between = numbers[1:] - 0.5
+    begins = np.unique(np.quantile(between, grid, method="nearest")) if len(between) else between
+    times = np.linspace(0, last, _BEGINS + 2)[1:-1]
+    changes = [(np.nan, begin, 0.0) for begin in begins] + [(np.nan, 0.0, time) for time in times]
+    return np.array(changes).reshape(-1, 3)
+
+
+mass_change = Effect(
+    "mass_change",
+    (
+        EffectParameter("factor", "1", _SCALE, null=1.0),
+        EffectParameter("trajectory", "1", Prior("half_normal", sigma=100.0)),
+        EffectParameter("time", "s", Prior("half_normal", sigma=100.0)),
+    ),
+    "the body is heavier or lighter from some trajectory, or some time, on: it carries a load",
+    "a change point in the mass",
+    Properties(_scale_mass, timed=True),
+    scan=_scan_begins,
+)

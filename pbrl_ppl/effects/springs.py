@@ -1,0 +1,201 @@
+"""Springs, attraction to a place, and rods that the scene does not show."""
+
+from itertools import product
+from math import floor, pi
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+
+from pbrl_ppl.effects.bodies import body_points, is_unpivoted
+from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.stages import Force, Rod, Structure
+from pbrl_ppl.history import History
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.state import wrapped
+
+Array = NDArray[np.float64]
+
+_PLACE = Prior("normal", sigma=10.0)
+#: Anchors of a spring that a scan tries along each axis: quantiles of the measured positions.
+_QUANTILES = (0.1, 0.5, 0.9)
+#: Angles of rest that a scan tries.
+_ANGLES = 8
+#: Attractors that a scan tries along each axis, how far beyond the measured positions (share of
+#: their range), and their depths (m).
+_PLACES, _BEYOND, _DEPTHS = 9, 0.15, (0.08, 0.25)
+#: Largest standard deviation of a rod's length, and largest length, as shares of the standard
+#: deviation of the positions: a longer rod cannot be told from a straight line.
+_HELD, _LONGEST = 0.03, 20.0
+#: Length of a rod (m) below which the data do not inform its direction.
+_SHORTEST = 0.02
+#: Ends of rods closer than this (m) are the same.
+_SAME = 0.01
+
+
+def _poses(history: History, body: Body, width: int) -> Array:
+    """Return the first coordinates of a body where all were measured, shape (n, width)."""
+    poses = history.dataset["start"].sel(body=body.name).to_numpy()[..., :width].reshape(-1, width)
+    return np.asarray(poses[np.isfinite(poses).all(axis=1)])
+
+
+def _spring(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    wrench[0] -= parameters[0] * (state[0] - parameters[1])
+    wrench[1] -= parameters[0] * (state[1] - parameters[2])
+
+
+def _scan_anchors(scene: Scene, history: History, body: Body) -> Any:
+    """Return anchors among the measured positions; the derivative is taken by the stiffness."""
+    places = _poses(history, body, 2)
+    if not len(places):
+        return np.empty((0, 3))
+    x, y = np.quantile(places, _QUANTILES, axis=0).T
+    return np.array([(np.nan, *anchor) for anchor in product(np.unique(x), np.unique(y))])
+
+
+spring = Effect(
+    "spring",
+    (
+        EffectParameter("stiffness", "N/m", Prior("half_normal", sigma=20.0)),
+        EffectParameter("anchor_x", "m", _PLACE),
+        EffectParameter("anchor_y", "m", _PLACE),
+    ),
+    "a pull towards a place that grows with the distance: a cable or a hose drags at the body",
+    "Hooke's law",
+    Force(_spring),
+    applies=is_unpivoted,
+    scan=_scan_anchors,
+)
+
+
+def _torsion_spring(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    # the shorter way round: a logged angle has no number of turns
+    off = state[2] - parameters[1]
+    off -= 2.0 * pi * floor((off + pi) / (2.0 * pi))
+    wrench[2] -= parameters[0] * off
+
+
+def _scan_angles(scene: Scene, history: History, body: Body) -> Any:
+    """Return angles of rest whose opposite the body never reaches; all if it reaches each.
+
+    The torque jumps at the opposite angle, and such a saw-tooth fits any residual. The derivative
+    is taken by the stiffness.
+    """
+    angles = np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False)
+    theta = history.dataset["start"].sel(body=body.name, state="theta").to_numpy().ravel()
+    off = np.abs(wrapped(theta[np.isfinite(theta), None] - angles))
+    smooth = off.max(axis=0, initial=0.0) < np.pi - np.pi / _ANGLES
+    return np.array([(np.nan, angle) for angle in (angles[smooth] if smooth.any() else angles)])
+
+
+torsion_spring = Effect(
+    "torsion_spring",
+    (
+        EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=5.0)),
+        EffectParameter("angle", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
+    ),
+    "a torque towards an angle that grows with the deflection: a twisted cable or a bent hinge",
+    "Hooke's law of torsion",
+    Force(_torsion_spring),
+    scan=_scan_angles,
+)
+
+
+def _attraction(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
+    x, y = parameters[1] - state[0], parameters[2] - state[1]
+    strength = parameters[0] * (x * x + y * y + parameters[3] * parameters[3]) ** -1.5
+    wrench[0] += strength * x
+    wrench[1] += strength * y
+
+
+def _scan_places(scene: Scene, history: History, body: Body) -> Any:
+    """Return places about the measured positions; the derivative is taken by the strength."""
+    places = _poses(history, body, 2)
+    if not len(places):
+        return np.empty((0, 4))
+    low, high = places.min(axis=0), places.max(axis=0)
+    wider = _BEYOND * (high - low)
+    x, y = np.linspace(low - wider, high + wider, _PLACES).T
+    return np.array([(np.nan, *at) for at in product(np.unique(x), np.unique(y), _DEPTHS)])
+
+
+point_attractor = Effect(
+    "point_attractor",
+    (
+        EffectParameter("strength", "N m^2", Prior("normal", sigma=10.0)),
+        EffectParameter("x", "m", _PLACE),
+        EffectParameter("y", "m", _PLACE),
+        EffectParameter("depth", "m", Prior("log_normal", mu=-1.6, sigma=0.7), null=0.2),
+    ),
+    "a pull towards a place, or a push away, that is strong near it and weak far off: a magnet",
+    "inverse-square law, of a source below or above the plane",
+    Force(_attraction),
+    applies=is_unpivoted,
+    scan=_scan_places,
+)
+
+
+def _rod(parameters: Any) -> Rod:
+    return Rod(*(parameters[name] for name in Rod._fields))
+
+
+def _scan_rods(scene: Scene, history: History, body: Body) -> Any:
+    """Return rods whose length is constant over the measured poses, by least squares."""
+    poses = _poses(history, body, 3)
+    if len(poses) < 6:
+        return np.empty((0, 5))
+    spread = float(np.sqrt(poses[:, :2].var(axis=0).sum()))
+
+    def deviation(ends: Array) -> Array:
+        length = _length(ends, poses)
+        return np.asarray(length - length.mean())
+
+    found: list[Array] = []
+    for begin in body_points(body):
+        ends = np.array([*begin, *_centre(begin, poses)])
+        fitted = least_squares(deviation, ends, x_scale="jac").x
+        length = float(_length(fitted, poses).mean())
+        if deviation(fitted).std() > _HELD * spread or not _SHORTEST < length < _LONGEST * spread:
+            continue
+        if all(np.abs(fitted - other[:4]).max() > _SAME for other in found):
+            found.append(np.array([*fitted, length]))
+    return np.array(found).reshape(-1, 5)
+
+
+def _length(ends: Array, poses: Array) -> Array:
+    """Return the distances (n,) from a point of the body to a place: ends (4,), poses (n, 3)."""
+    x, y = _positions(ends[:2], poses)
+    return np.asarray(np.hypot(x - ends[2], y - ends[3]))
+
+
+def _positions(point: Array, poses: Array) -> tuple[Array, Array]:
+    """Return where a point of the body is in the world, shape (n,) each."""
+    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    return poses[:, 0] + c * point[0] - s * point[1], poses[:, 1] + s * point[0] + c * point[1]
+
+
+def _centre(point: Array, poses: Array) -> Array:
+    """Return the centre of the circle on which a point of the body moves (Kasa, 1976)."""
+    x, y = _positions(point, poses)
+    table = np.column_stack([2 * x, 2 * y, np.ones(len(x))])
+    return np.asarray(np.linalg.lstsq(table, x * x + y * y, rcond=None)[0][:2])
+
+
+distance_joint = Effect(
+    "distance_joint",
+    (
+        EffectParameter("a_x", "m", Prior("normal", sigma=0.5)),
+        EffectParameter("a_y", "m", Prior("normal", sigma=0.5)),
+        EffectParameter("b_x", "m", _PLACE),
+        EffectParameter("b_y", "m", _PLACE),
+        EffectParameter("length", "m", Prior("half_normal", sigma=3.0)),
+    ),
+    "a rod or a taut tether that the scene does not show: it holds a point of the body at a"
+    " distance from a place",
+    "J_d of Scholz et al., ICML 2014, section 3.2, to the world",
+    Structure(rod=_rod),
+    applies=is_unpivoted,
+    scan=_scan_rods,
+)
