@@ -8,6 +8,8 @@ from pbrl_ppl.errors import EffectError
 from pbrl_ppl.scene import Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, simulator
 
+pytestmark = pytest.mark.one_stack
+
 PATHS = pytest.mark.parametrize("path", ["compiled", "plain"])
 BOX = Shape.box(0.9, 0.55)
 WHEEL = {"w_x": -0.25, "w_y": 0.05, "w_theta": 0.3, "mu_x": 0.05, "mu_y": 0.4}

@@ -7,6 +7,8 @@ from hypothesis import strategies as st
 
 from pbrl_ppl.oomdp.rays import spans
 
+pytestmark = pytest.mark.one_stack
+
 BOX = (np.array([[-1.0, -0.5], [1.0, -0.5], [1.0, 0.5], [-1.0, 0.5]]), 0.0)
 CIRCLE = (np.zeros((1, 2)), 0.7)
 WALL = (np.array([[2.0, -1.0], [2.0, 1.0]]), 0.0)

@@ -16,6 +16,8 @@ from pbrl_ppl.model.table1 import build_layout, random_variable, table1
 from pbrl_ppl.parameters import BODY_PARAMETERS, WHEEL_PARAMETERS, Block, Layout, Prior
 from pbrl_ppl.scene import Body, Scene, Shape
 
+pytestmark = pytest.mark.one_stack
+
 BOX = Shape.box(1.0, 0.6)
 BODIES = ("one", "two", "three")
 NORMAL = Prior("normal")
