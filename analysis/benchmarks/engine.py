@@ -134,7 +134,7 @@ def arms_scene() -> Scene:
 
 
 def arms_sides(n: int) -> tuple[Callable[[], float], Callable[[], float]]:
-    """A prediction of ``n`` transitions of the arms in the contact-free lane, and by the engine."""
+    """Return timers of ``n`` transitions of the arms: contact-free fast path and engine."""
     scene = arms_scene()
     attached = attach(scene)
     layout = build_layout(scene, attached)
@@ -144,15 +144,15 @@ def arms_sides(n: int) -> tuple[Callable[[], float], Callable[[], float]]:
     start[..., 2], start[..., 5] = rng.normal(0, 1, (n, 2)), rng.normal(0, 4, (n, 2))
     start, actions = hung(scene, start), np.zeros((n, 1, 2, 3))
     actions[..., 2] = rng.normal(0, 0.3, (n, 1, 2))
-    lane, engine = Simulator(scene, layout, attached), Simulator(scene, layout, attached)
+    fast, engine = Simulator(scene, layout, attached), Simulator(scene, layout, attached)
     engine(phi, start[:1], actions[:1])
     for worlds in engine._worlds.values():
         for world in worlds:
             world.chain = None
     np.testing.assert_allclose(
-        lane(phi, start, actions), engine(phi, start, actions), rtol=1e-9, atol=1e-9
+        fast(phi, start, actions), engine(phi, start, actions), rtol=1e-9, atol=1e-9
     )
-    return timed(lambda: lane(phi, start, actions)), timed(lambda: engine(phi, start, actions))
+    return timed(lambda: fast(phi, start, actions)), timed(lambda: engine(phi, start, actions))
 
 
 def naive(
@@ -248,7 +248,7 @@ def free_rows(n: int = MANY) -> list[Row]:
     return [
         Row("free_over_c", what + "with a wheel", "<= 0.15", *free_sides(n)),
         Row("free_plain_over_c", what + "without", "<= 0.10", *free_sides(n, wheel=False)),
-        Row("free_effects_over_c", what + "with a wheel and three effects, stepped without these",
+        Row("free_effects_over_c", what + "with a wheel and three effects (the C stepping without these)",
             "<= 0.2", *free_sides(n, effects=EFFECTS)),
     ]  # fmt: skip
 
@@ -277,8 +277,8 @@ def jacobian_rows() -> list[Row]:
     return [
         Row("jacobian_over_value", f"{what} {layout.size} parameters / the residual alone",
             "<= 10", both(problem.simulator), value),
-        Row("coarse_jacobian_over_value", "the same, derivatives with few engine steps, as climbs"
-            " take them", "", both(rough), value),
+        Row("coarse_jacobian_over_value", "the same, derivatives with few engine steps, as in the"
+            " search for modes", "", both(rough), value),
     ]  # fmt: skip
 
 
@@ -306,7 +306,7 @@ def rows() -> list[Row]:
     bodies = len(apartment.dynamic)
 
     return [
-        Row("naive_over_ours", "Python loop, a new Space a transition / ours, the same numbers",
+        Row("naive_over_ours", "Python loop, a new Space per transition / ours, with the same results",
             ">= 11", timed(lambda: naive(start, actions)),
             timed(lambda: plain(phi, start, actions))),
         Row("naive_over_default", "the same / ours with extrapolation, the default",
@@ -317,20 +317,20 @@ def rows() -> list[Row]:
         *jacobian_rows(),
         Row("two_threads", "two threads / one thread, throughput, 10,000 transitions",
             ">= 1.7", timed(lambda: usual(phi, *many)), timed(lambda: two(phi, *many))),
-        Row("two_threads_c", "the same of the bare C stepping: what the machine gives", "",
+        Row("two_threads_c", "the same of the bare C stepping: the machine's limit", "",
             lambda: seconds(lambda: [run() for run in both]),
             lambda: seconds(lambda: list(pool.map(lambda run: run(), both)))),
         Row("linear", "10,000 transitions / 100 transitions",
             "<= 105", timed(lambda: usual(phi, *many)), timed(lambda: usual(phi, start, actions))),
-        Row("apartment_per_body", f"{bodies}-body apartment, a transition and body / single body",
+        Row("apartment_per_body", f"{bodies}-body apartment, time per transition and body / single body",
             "<= 2", lambda: seconds(lambda: rooms(*furniture)) / bodies,
             timed(lambda: plain(phi, start, actions))),
-        Row("chain_lane_over_engine", "3600 transitions of a double pendulum: lane / engine",
+        Row("chain_lane_over_engine", "3600 transitions of a double pendulum: fast path / engine",
             "<= 0.1", *arms_sides(3600)),
         Row("proposals_30", "30 proposals in one call / 30 calls",
             "<= 1.0", timed(lambda: usual(proposals, start, actions)),
             timed(lambda: [usual(proposal, start, actions) for proposal in proposals])),
-        Row("op_overhead", "the Op / the rollout it wraps, less one",
+        Row("op_overhead", "the Op / the rollout it wraps, minus one",
             "<= 5 %", *op_sides(scene, layout, phi, start, actions), offset=-1.0),
     ]  # fmt: skip
 

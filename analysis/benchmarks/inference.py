@@ -206,7 +206,7 @@ def measure_update() -> Iterator[Row]:
 
 def measure_apartment() -> Iterator[Row]:
     """Eleven bodies under the continuous prior."""
-    what = "11 bodies, continuous prior, 30 transitions a body"
+    what = "11 bodies, continuous prior, 30 transitions per body"
     measured = sampled(*apartment(30))
     yield from fit_rows("apartment", what, 600, measured)
 
@@ -245,7 +245,7 @@ def measure_noise_free() -> Iterator[Row]:
 
 
 class PythonLoop(Op):
-    """Naive baseline: pymunk stepped from Python, a new Space a transition."""
+    """Naive baseline: pymunk stepped from Python, with a new Space for each transition."""
 
     __props__ = ()
 
@@ -314,7 +314,7 @@ def measure_ratio() -> Iterator[Row]:
     ratio = (ess / took) / (share / a_draw)
     yield (
         "ess_per_second_ratio",
-        f"ESS a second / pm.Metropolis on a Python loop ({a_draw:.2g} s a draw, ESS {share:.2g})",
+        f"ESS per second / pm.Metropolis on a Python loop ({a_draw:.2g} s per draw, ESS {share:.2g})",
         ">= 100",
         ratio,
     )
@@ -348,7 +348,7 @@ def measure_methods() -> Iterator[Row]:
         a_draw = max((more - less) / few, EFFORT / _MOST_DRAWS)
         draws = max(few, int(few + (EFFORT - less) / a_draw))
         took, r_hat, ess = judged(*run(draws))
-        what = f"cart, 30 transitions, {_CHAINS} chains, {method}: least ESS a second"
+        what = f"cart, 30 transitions, {_CHAINS} chains, {method}: least ESS per second"
         how = f"{took:.0f} s, {draws} draws a chain, ESS {ess:.0f}, R-hat {r_hat:.2f}"
         yield f"ess_per_second_{method}", f"{what} ({how})", "", ess / took
 

@@ -55,7 +55,7 @@ def measure_cart() -> Iterator[Row]:
     yield "cart_seconds_max", "the same: longest search (s)", "<= 60", took.max()
     yield "cart_seconds_median", "the same: median search (s)", "", float(np.median(took))
     rate = sum(plan.nodes for plan in plans) / took.sum()
-    yield "nodes_per_second", "the same: states generated a second", "", rate
+    yield "nodes_per_second", "the same: states generated per second", "", rate
 
 
 def python_astar(start: np.ndarray, nodes: int) -> float:
@@ -102,7 +102,7 @@ def measure_python() -> Iterator[Row]:
         ratios.append(found.nodes / found.seconds / python_astar(state, 3000))
     yield (
         "over_python_loop",
-        "states a second / those of A* on a Python loop over pymunk",
+        "states per second / those of A* on a Python loop over pymunk",
         ">= 8",
         float(np.median(ratios)),
     )
