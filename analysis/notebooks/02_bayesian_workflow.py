@@ -115,9 +115,9 @@ figure
 
 # %% [markdown]
 # Rank plot: the ranks of each chain's draws among all draws, minus those of uniform ranks.
-# Converged chains stay in the grey band. Draws of a Markov chain are correlated, so the band's width
-# follows from their effective sample size. `az.plot_rank` has no band in ArviZ 0.x, and in 1.3 marks
-# the points that a test of the ranks finds suspicious.
+# Converged chains stay in the grey band. Draws of a Markov chain are correlated, so the band's
+# width follows from their effective sample size. `az.plot_rank` has no band in ArviZ 0.x, and in
+# 1.3 marks the points that a test of the ranks finds suspicious.
 
 # %%
 figure = plot_rank(posteriors["with drag"], shown)
@@ -204,8 +204,8 @@ figure.savefig(OUT / "02_loo_pit.png", dpi=100)
 # Residuals against a possible cause: the error of the predicted angular velocity against the
 # angular velocity at the start. The declared model overestimates fast rotation in proportion to its
 # speed, as expected from missing viscous drag; with drag no pattern is left. LOO-PIT cannot detect
-# this, because it uses one measurement at a time. `pp.close_loop` does such tests automatically; see
-# the next notebook.
+# this, because it uses one measurement at a time. `pp.close_loop` does such tests automatically;
+# see the next notebook.
 
 # %%
 spin = start.sel(state="omega").to_numpy().ravel()
@@ -226,7 +226,8 @@ figure.savefig(OUT / "02_residual.png", dpi=100)
 # ## Comparison by leave-one-out cross-validation
 #
 # `az.loo` estimates the expected log predictive density of a transition that was left out
-# (PSIS-LOO, Vehtari et al., 2017). It is reliable if few Pareto k are high; it reports their number.
+# (PSIS-LOO, Vehtari et al., 2017). It is reliable if few Pareto k are high; it reports their
+# number.
 
 # %%
 warnings.filterwarnings("ignore", message="Estimated shape parameter of Pareto")

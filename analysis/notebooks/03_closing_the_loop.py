@@ -84,8 +84,8 @@ print("unexplained:", cart.unexplained)
 # ### Before and after
 #
 # Errors on the test recording, in units of the noise floor (dotted line), which is an estimate of
-# the error of a perfect model. Left: one step ahead. Right: a forecast over many steps, in which the
-# missing effect accumulates.
+# the error of a perfect model. Left: one step ahead. Right: a forecast over many steps, in which
+# the missing effect accumulates.
 
 # %%
 figure = plot_errors(cart.findings)
@@ -137,8 +137,8 @@ else:
 
 # %% [markdown]
 # A real machine never equals its model exactly. Besides the added effects, read the remaining
-# residual: the verdict is `unexplained` if forecasts or accelerations still have significant errors,
-# whatever was added.
+# residual: the verdict is `unexplained` if forecasts or accelerations still have significant
+# errors, whatever was added.
 
 # %%
 if pendulum is not None:
@@ -183,7 +183,8 @@ else:
 # 1.3 degrees.
 #
 # The friction's radius determines how the block turns as it slides. Its size `mu` is not reliable:
-# the pushes are slow, 2 mm/s, and any `mu` from 0.0001 to 0.3 gives the same error of the last pose.
+# the pushes are slow, 2 mm/s, and any `mu` from 0.0001 to 0.3 gives the same error of the last
+# pose.
 
 # %%
 if block is not None:

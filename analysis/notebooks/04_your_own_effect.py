@@ -37,10 +37,10 @@ for kind in (UninformedWarning, BoundWarning, ConvergenceWarning):
 # ## The effect
 #
 # A fan in the middle of the room makes the air circulate: a force perpendicular to the line to the
-# middle that grows with the distance, F = k (-y, x). The law runs inside the compiled engine loop, so it
-# is plain arithmetic on four arrays: `state` (x, y, theta, vx, vy, omega), `command` (the wrench
-# as commanded), `parameters`, and `wrench`, to which it adds (N, N, N m). At its null value, 0 by
-# default, the effect must vanish.
+# middle that grows with the distance, F = k (-y, x). The law runs inside the compiled engine loop,
+# so it is plain arithmetic on four arrays: `state` (x, y, theta, vx, vy, omega), `command` (the
+# wrench as commanded), `parameters`, and `wrench`, to which it adds (N, N, N m). At its null value,
+# 0 by default, the effect must vanish.
 
 
 # %%
@@ -120,9 +120,9 @@ for added in loop.added:
 print(f"simulated with {STRENGTH} N/m")
 
 # %% [markdown]
-# The candidates' score statistics: how strongly the residual resembles each effect's signature.
-# The dashes mark the value that clean data exceed in 1 % of cases. Effects that would explain a part of it
-# come next.
+# The candidates' score statistics: how strongly the residual resembles each effect's signature. The
+# dashes mark the value that clean data exceed in 1 % of cases. Effects that would explain a part of
+# it come next.
 
 # %%
 figure = plot_candidates(loop.findings)

@@ -128,8 +128,8 @@ pooled = pp.pool(posteriors)
 pooled.table().set_index("parameter").T
 
 # %% [markdown]
-# `left_out` names parameters that only some robots have. An effect found in some robots may be below
-# the detection limit in the others, so the mean over those that have it would be too large.
+# `left_out` names parameters that only some robots have. An effect found in some robots may be
+# below the detection limit in the others, so the mean over those that have it would be too large.
 
 # %%
 print("left out:", pooled.left_out)
