@@ -243,13 +243,14 @@ def free_sides(
 
 
 def free_rows(n: int = MANY) -> list[Row]:
-    """Predictions of a body that touches nothing, one thread, without extrapolation."""
-    what = f"{n} transitions that touch nothing / bare C stepping: "
+    """Return rows of contact-free predictions: one thread, without extrapolation."""
+    what = f"{n} contact-free transitions / bare C stepping: "
     return [
         Row("free_over_c", what + "with a wheel", "<= 0.15", *free_sides(n)),
         Row("free_plain_over_c", what + "without", "<= 0.10", *free_sides(n, wheel=False)),
         Row("free_effects_over_c",
-            what + "with a wheel and three effects (the C stepping without these)", "<= 0.2", *free_sides(n, effects=EFFECTS)),
+            what + "with a wheel and three effects (the C stepping without these)", "<= 0.2",
+            *free_sides(n, effects=EFFECTS)),
     ]  # fmt: skip
 
 
@@ -307,7 +308,8 @@ def rows() -> list[Row]:
 
     return [
         Row("naive_over_ours",
-            "Python loop, a new Space per transition / ours, with the same results", ">= 11", timed(lambda: naive(start, actions)),
+            "Python loop, a new Space per transition / ours, with the same results", ">= 11",
+            timed(lambda: naive(start, actions)),
             timed(lambda: plain(phi, start, actions))),
         Row("naive_over_default", "the same / ours with extrapolation, the default",
             "", timed(lambda: naive(start, actions)), timed(lambda: usual(phi, start, actions))),
@@ -323,7 +325,8 @@ def rows() -> list[Row]:
         Row("linear", "10,000 transitions / 100 transitions",
             "<= 105", timed(lambda: usual(phi, *many)), timed(lambda: usual(phi, start, actions))),
         Row("apartment_per_body",
-            f"{bodies}-body apartment, time per transition and body / single body", "<= 2", lambda: seconds(lambda: rooms(*furniture)) / bodies,
+            f"{bodies}-body apartment, time per transition and body / single body", "<= 2",
+            lambda: seconds(lambda: rooms(*furniture)) / bodies,
             timed(lambda: plain(phi, start, actions))),
         Row("chain_lane_over_engine", "3600 transitions of a double pendulum: fast path / engine",
             "<= 0.1", *arms_sides(3600)),

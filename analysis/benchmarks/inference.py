@@ -314,7 +314,7 @@ def measure_ratio() -> Iterator[Row]:
     ratio = (ess / took) / (share / a_draw)
     yield (
         "ess_per_second_ratio",
-        f"ESS per second / pm.Metropolis on a Python loop ({a_draw:.2g} s, ESS {share:.2g} per draw)",
+        f"ESS per second / pm.Metropolis on a Python loop ({a_draw:.2g} s, ESS {share:.2g} a draw)",
         ">= 100",
         ratio,
     )
