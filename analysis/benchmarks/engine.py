@@ -63,12 +63,12 @@ class Row:
     offset: float = 0.0
 
     def measure(self) -> float:
-        """Median over the rounds."""
+        """Return the median over the rounds."""
         return float(np.median([self.above() / self.below() for _ in range(ROUNDS)])) + self.offset
 
 
 def seconds(function: Callable[[], object], least: float = 0.1) -> float:
-    """Time of one call: the mean over as many as take ``least`` seconds."""
+    """Return the time of one call: the mean over as many as take ``least`` seconds."""
     function()
     calls, begin = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - begin) < least:
@@ -78,7 +78,7 @@ def seconds(function: Callable[[], object], least: float = 0.1) -> float:
 
 
 def timed(function: Callable[[], object]) -> Callable[[], float]:
-    """The function's time, to be measured when it is asked for."""
+    """Return a function that measures the given function's time."""
     return lambda: seconds(function)
 
 
@@ -86,20 +86,20 @@ def timed(function: Callable[[], object]) -> Callable[[], float]:
 
 
 def cart_scene(wheel: bool = True, effects: tuple[str, ...] = ()) -> Scene:
-    """A cart on a floor without walls, wheeled unless said otherwise."""
+    """Return a cart on a floor without walls, with a wheel by default."""
     cart = Body("cart", BOX, wheel=wheel, effects=effects)
     return Scene(time_step=TIME_STEP, substeps=SUBSTEPS, normal_gravity=G, bodies=(cart,))
 
 
 def cart_data(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Random start states (n, 1, 6) and wrenches (n, 1, 1, 3)."""
+    """Return random start states (n, 1, 6) and wrenches (n, 1, 1, 3)."""
     rng = np.random.default_rng(1)
     start = rng.normal(0, [3.0, 3.0, 1.5, 1.5, 1.5, 1.0], (n, 1, 6))
     return start, rng.normal(0, [40.0, 40.0, 5.0], (n, 1, 1, 3))
 
 
 def hung(scene: Scene, start: np.ndarray) -> np.ndarray:
-    """Start states (n, body, 6) with hinged bodies where their hinges hold them."""
+    """Return start states (n, body, 6) that satisfy the hinges."""
     start = start.copy()
     for i, body in enumerate(scene.dynamic):
         if any(body.name in (joint.bodies or ()) for joint in scene.joints):
@@ -109,7 +109,7 @@ def hung(scene: Scene, start: np.ndarray) -> np.ndarray:
 
 
 def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Furniture about its reference poses, moving; pushes on all of it; parameters."""
+    """Return states of moving furniture near its reference poses, pushes on all, and parameters."""
     rng = np.random.default_rng(2)
     k = len(scene.dynamic)
     start = rng.normal(0, [0.05, 0.05, 0.1, 0.5, 0.5, 0.5], (n, k, 6))
@@ -120,7 +120,7 @@ def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def arms_scene() -> Scene:
-    """Two hinged arms in a vertical plane, each with a moment and a centre of mass of its own."""
+    """Return two hinged arms in a vertical plane, with moments and centres of mass unknown."""
     effects = ("inertia_scale", "com_offset")
     bodies = (
         Body("upper", Shape.box(0.05, 0.2), effects=effects),
@@ -207,7 +207,7 @@ def _bare(fn, world, start, step, substeps):  # type: ignore[no-untyped-def]
 
 
 def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[], None]:
-    """The engine's own C stepping of the same world from the same states, and nothing else."""
+    """Return the engine's bare C stepping of the same world from the same states."""
     world = World(simulator.scene)
     given = simulator._properties(phi[None])
     world.set_properties(given.bodies[0, 0], given.joints[0])
@@ -227,7 +227,7 @@ def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[
 def free_sides(
     n: int, wheel: bool = True, effects: tuple[str, ...] = ()
 ) -> tuple[Callable[[], float], Callable[[], float]]:
-    """A prediction of ``n`` transitions that touch nothing, and bare C stepping without effects."""
+    """Return timers of ``n`` contact-free transitions, and of bare C stepping without effects."""
     start, actions = cart_data(n)
     simulators = []
     for acting in (effects, ()):
@@ -255,7 +255,7 @@ def free_rows(n: int = MANY) -> list[Row]:
 
 
 def jacobian_rows() -> list[Row]:
-    """The Jacobian of the demo's residual, as a mode's covariance and as a climb to it take it."""
+    """Return rows of the demo's Jacobian: as for a mode's covariance, and as in the search."""
     scene = Scene.load(RECORDED / "scene.toml").with_effects("cart", *EFFECTS)
     history = History.load(RECORDED / "recorded" / "train.csv", scene)
     problem = Problem.of(scene, history, attach(scene))
@@ -284,7 +284,7 @@ def jacobian_rows() -> list[Row]:
 
 
 def rows() -> list[Row]:
-    """All ratios."""
+    """Return all ratios."""
     scene = cart_scene()
     layout = build_layout(scene)
     phi = layout.to_vector(CART)
@@ -341,7 +341,7 @@ def rows() -> list[Row]:
 def op_sides(
     scene: Scene, layout: Layout, phi: np.ndarray, start: np.ndarray, actions: np.ndarray
 ) -> tuple[Callable[[], float], Callable[[], float]]:
-    """A compiled pytensor function of the Op, and the Simulator; each call at another phi."""
+    """Return timers of a compiled function of the Op and of the Simulator, at changing phi."""
     op = SimulatorOp(scene, layout)
     variable = pt.dvector("phi")
     function = pytensor.function([variable], op(variable, start, actions), trust_input=True)
@@ -357,7 +357,7 @@ def op_sides(
 
 
 def touching(scene: Scene) -> float:
-    """Share of the apartment's transitions in which shapes come close enough to touch."""
+    """Return the share of the apartment's transitions with possible contacts."""
     layout = build_layout(scene)
     phi, start, actions = apartment_data(scene, TRANSITIONS)
     plain, extrapolated = (
@@ -368,7 +368,7 @@ def touching(scene: Scene) -> float:
 
 
 def machine() -> str:
-    """What this was measured on."""
+    """Return a line on the machine and the versions."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -382,7 +382,7 @@ def machine() -> str:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print all ratios."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     as_json = parser.parse_args().json
