@@ -1,4 +1,4 @@
-# Every target makes its own environment; python3, pip and make are all it takes.
+# Every target makes its own environment and needs python3, pip and make alone.
 PYTHON ?= python3
 VENV ?= .venv
 PYTEST_ARGS ?=
@@ -16,15 +16,15 @@ demo: $(VENV)/.installed
 	$(BIN)/pbrl-ppl close-loop $(CART)/scene.toml $(CART)/recorded/train.csv \
 	    --test $(CART)/recorded/test.csv -o out/demo --overwrite
 
-# The paper's experiments at their published size, and their numbers; an interrupted run goes on.
-# A smoke size: make paper PAPER_ARGS=--quick, into folders of another name.
+# Run the paper's experiments at their published size and print their numbers. An interrupted run is
+# resumed. `make paper PAPER_ARGS=--quick` runs small versions, into folders of another name.
 paper: $(VENV)/.installed-test
 	for experiment in 04_shopping_cart.py 05_apartment.py 06_wrong_model.py "06_wrong_model.py --box2d" \
 	    07_scaling.py; do $(BIN)/python analysis/$$experiment $(PAPER_ARGS) || exit 1; done
 	$(BIN)/python analysis/benchmarks/agents.py --results \
 	    $(PAPER:%=out/%$(if $(findstring --quick,$(PAPER_ARGS)),_quick))
 
-# A file's fixtures are made once, by the worker that has it; tests/conftest.py has the order.
+# One worker runs a whole file, so that its fixtures are made once; the marker `first` sets the order.
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --durations 10
 
 test: $(VENV)/.installed-test
@@ -33,7 +33,7 @@ test: $(VENV)/.installed-test
 test-fast: $(VENV)/.installed-test
 	$(PYTEST) -m 'not slow and not long' $(PYTEST_ARGS)
 
-# what may differ between the generations of PyMC and ArviZ
+# the fast tests that depend on the generation of PyMC and ArviZ
 test-generation: $(VENV)/.installed-test
 	$(PYTEST) -m 'not slow and not long and not one_stack' $(PYTEST_ARGS)
 
@@ -45,9 +45,9 @@ lint: $(VENV)/.installed-lint
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -c 'from tests.test_rooms import test_sizes; test_sizes()'
 
-# as .ipynb and HTML with their pictures; jupytext runs them, from here, in a kernel of its own Python
+# Run the notebooks and write them as .ipynb and HTML with their pictures. Their kernel is this
+# environment's Python, their working directory this folder.
 notebooks: $(VENV)/.installed-docs
 	mkdir -p out/notebooks
 	for notebook in analysis/notebooks/*.py; do \
@@ -56,7 +56,7 @@ notebooks: $(VENV)/.installed-docs
 	        && $(BIN)/jupyter-nbconvert --to html $$page || exit 1; \
 	done
 
-# warnings are errors; notebooks have their pictures where `make notebooks` was run before
+# Warnings are errors. Notebooks have their pictures if `make notebooks` was run before.
 docs: $(VENV)/.installed-docs
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --config-file analysis/docs/mkdocs.yml
 
@@ -65,7 +65,7 @@ clean:
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-# Where Python comes without ensurepip (some distributions split it off), its pip fills the venv.
+# Some distributions package Python without ensurepip: there the system's pip fills the environment.
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { \
 	    echo "pbrl_ppl needs Python 3.11 or newer; $(PYTHON) is $$($(PYTHON) --version 2>&1)." \
@@ -73,10 +73,10 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV) || { $(PYTHON) -m venv --clear --without-pip $(VENV) \
 	    && $(PYTHON) -m pip --python $(BIN)/python install pip; }
 
-$(VENV)/.installed: pyproject.toml | $(BIN)/python
+$(VENV)/.installed: pyproject.toml setup.py | $(BIN)/python
 	$(BIN)/python -m pip install -e .
 	touch $@
 
-$(VENV)/.installed-%: pyproject.toml | $(BIN)/python
+$(VENV)/.installed-%: pyproject.toml setup.py | $(BIN)/python
 	$(BIN)/python -m pip install -e '.[$*]'
 	touch $@

@@ -1,4 +1,4 @@
-"""How the error of the cart's parameters falls with the number of transitions.
+"""Error of the cart's parameters against the number of transitions.
 
     python analysis/01_parameter_error.py           # table, and out/parameter_error.png
     python analysis/01_parameter_error.py --histories 20
@@ -32,7 +32,7 @@ OUT = Path("out")
 
 
 def error(transitions: int, sigma: float, seed: int) -> dict[str, float]:
-    """Absolute errors of one history's mode; that of the mass as a share."""
+    """Return the absolute errors of one history's mode, relative for the mass."""
     scene, history = cart(transitions, noise=np.full(6, sigma), seed=100 + seed)
     model = pp.physics_model(scene, history, sigma="scalar", threads=2)
     found = find_mode(model.problem, seed=1).values
@@ -41,7 +41,7 @@ def error(transitions: int, sigma: float, seed: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """Measure, print and draw."""
+    """Measure the errors, print and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--histories", type=int, default=10)
     histories = parser.parse_args().histories

@@ -33,17 +33,17 @@ BEGIN = time.monotonic()
 
 
 def say(text: str) -> None:
-    """Print what happened, and when."""
+    """Print an event with its time."""
     print(f"{time.monotonic() - BEGIN:4.0f} s  {text}", flush=True)
 
 
 def beliefs(idata: object) -> str:
-    """How probable it is that things move."""
+    """Return the probabilities that table and couch move."""
     return ", ".join(f"{name} {movable(idata, name):.0%}" for name in ("table", "couch"))
 
 
 def opening(states: np.ndarray) -> str:
-    """Through which opening the robot goes, if it does."""
+    """Return the opening through which the robot goes, if any."""
     crossed = np.flatnonzero(states[:, 0, 0] > 0)
     if not len(crossed):
         return "neither opening"
@@ -51,19 +51,19 @@ def opening(states: np.ndarray) -> str:
 
 
 def way(states: np.ndarray, name: str) -> float:
-    """How far a body is moved (m)."""
+    """Return the distance that a body is moved (m)."""
     i = [body.name for body in SCENE.dynamic].index(name)
     return float(np.hypot(*(states[-1] - states[0])[i, :2]))
 
 
 def told(states: np.ndarray) -> str:
-    """A motion in words."""
+    """Return a sentence about a motion."""
     moved = ", ".join(f"{name} moved by {way(states, name):.2f} m" for name in ("table", "couch"))
     return f"the robot goes through {opening(states)}; {moved}"
 
 
 def main() -> None:
-    """Plan, fail, learn, plan again; print and draw."""
+    """Plan, fail, update and replan; print and draw."""
     # that nothing is known of the furniture is the point of it
     warnings.simplefilter("ignore", UninformedWarning)
     OUT.mkdir(exist_ok=True)

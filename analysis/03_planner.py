@@ -1,4 +1,4 @@
-"""A planner script: it needs the posterior file, and nothing else.
+"""A planner script that needs only the posterior file.
 
 make demo && python analysis/03_planner.py out/demo/after.nc
 """

@@ -73,7 +73,7 @@ AIM = pp.Goal(
 
 
 class Explorer(pp.Agent):
-    """Acts at random: first which body, then how."""
+    """Agent that acts at random: it draws a body, then an action on it."""
 
     name = "random"
     model = None
@@ -102,7 +102,7 @@ def agent(name: str, seed: int, **options: object) -> pp.Agent:
 
 
 def explored(count: int, seed: int, sigma: float, box2d: bool) -> list[tuple[np.ndarray, ...]]:
-    """Return so many observed transitions."""
+    """Return a given number of observed transitions."""
     found: list[tuple[np.ndarray, ...]] = []
     part = 0
     while len(found) < count:
@@ -122,7 +122,7 @@ def explored(count: int, seed: int, sigma: float, box2d: bool) -> list[tuple[np.
 def trial(
     name: str, seed: int, counts: tuple[int, ...], sigma: float, box2d: bool, path: Path
 ) -> xr.Dataset:
-    """Plan after so many observations, play the plans, and keep what came out in a file."""
+    """Plan after given numbers of observations, execute the plans, and save the results."""
     learner, seen = agent(name, seed), 0
     every = explored(max(counts), seed, sigma, box2d)
     rows = {key: [] for key in ("planned", "valid", "reward", "models", "update", "search")}
@@ -162,7 +162,7 @@ def described() -> dict[str, str]:
 
 
 def played(wrenches: np.ndarray, box2d: bool) -> tuple[bool, float]:
-    """Play a plan in the true world: whether it reaches the goal, and the last reward (m)."""
+    """Execute a plan in the true world; return whether it succeeds, and the last reward (m)."""
     true = world(box2d=box2d)
     state = true.reset(0)
     for wanted in wrenches:

@@ -1,4 +1,4 @@
-"""Misspecification: a cart in worlds with an effect that no one told the agent of.
+"""Misspecification: a cart in worlds with an effect that the agent's model lacks.
 
     python analysis/06_wrong_model.py              # ten episodes of each, in out/wrong_model
     python analysis/06_wrong_model.py --resume     # go on where a run was interrupted
@@ -60,7 +60,7 @@ class Hidden:
     force: tuple[float, float] = (0.0, 0.0)
 
     def __call__(self, wrench: np.ndarray) -> np.ndarray:
-        """Return what acts in place of commanded wrenches (body, 3)."""
+        """Return the acting wrenches for commanded ones, shape (body, 3)."""
         c, s = np.cos(self.angle), np.sin(self.angle)
         out = wrench.copy()
         out[:, :2] = wrench[:, :2] @ np.array([[c, s], [-s, c]]) + self.force
@@ -68,7 +68,7 @@ class Hidden:
 
 
 def world(name: str, sigma: float, box2d: bool = False) -> pp.World:
-    """Return the cart's world with an effect, and noise on what is observed."""
+    """Return the cart's world with an effect and noisy observations."""
     sizes = WORLDS[name]
     if not box2d:
         return pp.World(TASK, TRUTH | sizes, (EFFECTS[name],), sigma=sigma, spread=SPREAD)

@@ -1,4 +1,4 @@
-"""What the baselines and the physics prior have to learn, against the number of objects.
+"""Number of conditions of the baselines and observations of PBRL against the number of objects.
 
     python analysis/07_scaling.py            # one to eight objects, five seeds, in out/scaling
     python analysis/07_scaling.py --resume   # go on where a run was interrupted
@@ -48,7 +48,7 @@ CONTACTS = {"": pp.SectorContacts(), "_by_object": pp.SectorContacts(by_object=T
 
 
 def room(objects: int) -> tuple[Scene, np.ndarray]:
-    """A room with so many boxes in rows, and their poses, shape (body, 3)."""
+    """Return a room with boxes in rows, and their poses, shape (body, 3)."""
     side = int(np.ceil(np.sqrt(objects)))
     half = 0.5 * side * (SIDE + GAP) + 0.5
     corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
@@ -76,7 +76,7 @@ def room(objects: int) -> tuple[Scene, np.ndarray]:
 def explore(
     objects: int, observations: int, seed: int
 ) -> tuple[Scene, dict[str, float], pd.DataFrame]:
-    """So many random pushes, one box at a time: scene, true masses, and what was seen."""
+    """Push boxes at random, one at a time; return scene, true masses and observations."""
     rng = np.random.default_rng([seed, objects])
     scene, grid = room(objects)
     layout = build_layout(scene)
@@ -110,7 +110,7 @@ def conditions_met(scene: Scene, seen: pd.DataFrame, contacts: pp.SectorContacts
 
 
 def observations_needed(scene: Scene, masses: dict[str, float], seen: pd.DataFrame) -> float:
-    """The least number of first observations whose mode has every mass to 5 %, by doubling."""
+    """Return the smallest number of observations whose mode has every mass to 5 %, by doubling."""
     history = pp.History.from_dataframe(seen, scene)
     truth = np.array(list(masses.values()))
 
@@ -142,7 +142,7 @@ def observations_needed(scene: Scene, masses: dict[str, float], seen: pd.DataFra
 
 
 def measured(objects: int, seed: int, observed: int, path: Path) -> xr.Dataset:
-    """What a room shows, kept in a file."""
+    """Measure a room, save the results in a file and return them."""
     scene, masses, seen = explore(objects, observed, seed)
     met = {
         f"conditions_met{kind}": float(conditions_met(scene, seen, contacts))
@@ -165,7 +165,7 @@ def measured(objects: int, seed: int, observed: int, path: Path) -> xr.Dataset:
 
 
 def stored(path: Path, observed: int) -> xr.Dataset:
-    """A room of an earlier run.
+    """Return the stored results of a room, if any.
 
     Raises
     ------
@@ -183,7 +183,7 @@ def stored(path: Path, observed: int) -> xr.Dataset:
 
 
 def measured_all(options: argparse.Namespace, counts: list[int], observed: int) -> xr.Dataset:
-    """Measure the rooms that are missing; return what the figure shows."""
+    """Measure the missing rooms; return the data of the figure."""
     folder = options.out / "rooms"
     folder.mkdir(parents=True, exist_ok=True)
     if any(folder.glob("*.nc")) and not options.resume:
@@ -243,7 +243,7 @@ def bars(axes: Axes, values: xr.DataArray, colour: str, label: str) -> None:
 
 
 def run() -> None:
-    """Measure, keep and draw."""
+    """Measure, save and draw."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--workers", type=int, default=processors(), help="rooms at a time")

@@ -1,19 +1,19 @@
-"""The scoreboard of attribution: whether the loop names what is missing, and nothing else.
+"""Scoreboard of attribution: whether the loop names the missing effect and no other.
 
-    python analysis/attribution_benchmark.py --cache out/attribution     # go on after Ctrl-C
+    python analysis/attribution_benchmark.py --cache out/attribution     # resumes after Ctrl-C
     python analysis/attribution_benchmark.py --cache out/attribution --part 1/3 --json board.json
     python analysis/attribution_benchmark.py --quick --method laplace    # a tenth of the cases
     python analysis/attribution_benchmark.py --only cart-linear_drag --verbose
-    python analysis/attribution_benchmark.py --seed 1 --list             # another board
-    python analysis/attribution_benchmark.py --measured --only pendulum-torque   # no cases
+    python analysis/attribution_benchmark.py --seed 1 --list             # other cases
+    python analysis/attribution_benchmark.py --measured --only pendulum-torque   # measured only
     python analysis/attribution_benchmark.py --measured --folder runs/arm        # your recording
     python analysis/attribution_benchmark.py --measured --write-page             # On hardware
 
 Box2D and MuJoCo make the data. A seed draws the cases: bodies (carts on a wheel, free boxes,
-pendulums, pairs, double pendulums), recordings, noises, and what is hidden: an effect of the
-catalogue; one that is left out of it; one that is not in it; nothing; and logs that are nonsense.
-An oracle that knows what is hidden says which cases can be told at all: scores are over those. Each
-tenth case has the loop's own sampler, the others Laplace's approximation.
+pendulums, pairs, double pendulums), recordings, noises, and a hidden effect: one of the catalogue,
+one removed from it, one outside it, or none; some logs are nonsense. An oracle that knows the
+effect tests which cases are detectable; scores are over those. Every tenth case uses the loop's
+default sampler, the others Laplace's approximation.
 
 ``--measured`` runs the loop on the measured recordings beside the project, minutes each, and prints
 a Markdown table of errors on held-out data beside those of independent fits. Each result is a JSON
@@ -64,14 +64,14 @@ def begin_worker() -> None:
 
 
 def end_worker(number: int, frame: object) -> None:
-    """End the chains that a worker has begun, and the worker: they would wait for it for ever."""
+    """End a worker and the chains that it started, which would wait for it forever."""
     for child in multiprocessing.active_children():
         child.terminate()
     os._exit(1)
 
 
 def results(cases: list[Case], executor: Executor, options: argparse.Namespace) -> Iterator[Row]:
-    """Rows as they are done; those in the cache are not made again, but for failures."""
+    """Yield rows as they finish; those in the cache are reused, except for failures."""
     waiting: dict[Future[Row], Case] = {}
     stale, now = 0, sources()
     seed, draws = options.seed, options.draws
@@ -102,14 +102,14 @@ def results(cases: list[Case], executor: Executor, options: argparse.Namespace) 
 
 
 def kept(case: Case, options: argparse.Namespace) -> Row | None:
-    """The row of a case in the cache, if it is there."""
+    """Return the row of a case from the cache, if any."""
     if options.cache is None:
         return None
     return load(cache_path(options.cache, case, options.seed, options.draws))
 
 
 def in_batches(cases: list[Case], options: argparse.Namespace) -> Iterator[Row]:
-    """Rows of all cases, with new workers from time to time.
+    """Yield the rows of all cases, with new workers from time to time.
 
     An executor's own ``max_tasks_per_child`` never ends on some versions of Python: all of its
     workers leave at once, and none comes.
@@ -129,7 +129,7 @@ def in_batches(cases: list[Case], options: argparse.Namespace) -> Iterator[Row]:
 
 
 def watched(rows: Iterator[Row], total: int, made: int, verbose: bool) -> list[Row]:
-    """Collect rows, telling progress and the time left; Ctrl-C keeps those that are done.
+    """Collect rows and print progress and the remaining time; Ctrl-C keeps finished rows.
 
     The first ``made`` of the ``total`` rows come from the cache, at once.
     """
@@ -156,7 +156,7 @@ def _duration(seconds: float) -> str:
 
 
 def chosen(options: argparse.Namespace) -> list[Case]:
-    """The cases asked for, shuffled: those done by an interrupted run stand for all."""
+    """Return the requested cases, shuffled, so that an interrupted run is representative."""
     cases = all_cases(options.seed, options.method)
     if options.quick:
         cases = a_tenth(cases)
@@ -167,7 +167,7 @@ def chosen(options: argparse.Namespace) -> list[Case]:
 
 
 def parsed() -> argparse.Namespace:
-    """The command line."""
+    """Parse the command line."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -220,7 +220,7 @@ def parsed() -> argparse.Namespace:
 
 
 def write(name: str | None, found: Mapping[str, object]) -> None:
-    """Write what was found where it is asked for."""
+    """Write the results to the requested outputs."""
     text = json.dumps(found, indent=1)
     if name == "-":
         print(text)
@@ -229,7 +229,7 @@ def write(name: str | None, found: Mapping[str, object]) -> None:
 
 
 def recordings(options: argparse.Namespace) -> list[Recording]:
-    """The measured recordings asked for."""
+    """Return the requested measured recordings."""
     if options.folder:
         return [Recording(options.folder.resolve().name, options.folder)]
     only = options.only or [""]
@@ -237,7 +237,7 @@ def recordings(options: argparse.Namespace) -> list[Recording]:
 
 
 def measure(options: argparse.Namespace) -> None:
-    """Run the loop on measured recordings, keep each result, and print their table."""
+    """Run the loop on measured recordings, save each result, and print their table."""
     chosen = recordings(options)
     if not chosen:
         sys.exit(f"no recording has {' or '.join(options.only)} in its name; --list prints them")
@@ -272,7 +272,7 @@ def measure(options: argparse.Namespace) -> None:
 
 
 def is_fresh(kept: Result | None, options: argparse.Namespace) -> bool:
-    """Whether a kept result is of this code and these settings."""
+    """Return whether a stored result has this code and these settings."""
     now = (options.seed, options.method or "laplace", sources())
     return kept is not None and kept.error is None and (kept.seed, kept.method, kept.sources) == now
 

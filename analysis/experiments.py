@@ -1,4 +1,4 @@
-"""What the paper's experiments, 04 to 07, share: intervals, curves, and files with their origin."""
+"""Shared code of the paper's experiments 04 to 07: intervals, curves, files with their origin."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def summary(name: str, episodes: list[pp.Episode], steps: int) -> dict[str, obje
 
 
 def save(data: xr.Dataset, path: Path) -> None:
-    """Write a small NetCDF file, whole or not at all."""
+    """Write a small NetCDF file atomically."""
     packed = {name: {"zlib": True} for name in data if data[name].dtype.kind == "f"}
     write_atomically(path, lambda to: data.to_netcdf(to, engine="h5netcdf", encoding=packed))
 

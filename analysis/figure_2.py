@@ -26,7 +26,7 @@ TO = Path(__file__).parent / "results" / "figure_2.svg"
 
 
 def cart_model() -> pm.Model:
-    """Table 1's prior, the engine as an Op and Eq. 11's likelihood of a cart with two pushes."""
+    """Return the model of a cart with two pushes: Table 1, the engine as an Op, Eq. 11."""
     cart = pp.Body("cart", pp.Shape.box(0.9, 0.55), wheel=True)
     scene = pp.Scene(time_step=0.1, normal_gravity=9.81, bodies=(cart,))
     state = dict.fromkeys(("x", "y", "theta", "vx", "vy", "omega"), 0.0)
@@ -47,7 +47,7 @@ def with_engine(model: pm.Model) -> pm.Model:
 
 
 def drawn(model: pm.Model) -> Any:
-    """The graph from left to right, with the paper's symbols and Table 1's order."""
+    """Return the graph from left to right, with the paper's symbols and Table 1's order."""
     graph = pm.model_to_graphviz(model)
     order = list(SYMBOLS)
 
@@ -79,7 +79,7 @@ def _relabelled(line: str) -> str:
 
 
 def main(to: Path) -> int:
-    """Draw the model; 2 if what it takes is not installed."""
+    """Draw the model; return 2 if a requirement is not installed."""
     try:
         import graphviz
     except ImportError:

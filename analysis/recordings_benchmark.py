@@ -1,4 +1,4 @@
-"""Benchmark on recordings as people have them: positions alone, few and short trajectories.
+"""Benchmark on typical recordings: positions alone, few and short trajectories.
 
     python analysis/recordings_benchmark.py --cache out/recordings      # go on after Ctrl-C
     python analysis/recordings_benchmark.py --cache out/recordings --part 1/2 --json scores.json
@@ -40,14 +40,14 @@ say = partial(print, file=sys.stderr, flush=True)
 
 
 def kept(case: Case, options: argparse.Namespace) -> Row | None:
-    """Return the row of a case from the cache, if it is there."""
+    """Return the row of a case from the cache, if any."""
     if options.cache is None:
         return None
     return load(cache_path(options.cache, case, options.seed, options.bare))
 
 
 def made(case: Case, options: argparse.Namespace) -> Row:
-    """Return the row of a case, from the cache or made anew; failures are made anew."""
+    """Return the row of a case from the cache, or run it; failures are run again."""
     row = kept(case, options)
     if row is None or row.error is not None:
         row = run_case(case, options.seed, options.bare, options.limit)
@@ -57,7 +57,7 @@ def made(case: Case, options: argparse.Namespace) -> Row:
 
 
 def chosen(options: argparse.Namespace) -> list[Case]:
-    """Return the cases asked for, shuffled: those done by an interrupted run stand for all."""
+    """Return the requested cases, shuffled, so that an interrupted run is representative."""
     cases = all_cases(options.seed)
     if options.only:
         cases = [case for case in cases if any(part in case.name for part in options.only)]

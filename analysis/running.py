@@ -1,4 +1,4 @@
-"""What benchmarks of many cases share: a time limit, the code's hash, parts, and kept rows."""
+"""Shared code of the benchmarks: a time limit, the code's hash, parts, and stored rows."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ import pbrl_ppl as pp
 
 @contextmanager
 def limited(limit: int, cure: str) -> Iterator[None]:
-    """Stop what takes longer than so many seconds, where the system can: in a main thread.
+    """Stop code that takes longer than a number of seconds, where supported: in a main thread.
 
     0 is no limit. The message says what to do: ``cure``.
     """
@@ -51,13 +51,13 @@ def sources() -> str:
 
 
 def cache_file(folder: Path, name: str, settings: tuple[Any, ...]) -> Path:
-    """Return where the row of a case is kept: its name, and a hash of version and settings."""
+    """Return the path of a case's row: its name, and a hash of version and settings."""
     text = repr((pp.__version__, *settings))
     return folder / f"{name}-{hashlib.sha256(text.encode()).hexdigest()[:12]}.json"
 
 
 def save(row: Any, path: Path) -> None:
-    """Write a row, a dataclass, whole or not at all."""
+    """Write a row, a dataclass, atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(".partial")
     partial.write_text(json.dumps(asdict(row)))
@@ -65,7 +65,7 @@ def save(row: Any, path: Path) -> None:
 
 
 def part(text: str) -> tuple[int, int]:
-    """Return which of how many parts."""
+    """Parse a part such as 1/3."""
     try:
         i, n = (int(number) for number in text.split("/"))
     except ValueError:

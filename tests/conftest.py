@@ -1,6 +1,7 @@
-"""Fixtures that many tests share."""
+"""Settings, the order of the test files, and fixtures shared by several test files."""
 
 import importlib.util
+import math
 import os
 from pathlib import Path
 from types import ModuleType
@@ -10,90 +11,31 @@ from hypothesis import settings
 
 from tests.helpers.places import RECORDED, ROOT
 
-# Where each tensor was made is a fiftieth of the tests' time, and what the C compiler makes quick
-# is never run for long. pytensor reads this when imported.
+# Traces of each tensor's origin cost 2 % of the tests' time, and no test runs long enough for
+# optimised C code to pay off. PyTensor reads this when it is imported.
 os.environ.setdefault("PYTENSOR_FLAGS", "traceback__limit=0,gcc__cxxflags=-O0")
-# a worker a processor: threads of linear algebra would wait for each other; read with numpy
+# One pytest worker per processor: BLAS threads would wait for each other. NumPy reads this when it
+# is imported.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# the same examples everywhere, and no test that fails because a machine is slow
+# The same examples on every machine, and no failure because a machine is slow.
 settings.register_profile("project", deadline=None, derandomize=True)
 settings.load_profile("project")
-
-#: Rooms that import neither PyMC nor ArviZ: their tests are the same whatever generation is there,
-#: but for those in which something is fitted.
-WITHOUT_PYMC = (
-    "scene", "parameters", "history", "effects", "physics", "modes", "planning", "oomdp",
-)  # fmt: skip
-FITTED = (
-    "modes/test_index_priors.py",
-    "modes/test_joints.py",
-    "planning/test_planning_files.py",
-    "planning/test_planning_modes.py",
-)
-#: Of a room that does import them, files whose tests stand on modes or on samplers of our own, and
-#: those that look at pages in a browser.
-ON_MODES = (
-    "agents/test_box2d_world.py",
-    "agents/test_library_agent.py",
-    "agents/test_revision.py",
-    "criticism/test_criticism.py",
-    "criticism/test_cross_validation.py",
-    "criticism/test_misfit.py",
-    "criticism/test_remainder.py",
-    "criticism/test_resolution.py",
-    "criticism/test_scan.py",
-    "criticism/test_selection.py",
-    "criticism/test_structure_search.py",
-    "likelihood/test_contact_noise.py",
-    "likelihood/test_trajectories.py",
-    "modes/test_configurations.py",
-    "report/test_pages.py",
-    "sampling/test_emulator.py",
-)
-#: Files that workers begin with: the longest first, and they fill up with the short ones. The
-#: second runs no engine, while the other worker compiles it for both.
-LONGEST = (
-    "criticism/test_revision.py",
-    "sampling/test_metropolis.py",
-    "test_notebooks.py",
-    "sampling/test_updating.py",
-    "modes/test_configurations.py",
-    "sampling/test_whole_trajectories.py",
-    "sampling/test_fitting.py",
-    "criticism/test_criticism.py",
-    "agents/test_figures.py",
-    "posterior/test_updated_prior.py",
-    "criticism/test_remainder.py",
-    "planning/test_experiments.py",
-    "modes/test_joint_search.py",
-    "sampling/test_calibration.py",
-    "model/test_gradients.py",
-    "planning/test_planning.py",
-)
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what one generation is enough for, and put the longest files first."""
-    tests = ROOT / "tests"
+    """Put the files marked `first` first: workers fill up with the short ones afterwards."""
 
-    def name_of(item: pytest.Item) -> str:
-        return item.path.relative_to(tests).as_posix() if tests in item.path.parents else ""
+    def rank(item: pytest.Item) -> float:
+        marker = item.get_closest_marker("first")
+        return marker.args[0] if marker else math.inf
 
-    def place(item: pytest.Item) -> int:
-        name = name_of(item)
-        return LONGEST.index(name) if name in LONGEST else len(LONGEST)
-
-    for item in items:
-        name = name_of(item)
-        if name in ON_MODES or (name.split("/")[0] in WITHOUT_PYMC and name not in FITTED):
-            item.add_marker("one_stack")
-    items.sort(key=place)
+    items.sort(key=rank)
 
 
 @pytest.fixture(scope="session")
 def shared_data() -> Path:
-    """Folder of recorded histories beside the project; tests on it are skipped where it is not."""
+    """Return the folder of recorded histories beside the project, or skip the test without it."""
     if not RECORDED.is_dir():
         pytest.skip(f"no recorded histories at {RECORDED}")
     return RECORDED
@@ -101,7 +43,7 @@ def shared_data() -> Path:
 
 @pytest.fixture(scope="session")
 def make_history() -> ModuleType:
-    """The Box2D generator, models/shopping_cart/make_history.py, as a module."""
+    """Return the Box2D generator models/shopping_cart/make_history.py as a module."""
     path = ROOT / "models" / "shopping_cart" / "make_history.py"
     spec = importlib.util.spec_from_file_location("make_history", path)
     module = importlib.util.module_from_spec(spec)
@@ -111,5 +53,5 @@ def make_history() -> ModuleType:
 
 @pytest.fixture
 def benchmarks(monkeypatch):
-    """Modules of analysis/benchmarks can be imported, as they import each other."""
+    """Put analysis/benchmarks on the import path: its modules import each other."""
     monkeypatch.syspath_prepend(str(ROOT / "analysis" / "benchmarks"))

@@ -13,6 +13,8 @@ import pytest
 from pbrl_ppl.posterior import load_posterior
 from tests.helpers.places import ROOT
 
+pytestmark = pytest.mark.first(3)
+
 FOLDER = ROOT / "analysis" / "notebooks"
 NOTEBOOKS = sorted(path.name for path in FOLDER.glob("*.py"))
 #: Ends the cell whose constants are replaced, as Papermill does it.

@@ -1,4 +1,4 @@
-"""README and pages of analysis/docs: blocks run in one session, links and commands exist."""
+"""README and pages of analysis/docs: Python blocks, links and commands."""
 
 import ast
 import builtins
@@ -21,7 +21,7 @@ from tests.helpers.places import MODELS, ROOT
 
 DOCS = ROOT / "analysis" / "docs"
 CART = MODELS / "shopping_cart"
-#: In the order in which they are read: the README, and what the pages' index names.
+#: The README and the pages, in the order of the pages' index.
 PROSE = [ROOT / "README.md"] + [
     DOCS / "pages" / name
     for name in re.findall(r"(\S+\.md)$", (DOCS / "mkdocs.yml").read_text(), re.M)
@@ -37,7 +37,7 @@ BLOCKS = [block for path in PROSE for block in blocks(path, "python")]
 
 
 def exported(folder: Path) -> None:
-    """The logs that the page on logs of others reads, made of the recorded cart."""
+    """Write the logs that the page Your own log reads, from the recorded cart."""
     rows = pd.read_csv(CART / "recorded" / "train.csv")
     mocap = pd.DataFrame({"take": rows.trajectory, "t": 1e3 * rows.time, "px": 1e3 * rows.x})
     mocap = mocap.assign(
@@ -63,7 +63,7 @@ def exported(folder: Path) -> None:
 
 
 def loaded(tree: ast.Module) -> Iterator[str]:
-    """Names that are read outside of functions."""
+    """Yield the names that are read outside functions."""
     for statement in tree.body:
         if not isinstance(statement, ast.FunctionDef):
             for node in ast.walk(statement):
@@ -93,7 +93,7 @@ def test_each_name_is_made_before_it_is_used() -> None:
 
 
 def test_links_lead_to_files() -> None:
-    """As they are read in the repository; what `make docs` makes of them it checks itself."""
+    """Links between files of the repository; `make docs` checks links between pages."""
     assert len(PROSE) > 10
     assert set(PROSE[1:]) == set((DOCS / "pages").rglob("*.md"))
     for path in PROSE:
@@ -180,8 +180,8 @@ def test_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(pp, "run_episode", episodes)
     names: dict[str, Any] = {"__name__": "__main__"}
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # too few draws, of course
-        for kind in (DeprecationWarning, FutureWarning, RuntimeWarning):  # ArviZ's own
+        warnings.simplefilter("ignore", UserWarning)  # too few draws
+        for kind in (DeprecationWarning, FutureWarning, RuntimeWarning):  # from ArviZ
             warnings.simplefilter("ignore", kind)
         for block in BLOCKS:
             exec(compile(block, block, "exec"), names)

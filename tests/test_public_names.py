@@ -1,4 +1,4 @@
-"""The public names: all resolve, each when it is first used."""
+"""The public names: all resolve, each at its first use."""
 
 import subprocess
 import sys
@@ -24,7 +24,7 @@ def test_star_import() -> None:
 
 
 def test_import_is_quick() -> None:
-    """PyMC is loaded with the first name that needs it."""
+    """The first name that needs PyMC loads it."""
     code = "import sys, pbrl_ppl; print(*sys.modules); pbrl_ppl.Scene; print(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     at_once, with_scene = (set(line.split()) for line in said.stdout.splitlines())

@@ -1,18 +1,14 @@
-"""Rooms: their list in CONTRIBUTING.md, their sizes, and tests that import no other test."""
+"""Layout: the rooms listed in CONTRIBUTING.md, and test files that import no other test file."""
 
 import ast
 import re
-import statistics
 import tomllib
 
 from tests.helpers.places import ROOT
 
-#: The most lines of a module, what their median is under, and the most entries of the package.
-MOST_LINES, MEDIAN_LINES, MOST_ENTRIES = 350, 150, 20
-
 
 def test_no_test_imports_another() -> None:
-    """What several need is in tests/helpers."""
+    """Code that several test files share is in tests/helpers."""
     files = sorted((ROOT / "tests").rglob("*.py"))
     others = re.compile(r"^\s*(?:from|import) tests(?!\.helpers\b).*", re.M)
     assert [(each.name, others.findall(each.read_text())) for each in files
@@ -30,16 +26,3 @@ def test_contributing_lists_the_rooms() -> None:
             for name in rooms]  # fmt: skip
     first = [(text or "").splitlines()[0] for text in said]
     assert listed == list(zip(rooms, first, strict=True))
-
-
-def test_sizes() -> None:
-    """`make lint` calls this too, where pytest need not be: hence the messages."""
-    package = ROOT / "pbrl_ppl"
-    modules = sorted(package.rglob("*.py"))
-    lines = {str(path.relative_to(ROOT)): len(path.read_text().splitlines()) for path in modules}
-    longer = {module: count for module, count in lines.items() if count > MOST_LINES}
-    assert not longer, f"modules of more than {MOST_LINES} lines: {longer}; split them by idea"
-    median = statistics.median(lines.values())
-    assert median < MEDIAN_LINES, f"the modules' median is {median} lines, not under {MEDIAN_LINES}"
-    entries = sorted(path.name for path in package.iterdir() if path.name != "__pycache__")
-    assert len(entries) <= MOST_ENTRIES, f"pbrl_ppl/ has {len(entries)} entries: {entries}"

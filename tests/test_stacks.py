@@ -1,4 +1,4 @@
-"""PyMC 5 with ArviZ 0.x and PyMC 6 with ArviZ 1.x: the same posterior, and files of each other.
+"""PyMC 5 with ArviZ 0.x and PyMC 6 with ArviZ 1.x: equal posteriors, interchangeable files.
 
 ``data/`` holds a fit of each generation; ``python -m tests.helpers.stacks`` writes them.
 """

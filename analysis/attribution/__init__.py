@@ -1,1 +1,1 @@
-"""Cases of attribution, the oracle beside them, and their scores; see attribution_benchmark.py."""
+"""Cases of attribution, their oracle and scores; see attribution_benchmark.py."""

@@ -1,4 +1,4 @@
-"""What a user would otherwise try: regress the residual force on quantities that were recorded."""
+"""Simple alternatives to the loop: regressions of the residual force on recorded quantities."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _EQUATIONS = {3: "x", 4: "y", 5: "turn"}
 
 
 def ask_baselines(declared: Mode) -> dict[str, str | None]:
-    """Name an effect in each of the usual ways; None where a way finds nothing or is not there.
+    """Return the effect that each method names; None if it finds none or is not installed.
 
     Parameters
     ----------
@@ -39,7 +39,7 @@ def ask_baselines(declared: Mode) -> dict[str, str | None]:
 
 
 def _equations(mode: Mode) -> tuple[dict[str, Array], dict[str, Terms]]:
-    """Residual accelerations and terms of each equation, by effect and term, shape (n,) each."""
+    """Return residual accelerations and terms of each equation, shape (n,) each."""
     problem = mode.problem
     residual = problem.residual(mode.phi)[:, 0, 0] / problem.scene.time_step
     start = problem.segments.start[:, 0]
@@ -57,7 +57,7 @@ def _equations(mode: Mode) -> tuple[dict[str, Array], dict[str, Terms]]:
 
 
 def _terms(state: Array, wrench: Array, before: Array) -> dict[str, Terms]:
-    """A library as one writes it down, of every law that is linear in a coefficient."""
+    """Return a library of all laws that are linear in a coefficient."""
     x, y, theta, vx, vy, omega = state.T
     force_x, force_y, torque = wrench.T
     speed, one = np.hypot(vx, vy), np.ones(len(state))
@@ -109,7 +109,7 @@ def _terms(state: Array, wrench: Array, before: Array) -> dict[str, Terms]:
 
 
 def _largest(left: dict[str, Array], named: dict[str, Terms]) -> str | None:
-    """The effect of the term that goes with the residual most closely."""
+    """Return the effect of the term with the largest correlation with the residual."""
     found = [
         (abs(float(np.corrcoef(own, left[equation])[0, 1])), effect)
         for equation, terms in named.items()
@@ -120,7 +120,7 @@ def _largest(left: dict[str, Array], named: dict[str, Terms]) -> str | None:
 
 
 def _sparse(left: dict[str, Array], named: dict[str, Terms]) -> str | None:
-    """The effect whose terms explain most of the residual's square, after pysindy's thresholds."""
+    """Return the effect whose terms explain most of the squared residual, by pysindy."""
     try:
         from pysindy.optimizers import STLSQ
     except ImportError:  # extra `bench`

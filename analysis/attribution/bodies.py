@@ -64,7 +64,7 @@ CONTAIN |= {sort: (*_RICHER, ("anisotropic_gain", "inertia_scale")) for sort in 
 
 
 def twins(sort: str, effect: str | None) -> tuple[str | None, ...]:
-    """Return the effects that are the same physics as this one on a sort of body, and itself."""
+    """Return an effect and those equivalent to it on a kind of body."""
     return next((group for group in TWINS[sort] if effect in group), (effect,))
 
 
@@ -88,18 +88,18 @@ class Body:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the bodies."""
+        """Return the names of the bodies."""
         return tuple(setup.name for setup in self.setups)
 
     @property
     def noise(self) -> dict[str, float]:
-        """Noise of each measured state dimension."""
+        """Return the noise of each measured state dimension."""
         noise = dict(zip(STATE, self.setups[0].noise, strict=True))
         return {name: size for name, size in noise.items() if not math.isnan(size)}
 
     @property
     def scene(self) -> pp.Scene:
-        """The declared scene."""
+        """Return the declared scene."""
         hinged, corner = self.sort in HINGED, _ROOM
         corners = [(-corner, -corner), (corner, -corner), (corner, corner), (-corner, corner)]
         walls = [pp.Wall(corners[i - 1], corners[i]) for i in range(4)]
@@ -134,7 +134,7 @@ class Body:
 
 
 def draw_body(sort: str, rng: Rng) -> Body:
-    """Draw a body of this sort: its size, mass and frictions, how it is pushed and measured."""
+    """Draw a body of a kind: size, mass, frictions, pushes and measurements."""
     recording = _recording(sort, rng)
     if sort == PAIR:
         discs = [_free(rng, name, recording, disc=True) for name in ("left", "right")]

@@ -1,4 +1,4 @@
-"""Cases of the scoreboard: which effect is hidden on which body, what the loop may name."""
+"""Cases of the scoreboard: the hidden effect, its body, and the loop's catalogue."""
 
 from __future__ import annotations
 
@@ -95,14 +95,14 @@ class Case:
 
     @property
     def value(self) -> Hidden | None:
-        """How much of the effect there is, as the generator takes it."""
+        """Return the effect's size, as an argument of the generator."""
         if self.effect is None or self.on is None or self.strength is None:
             return None
         return value(self.effect, self.body, self.on, self.strength, self.turn)
 
     @property
     def left_out(self) -> tuple[str | None, ...]:
-        """What the loop's catalogue lacks: the effect, its twins, and what contains it."""
+        """Return the effects removed from the loop's catalogue: the effect and its equivalents."""
         if self.kind != LEFT_OUT:
             return ()
         richer = (outer for outer, own in CONTAIN[self.body.sort] if own == self.effect)
@@ -110,7 +110,7 @@ class Case:
 
     @property
     def catalogue(self) -> tuple[pp.Effect, ...]:
-        """What the loop may name."""
+        """Return the loop's catalogue."""
         return tuple(effect for effect in pp.catalogue if effect.name not in self.left_out)
 
     def at(self, strength: float) -> Case:
@@ -118,7 +118,7 @@ class Case:
         return replace(self, strength=min(strength, STRONGEST))
 
     def histories(self, seed: int, coarse: bool = False) -> tuple[pp.History, pp.History]:
-        """Make the data to fit and those to judge by; ``coarse`` ones with longer steps."""
+        """Return the training and the test recording; ``coarse`` ones have longer steps."""
         own = zlib.crc32(f"{self.name} {seed} {coarse}".encode())
         hidden = {} if self.effect is None or self.value is None else {self.effect: self.value}
         frames = simulate(own, self.body, self.on, hidden, coarse)
@@ -155,7 +155,7 @@ _NONSENSE = (
 
 
 def all_cases(seed: int = 0, method: str | None = None) -> list[Case]:
-    """Return every case of a seed; another seed draws other ones.
+    """Return all cases of a seed.
 
     Parameters
     ----------
@@ -195,7 +195,7 @@ def _rng(seed: int, name: str) -> Rng:
 
 
 def _drawn(kind: str, sort: str, count: int, seed: int) -> list[Case]:
-    """Draw cases of one kind and sort of body; each effect once before one comes again."""
+    """Draw cases of one kind and sort of body; no effect repeats before each was drawn once."""
     if kind == CLEAN:
         named = [f"{kind}-{sort}-{i:02d}" for i in range(count)]
         return [Case(name, kind, draw_body(sort, _rng(seed, name))) for name in named]
@@ -222,5 +222,5 @@ def _drawn(kind: str, sort: str, count: int, seed: int) -> list[Case]:
 
 
 def a_tenth(cases: list[Case]) -> list[Case]:
-    """About a tenth of each kind, one at least."""
+    """Return about a tenth of each kind, at least one."""
     return [case for kind in KINDS for case in [each for each in cases if each.kind == kind][::11]]

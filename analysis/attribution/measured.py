@@ -1,4 +1,4 @@
-"""Measured recordings, what independent fits reach on them, and results of the loop on them."""
+"""Measured recordings, errors of independent fits, and results of the loop."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Ahead:
 
 @dataclass(frozen=True)
 class Recording:
-    """A folder with scene.toml, train.csv and test.csv, and what is known of it.
+    """A folder with scene.toml, train.csv and test.csv, and what independent fits found.
 
     Parameters
     ----------
@@ -196,13 +196,13 @@ class Result:
     seconds: float = 0.0
 
     def save(self, path: Path) -> None:
-        """Write it as JSON."""
+        """Write the result as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(json.dumps(asdict(self), indent=1) + "\n")
 
     @classmethod
     def load(cls, path: Path) -> Result | None:
-        """Read one, if it is there."""
+        """Return a stored result, if any."""
         if not path.is_file():
             return None
         kept = json.loads(path.read_text())
@@ -210,12 +210,12 @@ class Result:
 
     @property
     def names(self) -> tuple[tuple[str, ...], ...]:
-        """Each added effect, with those that are not separable from it."""
+        """Return each added effect with its confounded effects."""
         return tuple((each["effect"], *each["not_separable_from"]) for each in self.added)
 
 
 def load_recording(recording: Recording) -> tuple[pp.Scene, pp.History, pp.History]:
-    """Scene, train and test, with the velocities empty where none are used."""
+    """Return scene, train and test, without velocities if these are not used."""
     scene = pp.Scene.load(recording.folder / "scene.toml")
 
     def history(name: str) -> pp.History:
@@ -281,7 +281,7 @@ def run(
 def errors_ahead(
     recording: Recording, found: Findings, train: pp.History, test: pp.History, seed: int
 ) -> tuple[dict[str, Any], ...]:
-    """Held-out errors of each forecast, before and after; None where no trajectory is as long."""
+    """Return held-out errors of each forecast, before and after; None for short trajectories."""
     scene = found.scene
     train, test, *_ = checked_histories(scene, train, test)
     judged = HeldOut(test, seed)
@@ -317,7 +317,7 @@ def errors_ahead(
 
 
 def picture(found: Findings) -> bytes:
-    """PNG of positions and angle of a held-out trajectory, measured and forecast from its start."""
+    """Return a PNG of a held-out trajectory, measured and forecast from its start."""
     shown = found.rollout
     columns = [place for place, name in enumerate(shown.names) if name not in _VELOCITIES]
 

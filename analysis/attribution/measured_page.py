@@ -18,13 +18,13 @@ AS_GOOD = 1.3
 
 
 def kept_results(folder: Path, recordings: Iterable[Recording] = MEASURED) -> dict[str, Result]:
-    """Results that a folder has, by name."""
+    """Return the results in a folder, by name."""
     found = {each.name: Result.load(folder / f"{each.name}.json") for each in recordings}
     return {name: result for name, result in found.items() if result is not None}
 
 
 def markdown_table(recordings: Iterable[Recording], found: Mapping[str, Result]) -> str:
-    """One row a recording: declared, found, held-out errors, and those of the independent fit."""
+    """Return a table, one row per recording: declared, found, and held-out errors."""
     lines = [
         "| recording | declared | found | error before | error after | independent fit |",
         "|---|---|---|---|---|---|",
@@ -47,7 +47,7 @@ def markdown_table(recordings: Iterable[Recording], found: Mapping[str, Result])
 
 
 def failures(recording: Recording, result: Result) -> list[str]:
-    """Sentences on what is worse than the independent fit; none where nothing is known of it."""
+    """Return sentences on results that are worse than the independent fit."""
     if result.error is not None:
         return [f"The loop failed: {result.error}."]
     right = set(recording.right)
@@ -104,7 +104,7 @@ def write_page(page: Path = PAGE, recordings: Iterable[Recording] = MEASURED) ->
 
 
 def _section(recording: Recording, result: Result | None, page: Path) -> str:
-    """A recording's picture, and what was declared and found."""
+    """Return a recording's section: picture, declared model and findings."""
     lines = [f"## {recording.name}", "", recording.about, "", f"- Declared: {recording.declared}."]
     if recording.right:
         lines.append(f"- Physically there, by independent fits: {_listed(recording.right)}.")
@@ -139,7 +139,7 @@ def _section(recording: Recording, result: Result | None, page: Path) -> str:
 
 
 def _beside(recording: Recording, result: Result) -> Iterator[tuple[Any, dict[str, Any]]]:
-    """Forecasts of a recording, each with its errors."""
+    """Return the forecasts of a recording with their errors."""
     for ahead in recording.ahead:
         for row in result.errors:
             if (row["seconds"], row["quantity"]) == (ahead.seconds, ahead.quantity):
@@ -147,7 +147,7 @@ def _beside(recording: Recording, result: Result) -> Iterator[tuple[Any, dict[st
 
 
 def _found(result: Result) -> str:
-    """The verdict and the names, for a cell."""
+    """Return the verdict and the names, for a cell."""
     if result.error is not None:
         return "failed"
     return "<br>".join([result.verdict, *map(_added, result.added)])
@@ -162,7 +162,7 @@ def _either(names: Iterable[str]) -> str:
 
 
 def _added(added: Mapping[str, Any]) -> str:
-    """An effect, with means and intervals of its parameters."""
+    """Return an effect with means and intervals of its parameters."""
     sizes = [
         f"{name} {number(each['mean'])} ({_interval(each)}) {each['unit']}".rstrip()
         for name, each in added["parameters"].items()
@@ -172,7 +172,7 @@ def _added(added: Mapping[str, Any]) -> str:
 
 
 def _interval(estimate: Mapping[str, Any]) -> str:
-    """A 94 % interval."""
+    """Return a 94 % interval as text."""
     low, high = estimate["hdi"]
     return f"{number(low)} to {number(high)}"
 

@@ -27,7 +27,7 @@ _FORMAT = 3
 
 @dataclass(frozen=True)
 class Row:
-    """What came of a case.
+    """Result of a case.
 
     Parameters
     ----------
@@ -70,32 +70,32 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """The loop's, or ``failed``."""
+        """Return the loop's verdict, or ``failed``."""
         return "failed" if self.findings is None else str(self.findings["verdict"])
 
     @property
     def added(self) -> list[dict[str, Any]]:
-        """Effects that the loop added, the one that gained most first."""
+        """Return the effects that the loop added, the largest gain first."""
         return [] if self.findings is None else list(self.findings["added"])
 
     @property
     def open(self) -> bool:
-        """Whether the loop says that something remains."""
+        """Return whether the loop reports an unexplained remainder."""
         return self.findings is not None and self.findings["unexplained"] is not None
 
     @property
     def detected(self) -> bool:
-        """Whether the oracle sees the effect in the data."""
+        """Return whether the oracle detects the effect."""
         return self.oracle is not None and self.oracle.detects
 
     @property
     def matters(self) -> bool:
-        """Whether knowing the effect makes forecasts better, by the oracle."""
+        """Return whether the effect improves the oracle's forecasts."""
         return self.oracle is not None and self.oracle.matters
 
     @property
     def worse(self) -> bool:
-        """Whether what was added makes the held-out error larger."""
+        """Return whether the added effects increase the held-out error."""
         if self.findings is None or not self.added:
             return False
         before, after = (self.findings["error"][key] for key in ("before", "after"))
@@ -103,7 +103,7 @@ class Row:
 
     @property
     def excess(self) -> float | None:
-        """How much larger the revised model's errors of forecasts are than the oracle's, a share.
+        """Return the relative excess of the revised model's forecast errors over the oracle's.
 
         The root mean square over what is measured, of errors in units of the oracle's.
         """
@@ -114,7 +114,7 @@ class Row:
         return float(np.sqrt(np.mean(np.square(ratios)))) - 1.0 if ratios else None
 
     def within(self) -> list[bool]:
-        """Of each parameter of the right effect, if it was named: is the truth in the interval."""
+        """Return whether intervals have the truth: each parameter of a correctly named effect."""
         return [
             estimate["hdi"][0] <= self.truth[name] <= estimate["hdi"][1]
             for one in self.added
@@ -125,7 +125,7 @@ class Row:
 
 
 def run_case(case: Case, seed: int, draws: int | None = None, limit: int = 0) -> Row:
-    """Make a case's data, ask the oracle, run the loop; a failure is a row that says so.
+    """Simulate a case, fit the oracle, run the loop; a failure gives a row with its message.
 
     A case that takes longer than ``limit`` seconds is one; 0 is no limit.
     """
@@ -152,7 +152,7 @@ def run_case(case: Case, seed: int, draws: int | None = None, limit: int = 0) ->
 
 
 def about(case: Case) -> dict[str, Any]:
-    """Return what a row has of its case, whatever comes of it."""
+    """Return the fields of a row that describe the case."""
     known = {name: getattr(case, name) for name in ("name", "kind", "method", "effect", "on")}
     return known | {"body": case.body.sort, "sources": sources()}
 
@@ -160,7 +160,7 @@ def about(case: Case) -> dict[str, Any]:
 def _loop(
     case: Case, train: pp.History, test: pp.History, seed: int, draws: int | None
 ) -> dict[str, Any]:
-    """What the loop finds, with the seconds at which each of its stages began."""
+    """Return the loop's findings, and the start times of its stages (s)."""
     begin = time.perf_counter()
     stages: list[tuple[float, str]] = []
     found = revise(
@@ -177,14 +177,14 @@ def _loop(
 
 
 def cache_path(folder: Path, case: Case, seed: int, draws: int | None) -> Path:
-    """Where the row of a case is kept: its name, and a hash of version and settings."""
+    """Return the path of a case's row: its name, and a hash of version and settings."""
     catalogue = [effect.name for effect in case.catalogue]
     settings = (_FORMAT, case, case.body.scene.to_toml(), catalogue, seed, draws)
     return cache_file(folder, case.name, settings)
 
 
 def load(path: Path) -> Row | None:
-    """Read a row, if it is there."""
+    """Return a stored row, if any."""
     if not path.is_file():
         return None
     kept = json.loads(path.read_text())

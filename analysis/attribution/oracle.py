@@ -1,4 +1,4 @@
-"""The oracle: knows what is hidden, and says whether the data show it at all."""
+"""Oracle that knows the hidden effect and tests whether it is detectable."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _ABSORBED = 0.75
 
 @dataclass(frozen=True)
 class Oracle:
-    """Likelihood-ratio test of the effect that is hidden, its size free.
+    """Likelihood-ratio test of the hidden effect, its size free.
 
     Parameters
     ----------
@@ -62,17 +62,17 @@ class Oracle:
 
     @property
     def detects(self) -> bool:
-        """Whether the data show the effect to one who knows it."""
+        """Return whether the effect is detectable."""
         return self.p_value < CERTAIN
 
     @property
     def matters(self) -> bool:
-        """Whether the effect is no negligible one, and knowing it makes forecasts better."""
+        """Return whether the effect is not negligible and improves forecasts."""
         return min(self.gain, self.share) >= MATTERS
 
 
 def true_effect(case: Case) -> pp.Effect:
-    """The effect that is hidden in a case's data."""
+    """Return the hidden effect of a case."""
     if case.kind == OUTSIDE:
         return OUTSIDE_EFFECTS[str(case.effect)]
     (effect,) = (each for each in pp.catalogue if each.name == case.effect)
@@ -80,7 +80,7 @@ def true_effect(case: Case) -> pp.Effect:
 
 
 def true_parameters(case: Case) -> dict[str, float]:
-    """What is hidden, as the effect's own parameters."""
+    """Return the hidden effect's parameters."""
     if case.value is None or case.on is None:
         return {}
     hidden = case.value
@@ -140,7 +140,7 @@ def ask(case: Case, declared: Mode, test: pp.History, seed: int) -> Oracle:
 
 
 def _share(mode: Mode, case: Case) -> float:
-    """What the effect of a mode changes of a step's velocities, over the bodies' acceleration."""
+    """Return the effect's change of velocities per step, relative to the bodies' acceleration."""
     problem, null = mode.problem, mode.phi.copy()
     added = true_effect(case).on(str(case.on))
     null[[problem.layout.labels.index(label) for label in added.labels]] = added.effect.null
@@ -164,7 +164,7 @@ def _compared(case: Case, declared: Mode) -> tuple[Mode, Mode, float]:
 
 
 def _with(mode: Mode, added: Attached, values: dict[str, float]) -> Mode:
-    """Mode with the effect in the model, sought from the truth."""
+    """Return the mode with the effect in the model, starting from the truth."""
     problem = mode.problem.with_physics(effects=(*mode.problem.physics.effects, added))
     layout = problem.layout
     phi = layout.from_layout(mode.problem.layout, mode.phi)

@@ -1,4 +1,4 @@
-"""Effects that the loop's catalogue lacks, for the oracle: it knows what is hidden."""
+"""Effects outside the loop's catalogue, for the oracle."""
 
 from __future__ import annotations
 
@@ -102,6 +102,6 @@ OUTSIDE_EFFECTS = {effect.name: effect for effect in _EFFECTS}
 
 
 def parameters_of(effect: pp.Effect, value: float | tuple[float, ...]) -> dict[str, float]:
-    """Parameters of an effect from what the generator was told."""
+    """Return an effect's parameters from the generator's arguments."""
     values = value if isinstance(value, tuple) else (value,)
     return {p.name: float(v) for p, v in zip(effect.parameters, values, strict=True)}

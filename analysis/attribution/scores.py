@@ -1,4 +1,4 @@
-"""Scores of rows: how often the right effect was named, a wrong one, or none."""
+"""Scores of rows: how often the right effect, a wrong one or none was named."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _NO_VERDICT = ("not-converged", "failed")
 
 
 def outcome(row: Row) -> str:
-    """What came of a case in a word."""
+    """Return the outcome of a case in a word."""
     verdict = row.verdict
     if row.kind == CLEAN:
         return RIGHT if verdict == "adequate" else FALSE_ALARM
@@ -41,19 +41,19 @@ def outcome(row: Row) -> str:
 
 
 def _is_as_good(row: Row) -> bool:
-    """Whether what was added forecasts the test recording as the oracle's model does."""
+    """Return whether the revised model forecasts the test recording as well as the oracle's."""
     return row.excess is not None and row.excess < MATTERS
 
 
 def _is_right(row: Row, one: Mapping[str, Any]) -> bool:
-    """Whether a name is the right one, a twin of it, or of a group that holds it, on its body."""
+    """Return whether a name, or a group that contains it, is equivalent to the right effect."""
     same = twins(row.body, row.effect)
     names = (one["effect"], *one["not_separable_from"])
     return row.kind == CATALOGUED and one["body"] == row.on and any(n in same for n in names)
 
 
 def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
-    """Scores; a share of no cases is None. Failures and missing verdicts count against the loop.
+    """Return the scores; a share of no cases is None. Failures count against the loop.
 
     Returns
     -------
@@ -109,7 +109,7 @@ def score(rows: Sequence[Row]) -> dict[str, float | int | None]:
 
 
 def _baselines(rows: Sequence[Row]) -> dict[str, float | None]:
-    """Shares of right names of each of the usual ways that was there, and the best."""
+    """Return the share of right names of each installed baseline, and the best."""
     shares = {}
     for way in WAYS:
         names = [(row.baselines.get(way), row) for row in rows]

@@ -1,4 +1,4 @@
-"""Sizes of effects: a strength, which means the same on any body, to what the generator is told."""
+"""Sizes of effects: from a strength relative to the body to the generator's arguments."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ STRONGEST = 1.0
 
 
 def makes_sense(effect: str, body: Body) -> bool:
-    """Whether an effect can show on this body: a motor's needs one, and none is there twice."""
+    """Return whether an effect applies to this body and is not declared already."""
     idle = body.sort in HINGED and not body.setups[0].wrench_sd[2]
     # a patch's radius absorbs what scales the moment of inertia
     absorbed = {"inertia_scale", "torque_gain"} if dict(body.base).get("sliding_friction") else ()
@@ -56,7 +56,7 @@ def makes_sense(effect: str, body: Body) -> bool:
 
 
 def value(effect: str, body: Body, on: str, strength: float, turn: float) -> Hidden:
-    """Return what the generator is told of an effect of this strength.
+    """Return the generator's argument for an effect of this strength.
 
     Parameters
     ----------
@@ -103,14 +103,14 @@ def _pair(size: float, way: complex) -> tuple[float, float]:
 
 
 def _load(scale: _Scale, strength: float, way: complex) -> Hidden:
-    """From some trajectory on, or from some time on in each trajectory."""
+    """Draw a load from some trajectory on, or from some time on in each trajectory."""
     if way.real > 0:
         return 1 + strength, float(scale.setup.n_train // 2), 0.0
     return 1 + strength, 0.0, round(0.4 * scale.seconds, 3)
 
 
 def _disc(scale: _Scale, strength: float, way: complex) -> Hidden:
-    """Clear of where bodies start, within a metre of the middle along each axis."""
+    """Draw a disc away from the start positions, within a metre of the middle along each axis."""
     radius = 0.4 * strength
     return *_pair(1.5 + radius + 0.5 * math.hypot(*scale.setup.size), way), radius
 

@@ -1,4 +1,4 @@
-"""Rows and scores for a reader: the table, a case told in full, and JSON."""
+"""Rows and scores as text: the table, a case in full, and JSON."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _CANDIDATES = 6
 
 
 def table(rows: list[Row]) -> Table:
-    """One row a case, what the oracle saw beside what the loop said."""
+    """Return a table, one row per case: the oracle's result and the loop's."""
     shown = Table("case", "method", "oracle's p", "verdict", "added", "outcome", "in interval", "s")
     kind = None
     for row in sorted(rows, key=lambda row: (KINDS.index(row.kind), row.name)):
@@ -51,7 +51,7 @@ def _name(added: dict[str, Any]) -> str:
 
 
 def score_table(scores: dict[str, float | int | None]) -> Table:
-    """Scores in one column."""
+    """Return the scores in one column."""
     shown = Table("score", "value")
     for name, value in scores.items():
         text = "no cases" if value is None else f"{value:.3g}" if name != "seconds" else f"{value}"
@@ -60,7 +60,7 @@ def score_table(scores: dict[str, float | int | None]) -> Table:
 
 
 def plain(row: Row) -> dict[str, Any]:
-    """A row for JSON; its findings in short."""
+    """Return a row for JSON, with its findings in short."""
     short = {
         "verdict": row.verdict,
         "outcome": outcome(row),
@@ -73,7 +73,7 @@ def plain(row: Row) -> dict[str, Any]:
 
 
 def told(row: Row) -> str:
-    """A case in full: stages, candidates, tests, what was added and what remains."""
+    """Return a case in full: stages, candidates, tests, added effects and the remainder."""
     lines = [f"== {row.name}: {row.verdict} ({outcome(row)}), {row.method}, {row.seconds:.0f} s"]
     if row.effect is not None:
         lines.append(f"hidden: {row.effect} on {row.on} {row.truth}")

@@ -28,7 +28,7 @@ _ROUNDS = (20, 10)
 
 @dataclass(frozen=True)
 class Effects(mh.Effects):
-    """Physics that a scene does not declare, with what MuJoCo can have beside Box2D."""
+    """Undeclared physics of MuJoCo and Box2D."""
 
     com_offset: tuple[float, float] = (0.0, 0.0)  # m, body frame
 
@@ -70,7 +70,7 @@ def simulate(
 def _trajectory(
     rng: Rng, body: Body, effects: list[Effects], number: int, before: int
 ) -> pd.DataFrame:
-    """Return one trajectory, which was recorded after so many of another recording."""
+    """Return one trajectory, recorded after a number of others."""
     first = body.setups[0]
     n, count = first.n_intervals, len(body.setups)
     starts = _apart(rng, body) if body.sort == PAIR else _starts(rng, body)
@@ -100,7 +100,7 @@ def _starts(rng: Rng, body: Body) -> Array:
 
 
 def _apart(rng: Rng, body: Body) -> Array:
-    """Two discs near each other that move towards each other, most of the time."""
+    """Draw two discs near each other that mostly move towards each other."""
     starts = _starts(rng, body)
     way = cmath.exp(1j * rng.uniform(-math.pi, math.pi))
     gap = 0.5 * sum(setup.size[0] for setup in body.setups) * rng.uniform(1.05, 1.6)
@@ -112,7 +112,7 @@ def _apart(rng: Rng, body: Body) -> Array:
 
 
 class _Held:
-    """What the motors do: the held wrench, late or lagging."""
+    """Wrenches of the motors: the held wrench, delayed or lagging."""
 
     def __init__(self, effects: list[Effects], wrenches: Array) -> None:
         self.effects = effects
@@ -120,7 +120,7 @@ class _Held:
         self.before = np.concatenate([np.zeros((1, *wrenches.shape[1:])), wrenches])
 
     def at(self, i: int, share: float, step: float) -> Array:
-        """Wrenches in the middle of a step (s) that begins after a share of interval i."""
+        """Return the wrenches in the middle of a step (s) that starts at a share of interval i."""
         for k, effects in enumerate(self.effects):
             wanted = self.before[i if share < effects.actuator_delay else i + 1][k]
             half = math.exp(-0.5 * step / effects.actuator_lag) if effects.actuator_lag else 0.0

@@ -1,4 +1,4 @@
-"""Benchmark of the agents: the numbers of the paper's experiments, from what is kept of them.
+"""Benchmark of the agents: the numbers of the paper's experiments, from stored results.
 
     python analysis/benchmarks/agents.py              # a table, with the bounds
     python analysis/benchmarks/agents.py --json       # one JSON object

@@ -34,7 +34,7 @@ PRIOR = {
 
 
 def design(trajectories: int, intervals: int) -> tuple[pp.Scene, pp.History]:
-    """The scene, and the first intervals of the first trajectories."""
+    """Return the scene, and the first intervals of the first trajectories."""
     known = {"r": 0.2, "mu_c": 0.3}
     cart = pp.Body("cart", pp.Shape.box(0.9, 0.55), wheel=True, known=known, prior=PRIOR)
     scene = pp.Scene(time_step=0.1, normal_gravity=9.81, substeps=5, bodies=(cart,))
@@ -45,7 +45,7 @@ def design(trajectories: int, intervals: int) -> tuple[pp.Scene, pp.History]:
 
 
 def main() -> None:
-    """Replicate, and say whether the ranks are uniform."""
+    """Run the replications and print whether the ranks are uniform."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--trajectories", action="store_true")

@@ -63,12 +63,12 @@ class Row:
     offset: float = 0.0
 
     def measure(self) -> float:
-        """Median over the rounds."""
+        """Return the median over the rounds."""
         return float(np.median([self.above() / self.below() for _ in range(ROUNDS)])) + self.offset
 
 
 def seconds(function: Callable[[], object], least: float = 0.1) -> float:
-    """Time of one call: the mean over as many as take ``least`` seconds."""
+    """Return the time of one call: the mean over as many as take ``least`` seconds."""
     function()
     calls, begin = 0, time.perf_counter()
     while (elapsed := time.perf_counter() - begin) < least:
@@ -78,7 +78,7 @@ def seconds(function: Callable[[], object], least: float = 0.1) -> float:
 
 
 def timed(function: Callable[[], object]) -> Callable[[], float]:
-    """The function's time, to be measured when it is asked for."""
+    """Return a function that measures the given function's time."""
     return lambda: seconds(function)
 
 
@@ -86,20 +86,20 @@ def timed(function: Callable[[], object]) -> Callable[[], float]:
 
 
 def cart_scene(wheel: bool = True, effects: tuple[str, ...] = ()) -> Scene:
-    """A cart on a floor without walls, wheeled unless said otherwise."""
+    """Return a cart on a floor without walls, with a wheel by default."""
     cart = Body("cart", BOX, wheel=wheel, effects=effects)
     return Scene(time_step=TIME_STEP, substeps=SUBSTEPS, normal_gravity=G, bodies=(cart,))
 
 
 def cart_data(n: int) -> tuple[np.ndarray, np.ndarray]:
-    """Random start states (n, 1, 6) and wrenches (n, 1, 1, 3)."""
+    """Return random start states (n, 1, 6) and wrenches (n, 1, 1, 3)."""
     rng = np.random.default_rng(1)
     start = rng.normal(0, [3.0, 3.0, 1.5, 1.5, 1.5, 1.0], (n, 1, 6))
     return start, rng.normal(0, [40.0, 40.0, 5.0], (n, 1, 1, 3))
 
 
 def hung(scene: Scene, start: np.ndarray) -> np.ndarray:
-    """Start states (n, body, 6) with hinged bodies where their hinges hold them."""
+    """Return start states (n, body, 6) that satisfy the hinges."""
     start = start.copy()
     for i, body in enumerate(scene.dynamic):
         if any(body.name in (joint.bodies or ()) for joint in scene.joints):
@@ -109,7 +109,7 @@ def hung(scene: Scene, start: np.ndarray) -> np.ndarray:
 
 
 def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Furniture about its reference poses, moving; pushes on all of it; parameters."""
+    """Return states of moving furniture near its reference poses, pushes on all, and parameters."""
     rng = np.random.default_rng(2)
     k = len(scene.dynamic)
     start = rng.normal(0, [0.05, 0.05, 0.1, 0.5, 0.5, 0.5], (n, k, 6))
@@ -120,7 +120,7 @@ def apartment_data(scene: Scene, n: int) -> tuple[np.ndarray, np.ndarray, np.nda
 
 
 def arms_scene() -> Scene:
-    """Two hinged arms in a vertical plane, each with a moment and a centre of mass of its own."""
+    """Return two hinged arms in a vertical plane, with moments and centres of mass unknown."""
     effects = ("inertia_scale", "com_offset")
     bodies = (
         Body("upper", Shape.box(0.05, 0.2), effects=effects),
@@ -134,7 +134,7 @@ def arms_scene() -> Scene:
 
 
 def arms_sides(n: int) -> tuple[Callable[[], float], Callable[[], float]]:
-    """A prediction of ``n`` transitions of the arms in the contact-free lane, and by the engine."""
+    """Return timers of ``n`` transitions of the arms: contact-free fast path and engine."""
     scene = arms_scene()
     attached = attach(scene)
     layout = build_layout(scene, attached)
@@ -144,15 +144,15 @@ def arms_sides(n: int) -> tuple[Callable[[], float], Callable[[], float]]:
     start[..., 2], start[..., 5] = rng.normal(0, 1, (n, 2)), rng.normal(0, 4, (n, 2))
     start, actions = hung(scene, start), np.zeros((n, 1, 2, 3))
     actions[..., 2] = rng.normal(0, 0.3, (n, 1, 2))
-    lane, engine = Simulator(Physics(scene, attached)), Simulator(Physics(scene, attached))
+    fast, engine = Simulator(Physics(scene, attached)), Simulator(Physics(scene, attached))
     engine(phi, start[:1], actions[:1])
     for worlds in engine._worlds.values():
         for world in worlds:
             world.chain = None
     np.testing.assert_allclose(
-        lane(phi, start, actions), engine(phi, start, actions), rtol=1e-9, atol=1e-9
+        fast(phi, start, actions), engine(phi, start, actions), rtol=1e-9, atol=1e-9
     )
-    return timed(lambda: lane(phi, start, actions)), timed(lambda: engine(phi, start, actions))
+    return timed(lambda: fast(phi, start, actions)), timed(lambda: engine(phi, start, actions))
 
 
 def naive(
@@ -207,7 +207,7 @@ def _bare(fn, world, start, step, substeps):  # type: ignore[no-untyped-def]
 
 
 def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[], None]:
-    """The engine's own C stepping of the same world from the same states, and nothing else."""
+    """Return the engine's bare C stepping of the same world from the same states."""
     world = World(simulator.physics.scene)
     given = simulator._properties(phi[None])
     world.set_properties(given.bodies[0, 0], given.joints[0])
@@ -227,7 +227,7 @@ def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[
 def free_sides(
     n: int, wheel: bool = True, effects: tuple[str, ...] = ()
 ) -> tuple[Callable[[], float], Callable[[], float]]:
-    """A prediction of ``n`` transitions that touch nothing, and bare C stepping without effects."""
+    """Return timers of ``n`` contact-free transitions, and of bare C stepping without effects."""
     start, actions = cart_data(n)
     simulators = []
     for acting in (effects, ()):
@@ -243,18 +243,19 @@ def free_sides(
 
 
 def free_rows(n: int = MANY) -> list[Row]:
-    """Predictions of a body that touches nothing, one thread, without extrapolation."""
-    what = f"{n} transitions that touch nothing / bare C stepping: "
+    """Return rows of contact-free predictions: one thread, without extrapolation."""
+    what = f"{n} contact-free transitions / bare C stepping: "
     return [
         Row("free_over_c", what + "with a wheel", "<= 0.15", *free_sides(n)),
         Row("free_plain_over_c", what + "without", "<= 0.10", *free_sides(n, wheel=False)),
-        Row("free_effects_over_c", what + "with a wheel and three effects, stepped without these",
-            "<= 0.2", *free_sides(n, effects=EFFECTS)),
+        Row("free_effects_over_c",
+            what + "with a wheel and three effects (the C stepping without these)", "<= 0.2",
+            *free_sides(n, effects=EFFECTS)),
     ]  # fmt: skip
 
 
 def jacobian_rows() -> list[Row]:
-    """The Jacobian of the demo's residual, as a mode's covariance and as a climb to it take it."""
+    """Return rows of the demo's Jacobian: as for a mode's covariance, and as in the search."""
     scene = Scene.load(RECORDED / "scene.toml").with_effects("cart", *EFFECTS)
     history = History.load(RECORDED / "recorded" / "train.csv", scene)
     problem = Problem.of(scene, history, attach(scene))
@@ -277,13 +278,13 @@ def jacobian_rows() -> list[Row]:
     return [
         Row("jacobian_over_value", f"{what} {layout.size} parameters / the residual alone",
             "<= 10", both(problem.simulator), value),
-        Row("coarse_jacobian_over_value", "the same, derivatives with few engine steps, as climbs"
-            " take them", "", both(rough), value),
+        Row("coarse_jacobian_over_value", "the same, derivatives with few engine steps, as in the"
+            " search for modes", "", both(rough), value),
     ]  # fmt: skip
 
 
 def rows() -> list[Row]:
-    """All ratios."""
+    """Return all ratios."""
     scene = cart_scene()
     layout = build_layout(scene)
     phi = layout.to_vector(CART)
@@ -306,8 +307,9 @@ def rows() -> list[Row]:
     bodies = len(apartment.dynamic)
 
     return [
-        Row("naive_over_ours", "Python loop, a new Space a transition / ours, the same numbers",
-            ">= 11", timed(lambda: naive(start, actions)),
+        Row("naive_over_ours",
+            "Python loop, a new Space per transition / ours, with the same results", ">= 11",
+            timed(lambda: naive(start, actions)),
             timed(lambda: plain(phi, start, actions))),
         Row("naive_over_default", "the same / ours with extrapolation, the default",
             "", timed(lambda: naive(start, actions)), timed(lambda: usual(phi, start, actions))),
@@ -317,20 +319,21 @@ def rows() -> list[Row]:
         *jacobian_rows(),
         Row("two_threads", "two threads / one thread, throughput, 10,000 transitions",
             ">= 1.7", timed(lambda: usual(phi, *many)), timed(lambda: two(phi, *many))),
-        Row("two_threads_c", "the same of the bare C stepping: what the machine gives", "",
+        Row("two_threads_c", "the same of the bare C stepping: the machine's limit", "",
             lambda: seconds(lambda: [run() for run in both]),
             lambda: seconds(lambda: list(pool.map(lambda run: run(), both)))),
         Row("linear", "10,000 transitions / 100 transitions",
             "<= 105", timed(lambda: usual(phi, *many)), timed(lambda: usual(phi, start, actions))),
-        Row("apartment_per_body", f"{bodies}-body apartment, a transition and body / single body",
-            "<= 2", lambda: seconds(lambda: rooms(*furniture)) / bodies,
+        Row("apartment_per_body",
+            f"{bodies}-body apartment, time per transition and body / single body", "<= 2",
+            lambda: seconds(lambda: rooms(*furniture)) / bodies,
             timed(lambda: plain(phi, start, actions))),
-        Row("chain_lane_over_engine", "3600 transitions of a double pendulum: lane / engine",
+        Row("chain_lane_over_engine", "3600 transitions of a double pendulum: fast path / engine",
             "<= 0.1", *arms_sides(3600)),
         Row("proposals_30", "30 proposals in one call / 30 calls",
             "<= 1.0", timed(lambda: usual(proposals, start, actions)),
             timed(lambda: [usual(proposal, start, actions) for proposal in proposals])),
-        Row("op_overhead", "the Op / the rollout it wraps, less one",
+        Row("op_overhead", "the Op / the rollout it wraps, minus one",
             "<= 5 %", *op_sides(scene, layout, phi, start, actions), offset=-1.0),
     ]  # fmt: skip
 
@@ -338,7 +341,7 @@ def rows() -> list[Row]:
 def op_sides(
     scene: Scene, layout: Layout, phi: np.ndarray, start: np.ndarray, actions: np.ndarray
 ) -> tuple[Callable[[], float], Callable[[], float]]:
-    """A compiled pytensor function of the Op, and the Simulator; each call at another phi."""
+    """Return timers of a compiled function of the Op and of the Simulator, at changing phi."""
     op = SimulatorOp(Physics(scene))
     variable = pt.dvector("phi")
     function = pytensor.function([variable], op(variable, start, actions), trust_input=True)
@@ -354,7 +357,7 @@ def op_sides(
 
 
 def touching(scene: Scene) -> float:
-    """Share of the apartment's transitions in which shapes come close enough to touch."""
+    """Return the share of the apartment's transitions with possible contacts."""
     phi, start, actions = apartment_data(scene, TRANSITIONS)
     plain, extrapolated = (
         Simulator(Physics(scene, extrapolate=extrapolate))(phi, start, actions)
@@ -364,7 +367,7 @@ def touching(scene: Scene) -> float:
 
 
 def machine() -> str:
-    """What this was measured on."""
+    """Return a line on the machine and the versions."""
     model = platform.processor() or platform.machine()
     info = Path("/proc/cpuinfo")
     if info.exists():
@@ -378,7 +381,7 @@ def machine() -> str:
 
 
 def main() -> None:
-    """Measure and print."""
+    """Measure and print all ratios."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     as_json = parser.parse_args().json

@@ -1,4 +1,4 @@
-"""How good and how quick inference is, measured on data whose truth is known.
+"""Accuracy and speed of inference on simulated data.
 
     python analysis/benchmarks/inference.py                    # a table
     python analysis/benchmarks/inference.py --json             # one JSON object
@@ -58,7 +58,7 @@ def simulate(
     noise: np.ndarray,
     seed: int,
 ) -> pp.History:
-    """A history of single transitions (n, k, 6) under wrenches (n, k, 3), by Eq. 13."""
+    """Return a history of single transitions (n, k, 6) under wrenches (n, k, 3), by Eq. 13."""
     rng = np.random.default_rng(seed)
     n, k = start.shape[:2]
     end = PartedSimulator(Physics(scene))(phi, start, actions[:, None])[:, 0]
@@ -146,14 +146,14 @@ def furniture(n: int, joined: bool) -> tuple[pp.Scene, pp.History]:
 
 
 def seconds(function: Callable[[], object]) -> tuple[float, object]:
-    """Time of one call, and what it gave."""
+    """Return the time of one call, and its result."""
     begin = time.perf_counter()
     result = function()
     return time.perf_counter() - begin, result
 
 
 def fitted(scene: pp.Scene, history: pp.History, **options) -> tuple[float, object]:
-    """Seconds of a whole fit, mode and compilation included; and the posterior."""
+    """Return the seconds of a whole fit, with mode and compilation, and the posterior."""
     return seconds(
         lambda: pp.fit(
             pp.physics_model(scene, history, threads=1), seed=1, progress=False, **options
@@ -162,18 +162,18 @@ def fitted(scene: pp.Scene, history: pp.History, **options) -> tuple[float, obje
 
 
 def sampled(scene: pp.Scene, history: pp.History, **options) -> tuple[float, float, float]:
-    """Seconds of a whole fit; largest R-hat; least ESS."""
+    """Return the seconds of a whole fit, its largest R-hat and least ESS."""
     return judged(*fitted(scene, history, **options))
 
 
 def judged(took: float, idata: object) -> tuple[float, float, float]:
-    """Seconds, largest R-hat and least ESS of a finished fit."""
+    """Return seconds, largest R-hat and least ESS of a finished fit."""
     r_hat, ess = convergence(idata)
     return took, max(r_hat.values()), min(ess.values())
 
 
 def fit_rows(key: str, what: str, most: int, measured: tuple[float, float, float]) -> Iterator[Row]:
-    """The three rows of a fit, from what ``sampled`` gives."""
+    """Return the three rows of a fit from the result of ``sampled``."""
     took, r_hat, ess = measured
     yield f"{key}_seconds", f"{what}: seconds, mode and compilation included", f"<= {most}", took
     yield f"{key}_max_rhat", f"{what}: largest R-hat", "<= 1.01", r_hat
@@ -188,7 +188,7 @@ def measure_cart() -> Iterator[Row]:
 
 @cache
 def cart_posterior() -> tuple[float, object]:
-    """The cart's fit, once for all rows that need it."""
+    """Return the cart's fit, made once for all rows that need it."""
     return fitted(*cart(360))
 
 
@@ -206,7 +206,7 @@ def measure_update() -> Iterator[Row]:
 
 def measure_apartment() -> Iterator[Row]:
     """Eleven bodies under the continuous prior."""
-    what = "11 bodies, continuous prior, 30 transitions a body"
+    what = "11 bodies, continuous prior, 30 transitions per body"
     measured = sampled(*apartment(30))
     yield from fit_rows("apartment", what, 600, measured)
 
@@ -245,7 +245,7 @@ def measure_noise_free() -> Iterator[Row]:
 
 
 class PythonLoop(Op):
-    """Naive baseline: pymunk stepped from Python, a new Space a transition."""
+    """Naive baseline: pymunk stepped from Python, with a new Space for each transition."""
 
     __props__ = ()
 
@@ -271,7 +271,7 @@ class PythonLoop(Op):
 
 
 def plain_model(model: pm.Model) -> pm.Model:
-    """The same model on the Python loop."""
+    """Return the same model on the Python loop."""
     problem = model.problem
     loop = PythonLoop(problem)
     with pm.Model(coords=model.coords) as plain:
@@ -288,7 +288,7 @@ def plain_model(model: pm.Model) -> pm.Model:
 
 
 def measure_ratio() -> Iterator[Row]:
-    """Effective draws a second: ours over pm.Metropolis on the Python loop.
+    """Measure effective draws per second: ours / pm.Metropolis on the Python loop.
 
     How many draws of pm.Metropolis an effective one takes is the sampler's affair: measured on the
     fast Op. How long a draw takes on the Python loop is measured on the Python loop.
@@ -314,7 +314,7 @@ def measure_ratio() -> Iterator[Row]:
     ratio = (ess / took) / (share / a_draw)
     yield (
         "ess_per_second_ratio",
-        f"ESS a second / pm.Metropolis on a Python loop ({a_draw:.2g} s a draw, ESS {share:.2g})",
+        f"ESS per second / pm.Metropolis on a Python loop ({a_draw:.2g} s, ESS {share:.2g} a draw)",
         ">= 100",
         ratio,
     )
@@ -328,7 +328,7 @@ _CHAINS, _MOST_DRAWS = 4, 200_000
 
 
 def measure_methods() -> Iterator[Row]:
-    """Effective draws a second of every method with the same seconds: which should be the default.
+    """Measure effective draws per second of every method in the same time.
 
     Tuning draws are in the proportion to draws that each method has by default.
     """
@@ -348,7 +348,7 @@ def measure_methods() -> Iterator[Row]:
         a_draw = max((more - less) / few, EFFORT / _MOST_DRAWS)
         draws = max(few, int(few + (EFFORT - less) / a_draw))
         took, r_hat, ess = judged(*run(draws))
-        what = f"cart, 30 transitions, {_CHAINS} chains, {method}: least ESS a second"
+        what = f"cart, 30 transitions, {_CHAINS} chains, {method}: least ESS per second"
         how = f"{took:.0f} s, {draws} draws a chain, ESS {ess:.0f}, R-hat {r_hat:.2f}"
         yield f"ess_per_second_{method}", f"{what} ({how})", "", ess / took
 

@@ -1,4 +1,4 @@
-"""The loop on a long recording, and the memory that it takes; loop.py runs it in its own process.
+"""Time and memory of the loop on a long recording; loop.py runs it in a separate process.
 
     python analysis/benchmarks/long_loop.py 100000    # transitions; prints one JSON object
 
@@ -34,7 +34,7 @@ SHARE_HELD_OUT = 0.1
 
 
 def recorded(transitions: int, seed: int) -> pd.DataFrame:
-    """Whole trajectories of about so many transitions, in the history format."""
+    """Return whole trajectories of about ``n`` transitions, in the history format."""
     scene = pp.Scene.load(SCENE).with_effects("cart", "angular_drag")
     rng = np.random.default_rng(seed)
     n = max(1, round(transitions / INTERVALS))
@@ -53,7 +53,7 @@ def recorded(transitions: int, seed: int) -> pd.DataFrame:
 
 
 def gigabytes() -> float:
-    """Most memory of this process, and added to it that of the largest that it has started.
+    """Return the peak memory of this process plus that of its largest child.
 
     On Linux a process's ``ru_maxrss`` begins with that of the process which has started it.
     """
@@ -67,7 +67,7 @@ def gigabytes() -> float:
 
 
 def main() -> None:
-    """Record, close the loop, print."""
+    """Make the recording, close the loop and print the results."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("transitions", type=int)
     transitions = parser.parse_args().transitions

@@ -1,4 +1,4 @@
-"""How long the loop takes on a recording, from its files to the report.
+"""Time of the loop on a recording, from its files to the report.
 
     python analysis/benchmarks/loop.py                     # a table of the demo's cart
     python analysis/benchmarks/loop.py --json              # one JSON object
@@ -39,7 +39,7 @@ LONG = 100_000
 
 
 def closed(scene_file: Path, folder: Path) -> tuple[float, pp.Loop]:
-    """Seconds from a scene and its recordings to the report, and what was found."""
+    """Return the seconds from the files to the report, and the loop."""
     begin = time.perf_counter()
     with warnings.catch_warnings(), tempfile.TemporaryDirectory() as out:
         warnings.simplefilter("ignore")
@@ -51,14 +51,14 @@ def closed(scene_file: Path, folder: Path) -> tuple[float, pp.Loop]:
 
 
 def told(found: pp.Loop) -> str:
-    """What a loop was about, and what it found."""
+    """Return a sentence on a loop's recording and findings."""
     names = ", ".join(f"{one.effect} on {one.body}" for one in found.added) or "nothing"
     count = found.findings.provenance["transitions"]
     return f"{count} transitions; {found.verdict}, added: {names}"
 
 
 def there(key: str, *folders: Path) -> bool:
-    """Whether the recordings of a key are there; says so where they are not."""
+    """Return whether the recordings of a key exist; print a message if not."""
     missing = [str(folder) for folder in folders if not folder.is_dir()]
     if missing:
         print(f"{key} is left out: nothing at {' or '.join(missing)}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""MuJoCo's system identification on a comparable problem, to have beside ours in one run.
+"""MuJoCo's system identification on a comparable problem, to compare in one run.
 
 A cart of one body, free to slide along x and y and to turn, with damping and dry friction in each
 direction: seven parameters. 360 commands of 0.1 s, 20 engine steps each. Their toolbox fits one
@@ -48,7 +48,7 @@ MODEL = """
 
 
 def parameters() -> sysid.ParameterDict:
-    """What is sought, from a wrong start: mass, and each joint's damping and dry friction."""
+    """Return the unknown parameters at a wrong start: mass, damping and dry friction."""
 
     def entry(joint: str, name: str) -> object:
         def modify(spec: mujoco.MjSpec, parameter: sysid.Parameter) -> None:
@@ -77,7 +77,7 @@ def parameters() -> sysid.ParameterDict:
 
 
 def sysid_seconds() -> float:
-    """Median time of a fit, which must find the truth."""
+    """Return the median time of a fit, which must find the truth."""
     rng = np.random.default_rng(0)
     spec = mujoco.MjSpec.from_string(MODEL)
     model = spec.compile()

@@ -1,4 +1,4 @@
-"""How well and how quickly plans are found, and what they are worth in the world they are for.
+"""Speed of the planner, and success of its plans in the true world.
 
     python analysis/benchmarks/planning.py                    # a table
     python analysis/benchmarks/planning.py --json             # one JSON object
@@ -33,7 +33,7 @@ GOAL = pp.Goal.of({"cart": (3.0, 0.0, 0.0)})
 
 
 def starts(seed: int = 0) -> Iterator[dict[str, tuple[float, float, float]]]:
-    """Places at random on the far side of the wall, any heading, at rest."""
+    """Return random poses on the far side of the wall, at rest."""
     rng = np.random.default_rng(seed)
     for _ in range(STARTS):
         place = rng.uniform([-4.0, -2.0, -np.pi], [-1.0, 2.0, np.pi])
@@ -55,7 +55,7 @@ def measure_cart() -> Iterator[Row]:
     yield "cart_seconds_max", "the same: longest search (s)", "<= 60", took.max()
     yield "cart_seconds_median", "the same: median search (s)", "", float(np.median(took))
     rate = sum(plan.nodes for plan in plans) / took.sum()
-    yield "nodes_per_second", "the same: states generated a second", "", rate
+    yield "nodes_per_second", "the same: states generated per second", "", rate
 
 
 def python_astar(start: np.ndarray, nodes: int) -> float:
@@ -102,7 +102,7 @@ def measure_python() -> Iterator[Row]:
         ratios.append(found.nodes / found.seconds / python_astar(state, 3000))
     yield (
         "over_python_loop",
-        "states a second / those of A* on a Python loop over pymunk",
+        "states per second / those of A* on a Python loop over pymunk",
         ">= 8",
         float(np.median(ratios)),
     )

@@ -1,4 +1,4 @@
-"""What planning on posterior draws gains over planning with the mode, in the true world.
+"""Planning on posterior draws compared with planning on the mode, in the true world.
 
     python analysis/benchmarks/planning.py --only draws bimodal
 
@@ -47,7 +47,7 @@ PUSHES = pp.ActionSet.box(
 
 
 def through_file(idata: object) -> object:
-    """The posterior as a planner gets it: saved and loaded."""
+    """Return the posterior, saved and loaded, as a planner gets it."""
     with tempfile.TemporaryDirectory() as folder:
         pp.save_posterior(idata, Path(folder) / "cart.nc")
         return pp.load_posterior(Path(folder) / "cart.nc")
@@ -72,19 +72,19 @@ def noisy_posterior(n: int = 20) -> object:
 
 
 class World:
-    """Where the cart truly goes, from a pose (3,) at rest."""
+    """True world of the cart, from a pose (3,) at rest."""
 
     def __init__(self, truth: Dynamics, start: np.ndarray) -> None:
         self.truth, self.state = truth, np.concatenate([start, np.zeros(3)])[None]
 
     def __call__(self, wrench: np.ndarray) -> np.ndarray:
-        """Play one interval."""
+        """Execute one interval."""
         self.state = self.truth.step(self.state[None, None], wrench[None])[0, 0]
         return self.state
 
 
 def success(idata: object, starts: np.ndarray, draws: int | None) -> tuple[float, float]:
-    """Share of starts (n, 3) from which the goal behind the wall is reached, and seconds a start.
+    """Return the share of starts (n, 3) that reach the goal behind the wall, and seconds per start.
 
     Plans are made anew as they are played.
     """
@@ -144,7 +144,7 @@ def bimodal_posterior(n: int = 20, draws: int = 200) -> object:
 
 
 def open_loop(idata: object, starts: np.ndarray, draws: int | None, nodes: int) -> np.ndarray:
-    """Whether open-loop plans from starts (n, 3) reach, with either wheel in truth: (n, 2)."""
+    """Return whether open-loop plans from starts (n, 3) reach with either true wheel: (n, 2)."""
     goal = pp.Goal.of({"cart": (0.0, 0.0, None)}, tolerance=0.4)
     truths = [Dynamics.known(free_cart(), {"w_x": side * WHEEL}) for side in (1, -1)]
     reached = np.zeros((len(starts), 2), bool)
@@ -162,7 +162,7 @@ def open_loop(idata: object, starts: np.ndarray, draws: int | None, nodes: int) 
 def compared(
     idata: object, count: int, nodes: int = 640_000
 ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Which plays reach with the mode and with draws, and how likely by chance so many more.
+    """Return which runs reach with the mode and with draws, and the p-value of the difference.
 
     Starts are 1.5 to 3 m from the goal, which the cart faces within 20 degrees. A turn moves the
     middle about the wheel, whichever that is: 20 degrees move it 0.09 m one way or the other, 90

@@ -1,4 +1,4 @@
-"""What closing the loop gains a planner: plans with the model before and after, played in Box2D.
+"""Plans with the model before and after closing the loop, executed in Box2D.
 
     python analysis/benchmarks/planning.py --only loop
 
@@ -32,7 +32,7 @@ GOAL = pp.Goal.of({"cart": (3.0, 0.0, 0.0)})
 
 
 def box2d() -> ModuleType:
-    """The generator of histories.
+    """Return the generator of histories.
 
     Raises
     ------
@@ -50,7 +50,7 @@ def box2d() -> ModuleType:
 
 
 def closed(trajectories: int = 4, **options: int) -> pp.Loop:
-    """The loop closed on trajectories of 30 transitions; half as many are held out."""
+    """Return the loop closed on trajectories of 30 transitions; half as many are held out."""
     world = box2d()
     setup = replace(world.CART, n_train=trajectories, n_test=max(1, trajectories // 2))
     scene = pp.Scene.load(MODELS / "shopping_cart" / "scene.toml")
@@ -62,7 +62,7 @@ def closed(trajectories: int = 4, **options: int) -> pp.Loop:
 
 
 def final_distances(posterior: Path, starts: np.ndarray) -> np.ndarray:
-    """L2 distance (m) from the goal at the end of open-loop plans, from poses (n, 3) at rest."""
+    """Return final distances (m) from the goal of open-loop plans from poses (n, 3) at rest."""
     world = box2d()
     idata = pp.load_posterior(posterior)
     effects = world.Effects(linear_drag=DRAG)
@@ -76,7 +76,7 @@ def final_distances(posterior: Path, starts: np.ndarray) -> np.ndarray:
 
 
 def before_and_after(loop: pp.Loop, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Final distances (m) with the declared and with the revised model, from the same starts."""
+    """Return final distances (m) with the declared and the revised model, from the same starts."""
     rng = np.random.default_rng(SEED)
     starts = rng.uniform([-4.0, -2.0, -np.pi], [-2.0, 2.0, np.pi], (count, 3))
     with tempfile.TemporaryDirectory() as folder:
@@ -88,7 +88,7 @@ def before_and_after(loop: pp.Loop, count: int) -> tuple[np.ndarray, np.ndarray]
 
 
 def measure_loop(count: int = STARTS) -> Iterator[Row]:
-    """Median final distances, and their ratio."""
+    """Measure median final distances and their ratio."""
     try:
         loop = closed(draws=400)
     except ImportError as error:

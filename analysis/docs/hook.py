@@ -1,4 +1,4 @@
-"""Pages that are made of the repository's files, and links between files as links between pages."""
+"""MkDocs hook: pages from files of the repository, links between files as links between pages."""
 
 import ast
 import os
@@ -14,9 +14,9 @@ from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = ROOT / "analysis" / "notebooks"
-#: Executed ones, where `make notebooks` was run.
+#: Executed notebooks, if `make notebooks` was run.
 EXECUTED = ROOT / "out" / "notebooks"
-#: Files that are pages too.
+#: Files that become pages.
 PAGES = {
     "README.md": "index.md",
     "analysis/benchmarks/README.md": "results/benchmarks.md",
@@ -31,7 +31,7 @@ _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|[#/])([^)\s#]+)")
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add what is made of other files."""
+    """Add the pages that are made from other files."""
     for source, page in PAGES.items():
         files.append(File.generated(config, page, abs_src_path=str(ROOT / source)))
     for script in sorted(NOTEBOOKS.glob("*.py")):
@@ -44,7 +44,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Turn links to the repository's files; what has no page is copied beside the pages."""
+    """Convert links to files into links to pages; copy linked files that have no page."""
     if not page.file.abs_src_path:
         return markdown
     folder = Path(page.file.abs_src_path).parent
@@ -56,9 +56,9 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         target = (folder / match[1]).resolve()
         if target not in pages:
             if not target.is_file() or not target.is_relative_to(ROOT):
-                return match[0]  # which the build then complains of
+                return match[0]  # the build reports it
             uri = f"files/{target.relative_to(ROOT)}"
-            # as text, so that a browser shows it
+            # as text, so that a browser displays it
             shown = uri + ".txt" if target.suffix in (".py", ".toml", ".md") else uri
             pages[target] = shown
             files.append(File.generated(config, shown, content=target.read_bytes()))
@@ -68,7 +68,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def notebook(script: Path) -> dict[str, str | bytes]:
-    """A notebook's page and its pictures; without what it shows if it was not run as it is now."""
+    """Return a notebook's page and its pictures; without outputs if it changed after its run."""
     book, run = jupytext.read(script), EXECUTED / f"{script.stem}.ipynb"
     note = "*Not run when this page was made: `make notebooks docs` shows its pictures and tables.*"
     if run.is_file():
@@ -88,7 +88,7 @@ def notebook(script: Path) -> dict[str, str | bytes]:
 
 
 def rooms() -> dict[str, str]:
-    """The reference's pages: the public names of each room, and the errors."""
+    """Return the reference's pages: the public names of each room, and the errors."""
     found: dict[str, list[str]] = {}
     for statement in ast.parse((ROOT / "pbrl_ppl" / "__init__.pyi").read_text()).body:
         if isinstance(statement, ast.ImportFrom):
@@ -108,7 +108,7 @@ def rooms() -> dict[str, str]:
 
 
 def commands() -> str:
-    """Every command with its arguments and options."""
+    """Return the page of all commands with their arguments and options."""
     from pbrl_ppl.cli.app import COMMANDS, app
 
     text = ["# Commands", "", app.info.epilog or ""]

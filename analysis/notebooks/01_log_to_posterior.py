@@ -1,8 +1,8 @@
 # %% [markdown]
 # # From a log to a posterior
 #
-# A scene file says what is known of a physical system, a log says how it moved. This notebook
-# reads both, checks them, infers what is not known, looks at the result and saves it as a file.
+# A scene file declares a physical system, a log has its measured motion. This notebook reads both,
+# checks them, infers the unknown parameters, shows the result and saves it as a file.
 
 # %%
 # %matplotlib inline
@@ -21,7 +21,7 @@ CART = ROOT / "models" / "shopping_cart"
 
 # %% [markdown]
 # The constants below set how long this takes. `METHOD = "laplace"` with few trajectories is a
-# quick, approximate run, of which the fit warns.
+# quick, approximate run; the fit warns of that.
 
 # %% tags=["parameters"]
 TRAJECTORIES = 12  # of the recording, at most 12
@@ -48,7 +48,7 @@ print((CART / "scene.toml").read_text())
 # One row for each trajectory, step and body: time, the measured state `x, y, theta, vx, vy,
 # omega` (m, rad, m/s, rad/s), and the wrench `force_x, force_y, torque` (N, N m) that is held
 # over the interval that begins there. A log with gaps, wrong units or a wrong time step is
-# refused with a message that names the row. What was read is an `xarray.Dataset`.
+# refused with a message that names the row. The history is an `xarray.Dataset`.
 
 # %%
 history = pp.History.load(CART / "recorded" / "train.csv", scene)
@@ -58,7 +58,7 @@ history.to_dataframe().head()
 
 # %% [markdown]
 # The picture shows the tracks seen from above: a dashed outline where each trajectory begins, a
-# full one where it ends. The cart turns as it is pushed, which is where the wheel shows.
+# full one where it ends. The cart turns as it is pushed: that is the effect of the wheel.
 
 # %%
 states = history.dataset["observed"].transpose("trajectory", "time", "body", "state").to_numpy()
@@ -84,10 +84,10 @@ print([variable.name for variable in model.free_RVs])
 
 # %% [markdown]
 # A prior predictive check asks whether the declared prior could have produced these data at all.
-# Wrong units (degrees, millimetres) and wrong hyper-parameters show here, before any time is
-# spent on a fit. In the picture the measured changes of state over one interval (blue) should lie
-# within what the prior predicts (grey); thin lines hold 94 %, thick ones half. Far wider grey
-# bars are usual: the prior is vague.
+# This finds wrong units (degrees, millimetres) and wrong hyper-parameters before you spend time on
+# a fit. In the picture the measured changes of state over one interval (blue) should lie within
+# the prior's predictions (grey); thin lines hold 94 %, thick ones half. Far wider grey bars are
+# usual: the prior is vague.
 
 # %%
 check = pp.prior_predictive_check(model, seed=1)
@@ -99,7 +99,7 @@ figure
 # %% [markdown]
 # ## The fit
 #
-# `fit` looks for the mode, starts chains about it, and returns what ArviZ takes: an
+# `fit` searches for the mode, starts chains around it, and returns ArviZ's type: an
 # `InferenceData` (ArviZ 0.x) or an `xarray.DataTree` (ArviZ 1.x). This cart never touches a wall,
 # so its restitution `r` and contact friction `mu_c` keep their prior, and the fit says so in a
 # warning. That is expected here.
@@ -124,10 +124,10 @@ table = summary(idata)
 table.round(4)
 
 # %% [markdown]
-# The same as pictures: draws from the prior (grey), and of the posterior the median (line) and
-# the interval that holds 94 % (band). Where the band is narrow, the data say much; where it is as
-# wide as the prior, they say nothing. The wheel's direction `w_theta` has four equal
-# descriptions, of which the same one is shown of posterior and prior.
+# The same as pictures: draws from the prior (grey), and the posterior's median (line) and 94 %
+# interval (band). A narrow band means an informed parameter; with a band as wide as the prior, the
+# data do not inform it. The wheel's direction `w_theta` has four equivalent descriptions; posterior
+# and prior show the same one.
 
 # %%
 names = ("mass", "w_x", "w_y", "w_theta", "mu_x", "mu_y", "r", "mu_c")
@@ -150,7 +150,7 @@ figure.savefig(OUT / "01_posterior.png", dpi=100)
 # %% [markdown]
 # ## The file
 #
-# A posterior file holds all of it, scene and data included, as NetCDF. A planner or a later
+# A posterior file is complete, with the scene and the data, as NetCDF. A planner or a later
 # `update` needs nothing else.
 
 # %%
@@ -161,4 +161,4 @@ print(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB")
 print("mass:", float(again["posterior"]["mass"].mean()), "kg")
 
 # %% [markdown]
-# Whether this model is any good is another question: the next notebook asks it.
+# The next notebook tests whether this model is adequate.

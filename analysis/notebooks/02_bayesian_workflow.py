@@ -1,7 +1,7 @@
 # %% [markdown]
 # # A Bayesian workflow
 #
-# Two models of the same recording, taken through the steps of a Bayesian workflow (Gelman et al.,
+# Two models of the same recording go through the steps of a Bayesian workflow (Gelman et al.,
 # 2020): prior predictive check, fit, diagnostics of the sampler, posterior predictive checks,
 # comparison by leave-one-out cross-validation, sensitivity to the prior.
 #
@@ -58,8 +58,8 @@ models = {
 #
 # Parameters are drawn from the prior and simulated from the measured start states. Each panel has
 # the changes of one state dimension over one interval: predicted in grey, measured in blue; thin
-# lines hold 94 %, thick ones half. Measured bars that stick out would mean a prior that cannot
-# have made the data. `pm.sample_prior_predictive(model)` gives such draws too.
+# lines hold 94 %, thick ones half. Measured bars outside the predicted ones would mean a prior that
+# cannot have made the data. `pm.sample_prior_predictive(model)` gives such draws too.
 
 # %%
 check = pp.prior_predictive_check(models["with drag"], seed=1)
@@ -83,9 +83,9 @@ posteriors = {
 # %% [markdown]
 # ## Diagnostics of the sampler
 #
-# R-hat compares the chains with each other (at most 1.01); the effective sample sizes say how
-# many independent draws the chains are worth, in the bulk and in the tails (at least 400). What
-# the fit found wrong is also in `idata.attrs["warnings"]`.
+# R-hat compares the chains with each other (at most 1.01). The effective sample sizes are the
+# equivalent numbers of independent draws, in the bulk and in the tails (at least 400). The fit's
+# warnings are also in `idata.attrs["warnings"]`.
 
 # %%
 tables = {name: summary(idata) for name, idata in posteriors.items()}
@@ -104,7 +104,7 @@ tables["with drag"].round(4)
 
 # %% [markdown]
 # Trace plot: chains that mix look like noise about one level, and all alike. This is ArviZ's
-# picture, laid out alike on its two generations; `az.plot_trace(idata, var_names=["mass"])`
+# picture, with the same layout on its two generations; `az.plot_trace(idata, var_names=["mass"])`
 # works too.
 
 # %%
@@ -114,10 +114,10 @@ figure.savefig(OUT / "02_trace.png", dpi=100)
 figure
 
 # %% [markdown]
-# Rank plot: of each chain, how its draws rank among all, less what an even spread gives. Chains
-# that have converged stay in the grey band. Draws of a Markov chain depend on each other, so it is
-# as wide as their effective sample size makes it. `az.plot_rank` has no band in ArviZ 0.x, and in
-# 1.3 marks what a test of the ranks finds suspicious.
+# Rank plot: the ranks of each chain's draws among all draws, minus those of uniform ranks.
+# Converged chains stay in the grey band. Draws of a Markov chain are correlated, so the band's
+# width follows from their effective sample size. `az.plot_rank` has no band in ArviZ 0.x, and in
+# 1.3 marks the points that a test of the ranks finds suspicious.
 
 # %%
 figure = plot_rank(posteriors["with drag"], shown)
@@ -127,14 +127,13 @@ figure
 # %% [markdown]
 # ## Posterior predictive checks
 #
-# A first look: distribution of the measured changes (black) against those of 50 predictive draws
-# of each model. State dimensions have different units, so each has a panel of its own. In most
-# panels both models look right, and the declared one is only somewhat wide in `omega`: `sigma` is
-# free, and grows until the overall spread fits. Such a check has little power, and the ones below
-# ask more.
+# First, the distribution of the measured changes (black) against those of 50 predictive draws of
+# each model. State dimensions have different units, so each has a separate panel. In most panels
+# both models look right, and the declared one is only somewhat wide in `omega`: `sigma` is free,
+# and grows until the overall spread fits. Such a check has little power; the ones below have more.
 #
-# ArviZ's own check is of the states themselves, which spread so much more than the noise that
-# nothing can be seen. It pools all dimensions unless told otherwise:
+# ArviZ's check shows the states themselves, whose spread is so much larger than the noise that
+# nothing can be seen. It pools all dimensions by default:
 #
 #     az.plot_ppc(idata, flatten=["transition", "step", "body"])  # ArviZ 0.x
 #     az.plot_ppc_dist(idata, cols=["state"])  # ArviZ 1.x
@@ -171,13 +170,13 @@ figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=Fals
 figure.savefig(OUT / "02_predictive.png", dpi=100)
 
 # %% [markdown]
-# LOO-PIT: where each measurement lies in its prediction by the same model fitted without it (0:
-# below all draws, 1: above all). For a calibrated model that is uniform, and the grey band holds
+# LOO-PIT: the position of each measurement in its prediction by the same model fitted without it
+# (0: below all draws, 1: above all). For a calibrated model it is uniform, and the grey band holds
 # 99 % of the bars. Bars that rise in the middle mean predictions that are too wide, bars that
 # rise at the ends predictions that are too narrow.
 #
-# `pp.loo_pit` does this for all state dimensions. ArviZ's own functions take one of them at a
-# time, of those draws that have predictions:
+# `pp.loo_pit` does this for all state dimensions. ArviZ's functions take one of them at a time, and
+# only draws that have predictions:
 #
 #     draws = idata["posterior_predictive"]["draw"].values
 #     one = idata.sel(draw=draws).sel(state="vx").isel(step=0, body=0)
@@ -202,11 +201,11 @@ figure.legend(handles, labels, loc="outside upper center", ncols=2, frameon=Fals
 figure.savefig(OUT / "02_loo_pit.png", dpi=100)
 
 # %% [markdown]
-# Residuals against what may explain them: the error of the predicted angular velocity against the
-# angular velocity at the start. The declared model overrates fast rotation in proportion to its
-# speed, which is what viscous drag does; with drag nothing is left. LOO-PIT cannot see this, for
-# it looks at one measurement at a time. `pp.close_loop` does such tests by itself; see the next
-# notebook.
+# Residuals against a possible cause: the error of the predicted angular velocity against the
+# angular velocity at the start. The declared model overestimates fast rotation in proportion to its
+# speed, as expected from missing viscous drag; with drag no pattern is left. LOO-PIT cannot detect
+# this, because it uses one measurement at a time. `pp.close_loop` does such tests automatically;
+# see the next notebook.
 
 # %%
 spin = start.sel(state="omega").to_numpy().ravel()
@@ -227,16 +226,16 @@ figure.savefig(OUT / "02_residual.png", dpi=100)
 # ## Comparison by leave-one-out cross-validation
 #
 # `az.loo` estimates the expected log predictive density of a transition that was left out
-# (PSIS-LOO, Vehtari et al., 2017). It can be relied on where few Pareto k are high, of which it
-# tells.
+# (PSIS-LOO, Vehtari et al., 2017). It is reliable if few Pareto k are high; it reports their
+# number.
 
 # %%
 warnings.filterwarnings("ignore", message="Estimated shape parameter of Pareto")
 print(az.loo(posteriors["with drag"]))
 
 # %% [markdown]
-# `az.compare` ranks the models: the difference in elpd is to be set against its standard error,
-# `dse`. A difference of several times `dse` is beyond doubt.
+# `az.compare` ranks the models: compare the difference in elpd with its standard error, `dse`. A
+# difference of several times `dse` is significant.
 
 # %%
 comparison = az.compare(posteriors)
@@ -254,11 +253,11 @@ print(*said.sentences, sep="\n")
 said.table().round(4)
 
 # %% [markdown]
-# Then, how much the posterior would move with another prior. Power scaling (Kallioinen et al.,
+# Then, how much the posterior would change with another prior. Power scaling (Kallioinen et al.,
 # 2024) raises the prior to a power and weighs the draws accordingly, without a new fit: a power
 # of 0.8 is a somewhat weaker prior, 1.25 a somewhat stronger one. The table has the shift of each
-# mean in posterior standard deviations between the two. It is small for what the data inform, and
-# large for `r`, of which they say nothing. The density of the prior at the draws is in the group
+# mean in posterior standard deviations between the two. It is small for informed parameters, and
+# large for `r`, which the data do not inform. The density of the prior at the draws is in the group
 # `log_prior`; with ArviZ 1.x `az.psense_summary(idata)` uses it too, and
 # `az.plot_prior_posterior(idata)` the group `prior`.
 

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Closing the loop
 #
-# `close_loop` does by itself what the last notebook did by hand: it fits the declared model,
-# looks at the residual, traces it to a physical effect that the model lacks, adds it, fits again,
-# and reports the error before and after on a recording that no decision has seen.
+# `close_loop` automates the steps of the last notebook: it fits the declared model, tests the
+# residual, finds the physical effect that the model lacks, adds it, refits, and reports the error
+# before and after on a recording that no decision used.
 
 # %%
 # %matplotlib inline
@@ -22,7 +22,7 @@ CART = ROOT / "models" / "shopping_cart"
 
 # %% [markdown]
 # The constants below set how long this takes. `METHOD = "laplace"` takes the posteriors from the
-# modes, quickly; the verdict then stands on these.
+# modes, quickly; the verdict then depends on this approximation.
 
 # %% tags=["parameters"]
 TRAJECTORIES = 12  # of the cart's recording, at most 12
@@ -42,7 +42,7 @@ for kind in (UninformedWarning, BoundWarning, ConvergenceWarning):
 # ## A recorded cart
 #
 # The recording was made in another physics engine (Box2D). Its cart has a castor that resists
-# turning with 1.2 N m s, of which the scene file does not know.
+# turning with 1.2 N m s, which the scene file does not declare.
 
 # %%
 scene = pp.Scene.load(CART / "scene.toml")
@@ -52,12 +52,12 @@ cart = pp.close_loop(scene, train, test, seed=1, method=METHOD)
 cart
 
 # %% [markdown]
-# ### What was looked for
+# ### The candidates
 #
-# Each effect of the catalogue was tried against the residual by a score test: how strongly does
-# the residual resemble the signature that this effect would leave, beyond what the declared
-# parameters can absorb? The picture has the first candidates, the strongest first. Several
-# resemble each other, so the first of them are fitted, and cross-validation decides.
+# A score test compares the residual with the signature of each effect of the catalogue, after
+# projecting out the part that the declared parameters can absorb. The picture has the first
+# candidates, the strongest first. Several resemble each other, so the best of them are fitted, and
+# cross-validation decides.
 
 # %%
 figure = plot_candidates(cart.findings)
@@ -65,7 +65,7 @@ figure.savefig(OUT / "03_candidates.png", dpi=100)
 figure
 
 # %% [markdown]
-# ### What was added
+# ### The added effect
 #
 # The rise of the expected log predictive density (elpd), cross-validated over whole training
 # trajectories, must be above 4 and above 2 standard errors.
@@ -84,8 +84,8 @@ print("unexplained:", cart.unexplained)
 # ### Before and after
 #
 # Errors on the test recording, in units of the noise floor (dotted line), which is an estimate of
-# how well any model could do. Left: one step ahead. Right: a forecast over many steps, where what
-# is missing adds up.
+# the error of a perfect model. Left: one step ahead. Right: a forecast over many steps, in which
+# the missing effect accumulates.
 
 # %%
 figure = plot_errors(cart.findings)
@@ -121,9 +121,9 @@ print(cart.report(OUT / "03_cart.html").name)
 # ## A measured pendulum
 #
 # A real arm on a bearing, recorded at 50 Hz by an encoder. The scene knows its mass and its
-# pivot, and says that it may not be an even bar (`inertia_scale`). It declares no friction. The
-# posteriors are taken from the modes (`laplace`), for chains over so many samples take many
-# minutes. The data are not part of this repository; without them this section is skipped.
+# pivot, and declares that its mass may not be uniform (`inertia_scale`). It declares no friction.
+# The posteriors are Gaussians at the modes (`laplace`), because chains over so many samples take
+# many minutes. The data are not part of this repository; without them this section is skipped.
 
 # %%
 pendulum = None
@@ -136,9 +136,9 @@ else:
     print("skipped: the measured pendulum is not here")
 
 # %% [markdown]
-# A real machine is never exactly as its model. Besides the effects that were added, look at what
-# remains: the verdict is `unexplained` where forecasts or accelerations are still off, whatever
-# was added on the way.
+# A real machine never equals its model exactly. Besides the added effects, read the remaining
+# residual: the verdict is `unexplained` if forecasts or accelerations still have significant
+# errors, whatever was added.
 
 # %%
 if pendulum is not None:
@@ -161,10 +161,10 @@ plot_rollout(pendulum.findings) if pendulum is not None else None
 # %% [markdown]
 # ## A measured block, pushed over a table
 #
-# A triangular steel block that a robot's finger pushes. The finger's path was measured all the
-# way, the block only before and after each push: what is in between is empty cells. The scene
-# knows the block's outline and mass, and that the finger goes where the recording says; of the
-# table it says nothing. These data are not part of this repository either.
+# A triangular steel block that a robot's finger pushes. The finger's path was measured throughout,
+# the block only before and after each push: the cells in between are empty. The scene declares the
+# block's outline and mass, and that the finger follows its recorded path, but no friction of the
+# table. These data are not part of this repository either.
 
 # %%
 block = None
@@ -182,8 +182,9 @@ else:
 # for such data, reaches 1.5 mm and 1.4 degrees. With all 30 pushes the loop ends at 1.5 mm and
 # 1.3 degrees.
 #
-# The friction's radius says how the block turns as it slides. Its size `mu` is not to be relied on:
-# the pushes are slow, 2 mm/s, and with any `mu` from 0.0001 to 0.3 the last pose is as far off.
+# The friction's radius determines how the block turns as it slides. Its size `mu` is not reliable:
+# the pushes are slow, 2 mm/s, and any `mu` from 0.0001 to 0.3 gives the same error of the last
+# pose.
 
 # %%
 if block is not None:

@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Writing your own effect
 #
-# The catalogue has common effects: drags, springs, delays, offsets. One that is particular to
-# your system takes a dozen lines: a law, its parameters with priors, and a sentence for the
-# report. It is passed in; there is no registry.
+# The catalogue has common effects: drags, springs, delays, offsets. An effect that is particular
+# to your system takes a dozen lines: a law, its parameters with priors, and a sentence for the
+# report. You pass it as an argument; there is no registry.
 
 # %%
 # %matplotlib inline
@@ -36,11 +36,11 @@ for kind in (UninformedWarning, BoundWarning, ConvergenceWarning):
 # %% [markdown]
 # ## The effect
 #
-# A fan in the middle of the room makes the air go round: a force across the line to the middle
-# that grows with the distance, F = k (-y, x). The law runs inside the compiled engine loop, so it
-# is plain arithmetic on four arrays: `state` (x, y, theta, vx, vy, omega), `command` (the wrench
-# as commanded), `parameters`, and `wrench`, to which it adds (N, N, N m). At its null value, 0 by
-# default, the effect must vanish.
+# A fan in the middle of the room makes the air circulate: a force perpendicular to the line to the
+# middle that grows with the distance, F = k (-y, x). The law runs inside the compiled engine loop,
+# so it is plain arithmetic on four arrays: `state` (x, y, theta, vx, vy, omega), `command` (the
+# wrench as commanded), `parameters`, and `wrench`, to which it adds (N, N, N m). At its null value,
+# 0 by default, the effect must vanish.
 
 
 # %%
@@ -59,10 +59,10 @@ swirl = pp.Effect(
 )
 
 # %% [markdown]
-# ## A recording in which it acts
+# ## A recording with this effect
 #
 # A puck that slides without friction is pushed at random. The recording is simulated with a swirl
-# of 0.8 N/m, of which the scene says nothing, and with measurement noise. `pp.Transition` is the
+# of 0.8 N/m, which the scene does not declare, and with measurement noise. `pp.Transition` is the
 # engine as a function of start states and wrenches.
 
 # %%
@@ -95,7 +95,7 @@ train, test = recording(seed=1), recording(seed=2)
 # %% [markdown]
 # ## Without it
 #
-# With the package's own catalogue the loop sees that something is missing, and has no name for
+# With the package's catalogue the loop detects that something is missing, but no effect explains
 # it: the verdict is `unexplained`.
 
 # %%
@@ -120,9 +120,9 @@ for added in loop.added:
 print(f"simulated with {STRENGTH} N/m")
 
 # %% [markdown]
-# The candidates' score statistics: how strongly the residual resembles each effect's signature.
-# The dashes mark what chance reaches in 1 % of cases. Effects that would explain a part of it
-# come next.
+# The candidates' score statistics: how strongly the residual resembles each effect's signature. The
+# dashes mark the value that clean data exceed in 1 % of cases. Effects that would explain a part of
+# it come next.
 
 # %%
 figure = plot_candidates(loop.findings)
@@ -144,6 +144,6 @@ errors = pd.DataFrame(
 errors.round(4)
 
 # %% [markdown]
-# A posterior file holds the effect's name, not its code. What reads such a file takes your effect
+# A posterior file holds the effect's name, not its code. Functions that read it take your effect
 # as an argument: `pp.plan(idata, ..., effects=(*pp.catalogue, swirl))`, and `pp.update` and
 # `pp.identify` likewise.

@@ -2,7 +2,7 @@
 # # Planning from a posterior file
 #
 # A planner needs one file: the posterior. The scene, the effects, the usual pushes and the
-# uncertainty are in it. This notebook makes such a file, forgets everything else, and plans.
+# uncertainty are in it. This notebook makes such a file, deletes everything else, and plans.
 
 # %%
 import warnings
@@ -52,7 +52,7 @@ del scene, history, fitted
 # %% [markdown]
 # ## The planner
 #
-# From here on there is only the file. Start and goal are given by body, as x, y (m) and theta
+# From here on only the file is used. Start and goal are given by body, as x, y (m) and theta
 # (rad). With `draws` one plan must do for several posterior draws, so that it does not rely on
 # one guess of the parameters. The search is A\* over continuous states.
 
@@ -64,7 +64,7 @@ print(plan.in_words())
 print(f"{plan.nodes} states looked at in {plan.seconds:.1f} s")
 
 # %% [markdown]
-# Left: the way of the cart as each draw foresees it, with its outline every half second for one
+# Left: the path of the cart predicted by each draw, with its outline every half second for one
 # draw and at the end for all; the hatched circle is the goal with its tolerance. Right: the
 # pushes of the plan, each held for an interval.
 
@@ -86,19 +86,19 @@ right.legend(frameon=False)
 figure.savefig(OUT / "05_plan.png", dpi=100)
 
 # %% [markdown]
-# How sure the model is of the end: mean and standard deviation over the draws. The spread is what
-# the data have left open.
+# Uncertainty of the final state: mean and standard deviation over the draws. The spread is the
+# uncertainty that the data leave.
 
 # %%
 end = plan.predicted["predicted"].isel(time=-1).sel(body="cart")
 print(end.mean("draw").to_series().round(3), end.std("draw").to_series().round(3), sep="\n")
 
 # %% [markdown]
-# ## What comes of it
+# ## Executing the plan
 #
-# The plan is saved as a history without measurements. Play it on the machine, record what happens
-# in the same form, and `pp.update` brings the posterior up to date with it; `pp.act` is that
-# loop, with a new plan every few intervals.
+# The plan is saved as a history without measurements. Execute it on the machine, record the motion
+# in the same format, and `pp.update` adds it to the posterior; `pp.act` is that loop, with a new
+# plan every few intervals.
 
 # %%
 plan.save(OUT / "05_plan.csv")

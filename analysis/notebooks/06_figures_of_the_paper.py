@@ -3,9 +3,8 @@
 #
 # Scholz, Levihn, Isbell and Wingate (ICML 2014) let four agents push a shopping cart to a goal
 # behind a wall, without noise (their figure 4a) and with it (4b). This notebook draws both from
-# ten episodes of each agent that are kept in `analysis/results`, and says what agrees with the
-# paper and what does not. The episodes themselves take hours: `python
-# analysis/04_shopping_cart.py`.
+# ten episodes of each agent that are stored in `analysis/results`, and compares them with the
+# paper. `python analysis/04_shopping_cart.py` runs the episodes.
 
 # %%
 from pathlib import Path
@@ -47,16 +46,15 @@ def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 # %% [markdown]
-# The agents are told the room, the cart's outline and the goal, and nothing of the dynamics but
-# for the first:
+# The agents know the room, the cart's outline and the goal. Only the first knows the dynamics:
 #
 # - the *true model* plans with the parameters of the world;
-# - *PBRL* has the physics engine as its prior, and the posterior of what it has seen so far;
-# - *OO-LWR* has a locally weighted regression for each condition, that is for what touches which
-#   side of the cart;
-# - *LWR* has one regression whatever touches the cart.
+# - *PBRL* has the physics engine as its prior, and the posterior given its observations so far;
+# - *OO-LWR* has a locally weighted regression for each condition: which sides of the cart are in
+#   contact;
+# - *LWR* has one regression for all conditions.
 #
-# All plan with the same A\*, and act at random where they have no plan.
+# All plan with the same A\*, and act at random if they have no plan.
 #
 # ## Figures 4(a) and 4(b)
 #
@@ -116,13 +114,13 @@ tables["a"].round(1)
 tables["b"].round(1)
 
 # %% [markdown]
-# ## What PBRL knows
+# ## PBRL's estimates
 #
 # Each line is the estimate (the mode) of one of the ten episodes, the dashes are the truth. The
-# paper says that PBRL recovers the true model after two steps. Without noise mass, the wheel's
-# place and the friction along it are there after two or three. The friction across it, `mu_y`,
-# comes later, in 9 of 10 episodes after 7 to 10 steps: before its wheel slides sideways, no data
-# tell it.
+# paper says that PBRL recovers the true model after two steps. Without noise the mass, the wheel's
+# position and the friction along it are right after two or three. The friction across it, `mu_y`,
+# takes longer, in 9 of 10 episodes 7 to 10 steps: before its wheel slides sideways, no data inform
+# it.
 
 # %%
 # as of models/shopping_cart/task.py
@@ -162,9 +160,9 @@ print("mu_y as well, from step:", first.to_series().to_dict())
 # %% [markdown]
 # ## Bumps
 #
-# The paper says that OO-LWR tends to bump into walls. Here that is so with noise only. Without it
-# OO-LWR keeps away from walls, for it plans through no condition that it has not seen; PBRL rubs
-# along them, which costs nothing in this task.
+# The paper says that OO-LWR tends to bump into walls. Here this holds only with noise. Without it
+# OO-LWR keeps away from walls, because it plans through no condition that it has not seen; PBRL
+# slides along them, which costs nothing in this task.
 
 # %%
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
@@ -179,7 +177,7 @@ axes[0].legend(frameon=False)
 figure.savefig(OUT / "06_bumps.png", dpi=100)
 
 # %% [markdown]
-# ## What agrees, and what does not
+# ## Agreement with the paper
 #
 # | the paper says | here |
 # |---|---|
@@ -193,5 +191,4 @@ figure.savefig(OUT / "06_bumps.png", dpi=100)
 # The paper prints no sizes, masses, forces or goals, so those of `models/shopping_cart` are ours,
 # and numbers need not agree. Ten episodes leave the intervals above. Agents and world are the
 # same engine here, so that PBRL's model can be exactly right; `04_shopping_cart.py --box2d` has
-# the world in another. Figure 4(c), the apartment, is not finished. `analysis/paper.md` has all
-# of it.
+# the world in another. `analysis/paper.md` has all experiments, figure 4(c) included.

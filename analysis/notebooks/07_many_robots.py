@@ -1,9 +1,9 @@
 # %% [markdown]
 # # Many robots, many logs
 #
-# `close_loop_many` closes the loop on each log of a manifest, goes on after an interrupt, and says
-# which effects were found where. Robots of one kind are pooled: what is known of some of them is
-# the prior of the next.
+# `close_loop_many` closes the loop on each log of a manifest, continues after an interrupt, and
+# reports the effects found in each log. Robots of one kind are pooled: the posteriors of some of
+# them give the prior of the next.
 
 # %%
 import logging
@@ -20,8 +20,8 @@ from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, UninformedWarning
 ROOT = next(p for p in (Path.cwd(), *Path.cwd().parents) if (p / "pyproject.toml").is_file())
 
 # %% [markdown]
-# The constants below set how long this takes. Posteriors are taken from the modes (`laplace`);
-# `METHOD = "metropolis"` takes minutes a robot.
+# The constants below set how long this takes. Posteriors are Gaussians at the modes (`laplace`);
+# `METHOD = "metropolis"` takes minutes per robot.
 
 # %% tags=["parameters"]
 ROBOTS, TRAJECTORIES, INTERVALS = 6, 8, 15  # how many, and of each one's recording
@@ -41,8 +41,8 @@ logging.getLogger("arviz").addFilter(lambda record: False)
 # ## A fleet
 #
 # Pucks of one make slide on air and are pushed at random. Their masses differ by about a tenth.
-# The air supply of every third, from the second on, is bad: it drags, of which the scene says
-# nothing. The recordings are simulated, with noise. A manifest names each robot, its scene and
+# The air supply of every third, from the second on, is bad: it has a drag that the scene does not
+# declare. The recordings are simulated, with noise. A manifest names each robot, its scene and
 # files, and its kind.
 
 # %%
@@ -90,7 +90,7 @@ manifest
 #
 # One after another here; with `executor=`, any `concurrent.futures.Executor` (processes, or a Dask
 # cluster's) closes several at a time. Robots whose log and settings have not changed are not run
-# again by the same call, and one that fails does not stop the rest. At the command line this is
+# again by the same call, and one that fails does not stop the others. At the command line this is
 # `pbrl-ppl close-loop --many logs.csv -o results --jobs 4`.
 
 # %%
@@ -100,10 +100,10 @@ loops = pp.close_loop_many(
 loops
 
 # %% [markdown]
-# ## What was found where
+# ## Effects found in each log
 #
 # `results/index.html` is the same as a page, with a link to each robot's own report. Errors are
-# those of a step on the test recordings, in units of the noise: 1 is as good as any model can be.
+# those of a step on the test recordings, in units of the noise: 1 is the error of a perfect model.
 
 # %%
 loops.table()[["name", "verdict", "effects", "error_before", "error_after"]].round(3)
@@ -116,11 +116,11 @@ found = sorted(loops.effects()["name"])
 print("drag was put into", ", ".join(dragged), "and found in", ", ".join(found) or "none")
 
 # %% [markdown]
-# ## What they share
+# ## The population
 #
 # Robots of the manifest's `kind` are pooled, as `pp.pool` does with any posteriors of one scene.
-# Each robot's posterior, its prior divided out, is evidence of the kind's mean and of the spread
-# between robots. `p_same` says how probable such differences are if there are none.
+# Each robot's posterior, with its prior divided out, informs the population's mean and the spread
+# between robots. `p_same` is the p-value of no difference between robots.
 
 # %%
 posteriors = {name: pp.load_posterior(loops.folder / name / "after.nc") for name in names}
@@ -128,8 +128,8 @@ pooled = pp.pool(posteriors)
 pooled.table().set_index("parameter").T
 
 # %% [markdown]
-# `left_out` names what is known of some robots only. An effect that was found in some has too
-# small a size in the others to be found, so the mean of those that have it would be too large.
+# `left_out` names parameters that only some robots have. An effect found in some robots may be
+# below the detection limit in the others, so the mean over those that have it would be too large.
 
 # %%
 print("left out:", pooled.left_out)
@@ -158,9 +158,9 @@ figure.savefig(OUT / "07_masses.png", dpi=100)
 # %% [markdown]
 # ## The next robot
 #
-# `pooled.scene` is the scene for the next puck, with what is known of the kind in its `prior`.
-# Before anything is measured of that puck, its mass is known to be in an interval far narrower
-# than Table 1's prior has it; `pp.physics_model(pooled.scene, history)` takes it from there.
+# `pooled.scene` is the scene for the next puck, with the population's distribution as its `prior`.
+# Before any measurement of that puck, its mass has an interval far narrower than that of Table 1's
+# prior; `pp.physics_model(pooled.scene, history)` uses it.
 
 # %%
 print(pooled.scene.to_toml())
@@ -174,5 +174,5 @@ known = pd.DataFrame(
 known.astype(float).round(2)
 
 # %% [markdown]
-# With few robots the answer hangs on what is assumed of the spread: `pp.pool(posteriors,
-# spread=0.5)` says how different robots of a kind may be.
+# With few robots the result depends on the prior of the spread: `pp.pool(posteriors, spread=0.5)`
+# sets how different robots of a kind may be.

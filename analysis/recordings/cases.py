@@ -1,4 +1,4 @@
-"""Cases: bodies, starts, commands and noises drawn by a seed, and the recordings made of them."""
+"""Cases: bodies, starts, commands and noises drawn by a seed, and their recordings."""
 
 from __future__ import annotations
 
@@ -100,17 +100,17 @@ class Case:
 
     @property
     def name(self) -> str:
-        """Name that tells cases apart."""
+        """Return the unique name of the case."""
         return named(self.world, self.rate, self.shape, self.noise, self.clean)
 
     @property
     def truth(self) -> float:
-        """The true coefficient."""
+        """Return the true coefficient."""
         return 0.0 if self.clean else self.size
 
     @property
     def answers(self) -> dict[str, tuple[str, float] | None]:
-        """Effects that are right, each with the true value of a parameter where it has one.
+        """Return the correct effects, each with the true value of its parameter, if any.
 
         Linear and quadratic drag are both right for a ball; about a hinge, drag of the rod is
         friction in the hinge.
@@ -131,7 +131,7 @@ class Case:
 
     @property
     def scene(self) -> pp.Scene:
-        """The declared scene: the body's outline and mass, gravity, and the rod's hinge."""
+        """Return the declared scene: the body's outline and mass, gravity, and the rod's hinge."""
         known = {"mass": self.body.mass}
         dt = 1.0 / self.rate
         if self.world == FALL:
@@ -147,7 +147,7 @@ class Case:
         return pp.Scene(time_step=dt, normal_gravity=G, bodies=(body,))  # a top view
 
     def recordings(self) -> tuple[Recording, Recording]:
-        """Make the recording to fit and the held-out one, which have the same law and noise."""
+        """Return the training and the test recording, with the same law and noise."""
         rng = np.random.default_rng(self.seed)
         train, test, _ = SHAPES[self.shape]
         return self._recorded(train, rng), self._recorded(test, rng)
@@ -180,12 +180,12 @@ class Case:
         return measured, good
 
     def history(self, recording: Recording, bare: bool = False) -> pp.History:
-        """Return a recording as a user has it; ``bare`` leaves out what never changes."""
+        """Return a recording as a history; ``bare`` leaves out coordinates that never change."""
         frame = self.frame(recording, bare)
         return pp.History.from_dataframe(frame, self.scene, estimate_velocities=True)
 
     def frame(self, recording: Recording, bare: bool = False) -> pd.DataFrame:
-        """Return the rows of a log: velocities are empty, and so is what was not measured."""
+        """Return the rows of a log: velocities and unmeasured coordinates are empty."""
         count, rows = recording.good.shape
         table = pd.DataFrame({
             "trajectory": np.repeat(np.arange(count), rows),
@@ -215,7 +215,7 @@ def _falling(case: Case, count: int, lasts: float, rng: Rng) -> Array:
 
 
 def _terminal(case: Case) -> float:
-    """Terminal speed of a ball (m/s)."""
+    """Return the terminal speed of a ball (m/s)."""
     weight = case.body.mass * G / case.size
     return weight if case.effect == "linear_drag" else math.sqrt(weight)
 
@@ -243,7 +243,7 @@ def named(world: str, rate: int, shape: str, noise: str, clean: bool) -> str:
 
 
 def all_cases(seed: int = 0) -> list[Case]:
-    """Return the 144 cases of a seed; another seed draws other bodies, sizes and noises."""
+    """Return the 144 cases of a seed."""
     every = product(WORLDS, RATES, SHAPES, NOISES, (False, True))
     return [drawn(*which, seed) for which in every]
 

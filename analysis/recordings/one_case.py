@@ -63,33 +63,33 @@ class Row:
 
     @property
     def verdict(self) -> str:
-        """The loop's verdict, or ``failed``."""
+        """Return the loop's verdict, or ``failed``."""
         return "failed" if self.findings is None else str(self.findings["verdict"])
 
     @property
     def added(self) -> list[dict[str, Any]]:
-        """Effects that the loop added."""
+        """Return the effects that the loop added."""
         return [] if self.findings is None else list(self.findings["added"])
 
     @property
     def detectable(self) -> bool:
-        """Whether there is an effect that the oracle detects."""
+        """Return whether there is an effect that the oracle detects."""
         return not self.clean and self.oracle is not None and self.oracle.detects
 
     @property
     def named(self) -> bool:
-        """Whether the right effect was added, alone or in a group that holds it, and no other."""
+        """Return whether only the right effect, or a group that contains it, was added."""
         return bool(self.added) and all(map(self._right, self.added)) and not self.clean
 
     @property
     def extra(self) -> bool:
-        """Whether there is a wrong name beside the right one."""
+        """Return whether there is a wrong name beside the right one."""
         right = [self._right(one) for one in self.added]
         return not self.clean and any(right) and not all(right)
 
     @property
     def silent(self) -> bool:
-        """Whether the loop calls the model adequate and adds nothing."""
+        """Return whether the loop calls the model adequate and adds nothing."""
         return self.verdict == ADEQUATE and not self.added
 
     def _right(self, one: dict[str, Any]) -> bool:
@@ -97,7 +97,7 @@ class Row:
 
     @property
     def inside(self) -> list[bool]:
-        """Of each effect added whose coefficient has a true value: is it in the interval."""
+        """Return, for each added effect with a true coefficient, whether its interval has it."""
         found = []
         for one in self.added:
             known = None if self.clean else self.answers.get(one["effect"])
@@ -108,7 +108,7 @@ class Row:
 
 
 def run_case(case: Case, seed: int, bare: bool, limit: int) -> Row:
-    """Make a case's recordings, ask the oracle, run the loop; a failure is a row that says so.
+    """Simulate a case, fit the oracle, run the loop; a failure gives a row with its message.
 
     A case that takes longer than ``limit`` seconds is one; 0 is no limit.
     """
@@ -141,12 +141,12 @@ def _where(error: Exception) -> str:
 
 
 def cache_path(folder: Path, case: Case, seed: int, bare: bool) -> Path:
-    """Return where the row of a case is kept: its name, and a hash of the settings."""
+    """Return the path of a case's row: its name, and a hash of the settings."""
     return cache_file(folder, case.name, (_FORMAT, case, case.scene.to_toml(), seed, bare))
 
 
 def load(path: Path) -> Row | None:
-    """Read a row, if it is there."""
+    """Return a stored row, if any."""
     if not path.is_file():
         return None
     kept = json.loads(path.read_text())

@@ -20,7 +20,7 @@ _STEP = 1e-6
 
 @dataclass(frozen=True)
 class Oracle:
-    """What the data show to a fit of the right law with the right noise.
+    """Result of a fit of the right law with the right noise.
 
     Parameters
     ----------
@@ -42,7 +42,7 @@ class Oracle:
 
     @property
     def detects(self) -> bool:
-        """Whether the effect is detectable."""
+        """Return whether the effect is detectable."""
         return self.p_value < DETECTS
 
 
@@ -59,7 +59,7 @@ def ask(case: Case, recording: Recording) -> Oracle:
 
 
 def _fitted(case: Case, recording: Recording) -> Oracle:
-    """Fit with and without the coefficient, and compare."""
+    """Fit with and without the coefficient, and return the comparison."""
     law, good = LAWS[case.effect], recording.good
     count, states = recording.start.shape
     cell = np.nonzero(good)[0].repeat(recording.measured.shape[2])  # trajectory of each residual

@@ -114,7 +114,7 @@ def _name(one: dict[str, object]) -> str:
 
 
 def told(row: Row) -> str:
-    """Return a case in full: candidates and why they were rejected, tests, what remains."""
+    """Return a case in full: candidates and why they were rejected, tests, the remainder."""
     lines = [brief(row)]
     lines += [f"    true {name}: {value}" for name, value in row.answers.items() if value]
     if row.oracle is not None:

@@ -44,7 +44,7 @@ app = typer.Typer(
     name="pbrl-ppl",
     help="A physics engine as model prior, and a loop that closes on measured data.",
     epilog="Example: pbrl-ppl new --from shopping_cart. Exit codes: 0; 1 for a calibration that"
-    " failed, a goal that was not reached, effects that stay inseparable or some of many logs that"
+    " failed, a goal that was not reached, effects that stay inseparable or at least one log that"
     " failed; 2 for bad usage or input, with one message on stderr; 3 where chains have not"
     " converged; 130 after an interrupt.",
     no_args_is_help=True,
@@ -66,7 +66,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     -------
     int
         0; 1 for a calibration that failed, a goal that was not reached, effects that no allowed
-        actions are expected to tell apart, or some of many logs that failed; 2 for bad usage or bad
+        actions are expected to tell apart, or at least one log that failed; 2 for bad usage or bad
         input, with one message on stderr; 3 where chains have not converged; 130 if interrupted.
     """
     argv = sys.argv[1:] if argv is None else list(argv)

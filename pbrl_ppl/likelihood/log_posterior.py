@@ -15,8 +15,8 @@ def noise_law(problem: Problem) -> tuple[Array, float]:
     """Return the prior of sigma: log medians, and the standard deviation of log sigma.
 
     Measurement noise is log-normal. Unexplained accelerations and correlated errors are
-    exponential, without the spread: penalised-complexity priors (Simpson et al., Statistical Science
-    32, 2017), under which motion follows the physics unless the data say otherwise.
+    exponential, without the spread: penalised-complexity priors (Simpson et al., Statistical
+    Science 32, 2017), under which motion follows the physics unless the data say otherwise.
 
     Parameters
     ----------

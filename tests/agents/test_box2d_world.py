@@ -11,6 +11,8 @@ from pbrl_ppl.planning import ActionSet, Goal
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.tasks import CART, CART_TRUTH, PUCK, PUCK_TRUTH
 
+pytestmark = pytest.mark.one_stack
+
 
 def played(world: World, actions: list[int]) -> np.ndarray:
     """States of an episode in which these actions are taken, the start first."""

@@ -17,6 +17,8 @@ import pbrl_ppl as pp
 from pbrl_ppl.agents import Revision
 from tests.helpers.places import ROOT
 
+pytestmark = pytest.mark.first(4)
+
 ANALYSIS = ROOT / "analysis"
 #: What the scripts of episodes say on Ctrl-C, and nothing else.
 INTERRUPTED = "interrupted: finished episodes are kept; go on with --resume\n"

@@ -10,6 +10,8 @@ from pbrl_ppl.planning import ActionSet, Dynamics, Goal
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.marks import OBJECT_MODE
 
+pytestmark = pytest.mark.one_stack
+
 SCENE = Scene(
     time_step=0.25,
     normal_gravity=9.81,

@@ -8,6 +8,8 @@ from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import EffectError
 from tests.helpers.tasks import CART, CART_TRUTH
 
+pytestmark = pytest.mark.one_stack
+
 EFFECTS = {effect.name: effect for effect in catalogue}
 SIZES = {
     "linear_drag": {"linear_drag_coefficient": 4.0},

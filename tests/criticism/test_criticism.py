@@ -17,6 +17,8 @@ from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
 from tests.helpers.histories import NOISE
 from tests.helpers.places import MODELS
 
+pytestmark = [pytest.mark.one_stack, pytest.mark.first(3)]
+
 EFFECTS = {effect.name: effect for effect in catalogue}
 
 #: What the Box2D generator hides in a free puck's 120 transitions, and how the catalogue describes

@@ -16,6 +16,8 @@ from pbrl_ppl.modes.laplace import finish
 from pbrl_ppl.scene import Scene
 from tests.helpers.free_puck import DISC, Disc
 
+pytestmark = pytest.mark.one_stack
+
 DRAGGED = DISC.with_effects("puck", "linear_drag")
 #: Eight recordings of six intervals, the truth with a drag that shows.
 DATA = Disc(trajectories=8, intervals=6, drag=0.3)

@@ -16,6 +16,8 @@ from pbrl_ppl.criticism.unexplained import Left, noise_alone, unexplained_accele
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
 from tests.helpers.histories import NOISE
 
+pytestmark = pytest.mark.one_stack
+
 WHITENESS, COMMANDS = "whiteness", "correlation with commands"
 #: Chance that each fails on clean data, as stated; the permutation test has a level of its own.
 RATES = dict.fromkeys((ACCELERATION, WHITENESS, COMMANDS, FORECASTS), DEFAULT.false_alarm)

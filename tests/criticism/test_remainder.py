@@ -22,7 +22,11 @@ from tests.helpers.made_up import made_up
 #: kg s/m^2; no effect of the catalogue grows with the cube of the speed.
 CUBIC = 0.3
 # few draws are enough here, and say that they are few
-pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+pytestmark = [
+    pytest.mark.one_stack,
+    pytest.mark.first(4),
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
+]
 
 
 def posterior_of(frame):

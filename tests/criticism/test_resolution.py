@@ -3,9 +3,12 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pbrl_ppl.criticism.resolution import SMALL_SHIFT, shift, with_enough_substeps
 from tests.helpers.free_puck import DISC, Disc
+
+pytestmark = pytest.mark.one_stack
 
 #: A drag's exponential shows the steps of a coarse engine.
 DRAGGED = DISC.with_effects("puck", "linear_drag")

@@ -32,6 +32,7 @@ from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
 from tests.helpers.places import load
 
 pytestmark = [
+    pytest.mark.first(1),
     # a posterior of few draws is enough to test a verdict, and says that it is one
     pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
     # of a missing effect too, where it is large

@@ -15,6 +15,8 @@ from pbrl_ppl.state import STATE
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
 from tests.helpers.histories import NOISE
 
+pytestmark = pytest.mark.one_stack
+
 EFFECTS = {effect.name: effect for effect in catalogue}
 
 

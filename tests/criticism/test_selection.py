@@ -11,6 +11,8 @@ from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.effects import catalogue
 from tests.helpers.free_puck import DISC, Disc, fitted
 
+pytestmark = pytest.mark.one_stack
+
 FINE = DISC.replace(substeps=40)
 TRIED = ("linear_drag", "quadratic_drag", "torque_gain", "inertia_scale", "constant_torque",
          "heavy_tails")  # fmt: skip

@@ -10,6 +10,8 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Joint, Scene, Shape
 from tests.helpers.worlds import BY_NAME, body
 
+pytestmark = pytest.mark.one_stack
+
 BOX = Shape.box(0.9, 0.55)
 
 

@@ -15,6 +15,8 @@ from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.places import ROOT
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 
+pytestmark = pytest.mark.one_stack
+
 BOX = Shape.box(0.9, 0.55)
 MASS = 2.0
 INERTIA = MASS * BOX.unit_moment

@@ -12,6 +12,8 @@ from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 
+pytestmark = pytest.mark.one_stack
+
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 BOX = Shape.box(0.9, 0.55)
 MASS, MU, RADIUS = 2.0, 0.3, 0.25

@@ -10,6 +10,8 @@ from pbrl_ppl.effects import LEARNED_REMAINDER, candidates, catalogue, learned_r
 from pbrl_ppl.scene import Scene, Shape
 from tests.helpers.worlds import body, simulator, state
 
+pytestmark = pytest.mark.one_stack
+
 TABLE = json.dumps(
     {
         "centre": [[0.5, 0.0, 0.0], [0.0, -1.0, 0.3], [0.2, 0.1, 1.0]],

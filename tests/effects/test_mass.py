@@ -9,6 +9,8 @@ from scipy.integrate import solve_ivp
 from pbrl_ppl.scene import Joint, Scene, Shape
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, simulator, state
 
+pytestmark = pytest.mark.one_stack
+
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 BOX = Shape.box(0.9, 0.55)
 MASS, OFF = 2.0, (0.13, -0.07)

@@ -8,6 +8,8 @@ from pbrl_ppl.history import History
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.worlds import BY_NAME, body, predict, state
 
+pytestmark = pytest.mark.one_stack
+
 SCAN = BY_NAME["hidden_obstacle"].scan
 DISC = np.array([0.4, -0.2, 0.3])
 DT = 0.05

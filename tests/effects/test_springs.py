@@ -12,6 +12,8 @@ from pbrl_ppl.physics.rods import on_rod
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, predict, simulator, state
 
+pytestmark = pytest.mark.one_stack
+
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 BOX = Shape.box(0.9, 0.55)
 A, B, LENGTH = (0.2, 0.1), (1.5, 0.4), np.hypot(1.3, 0.3)

@@ -23,6 +23,8 @@ from pbrl_ppl.physics.world import FINER
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, state
 
+pytestmark = pytest.mark.one_stack
+
 BOX = Shape.box(0.9, 0.55)
 MASS = 2.0
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])

@@ -1,1 +1,1 @@
-"""What several tests use: scenes, made histories, findings; tests import nothing of each other."""
+"""Shared code of the tests: scenes, simulated histories, findings."""

@@ -1,4 +1,4 @@
-"""A wheeled cart, and parameters that made its histories."""
+"""A wheeled cart and the true parameters of its histories."""
 
 from pbrl_ppl.scene import Body, Scene, Shape
 
@@ -15,6 +15,6 @@ CART = {
 
 
 def cart_scene(**options) -> Scene:
-    """A wheeled cart on a floor, seen from above, in a room without walls."""
+    """Return a wheeled cart on a floor, seen from above, in a room without walls."""
     cart = Body("cart", Shape.box(0.9, 0.55), **({"wheel": True} | options))
     return Scene(time_step=0.1, normal_gravity=9.81, bodies=(cart,))

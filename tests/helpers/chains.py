@@ -1,4 +1,4 @@
-"""Chains of joined bodies, and states in which their joints hold."""
+"""Chains of joined bodies, and states that satisfy their joints."""
 
 from collections.abc import Sequence
 
@@ -15,7 +15,7 @@ POST = Body("post", Shape.circle(0.02), static=True, pose=(2.0, 1.0, 0.4))
 
 
 def chain(kinds: str, *, holder: str = WORLD, turned: Sequence[int] = (), **options) -> Scene:
-    """Links ``b0``, ``b1``, ... under each other, joined from the top by what ``kinds`` says.
+    """Return links ``b0``, ``b1``, ... under each other, with joints of the given ``kinds``.
 
     ``h`` is a hinge, ``r`` a rod of 0.25 m and ``-`` nothing; the first is to the holder.
     ``turned`` are joints whose bodies are named the other way round.
@@ -34,7 +34,7 @@ def chain(kinds: str, *, holder: str = WORLD, turned: Sequence[int] = (), **opti
 
 
 def cart_with_trailers(**options) -> Scene:
-    """A wheeled cart that drags a wheeled trailer and, on a rod, a sledge."""
+    """Return a wheeled cart that drags a wheeled trailer and, on a rod, a sledge."""
     bodies = (
         Body("cart", BOX, wheel=True, pose=(0.0, 0.0, 0.0)),
         Body("trailer", Shape.box(0.5, 0.4), wheel=True, pose=(-1.2, 0.0, 0.0)),

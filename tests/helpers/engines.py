@@ -1,4 +1,4 @@
-"""Worlds that every way of running the engine is tried on."""
+"""Worlds for tests of all engine paths."""
 
 import numpy as np
 
@@ -25,7 +25,7 @@ def ring(half: float) -> tuple[Wall, ...]:
 
 
 def cart(walls: bool) -> tuple[Simulator, np.ndarray, np.ndarray]:
-    """A wheeled cart of unknown parameters with all effects that apply."""
+    """Return a wheeled cart with unknown parameters and all effects that apply."""
     scene = Scene(
         time_step=0.1,
         normal_gravity=G,
@@ -41,7 +41,7 @@ def cart(walls: bool) -> tuple[Simulator, np.ndarray, np.ndarray]:
 
 
 def chain() -> tuple[Simulator, np.ndarray, np.ndarray]:
-    """Two hinged arms with friction in both pivots, and a motor on each."""
+    """Return two hinged arms with friction in both pivots, and a motor on each."""
     scene = Scene(
         time_step=0.05,
         substeps=12,

@@ -1,4 +1,4 @@
-"""Many logs without a loop: what closes it does what the log's own file says, at once."""
+"""Many logs with a stand-in for the loop that does at once what each log's file says."""
 
 import json
 import os
@@ -25,7 +25,7 @@ BEGUN, KEPT = "begun.txt", "kept.txt"
 
 
 def made_logs(folder: Path, **what: str) -> list[Log]:
-    """Logs by name; what each does: wait, fail, crash, die, die-once, warn, or an effect's name."""
+    """Write logs by name and behaviour: wait, fail, crash, die, die-once, warn, or an effect."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "scene.toml").write_text("a scene")
     for name, text in what.items():
@@ -35,7 +35,7 @@ def made_logs(folder: Path, **what: str) -> list[Log]:
 
 @contextmanager
 def cluster(folder: Path) -> Iterator[Any]:
-    """A client of a Dask cluster of two worker processes."""
+    """Return a client of a Dask cluster of two worker processes."""
     distributed = pytest.importorskip("distributed")
     with (
         distributed.LocalCluster(
@@ -47,7 +47,7 @@ def cluster(folder: Path) -> Iterator[Any]:
 
 
 def lines(folder: Path, name: str) -> list[str]:
-    """What was begun or kept, in order."""
+    """Return the started or finished logs, in order."""
     path = folder / name
     return path.read_text().split() if path.exists() else []
 

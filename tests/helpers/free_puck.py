@@ -1,4 +1,4 @@
-"""Pucks that slide freely: a box that Box2D makes, and a disc in closed form with known noise."""
+"""Pucks that slide freely: a box by Box2D, and a disc in closed form with known noise."""
 
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -40,7 +40,7 @@ def box2d(
     near: bool = False,
     **hidden: Any,
 ) -> tuple[pd.DataFrame, pd.DataFrame]:
-    """Train and test rows of the box; ``near`` starts it within 1 m of the middle."""
+    """Return train and test rows of the box; ``near`` starts it within 1 m of the middle."""
     setup = make_history.Setup(
         name="puck", size=(0.4, 0.3), mass=MASS, r=0.1, mu_c=0.3, wrench_sd=(4.0, 4.0, 0.1),
         n_train=trajectories, n_intervals=intervals,

@@ -1,4 +1,4 @@
-"""Histories made with the package's engine."""
+"""Histories simulated with the package's engine."""
 
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -30,7 +30,7 @@ def simulated_history(
     poses: Any = None,
     substeps: int = 40,
 ) -> History:
-    """A history made with the package's engine.
+    """Return a history simulated with the package's engine.
 
     The bodies start 4 m apart, or at rest in these poses (body, 3).
     """

@@ -1,4 +1,4 @@
-"""Four boxes of which everything is known, and joints between them."""
+"""Four boxes with known parameters, and joints between them."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ NAMES = ("a", "b", "c", "d")
 
 
 def scene(*joints: Joint, walls: bool = False, poses=POSES) -> Scene:
-    """Four wheeled boxes of which everything is known, and joints."""
+    """Return four wheeled boxes with known parameters, and joints."""
     wheel = {"mu_x": 0.02, "mu_y": 0.2, "w_x": 0.1}
     shape = Shape.box(0.8, 0.5)
     bodies = (
@@ -30,7 +30,7 @@ def scene(*joints: Joint, walls: bool = False, poses=POSES) -> Scene:
 
 
 def reference_anchors(first: int, second: int, point=PIN, poses=HINGED) -> list[float]:
-    """The world point in both bodies' frames, in their reference poses."""
+    """Return the world point in both bodies' frames, in their reference poses."""
     anchors = []
     for i in (first, second):
         x, y, theta = poses[i]

@@ -1,4 +1,4 @@
-"""Motions along a line with impacts, blows, dry friction and fast swings, as histories."""
+"""Histories of motion along a line with impacts, blows, dry friction and fast swings."""
 
 from collections.abc import Callable
 from functools import cache
@@ -21,12 +21,12 @@ RATES = (10, 30, 100, 500)
 
 
 def _dry(p: float, v: float) -> float:
-    """Dry friction, 3 m/s^2; it stops a body within a few milliseconds of standing still."""
+    """Return dry friction of 3 m/s^2, smoothed within a few milliseconds of rest."""
     return -3.0 * np.clip(v / 0.01, -1.0, 1.0)
 
 
 def motion(name: str, rng: np.random.Generator, dt: float, rows: int) -> Floats:
-    """Position and velocity of one trajectory, shape (time, 2): SI units, no noise."""
+    """Return position and velocity of one trajectory, shape (time, 2): SI units, no noise."""
     restitution, blow = rng.uniform(0.3, 1.0), rng.uniform(0.1, 0.9) * rows * dt
     kick, start, speed = rng.normal(0.0, 3.0), rng.uniform(1.0, 3.0), rng.normal(0.0, 2.0)
 

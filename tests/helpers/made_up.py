@@ -27,7 +27,7 @@ DRAG = "a force against the motion that grows with the speed"
 
 
 def idata(posterior: dict[str, np.ndarray], dims: dict[str, list[str]]) -> Any:
-    """An InferenceData or a DataTree, as the installed ArviZ has it."""
+    """Return an InferenceData or a DataTree, as the installed ArviZ has it."""
     coords = {"body": ["cart"], "linear_drag_body": ["cart"], "state": list(STATE)}
     if az.__version__.startswith("0."):
         return az.from_dict(posterior, coords=coords, dims=dims)

@@ -2,6 +2,6 @@
 
 import pytest
 
-# PyMC 6 compiles to numba, which has no truncated normal draws and cannot compile a random
-# function of our own: it says that it runs them in Python. Nothing is wrong.
+# PyMC 6 compiles to numba, which has no truncated normal draws and cannot compile custom random
+# functions. It warns that it runs them in Python, which is correct.
 OBJECT_MODE = pytest.mark.filterwarnings("ignore:Numba will use object mode:UserWarning")

@@ -1,4 +1,4 @@
-"""Recordings of a sliding box, by Box2D, in which two effects look alike."""
+"""Recordings of a sliding box, by Box2D, with two confounded effects."""
 
 from types import ModuleType
 from typing import Any
@@ -15,7 +15,7 @@ SIZE = 0.6
 def record(
     make_history: ModuleType, start: Any, wrenches: Any, number: int, seed: int, **hidden: Any
 ) -> pd.DataFrame:
-    """Rows of one trajectory, from a state (6,) under wrenches (time, 3)."""
+    """Return rows of one trajectory, from a state (6,) under wrenches (time, 3)."""
     setup = make_history.Setup(name="puck", size=(0.4, 0.3), mass=MASS, r=0.1, mu_c=0.3)
     start, wrenches = np.asarray(start, dtype=float), np.asarray(wrenches, dtype=float)
     states = make_history.rollout(setup, start, wrenches, make_history.Effects(**hidden))
@@ -29,7 +29,7 @@ def record(
 
 
 def at_one_speed(make_history: ModuleType, seed: int, **hidden: Any) -> pd.DataFrame:
-    """Six trajectories at about 1 m/s: pushes make up for the drag, and some go across.
+    """Return six trajectories at about 1 m/s: pushes balance the drag, and some are sideways.
 
     The latter tell the mass; a torque now and then turns the box.
     """

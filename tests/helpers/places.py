@@ -1,4 +1,4 @@
-"""Where data lie."""
+"""Paths of the repository and of recorded data."""
 
 from pathlib import Path
 
@@ -11,7 +11,7 @@ RECORDED = ROOT.parent / "shared" / "data"
 
 
 def load(folder: Path, data: Path | None = None) -> tuple[pp.Scene, pp.History, pp.History]:
-    """Scene, train and test of a folder; the recordings may be in another."""
+    """Return scene, train and test of a folder; the recordings may be in another."""
     scene = pp.Scene.load(folder / "scene.toml")
     parts = (pp.History.load((data or folder) / f"{part}.csv", scene) for part in ("train", "test"))
     return scene, *parts

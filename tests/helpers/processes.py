@@ -1,4 +1,4 @@
-"""Calls for other processes that die there; without imports, which take each of them seconds."""
+"""Functions for worker processes that die; without imports, which take seconds in each."""
 
 import os
 import signal
@@ -6,7 +6,7 @@ from pathlib import Path
 
 
 def dies(folder: str, times: int) -> int:
-    """Dies so many times, then gives the process's number."""
+    """Die a number of times, then return the process's number."""
     before = len(list(Path(folder).iterdir()))
     (Path(folder) / f"{before}").touch()
     if before < times:

@@ -1,4 +1,4 @@
-"""A puck of known mass to plan for, in the open and in a room with a wall across."""
+"""A puck of known mass for planning, without walls and in a room with a wall."""
 
 import numpy as np
 
@@ -24,5 +24,5 @@ ACROSS = {"puck": (-1.5, -1.0, 0.0)}, {"puck": (1.5, -1.0, None)}
 
 
 def known(scene: Scene = FREE, *masses: float) -> Dynamics:
-    """A puck of one mass, or one a draw."""
+    """Return the posterior of a puck with one mass, or one per draw."""
     return Dynamics(scene, np.array(masses or (MASS,))[:, None])

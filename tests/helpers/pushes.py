@@ -1,4 +1,4 @@
-"""A block that a finger pushes, seen before and after each push alone."""
+"""A block that a finger pushes, measured only before and after each push."""
 
 import pandas as pd
 
@@ -17,7 +17,7 @@ WRENCH = ["force_x", "force_y", "torque"]
 
 
 def rows(steps=(4, 6)) -> pd.DataFrame:
-    """A finger whose pose is known, and a block seen before and after each push."""
+    """Return a finger with known poses, and a block measured before and after each push."""
     table = []
     for trajectory, count in enumerate(steps):
         for step in range(count):

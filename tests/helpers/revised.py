@@ -1,4 +1,4 @@
-"""Findings with posteriors of a real fit, of a puck that drags, in seconds."""
+"""Findings with the posteriors of a quick fit, of a puck with drag."""
 
 from dataclasses import replace
 from functools import cache
@@ -18,7 +18,7 @@ DRAG = 0.8
 
 @cache
 def recordings() -> tuple[History, History]:
-    """A recording to fit and one to judge by."""
+    """Return a training and a test recording."""
     dragged = Disc(trajectories=6, intervals=12, drag=DRAG)
     frames = (dragged.frame(np.random.default_rng(seed)) for seed in (1, 2))
     train, test = (History.from_dataframe(frame, DISC) for frame in frames)
@@ -27,7 +27,7 @@ def recordings() -> tuple[History, History]:
 
 @cache
 def revised() -> Findings:
-    """Findings as made up, with the posteriors of a puck without drag and with it."""
+    """Return findings with the posteriors of a puck without drag and with it."""
     train, _ = recordings()
     drag = [effect for effect in catalogue if effect.name == "linear_drag"]
     models = (physics_model(DISC, train, e, trajectories=True) for e in ((), drag))
@@ -40,7 +40,7 @@ def revised() -> Findings:
 
 
 def unexplained() -> Findings:
-    """The same where no effect has a name."""
+    """Return the same without a named effect."""
     left = Unexplained("puck", "vx", "velocity x", 0.5, 0.001, "vx of puck depends on velocity x")
     before = revised().posterior_before
     return replace(

@@ -1,4 +1,4 @@
-"""Samplers that run shorter than users' do."""
+"""Samplers with short runs."""
 
 from dataclasses import replace
 

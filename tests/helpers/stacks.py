@@ -1,4 +1,4 @@
-"""A fit of each generation of PyMC and ArviZ, kept in tests/data.
+"""A fit of each generation of PyMC and ArviZ, stored in tests/data.
 
 ``python -m tests.helpers.stacks`` writes the running generation's.
 """
@@ -24,7 +24,7 @@ SCENE = Scene(
 
 
 def history(seed: int, trajectories: int = 3) -> History:
-    """A pushed puck."""
+    """Return the history of a pushed puck."""
     truth = {"mass": 2.0}
     return simulated_history(SCENE, truth, seed=seed, trajectories=trajectories, intervals=4)
 
@@ -34,7 +34,7 @@ def file(generation: str) -> Path:
 
 
 def fitted(draws: int = 500, tune: int = 500) -> Any:
-    """The puck's posterior on the running generation."""
+    """Return the puck's posterior on the running generation."""
     model = physics_model(SCENE, history(1))
     return fit(model, seed=3, draws=draws, tune=tune, chains=2, progress=False)
 

@@ -1,4 +1,4 @@
-"""Small tasks to act in: a cart to push in the open, and a puck with a wall in its way."""
+"""Small tasks for agents: a cart without walls, and a puck behind a wall."""
 
 from pbrl_ppl.agents import Task, World
 from pbrl_ppl.planning import ActionSet, Goal
@@ -34,5 +34,5 @@ PUCK = Task(
 
 
 def puck_world(sigma: float = 0.0) -> World:
-    """The puck's true dynamics."""
+    """Return the puck's true dynamics."""
     return World(PUCK, PUCK_TRUTH, sigma=sigma)

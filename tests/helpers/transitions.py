@@ -1,4 +1,4 @@
-"""Transitions of bodies that are pushed about, played by the package's engine."""
+"""Transitions of pushed bodies, simulated with the package's engine."""
 
 import numpy as np
 
@@ -18,7 +18,7 @@ def transitions(
     force: float = 4.0,
     mass: float = 2.0,
 ) -> Transitions:
-    """States (n, body, 6), wrenches (n, body, 3) and next states of bodies in a rectangle (m).
+    """Return states (n, body, 6), wrenches (n, body, 3), next states of bodies in a rectangle (m).
 
     Pushes are those of an action set: none or a force, either way, along x and y.
     """

@@ -1,4 +1,4 @@
-"""Bodies of which everything is known, and a prediction in one call."""
+"""Bodies with known parameters, and a prediction in one call."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -15,7 +15,7 @@ BY_NAME = {effect.name: effect for effect in catalogue}
 
 
 def body(name: str, shape: Shape, *, wheel: bool = False, **known: float) -> Body:
-    """A body of which every parameter is known: mass 1 and no friction or bounce by default."""
+    """Return a body with known parameters: mass 1, no friction or restitution by default."""
     defaults = {"mass": 1.0, "r": 0.0, "mu_c": 0.0}
     if wheel:
         defaults |= {"w_x": 0.0, "w_y": 0.0, "w_theta": 0.0, "mu_x": 0.0, "mu_y": 0.0}
@@ -23,7 +23,7 @@ def body(name: str, shape: Shape, *, wheel: bool = False, **known: float) -> Bod
 
 
 def state(x=0.0, y=0.0, theta=0.0, vx=0.0, vy=0.0, omega=0.0) -> np.ndarray:
-    """One body's state (6,)."""
+    """Return one body's state (6,)."""
     return np.array([x, y, theta, vx, vy, omega], dtype=float)
 
 

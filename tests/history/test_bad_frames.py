@@ -8,6 +8,8 @@ from pbrl_ppl.state import STATE
 from tests.helpers.kinks import MOTIONS, RATES, kinked
 from tests.helpers.places import RECORDED, load
 
+pytestmark = pytest.mark.one_stack
+
 
 def changed(history: History, cells: dict[tuple[int, int, int], float]) -> History:
     """The history with something added to (trajectory, row, state) of the first body."""

@@ -14,6 +14,8 @@ from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import RECORDED
 
+pytestmark = pytest.mark.one_stack
+
 DT = 0.05
 PUCK = Scene(time_step=DT, bodies=(Body("puck", Shape.circle(0.2)),))
 ALL = ["vx", "vy", "omega"]

@@ -11,6 +11,8 @@ from tests.helpers.histories import COLUMNS
 from tests.helpers.kinks import MOTIONS, RATES, kinked
 from tests.helpers.places import RECORDED, load
 
+pytestmark = pytest.mark.one_stack
+
 
 def falls(
     rate: int,

@@ -16,6 +16,8 @@ from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.places import RECORDED
 
+pytestmark = pytest.mark.one_stack
+
 needs_data = pytest.mark.skipif(
     not RECORDED.is_dir(), reason="../shared/data is not beside the repository"
 )

@@ -7,6 +7,8 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import from_mujoco
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 
+pytestmark = pytest.mark.one_stack
+
 mujoco = pytest.importorskip("mujoco")
 
 SLED = """

@@ -14,6 +14,8 @@ from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.free_puck import DISC, Disc
 from tests.helpers.histories import NOISE
 
+pytestmark = pytest.mark.one_stack
+
 PUCK = Shape.circle(0.2)
 PAIR = Scene(time_step=0.1, bodies=(Body("a", PUCK), Body("b", PUCK)))
 NAMES = {"time": "Time (s)", "x": "pos_x", "y": "pos_y", "theta": "yaw", "force_x": "push"}

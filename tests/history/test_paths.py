@@ -7,6 +7,8 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, from_segments, segment_rows
 from tests.helpers.pushes import SCENE, WRENCH, pushed, rows
 
+pytestmark = pytest.mark.one_stack
+
 
 def test_its_path_is_the_action_and_is_not_observed() -> None:
     segments = pushed()[1].segments(5)

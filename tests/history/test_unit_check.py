@@ -10,6 +10,8 @@ from pbrl_ppl.history import History, unit_mismatches
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS
 
+pytestmark = pytest.mark.one_stack
+
 DT = 0.05
 PUCK = Scene(time_step=DT, bodies=(Body("puck", Shape.circle(0.2)),))
 DEGREES = 180 / np.pi

@@ -16,6 +16,8 @@ from pbrl_ppl.modes import profile_sigma
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 
+pytestmark = pytest.mark.one_stack
+
 KNOWN = {"mass": 1.0, "r": 0.5, "mu_c": 0.2}
 PUCKS = Scene(
     time_step=0.1,

@@ -27,6 +27,8 @@ from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import wrapped
 from tests.helpers.histories import simulated_history
 
+pytestmark = pytest.mark.one_stack
+
 PUCK = Scene(
     time_step=0.1,
     substeps=2,

@@ -11,7 +11,10 @@ from tests.helpers.histories import simulated_history
 POSES = ((0.0, 0.0, 0.0), (1.2, 0.1, 0.4), (0.3, 1.6, -0.3))
 NOISE = (0.002, 0.002, 0.004, 0.01, 0.01, 0.02)
 ROD = Joint("distance", ("a", "b"), (0.1, 0.05), (-0.1, 0.0))
-pytestmark = pytest.mark.filterwarnings("ignore:which bodies are joined is rough")
+pytestmark = [
+    pytest.mark.one_stack,
+    pytest.mark.filterwarnings("ignore:which bodies are joined is rough"),
+]
 
 
 def pucks(names: str, *joints: Joint) -> Scene:

@@ -48,6 +48,8 @@ from tests.helpers.histories import simulated_history
 from tests.helpers.joints import HINGED, reference_anchors, scene
 from tests.helpers.worlds import G, body
 
+pytestmark = [pytest.mark.one_stack, pytest.mark.first(3)]
+
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 # so few draws do not converge, and are not meant to

@@ -10,6 +10,8 @@ from pbrl_ppl.oomdp import SectorContacts
 from pbrl_ppl.oomdp.contacts import spans
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 
+pytestmark = pytest.mark.one_stack
+
 BOX = Shape.box(0.9, 0.5)
 #: Concave: a corner sofa.
 SOFA = Shape.polygon([(-1.0, -0.6), (1.4, -0.6), (1.4, 0.2), (-0.2, 0.2), (-0.2, 1.0), (-1.0, 1.0)])

@@ -11,6 +11,8 @@ from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.pucks import FREE, known
 from tests.helpers.transitions import transitions
 
+pytestmark = pytest.mark.one_stack
+
 #: A wall along y; what is near it comes from the left.
 WALLED = FREE.replace(walls=(Wall((1.0, -50.0), (1.0, 50.0)),))
 LOW, HIGH = (0.0, -1.0), (0.8, 1.0)

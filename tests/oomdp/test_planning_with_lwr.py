@@ -10,6 +10,8 @@ from pbrl_ppl.planning import plan
 from tests.helpers.pucks import ACROSS, FREE, PUSHES, ROOM, known
 from tests.helpers.transitions import transitions
 
+pytestmark = pytest.mark.one_stack
+
 GOAL = {"puck": (-1.5, -1.0, 0.0)}, {"puck": (1.5, -1.0, None)}
 
 

@@ -5,6 +5,8 @@ import pytest
 
 from pbrl_ppl.oomdp import Regression
 
+pytestmark = pytest.mark.one_stack
+
 
 def linear(n: int, seed: int = 1) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)

@@ -9,6 +9,8 @@ from pbrl_ppl.errors import FitError
 from pbrl_ppl.oomdp import OOLWR, Attributes, Pushed, Relation, SectorContacts
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 
+pytestmark = pytest.mark.one_stack
+
 DISC = Shape.circle(0.2)
 #: Two chairs, a locked one and a table, far from each other.
 PLACES = np.array([[0.0, 0.0], [5.0, 0.0], [10.0, 0.0], [15.0, 0.0]])

@@ -18,6 +18,8 @@ from pbrl_ppl.physics import build_layout
 from pbrl_ppl.physics.table1 import table1
 from pbrl_ppl.scene import Body, Scene, Shape
 
+pytestmark = pytest.mark.one_stack
+
 BOX = Shape.box(1.0, 0.6)
 BODIES = ("one", "two", "three")
 NORMAL = Prior("normal")

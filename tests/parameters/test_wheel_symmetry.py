@@ -25,6 +25,8 @@ from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE
 
+pytestmark = pytest.mark.one_stack
+
 PRIORS = {
     "default": {},
     "frictions alike": {"mu_x": {"mu": 0.1}, "mu_y": {"mu": 0.1}},

@@ -10,6 +10,8 @@ from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.pushes import pushed
 from tests.helpers.worlds import BY_NAME, body, simulator, state
 
+pytestmark = pytest.mark.one_stack
+
 PATHS = pytest.mark.parametrize("path", ["auto", "python"])
 FINGER = Body("finger", Shape.circle(0.05), kinematic=True, known={"r": 1.0, "mu_c": 1.0})
 

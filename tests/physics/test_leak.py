@@ -10,6 +10,8 @@ from pbrl_ppl.physics import Physics, Simulator, calls
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.worlds import G, body
 
+pytestmark = pytest.mark.one_stack
+
 MIB = (
     1024 if sys.platform.startswith("linux") else 1024**2
 )  # ru_maxrss is in KiB, on a Mac in bytes

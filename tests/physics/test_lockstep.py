@@ -10,9 +10,12 @@ from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import ARM, BOX, proposals
 from tests.helpers.worlds import BY_NAME, G
 
-pytestmark = pytest.mark.skipif(
-    not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-)
+pytestmark = [
+    pytest.mark.one_stack,
+    pytest.mark.skipif(
+        not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
+    ),
+]
 
 PATHS = ("auto", "python")
 POST = Body("post", Shape.circle(0.05), static=True, pose=(3.0, -2.0, 0.7))

@@ -12,9 +12,12 @@ from tests.helpers.chains import LINK, cart_with_trailers, case, chain
 from tests.helpers.engines import BOX
 from tests.helpers.worlds import G
 
-pytestmark = pytest.mark.skipif(
-    not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-)
+pytestmark = [
+    pytest.mark.one_stack,
+    pytest.mark.skipif(
+        not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
+    ),
+]
 
 PIVOT = ("pivot_friction", "pivot_damping")
 CASES = {

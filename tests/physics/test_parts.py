@@ -15,6 +15,8 @@ from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import RECORDED
 
+pytestmark = pytest.mark.one_stack
+
 NAMES = ("a", "b", "c", "d")
 JOINT = Joint("hinge", ("a", "b"), (0.3, 0.0), (-0.3, 0.0))
 

@@ -12,9 +12,12 @@ from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.engines import BOX, CASES, chain, mixed, proposals, ring
 from tests.helpers.worlds import body, simulator, state
 
-pytestmark = pytest.mark.skipif(
-    not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-)
+pytestmark = [
+    pytest.mark.one_stack,
+    pytest.mark.skipif(
+        not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
+    ),
+]
 
 #: Largest difference between the plain and the compiled path, relative to values of order one.
 TOLERANCE = {"free": 1e-12, "walls": 1e-9, "chain": 1e-12, "crowd": 1e-9, "mixed": 1e-9}

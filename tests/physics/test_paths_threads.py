@@ -8,6 +8,8 @@ import pytest
 from pbrl_ppl.physics import calls
 from tests.helpers.places import ROOT
 
+pytestmark = pytest.mark.one_stack
+
 CODE = """
 from concurrent.futures import ThreadPoolExecutor
 import numpy as np

@@ -9,6 +9,8 @@ import pytest
 from pbrl_ppl.scene import Joint, Scene, Shape
 from tests.helpers.worlds import G, body, predict, simulator
 
+pytestmark = pytest.mark.one_stack
+
 NOISE = np.array([0.002, 0.002, 0.004, 0.01, 0.01, 0.02])
 
 

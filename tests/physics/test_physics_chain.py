@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 from pbrl_ppl.scene import Joint, Scene, Shape
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, simulator
 
+pytestmark = pytest.mark.one_stack
+
 LEVER = 0.18  # m, from a link's middle to either of its hinges
 BOB = Shape.circle(0.05)  # at each link's middle: links two apart do not touch
 MASSES = np.array([0.5, 0.3, 0.4])

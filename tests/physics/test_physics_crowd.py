@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, predict, simulator
 
+pytestmark = pytest.mark.one_stack
+
 number = st.floats(-2.0, 2.0)
 
 # -- a crowd, moved, turned and mirrored -----------------------------------------------------------

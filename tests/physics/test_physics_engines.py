@@ -12,6 +12,8 @@ import pytest
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
 from tests.helpers.worlds import BY_NAME, G, body, phi_of, simulator
 
+pytestmark = pytest.mark.one_stack
+
 N = 200
 
 

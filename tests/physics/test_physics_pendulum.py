@@ -10,6 +10,8 @@ from scipy.special import ellipk
 from pbrl_ppl.scene import Joint, Scene, Shape
 from tests.helpers.worlds import G, body, predict, state
 
+pytestmark = pytest.mark.one_stack
+
 ARM = Shape.box(0.03, 0.4)
 MASS, LEVER = 0.5, 0.18
 MOMENT = MASS * ARM.unit_moment + MASS * LEVER**2  # about the hinge, kg m^2

@@ -8,6 +8,8 @@ from hypothesis import strategies as st
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
 from tests.helpers.worlds import G, body, predict
 
+pytestmark = pytest.mark.one_stack
+
 BOX = Shape.box(0.9, 0.55)
 number = st.floats(-3.0, 3.0)
 states = st.tuples(number, number, number, number, number, number)

@@ -18,6 +18,8 @@ from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.places import ROOT
 from tests.helpers.worlds import body, predict, state
 
+pytestmark = pytest.mark.one_stack
+
 CART, BOX = Shape.box(0.9, 0.55), Shape.box(0.4, 0.3)
 # a channel 1.2 m wide and 1 m high about a mouth of 0.8 m by 0.8 m that is open at the top
 CHANNEL = [(-0.6, 0.6), (-0.6, -0.4), (0.6, -0.4), (0.6, 0.6), (0.4, 0.6), (0.4, -0.2),

@@ -13,9 +13,12 @@ from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import proposals
 from tests.helpers.worlds import G
 
-pytestmark = pytest.mark.skipif(
-    not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
-)
+pytestmark = [
+    pytest.mark.one_stack,
+    pytest.mark.skipif(
+        not calls.AVAILABLE, reason="the compiled path cannot call the engine on this platform"
+    ),
+]
 
 SHAPES = (
     Shape.box(0.4, 0.3),

@@ -6,6 +6,8 @@ import pytest
 from pbrl_ppl.physics import touching
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 
+pytestmark = pytest.mark.one_stack
+
 BOX, DISC = Shape.box(0.6, 0.2), Shape.circle(0.1)
 
 

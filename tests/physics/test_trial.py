@@ -12,6 +12,8 @@ from pbrl_ppl.physics import try_effect
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 
+pytestmark = pytest.mark.one_stack
+
 PUCK = Scene(
     time_step=0.1, bodies=(Body("puck", Shape.circle(0.2), known={"r": 0.2, "mu_c": 0.3}),)
 )

@@ -26,7 +26,11 @@ LOOKED = [e for e in pp.catalogue if e.name in (*DRAGS, "constant_force", "magnu
 BOUNDS = {"puck": {"force_x": (-6.0, 6.0), "force_y": (-6.0, 6.0)}}
 REST = {"puck": (0.0, 0.0, 0.0)}
 # few draws are enough to compare models by, and say that they are few
-pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+pytestmark = [
+    pytest.mark.one_stack,
+    pytest.mark.first(4),
+    pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
+]
 
 
 def selected(frame: pd.DataFrame) -> Step:

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+pytestmark = pytest.mark.one_stack
+
 pytest.importorskip("Box2D", reason="Box2D is the world; install the extra `test`")
 
 

@@ -18,6 +18,7 @@ from tests.helpers.revised import recordings, revised
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 pytestmark = [
+    pytest.mark.one_stack,
     pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
     # of the driver's pipes, when it ends
     pytest.mark.filterwarnings("ignore::ResourceWarning"),

@@ -26,7 +26,10 @@ from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE
 
 # from here on every model is also drawn from
-pytestmark = OBJECT_MODE
+pytestmark = [
+    pytest.mark.first(4),
+    OBJECT_MODE,
+]
 PRIOR = {
     "mass": {"mu": 1.8, "sigma": 0.3},
     "w_x": {"mu": -0.25, "sigma": 0.05},

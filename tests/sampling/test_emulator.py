@@ -19,6 +19,8 @@ from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 
+pytestmark = pytest.mark.one_stack
+
 
 def two_parts(sizes: tuple[int, int]) -> Pieces:
     """One body a piece, with its own parameters, in the one transition."""

@@ -39,6 +39,8 @@ from pbrl_ppl.scene import Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history
 
+pytestmark = pytest.mark.first(3)
+
 PARAMETERS = ("mass", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
 UNITS = ("kg", "m", "m", "rad", "1", "1")
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork

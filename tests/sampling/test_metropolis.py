@@ -11,7 +11,10 @@ from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Gaussian, Jumps
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 # PyTensor's wheels come without BLAS; nothing here multiplies large matrices
-pytestmark = pytest.mark.filterwarnings("ignore:PyTensor could not link to a BLAS:UserWarning")
+pytestmark = [
+    pytest.mark.first(2),
+    pytest.mark.filterwarnings("ignore:PyTensor could not link to a BLAS:UserWarning"),
+]
 MEAN = np.array([1.0, -2.0, 0.5])
 SD = np.array([0.2, 3.0, 1.0])
 CORRELATION = np.array([[1.0, 0.9, 0.0], [0.9, 1.0, -0.3], [0.0, -0.3, 1.0]])

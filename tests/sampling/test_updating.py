@@ -42,6 +42,8 @@ from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.samplers import shorten
 
+pytestmark = pytest.mark.first(3)
+
 KNOWN = {"r": 0.2, "mu_c": 0.3}
 PUCKS = {"mass": [2.0, 3.0], "linear_drag_coefficient": [0.5, 1.0]}
 QUICK = {"draws": 1000, "tune": 300, "chains": 2, "cores": 1, "progress": False}

@@ -25,6 +25,8 @@ from pbrl_ppl.state import STATE
 from tests.helpers.histories import simulated_history
 from tests.helpers.samplers import shorten
 
+pytestmark = pytest.mark.first(3)
+
 SCENE = Scene(
     time_step=0.1,
     substeps=4,

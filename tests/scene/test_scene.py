@@ -12,6 +12,8 @@ from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.places import RECORDED
 
+pytestmark = pytest.mark.one_stack
+
 CART = """
 [world]
 normal_gravity = 9.81
