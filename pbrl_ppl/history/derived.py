@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.stats import t as t_distribution
 
-from pbrl_ppl.history.angles import unwrapped
 from pbrl_ppl.history.bad_frames import finest_step
 from pbrl_ppl.history.filters import Runs, computed_by, position_noise
 from pbrl_ppl.history.history import History
+from pbrl_ppl.history.kinematics import unwrapped
 from pbrl_ppl.state import STATE, THETA, wrapped
 
 Floats = npt.NDArray[np.float64]

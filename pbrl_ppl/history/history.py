@@ -2,26 +2,79 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Unpack
+from typing import Any, Unpack
 
 import numpy as np
 import numpy.typing as npt
 import pandas as pd
 import xarray as xr
+from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.digest import hashed
+from pbrl_ppl.history.conversion import Reading, as_history
 from pbrl_ppl.history.files import read_table, to_table, write_dataset
-from pbrl_ppl.history.paths import kinematic_bodies, path_velocities
-from pbrl_ppl.history.pieces import cut
-from pbrl_ppl.history.reading import Reading, as_history
+from pbrl_ppl.history.kinematics import complete_start, kinematic_bodies, path_velocities
 from pbrl_ppl.history.rows import arrays
-from pbrl_ppl.history.start import complete_start
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
+
+
+def hashed(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the dataset with the hash of its measured arrays among its attributes."""
+    digest = hashlib.sha256()
+    for name in ("trajectory", "body"):
+        digest.update("\0".join(str(label) for label in dataset[name].to_numpy()).encode())
+        digest.update(b"\1")
+    digest.update(dataset["n_rows"].to_numpy().astype("<i8").tobytes())
+    for name in ("clock", "observed", "action"):
+        values: Any = dataset[name].to_numpy()
+        # One NaN and one zero: both have several bit patterns.
+        canonical = np.where(np.isnan(values), np.nan, values + 0.0)
+        digest.update(np.ascontiguousarray(canonical, dtype="<f8").tobytes())
+    return dataset.assign_attrs(data_sha256=digest.hexdigest())
+
+
+Ints = npt.NDArray[np.int64]
+
+
+def cut(complete: npt.NDArray[np.bool_], intervals: Ints, horizon: int) -> tuple[Ints, Ints]:
+    """Trajectory and first step of pieces that do not overlap.
+
+    A piece starts at the first complete state after the piece before it, and must end within its
+    trajectory. A trajectory too short for any has one that its end cuts short.
+
+    Parameters
+    ----------
+    complete : ndarray
+        Whether a piece may start there, shape (trajectory, time).
+    intervals : ndarray
+        Of each trajectory, shape (trajectory,).
+    horizon : int
+        Intervals of a piece.
+
+    Examples
+    --------
+    >>> cut(np.array([[True] * 6, [False, True, True, False, False, False]]), np.array([5, 3]), 2)
+    (array([0, 0, 1]), array([0, 2, 1]))
+    """
+    trajectory, step = [], []
+    for i, count in enumerate(intervals):
+        starts = np.flatnonzero(complete[i, :count])
+        own: list[int] = []
+        at = 0
+        while (place := int(np.searchsorted(starts, at))) < len(starts):
+            at = int(starts[place]) + horizon
+            if at > count and own:
+                break
+            own.append(at - horizon)
+        trajectory += [i] * len(own)
+        step += own
+    return np.array(trajectory, dtype=np.int64), np.array(step, dtype=np.int64)
+
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
@@ -346,3 +399,58 @@ class History:
             f"History({self.n_trajectories} trajectories, {self.n_transitions} transitions, "
             f"bodies {', '.join(self.bodies)}, sha256 {self.data_sha256[:12]})"
         )
+
+
+Array = NDArray[np.float64]
+
+
+def from_segments(scene: Scene, start: Array, actions: Array, observed: Array) -> History:
+    """A history of segments; arguments as of :func:`segment_rows`.
+
+    Actions of shape (n, H, body, 9) are inputs as in :data:`pbrl_ppl.state.INPUT`: they also say
+    what acted before, and when.
+    """
+    wrench = actions[..., : len(WRENCH)]
+    history = History.from_dataframe(segment_rows(scene, start, wrench, observed), scene)
+    if actions.shape[-1] == len(WRENCH):
+        return history
+    previous, (number, begin, end) = actions[..., 3:6], np.moveaxis(actions[:, :, 0, 6:], -1, 0)
+    data = history.dataset.copy()
+    data["before"] = data["before"].copy(data=previous[:, 0])
+    data["number"] = data["number"].copy(data=number[:, 0])
+    data["clock"] = data["clock"].copy(data=np.concatenate([begin, end[:, -1:]], axis=1))
+    return History(data)
+
+
+def segment_rows(scene: Scene, start: Array, actions: Array, observed: Array) -> pd.DataFrame:
+    """A history's rows, of one trajectory a segment, each from its own start state.
+
+    Parameters
+    ----------
+    scene : Scene
+        Names the bodies and the time step.
+    start : ndarray
+        Complete start states, shape (n, body, 6), SI units.
+    actions : ndarray
+        Wrenches, shape (n, H, body, 3); of a kinematic body its velocities.
+    observed : ndarray
+        Next states, shape (n, H, body, 6), NaN where missing.
+    """
+    n, h, k = actions.shape[:3]
+    states = np.concatenate([start[:, None], observed], axis=1)
+    wrenches = np.concatenate([actions, np.full((n, 1, k, len(WRENCH)), np.nan)], axis=1)
+    follows = kinematic_bodies(scene)
+    way = scene.time_step * np.cumsum(actions[:, :, follows], axis=1)
+    states[:, 1:, follows, :3] = start[:, None, follows, :3] + way
+    wrenches[:, :, follows] = np.nan
+    trajectory, step, body = np.indices((n, h + 1, k)).reshape(3, -1)
+    return pd.DataFrame(
+        {
+            "trajectory": trajectory,
+            "step": step,
+            "time": step * scene.time_step,
+            "body": np.array([mover.name for mover in scene.moving])[body],
+            **dict(zip(STATE, states.reshape(-1, len(STATE)).T, strict=True)),
+            **dict(zip(WRENCH, wrenches.reshape(-1, len(WRENCH)).T, strict=True)),
+        }
+    )

@@ -11,9 +11,8 @@ import pandas as pd
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from pbrl_ppl.errors import HistoryError, ResamplingWarning
-from pbrl_ppl.history.angles import unwrapped
-from pbrl_ppl.history.cells import Rows, read_rows
-from pbrl_ppl.history.rows import TIME_TOLERANCE
+from pbrl_ppl.history.kinematics import unwrapped
+from pbrl_ppl.history.rows import TIME_TOLERANCE, Rows, read_rows
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA, WRENCH
 

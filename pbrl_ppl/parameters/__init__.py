@@ -1,6 +1,5 @@
 """Phi: priors as data, the layout of the parameter vector, the wheel's symmetry."""
 
-from pbrl_ppl.parameters.differences import differentiate
 from pbrl_ppl.parameters.layout import (
     BODY_PARAMETERS,
     JOINT_ANCHORS,
@@ -12,6 +11,7 @@ from pbrl_ppl.parameters.layout import (
 from pbrl_ppl.parameters.priors import (
     Prior,
     box,
+    differentiate,
     inside,
     prior_draws,
     prior_residual,

@@ -16,6 +16,7 @@ import numpy as np
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import toml as scene_toml
+from pbrl_ppl.scene.bodies import Body, Wall, check_classes
 from pbrl_ppl.scene.checks import (
     PARAMETER_NAMES,
     Point,
@@ -26,8 +27,7 @@ from pbrl_ppl.scene.checks import (
     stated_noise,
     vector,
 )
-from pbrl_ppl.scene.classes import check_classes
-from pbrl_ppl.scene.parts import WORLD, Body, Joint, Wall
+from pbrl_ppl.scene.joints import WORLD, Joint
 from pbrl_ppl.scene.shape import Shape
 
 __all__ = ["PARAMETER_NAMES", "WORLD", "Body", "Joint", "Point", "Scene", "Shape", "Wall"]

@@ -1,4 +1,4 @@
-"""States that a segment may start from: what was measured, completed by hinges and derivatives."""
+"""Kinematics of a history: angles, recorded paths, hinges, and complete start states."""
 
 from __future__ import annotations
 
@@ -6,9 +6,84 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import savgol_filter
 
-from pbrl_ppl.history.paths import fill_path_velocities
 from pbrl_ppl.scene import WORLD, Point, Scene
-from pbrl_ppl.state import THETA
+from pbrl_ppl.state import THETA, wrapped
+
+Floats = npt.NDArray[np.float64]
+
+
+def unwrapped(time: Floats, angle: Floats, rate: Floats) -> Floats:
+    """Angles without jumps; measured rates say how often a body has turned round meanwhile.
+
+    Parameters
+    ----------
+    time, angle, rate : ndarray
+        Shape (n,): s, rad, rad/s. A rate that is not known everywhere is not used.
+
+    Examples
+    --------
+    >>> time = np.arange(4.0)
+    >>> unwrapped(time, np.array([0.0, 1.0, 2.0, 3.0]), np.full(4, 7.0)).round(3)
+    array([ 0.   ,  7.283, 14.566, 21.85 ])
+    """
+    if not np.isfinite(rate).all():
+        return np.asarray(np.unwrap(angle))
+    turned = np.cumsum(0.5 * np.diff(time) * (rate[1:] + rate[:-1]))
+    turned = np.concatenate([np.zeros(1), turned])
+    return np.asarray(np.unwrap(angle - turned) + turned)
+
+
+Floats = npt.NDArray[np.float64]
+Bools = npt.NDArray[np.bool_]
+
+
+def kinematic_bodies(scene: Scene) -> Bools:
+    """Which of the moving bodies are kinematic, shape (body,)."""
+    return np.array([body.kinematic for body in scene.moving], dtype=bool)
+
+
+def path_velocities(poses: Floats, time_step: float) -> Floats:
+    """Constant velocities that lead from each pose to the next.
+
+    Parameters
+    ----------
+    poses : ndarray
+        Shape (..., time, body, 3): x, y, theta (m, m, rad).
+    time_step : float
+        Between poses (s).
+
+    Returns
+    -------
+    ndarray
+        Shape (..., time - 1, body, 3): m/s, m/s, rad/s, the shorter way round.
+    """
+    change = np.diff(poses, axis=-3)
+    change[..., 2] = wrapped(change[..., 2])
+    return np.asarray(change / time_step)
+
+
+def fill_path_velocities(state: Floats, scene: Scene) -> None:
+    """Fill missing velocities of kinematic bodies in place, by differences of their positions.
+
+    Parameters
+    ----------
+    state : ndarray
+        Shape (trajectory, time, body, 6); changed.
+    scene : Scene
+        Says which bodies are kinematic.
+    """
+    follows = kinematic_bodies(scene)
+    if not follows.any():
+        return
+    path = state[:, :, follows]
+    rate = path_velocities(path[..., :3], scene.time_step)
+    # the velocity of the interval that begins there, of a last row the one that ends
+    ahead = np.concatenate([rate, rate[:, -1:]], axis=1)
+    behind = np.concatenate([rate[:, :1], rate], axis=1)
+    filled = np.where(np.isnan(ahead), behind, ahead)
+    path[..., 3:] = np.where(np.isnan(path[..., 3:]), filled, path[..., 3:])
+    state[:, :, follows] = path
+
 
 Floats = npt.NDArray[np.float64]
 Bools = npt.NDArray[np.bool_]
