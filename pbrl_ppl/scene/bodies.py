@@ -1,7 +1,5 @@
 """Bodies and walls of a scene, frozen and checked when they are built."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +7,7 @@ from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene.checks import (
     CONTACT_NAMES,
     PARAMETER_NAMES,
+    Named,
     Point,
     flag,
     hyper_parameters,
@@ -72,8 +71,8 @@ class Body:
     wheel: bool = False
     static: bool = False
     kinematic: bool = False
-    known: tuple[tuple[str, float], ...] = ()
-    prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
+    known: Named = ()
+    prior: tuple[tuple[str, Named], ...] = ()
     effects: tuple[str, ...] = ()
     pose: tuple[float, float, float] | None = None
     object_class: str | None = None
@@ -86,8 +85,8 @@ class Body:
             raise SceneError(f'{where}: "world" is the name of the ground; call the body otherwise')
         if not isinstance(self.shape, Shape):
             raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
-        flag(self.wheel, f"{where}: wheel")
-        flag(self.static, f"{where}: static")
+        for key in ("wheel", "static", "kinematic"):
+            flag(getattr(self, key), f"{where}: {key}")
         object.__setattr__(self, "known", known_parameters(self.known, where))
         for key in ("effects", "attributes"):
             object.__setattr__(self, key, names(getattr(self, key), f"{where}: {key}"))
@@ -102,13 +101,12 @@ class Body:
             raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
         if self.static and self.wheel:
             raise SceneError(f"{where}: a static body cannot have a wheel; drop one of the two")
-        flag(self.kinematic, f"{where}: kinematic")
         if self.kinematic:
             self._check_kinematic(where)
 
     @property
     def owner(self) -> str:
-        """What owns its parameters of Table 1: its class with its attributes, or itself."""
+        """Name of the owner of its parameters of Table 1: its class and attributes, or itself."""
         if self.object_class is None:
             return self.name
         listed = ", ".join(sorted(self.attributes))
@@ -119,7 +117,7 @@ class Body:
         for name in ("static", "wheel", "effects"):
             if getattr(self, name):
                 raise SceneError(
-                    f"{where}: it is kinematic, it goes where its path leads, and has {name} ="
+                    f"{where}: it is kinematic, follows its recorded path, and has {name} ="
                     f" {getattr(self, name)!r}; drop one of the two"
                 )
         for table in ("known", "prior"):
@@ -146,7 +144,7 @@ class Wall:
 
 
 def check_classes(bodies: Sequence[Body]) -> None:
-    """Check that classes have names of their own, and that bodies can share parameters.
+    """Check that names of classes differ from bodies', and that bodies can share parameters.
 
     Parameters
     ----------
@@ -183,19 +181,18 @@ def check_classes(bodies: Sequence[Body]) -> None:
 
 
 def _differing(body: Body, other: Body) -> list[tuple[str, object, object]]:
-    """What shapes the parameters and is not the same of two bodies: its name and both values."""
-    pairs: list[tuple[str, object, object]] = [
-        (key, getattr(body, key), getattr(other, key))
-        for key in ("object_class", "wheel", "kinematic")
-    ]
-    pairs.append(("known", dict(body.known), dict(other.known)))
-    # an effect's parameters are each body's own
-    mine, its = (
-        {name: dict(hyper) for name, hyper in one.prior if name in PARAMETER_NAMES}
-        for one in (body, other)
-    )
-    pairs.append(("prior", mine, its))
-    pairs.append(("attributes", sorted(body.attributes), sorted(other.attributes)))
-    if body.wheel:  # its place is bounded by the outline
-        pairs.append(("shape", body.shape, other.shape))
-    return [pair for pair in pairs if pair[1] != pair[2]]
+    """Return what shapes the parameters and differs between two bodies: its name, both values."""
+
+    def shaping(one: Body) -> dict[str, object]:
+        # an effect's parameters belong to each body alone
+        prior = {name: dict(hyper) for name, hyper in one.prior if name in PARAMETER_NAMES}
+        return {
+            **{key: getattr(one, key) for key in ("object_class", "wheel", "kinematic")},
+            "known": dict(one.known),
+            "prior": prior,
+            "attributes": sorted(one.attributes),
+            "shape": one.shape if one.wheel else None,  # the wheel's place is bounded by it
+        }
+
+    pairs = zip(shaping(body).items(), shaping(other).values(), strict=True)
+    return [(key, mine, its) for (key, mine), its in pairs if mine != its]
