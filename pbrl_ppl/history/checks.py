@@ -1,22 +1,17 @@
 """Checks of a recording: gaps, states that rest on no measurement, and wrong units."""
 
-from __future__ import annotations
-
 import numpy as np
-import numpy.typing as npt
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.history import History
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, THETA, wrapped
-
-Bools = npt.NDArray[np.bool_]
+from pbrl_ppl.state import STATE, THETA, Bools, Floats, wrapped
 
 
 def unseen(history: History) -> Bools:
-    """Which bodies were not seen in a row, shape (trajectory, time, body).
+    """Return which bodies were not seen in a row, shape (trajectory, time, body).
 
-    A trajectory's first row has a state, and a body that follows a path is where that says.
+    A trajectory's first row and a kinematic body's path count as seen.
     """
     dataset = history.dataset
     hidden = ~np.isfinite(dataset["observed"].to_numpy()).any(axis=-1)
@@ -27,20 +22,21 @@ def unseen(history: History) -> Bools:
 
 
 def longest_gap(history: History) -> int:
-    """Intervals between rows that show all bodies, in a sparse recording the most; 1 otherwise.
+    """Return the most intervals between rows with all bodies in a sparse recording, else 1.
 
     A recording is sparse if more than half of the steps from one such row to the next skip rows: a
     block that is seen before and after a push, say.
     """
-    shown = np.asarray(~unseen(history).any(axis=-1))
+    complete = ~unseen(history).any(axis=-1)
     rows = history.dataset["n_rows"].to_numpy()
-    gaps = [np.diff(np.flatnonzero(own[:n])) for own, n in zip(shown, rows, strict=True)]
-    each = np.concatenate(gaps)
-    return int(each.max()) if len(each) and np.median(each) > 1 else 1
+    gaps = np.concatenate(
+        [np.diff(np.flatnonzero(each[:n])) for each, n in zip(complete, rows, strict=True)]
+    )
+    return int(gaps.max()) if len(gaps) and np.median(gaps) > 1 else 1
 
 
 def check_start(history: History, scene: Scene) -> None:
-    """Refuse a history whose transitions start from states that rest on no measurement.
+    """Refuse a history whose transitions start from states without measurements.
 
     Transitions of Eq. 11 start from states as measured; in whole trajectories states are latent.
 
@@ -53,9 +49,9 @@ def check_start(history: History, scene: Scene) -> None:
     if not assumed.any():
         return
     parts = [
-        f'{", ".join(np.array(STATE)[own])} of body "{body.name}"'
-        for body, own in zip(scene.moving, assumed, strict=True)
-        if own.any()
+        f'{", ".join(np.array(STATE)[columns])} of body "{body.name}"'
+        for body, columns in zip(scene.moving, assumed, strict=True)
+        if columns.any()
     ]
     raise HistoryError(
         f"history: single transitions start from measured states: missing are {'; '.join(parts)};"
@@ -64,8 +60,6 @@ def check_start(history: History, scene: Scene) -> None:
         " estimate_velocities=True (it gives vx, vy, omega from x, y, theta)"
     )
 
-
-Floats = npt.NDArray[np.float64]
 
 #: Factors by which a position in other units changes faster than its velocity says, and the units;
 #: where the velocity is too large by as much, it may be in these units per second.
@@ -86,8 +80,8 @@ _ENOUGH = 8
 def unit_mismatches(history: History) -> tuple[str, ...]:
     """Return a sentence for each velocity that differs from its position's changes by a unit.
 
-    Changes of a position are divided by the integral of the measured velocity. Nothing is said
-    where that factor varies (noise), where it is near one, or where no unit is near it.
+    Changes of a position are divided by the integral of the measured velocity. A position is left
+    out where that factor varies (noise), where it is near one, or where no unit is near it.
 
     Parameters
     ----------
@@ -113,35 +107,35 @@ def unit_mismatches(history: History) -> tuple[str, ...]:
 
 
 def _factor(position: Floats, rate: Floats, dt: float, *, angle: bool) -> float | None:
-    """How many times as fast a position changes as its rate says; None where that varies."""
+    """Return a position's change over the integral of its rate; None where that varies."""
     best, least = None, _SPREAD
     for span in _SPANS:
         n = (position.shape[1] - 1) // span
         change = np.diff(position[:, : n * span + 1 : span], axis=1).ravel()
         mean = ((rate[:, 1:] + rate[:, :-1]) / 2)[:, : n * span].reshape(len(rate), n, span)
-        told = dt * span * mean.mean(axis=2).ravel()
-        seen = np.isfinite(change) & np.isfinite(told)
-        change, told = change[seen], told[seen]
-        if len(told) < _ENOUGH:
+        integral = dt * span * mean.mean(axis=2).ravel()
+        seen = np.isfinite(change) & np.isfinite(integral)
+        change, integral = change[seen], integral[seen]
+        if len(integral) < _ENOUGH:
             continue
-        size = np.abs(told)
-        fast = (size > 0) & (size >= np.quantile(size, 0.9) / 2)  # what noise counts least for
-        change, told = change[fast], told[fast]
-        if len(told) < _ENOUGH:
+        size = np.abs(integral)
+        fast = (size > 0) & (size >= np.quantile(size, 0.9) / 2)  # where noise counts least
+        change, integral = change[fast], integral[fast]
+        if len(integral) < _ENOUGH:
             continue
         # angles may have been wrapped between two rows
-        off = np.median(np.abs(wrapped(change - told)))
-        if angle and off < 0.5 * min(1.0, float(np.median(np.abs(told)))):
+        off = np.median(np.abs(wrapped(change - integral)))
+        if angle and off < 0.5 * min(1.0, float(np.median(np.abs(integral)))):
             return 1.0
-        factor = float(np.median(change / told))
-        spread = float(np.median(np.abs(change / told - factor))) / (abs(factor) or np.inf)
+        factor = float(np.median(change / integral))
+        spread = float(np.median(np.abs(change / integral - factor))) / (abs(factor) or np.inf)
         if factor > 0 and spread < least:
             best, least = factor, spread
     return best
 
 
 def _sentence(body: str, d: int, factor: float) -> str:
-    """What a factor between a position's changes and its velocity says, if it is near a unit's."""
+    """Return a sentence about a factor between a position and its rate that is near a unit's."""
     place, rate = STATE[d], STATE[d + 3]
     units, rates = (_ANGLES, _RATES) if d == THETA else (_LENGTHS, _SPEEDS)
     faster = f"{place} of {body} changes {factor:.3g} times as fast as {rate} says"

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.history import History, hashed
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA
-
-Floats = npt.NDArray[np.float64]
+from pbrl_ppl.state import THETA, Floats
 
 #: Rows at rest, at least, and rows of motion beside them that are looked at, at least and at most.
 LEAST, BESIDE, _MOST = 3, 6, 200
@@ -45,7 +43,10 @@ class Column:
 
     @classmethod
     def of(cls, series: list[Floats]) -> Column | None:
-        """From fourth and second differences; None where nothing moves or rows are too few."""
+        """Return the column of series; None where nothing moves or rows are too few.
+
+        Noise comes from fourth differences, changes of velocity from second ones.
+        """
         longer = [np.diff(own, 4) for own in series if len(own) > 4]
         if not longer or not any(np.ptp(own) > 0 for own in series):
             return None
@@ -61,7 +62,7 @@ class Column:
         return cls(series, noise, float(np.sqrt(max(change, 0.0))))
 
     def held(self, own: Floats, push: Floats) -> int:
-        """Rows at the beginning at rest, then moving off with no command."""
+        """Return the rows at rest at the beginning, before it moves off without a command."""
         still = self._still(own)
         if not LEAST <= still < len(own) - BESIDE:
             return 0
@@ -77,7 +78,7 @@ class Column:
         return 0
 
     def stopped(self, own: Floats, push: Floats) -> int:
-        """Rows at the end after an abrupt change of velocity while no command changes."""
+        """Return the rows at the end after an abrupt change of velocity with constant commands."""
         back = own[::-1]
         still = self._still(back)
         n = len(own)
@@ -86,22 +87,23 @@ class Column:
             skip = max(0, still - _MOST)
             tries.append((still - skip, skip, True))
         best, rows = None, 0
-        for longest, skip, rest, window in (
-            (*each, w) for each in tries for w in _windows(back[each[1] :], each[0])
-        ):
-            if np.ptp(push[n - skip - len(window) : -1], axis=0).any():
-                continue
+        for longest, skip, rest in tries:
             places = np.linspace(1.5, longest, min(2 * longest - 2, _PLACES))
-            bend = self._bend(window, places, 2, rest=rest, abrupt=True)
-            if bend is None or bend.certainty < _ABRUPT or abs(bend.jump) < _LARGE * self.change:
-                continue
-            if best is None or bend.certainty > best.certainty:
-                # rows after the moment of the stop: in reversed time those before it
-                best, rows = bend, skip + int(np.floor(bend.latest)) + 1
+            for window in _windows(back[skip:], longest):
+                if np.ptp(push[n - skip - len(window) : -1], axis=0).any():
+                    continue
+                bend = self._bend(window, places, 2, rest=rest, abrupt=True)
+                if bend is None or abs(bend.jump) < _LARGE * self.change:
+                    continue
+                if bend.certainty < _ABRUPT:
+                    continue
+                if best is None or bend.certainty > best.certainty:
+                    # rows after the moment of the stop: in reversed time those before it
+                    best, rows = bend, skip + int(np.floor(bend.latest)) + 1
         return rows
 
     def _still(self, own: Floats) -> int:
-        """Rows at the beginning that stay within the noise of where they begin."""
+        """Return the number of rows at the beginning that stay within the noise of their mean."""
         mean = np.cumsum(own) / np.arange(1, len(own) + 1)
         off = np.abs(own - mean) > _STILL * self.noise
         return int(np.argmax(off)) if off.any() else len(own)
@@ -109,7 +111,7 @@ class Column:
     def _bend(
         self, window: Floats, places: Floats, degree: int, *, rest: bool, abrupt: bool
     ) -> Bend | None:
-        """Return the best place of a bend, if nothing smoother does as well and fits elsewhere.
+        """Return the best bend, if no smoother motion fits as well and it is unlike other rows.
 
         Smoother is a cubic; than an abrupt change of velocity also one of the acceleration, as
         where dry friction ends a motion.
@@ -171,12 +173,10 @@ def _fitted(window: Floats, parts: list[Floats]) -> tuple[float, float, float]:
 
 
 def _windows(own: Floats, still: int) -> list[Floats]:
-    """Beginnings of a series: the rows at rest, and more and more beside them."""
+    """Return beginnings of a series: the rows at rest, and more and more beside them."""
     beside = (int(np.clip(times * still, BESIDE, _MOST)) for times in _LENGTHS)
     return [own[: still + each] for each in beside if still + each <= len(own)]
 
-
-Floats = npt.NDArray[np.float64]
 
 HELD, STOPPED = "held", "stopped"
 #: Rows on either side that a velocity estimated for ``start`` looks at.
@@ -220,7 +220,7 @@ class End:
     what: str
 
     def __str__(self) -> str:
-        """Say which rows, and why."""
+        """Return a sentence: which rows, and why."""
         where = f"{'first' if self.first else 'last'} {self.rows} rows of trajectory"
         said = f"is held in the {where}" if self.first else f"stops abruptly before the {where}"
         return f"{self.body} {said} {self.trajectory} (t = {self.begin:.4g} to {self.end:.4g} s)"
@@ -260,33 +260,28 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     follows = dataset["kinematic"].to_numpy()
     labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
     found: dict[tuple[int, bool], End] = {}
-    for body in np.flatnonzero(~follows):
-        for d in range(3):
-            series = [_filled(observed[t, :n, body, d], angle=d == THETA)
-                      for t, n in enumerate(n_rows)]  # fmt: skip
-            column = Column.of([each for each in series if each is not None])
-            if column is None:
+    for body, d in product(np.flatnonzero(~follows), range(3)):
+        series = [_filled(observed[t, :n, body, d], d == THETA) for t, n in enumerate(n_rows)]
+        column = Column.of([each for each in series if each is not None])
+        for t, own in enumerate(series):
+            if own is None or column is None:
                 continue
-            for t, own in enumerate(series):
-                if own is None:
+            n = len(own)
+            push = action[t, :n][:, ~follows].reshape(n, -1)
+            others = np.delete(observed[t, :n], body, axis=1)[..., :3]
+            for first in (True, False):
+                rows = column.held(own, push) if first else column.stopped(own, push)
+                if rows <= (found[t, first].rows if (t, first) in found else 0):
                     continue
-                n = len(own)
-                push = action[t, :n][:, ~follows].reshape(n, -1)
-                for first in (True, False):
-                    rows = column.held(own, push) if first else column.stopped(own, push)
-                    others = np.delete(observed[t, :n], body, axis=1)[..., :3]
-                    if rows and (
-                        _moves(others[: 2 * rows + BESIDE])
-                        if first
-                        else _near(scene, int(body), observed[t, :n], n - rows, dt)
-                    ):
-                        rows = 0
-                    if rows > (found[t, first].rows if (t, first) in found else 0):
-                        times = clock[t, :rows] if first else clock[t, n - rows : n]
-                        found[t, first] = End(
-                            labels[t], first, rows, float(times[0]), float(times[-1]),
-                            history.bodies[body], HELD if first else STOPPED,
-                        )  # fmt: skip
+                if first:
+                    explained = _moves(others[: 2 * rows + BESIDE])
+                else:
+                    explained = _near(scene, int(body), observed[t, :n], n - rows, dt)
+                if not explained:
+                    times = clock[t, :rows] if first else clock[t, n - rows : n]
+                    begin, end = float(times[0]), float(times[-1])
+                    what, name = HELD if first else STOPPED, history.bodies[body]
+                    found[t, first] = End(labels[t], first, rows, begin, end, name, what)
     return [found[key] for key in sorted(found, key=lambda key: (key[0], not key[1]))]
 
 
@@ -359,8 +354,8 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     return History(hashed(result))
 
 
-def _filled(values: Floats, *, angle: bool) -> Floats | None:
-    """Values with gaps interpolated, an angle without jumps; None with gaps at an end, or many."""
+def _filled(values: Floats, angle: bool) -> Floats | None:
+    """Return values with gaps interpolated, an angle without jumps; None with too many gaps."""
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < max(2 * BESIDE, 0.8 * len(values)):
         return None
@@ -371,36 +366,33 @@ def _filled(values: Floats, *, angle: bool) -> Floats | None:
 
 
 def _moves(states: Floats) -> bool:
-    """Whether any body of shape (time, body, 3) moves: it may be what sets others moving."""
+    """Return whether any body of shape (time, body, 3) moves, and may set others moving."""
     with np.errstate(invalid="ignore"):
         spread = np.fmax.reduce(states, axis=0) - np.fmin.reduce(states, axis=0)
     return bool((np.nan_to_num(spread) > 0).any())
 
 
 def _near(scene: Scene, body: int, states: Floats, row: int, dt: float) -> bool:
-    """Whether something is near enough at a row to be met: a wall, or another body."""
-    bodies = scene.moving
-    own = states[max(row - 2, 0) : row + 2, body, :2]
+    """Return whether a wall, another body or a joint may have stopped a body at a row."""
+    moving = scene.moving
+    places = states[max(row - 2, 0) : row + 2, :, :2]
+    own = places[:, body]
     if not np.isfinite(own).all():
-        return False  # a hinged body, of which the angle was measured
+        return False  # a hinged body with a measured angle alone
     speed = np.abs(np.diff(own, axis=0)).max() if len(own) > 1 else 0.0
-    reach = (1 + _REACH) * bodies[body].shape.bounding_radius + 2 * float(speed)
+    reach = (1 + _REACH) * moving[body].shape.bounding_radius + 2 * float(speed)
     for wall in scene.walls:
         start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
         along = np.clip((own - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
         if (np.linalg.norm(own - start - along[:, None] * way, axis=1) < reach).any():
             return True
-    for other, shape in enumerate(bodies):
-        if other != body:
-            place = states[max(row - 2, 0) : row + 2, other, :2]
-            far = np.linalg.norm(own - place, axis=1)
-            if not (far > reach + (1 + _REACH) * shape.shape.bounding_radius).all():
-                return True
-    for static in (each for each in scene.bodies if each.static and each.pose is not None):
-        far = np.linalg.norm(own - np.array(static.pose or ())[:2], axis=1)
-        if (far < reach + (1 + _REACH) * static.shape.bounding_radius).any():
+    others = [(each, places[:, i]) for i, each in enumerate(moving) if i != body]
+    others += [(each, np.array(each.pose)[:2]) for each in scene.bodies if each.static]
+    for other, place in others:
+        far = np.linalg.norm(own - place, axis=1)
+        if not (far > reach + (1 + _REACH) * other.shape.bounding_radius).all():
             return True
     return any(
-        joint.kind == "distance" and bodies[body].name in (joint.bodies or ())
+        joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())
         for joint in scene.joints
     )
