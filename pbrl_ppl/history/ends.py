@@ -256,7 +256,6 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     dataset = history.dataset
     observed, clock = dataset["observed"].to_numpy(), dataset["clock"].to_numpy()
     action = np.nan_to_num(dataset["action"].to_numpy())
-    dt = float(dataset.attrs["time_step"])
     follows = dataset["kinematic"].to_numpy()
     labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
     found: dict[tuple[int, bool], End] = {}
@@ -276,7 +275,7 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
                 if first:
                     explained = _moves(others[: 2 * rows + BESIDE])
                 else:
-                    explained = _near(scene, int(body), observed[t, :n], n - rows, dt)
+                    explained = _near(scene, int(body), observed[t, :n], n - rows)
                 if not explained:
                     times = clock[t, :rows] if first else clock[t, n - rows : n]
                     begin, end = float(times[0]), float(times[-1])
@@ -372,7 +371,7 @@ def _moves(states: Floats) -> bool:
     return bool((np.nan_to_num(spread) > 0).any())
 
 
-def _near(scene: Scene, body: int, states: Floats, row: int, dt: float) -> bool:
+def _near(scene: Scene, body: int, states: Floats, row: int) -> bool:
     """Return whether a wall, another body or a joint may have stopped a body at a row."""
     moving = scene.moving
     places = states[max(row - 2, 0) : row + 2, :, :2]
