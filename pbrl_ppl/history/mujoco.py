@@ -155,8 +155,8 @@ def _batched(values: npt.ArrayLike, width: int, name: str, symbol: str) -> Float
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.shape[-1] != width:
         raise HistoryError(
-            f"{name} has shape {np.shape(values)}, expected (trajectory, row, {width}): {symbol} of the"
-            " model"
+            f"{name} has shape {np.shape(values)}, expected (trajectory, row, {width}): {symbol} of"
+            " the model"
         )
     return array
 
