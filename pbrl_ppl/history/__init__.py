@@ -1,13 +1,12 @@
 """Measured files to a validated `xarray.Dataset`; trajectories and segments."""
 
 from pbrl_ppl.history.bad_frames import (
-    BadFrame,
     bad_frames,
     without_bad_frames,
     without_measurements,
 )
 from pbrl_ppl.history.checks import check_start, longest_gap, unit_mismatches, unseen
-from pbrl_ppl.history.conversion import Reading, as_history
+from pbrl_ppl.history.conversion import as_history
 from pbrl_ppl.history.derived import (
     UnusedVelocity,
     measured_alone,
@@ -21,10 +20,8 @@ from pbrl_ppl.history.kinematics import estimate_rates, fill_hinges, hung_bodies
 from pbrl_ppl.history.mujoco import from_mujoco
 
 __all__ = [
-    "BadFrame",
     "End",
     "History",
-    "Reading",
     "Segments",
     "UnusedVelocity",
     "as_history",

@@ -27,7 +27,7 @@ def longest_gap(history: History) -> int:
     A recording is sparse if more than half of the steps from one such row to the next skip rows: a
     block that is seen before and after a push, say.
     """
-    complete = ~unseen(history).any(axis=-1)
+    complete = np.asarray(~unseen(history).any(axis=-1))
     rows = history.dataset["n_rows"].to_numpy()
     gaps = np.concatenate(
         [np.diff(np.flatnonzero(each[:n])) for each, n in zip(complete, rows, strict=True)]

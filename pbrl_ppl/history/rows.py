@@ -81,7 +81,7 @@ def read_rows(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
             "(step is optional)"
         )
     blank = (frame.isna() | (frame.astype(object) == "")).to_numpy(dtype=bool).all(axis=1)
-    line, frame = np.flatnonzero(~blank) + 2, frame[~blank].reset_index(drop=True)
+    line, frame = np.flatnonzero(~blank) + 2, frame.loc[~blank].reset_index(drop=True)
     if not len(frame):
         raise HistoryError(f"{source}: it has no rows; expected one for each body at each step")
 
@@ -232,53 +232,33 @@ def _steps(rows: Rows, order: Ints, scene: Scene) -> tuple[Bools, Ints]:
     group = np.cumsum(first) - 1
     again = pd.Series(group * len(scene.moving) + rows.body[order]).duplicated().to_numpy()
     # In the order of the cures: rows out of order or twice look like gaps further on.
-    rules = (
-        (
-            inside & (change < np.where(first, 0.0, -tolerance)),
-            "time goes back by {back:.6g} s in {where}; sort the rows or drop the duplicate",
-        ),
-        (
-            again,
-            'a second row of body "{body}" at {moment} in {where}; expected one; drop the'
-            " duplicate",
-        ),
-        (inside & (jump < 0), "step goes back from {before} to {step} in {where}; sort the rows"),
-        (
-            inside & (jump > 1),
-            "step skips from {before} to {step} in {where}; expected {next}; record every step, or"
-            " give the rows after the gap a trajectory of their own",
-        ),
-        (
-            inside & ~first & (change > tolerance),
-            "step {step} has two times, {change:.6g} s apart, in {where}; expected one; give every"
-            " body the same time at a step",
-        ),
-        (
-            inside & first & (np.abs(change - dt) > tolerance),
-            "{change:.6g} s since the step before in {where}; expected {dt:.6g} s, the scene's"
-            " time_step, within 1 %; correct time_step, or have the history resampled"
-            " (resample=True, --time-step)",
-        ),
-    )
-    for broken, message in rules:
-        if broken.any():
-            places = np.flatnonzero(broken)
-            place = int(places[np.argmin(order[places])])
-            row = int(order[place])
-            step = 0 if rows.step is None else int(rows.step[row])
-            before = step - int(jump[place])
-            words = {
-                "where": rows.trajectory_of(row),
-                "body": scene.moving[rows.body[row]].name,
-                "moment": f"time {time[place]:.6g} s" if rows.step is None else f"step {step}",
-                "back": -change[place],
-            }
-            raise rows.error(
-                row,
-                message.format(
-                    **words, change=change[place], step=step, before=before, next=before + 1, dt=dt
-                ),
-            )
+    rules = {
+        "time goes back by {back:.6g} s in {where}; sort the rows or drop the duplicate": inside
+        & (change < np.where(first, 0.0, -tolerance)),
+        'a second row of body "{body}" at {moment} in {where}; expected one; drop the'
+        " duplicate": again,
+        "step goes back from {before} to {step} in {where}; sort the rows": inside & (jump < 0),
+        "step skips from {before} to {step} in {where}; expected {next}; record every step, or give"
+        " the rows after the gap a trajectory of their own": inside & (jump > 1),
+        "step {step} has two times, {change:.6g} s apart, in {where}; expected one; give every body"
+        " the same time at a step": inside & ~first & (change > tolerance),
+        "{change:.6g} s since the step before in {where}; expected {dt:.6g} s, the scene's"
+        " time_step, within 1 %; correct time_step, or have the history resampled (resample=True,"
+        " --time-step)": inside & first & (np.abs(change - dt) > tolerance),
+    }
+    for message, broken in rules.items():
+        if not broken.any():
+            continue
+        places = np.flatnonzero(broken)
+        place = int(places[np.argmin(order[places])])
+        row = int(order[place])
+        step = 0 if rows.step is None else int(rows.step[row])
+        before = step - int(jump[place])
+        words = {"where": rows.trajectory_of(row), "body": scene.moving[rows.body[row]].name}
+        words["moment"] = f"time {time[place]:.6g} s" if rows.step is None else f"step {step}"
+        numbers = {"change": change[place], "back": -change[place], "dt": dt}
+        steps = {"step": step, "before": before, "next": before + 1}
+        raise rows.error(row, message.format(**words, **numbers, **steps))
     position = np.empty(len(order), dtype=np.int64)
     position[order] = group - np.maximum.accumulate(np.where(inside, 0, group))
     return first, position

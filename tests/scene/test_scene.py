@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from pbrl_ppl.scene.joints import JOINT_KINDS
 from tests.helpers.places import RECORDED
 
 CART = """
@@ -242,7 +243,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     ]
     bodies.append(Body("w" + max(movers), draw(shapes), static=True, pose=(*draw(pairs), 1)))
     walls = [Wall(a, b) for a, b in draw(st.lists(st.tuples(pairs, pairs))) if a != b]
-    kinds = st.sampled_from(["hinge", "distance"])
+    kinds = st.sampled_from(sorted(JOINT_KINDS))
     weights = st.dictionaries(st.sampled_from(["world", *movers]), size, min_size=1)
     indices = st.fixed_dictionaries({}, optional={"i_a": weights, "i_b": weights})
     two, maybe = st.just(("world", movers[0])), st.none() | pairs
