@@ -82,7 +82,7 @@ def bad_frames(history: History) -> Bools:
     """Return which measurements are single bad frames.
 
     A row, or two neighbouring rows, are bad if they are far off the curve through the rows before,
-    far off the one through the rows after, and far off the one through both, which must fit its own
+    far off the one through the rows after, and far off the one through both, which must fit these
     rows. After an impact a row is on one of the first two curves, so it is never called bad; nor is
     it where the body's other positions (or velocities) are not smooth, as in a contact, or where
     positions confirm a velocity. The scale is the median absolute deviation of the whole column, in

@@ -61,7 +61,7 @@ class UnusedVelocity:
 
     @property
     def sentence(self) -> str:
-        """The column, how it was computed or by how much it lags, and that it is not used."""
+        """Sentence: the column, how it was computed or by how much it lags."""
         name, late = f"{self.state} of {self.body}", f"{1e3 * abs(self.lag):.3g} ms"
         if self.computed_by is None:
             verb = "lags" if self.lag > 0 else "leads"

@@ -155,7 +155,7 @@ def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
 def computed_by(runs: Runs, dt: float) -> Match | None:
     """Return the filter that computed velocities from positions, or None.
 
-    A velocity with a noise of its own differs from a filter of noisy positions with weights ``w``
+    A velocity with independent noise differs from a filter of noisy positions with weights ``w``
     by a variance of at least ``|w|^2 s^2``, ``s`` being the positions' noise. A computed velocity
     does not. The ratio of what a filter leaves to that bound is compared with the lower tail of the
     F distribution (1e-5 for each filter), degrees of freedom corrected for serial correlation.
@@ -209,46 +209,48 @@ def _noise_bounds(runs: Runs) -> tuple[float, float]:
 
 
 def _tested(
-    own: Filter, runs: Runs, dt: float, noise: float, shown: float, total: float
+    candidate: Filter, runs: Runs, dt: float, noise: float, shown: float, total: float
 ) -> Match | None:
     """Return the match of a filter; None if its misfit is above the bound."""
-    before = -min(own.places + tuple(min(group) for group in own.rates))
-    after = max(own.places + tuple(max(group) for group in own.rates))
+    before = -min(candidate.places + tuple(min(group) for group in candidate.rates))
+    after = max(candidate.places + tuple(max(group) for group in candidate.rates))
     places, rates, middle = [], [], []
     for position, rate in runs:
         k = np.arange(max(before, 0), len(position) - max(after, 0))
         if len(k):
-            places.append(position[k[:, None] + own.places] - position[k, None])
-            groups = [rate[k[:, None] + group].sum(axis=1) for group in own.rates]
+            places.append(position[k[:, None] + candidate.places] - position[k, None])
+            groups = [rate[k[:, None] + group].sum(axis=1) for group in candidate.rates]
             rates.append(np.array(groups).T.reshape(len(k), len(groups)))
             middle.append(rate[k])
     if not middle:
         return None
     x, v, y = np.concatenate(places), np.concatenate(rates), np.concatenate(middle)
-    if own.weights:
-        a, b, errors = np.zeros(0), np.array(own.weights) / dt, np.zeros((0, len(y)))
+    if candidate.weights:
+        a, b, errors = np.zeros(0), np.array(candidate.weights) / dt, np.zeros((0, len(y)))
     else:
-        if len(y) < own.rows * (x.shape[1] - 1 + v.shape[1]):
+        if len(y) < candidate.rows * (x.shape[1] - 1 + v.shape[1]):
             return None
-        middle_one = own.places.index(0)
+        middle_one = candidate.places.index(0)
         inverse = np.linalg.pinv(np.hstack([v, np.delete(x, middle_one, axis=1) / dt]))
         errors = inverse[v.shape[1] :] / dt
         errors = np.insert(errors, middle_one, -errors.sum(axis=0), axis=0)
         a, b = inverse[: v.shape[1]] @ y, errors @ y
-        ends = (sum((-1.0) ** row for row in group) for group in own.rates)
+        ends = (sum((-1.0) ** row for row in group) for group in candidate.rates)
         if 1 - sum(weight * end for weight, end in zip(a, ends, strict=True)) < _POLE:
             return None
-    dof = len(y) - (len(own.places) - 1 + len(a) if len(errors) else 0)
-    left = float(((y - v @ a - x @ b) ** 2).sum()) / dof
-    square = float(b @ b) - left * float((errors**2).sum())  # without the weights' own errors
+    dof = len(y) - (len(candidate.places) - 1 + len(a) if len(errors) else 0)
+    variance = float(((y - v @ a - x @ b) ** 2).sum()) / dof
+    square = float(b @ b) - variance * float((errors**2).sum())  # without the errors of the weights
     if not square > 0:
         return None
     share = min(_SHARE, float(f_distribution.ppf(_ALARM, dof / _correlation(b), max(shown, 1.0))))
-    exact = _EXACT if own.weights else _EXACT_FITTED if own.rows == _ROWS_LONGEST else 0.0
+    exact = (
+        _EXACT if candidate.weights else _EXACT_FITTED if candidate.rows == _ROWS_LONGEST else 0.0
+    )
     bound = max(share * square * noise, exact * total)
-    if not left < bound:
+    if not variance < bound:
         return None
-    return Match(own.name, _lag(own, a, b) * dt, left / square)
+    return Match(candidate.name, _lag(candidate, a, b) * dt, variance / square)
 
 
 def _correlation(weights: Floats | list[int]) -> float:
@@ -257,10 +259,10 @@ def _correlation(weights: Floats | list[int]) -> float:
     return float(product @ product / product.max() ** 2)
 
 
-def _lag(own: Filter, a: Floats, b: Floats) -> float:
+def _lag(candidate: Filter, a: Floats, b: Floats) -> float:
     """Return the group delay of a differentiator at low frequency, in rows."""
-    row = np.array(own.places, dtype=float)
+    row = np.array(candidate.places, dtype=float)
     lag = -float(b @ row**2) / (2 * float(b @ row))
-    for weight, group in zip(a, own.rates, strict=True):
-        lag -= float(weight) * sum(group) / (1 - sum(a * [len(each) for each in own.rates]))
+    for weight, group in zip(a, candidate.rates, strict=True):
+        lag -= float(weight) * sum(group) / (1 - sum(a * [len(each) for each in candidate.rates]))
     return round(float(lag), 6) + 0.0

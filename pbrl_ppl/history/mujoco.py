@@ -50,7 +50,7 @@ def from_mujoco(
     """Return a history of MuJoCo rollouts of bodies that move in a plane.
 
     Bodies go by their names in the model. A body has slide joints along the plane's axes, a hinge
-    about its normal, or a free joint; of what has no joint of its own nothing is measured, so a
+    about its normal, or a free joint; a coordinate without a joint is not measured, so a
     pendulum's hinge gives its angle and rate. A scene's body has its origin where MuJoCo's body
     frame is: put that at the shape's centroid, unless a hinge alone holds it.
 

@@ -204,6 +204,8 @@ def hyper_parameters(
 
     # which parameters an effect has is known where the catalogue is: `prior.build_layout`
     given = {str(name) for name in _items(value, f"prior of {where}")} - set(PARAMETER_NAMES)
-    own = sorted(name for name in given if name.startswith(tuple(f"{e}_" for e in effects)))
+    declared = sorted(name for name in given if name.startswith(tuple(f"{e}_" for e in effects)))
     hint = " (an effect's parameter needs the effect among the body's effects)"
-    return table(value, f"prior of {where}", (*PARAMETER_NAMES, *own), check, "parameter", hint)
+    return table(
+        value, f"prior of {where}", (*PARAMETER_NAMES, *declared), check, "parameter", hint
+    )

@@ -16,7 +16,7 @@ from pbrl_ppl.state import Floats
 
 @dataclass(frozen=True)
 class Shape:
-    """Outline of a body in its own frame, whose origin is the centroid.
+    """Outline of a body in its frame, whose origin is the centroid.
 
     Attributes
     ----------
