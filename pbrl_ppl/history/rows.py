@@ -81,7 +81,8 @@ def read_rows(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
             "(step is optional)"
         )
     blank = (frame.isna() | (frame.astype(object) == "")).to_numpy(dtype=bool).all(axis=1)
-    line, frame = np.flatnonzero(~blank) + 2, frame.loc[~blank].reset_index(drop=True)
+    filled = np.flatnonzero(~blank)
+    line, frame = filled + 2, frame.iloc[filled].reset_index(drop=True)
     if not len(frame):
         raise HistoryError(f"{source}: it has no rows; expected one for each body at each step")
 
