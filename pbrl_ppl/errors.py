@@ -1,4 +1,4 @@
-"""The package's exceptions: each message says what is wrong, where, and the cure."""
+"""Exceptions and warnings: each message says what is wrong, where, and the cure."""
 
 
 class PbrlError(Exception):
@@ -26,7 +26,7 @@ class SimulationError(PbrlError, RuntimeError):
 
 
 class PosteriorError(PbrlError, ValueError):
-    """A file that is no posterior of this package, or one that lacks a part."""
+    """A file that is not a posterior of this package, or that lacks a part."""
 
 
 class OutputError(PbrlError, OSError):
@@ -38,27 +38,27 @@ class ConvergenceWarning(UserWarning):
 
 
 class BoundWarning(UserWarning):
-    """A fit that presses a parameter against the end of its support."""
+    """A fit with a parameter at a bound of its support."""
 
 
 class LinearisationWarning(UserWarning):
-    """A fit of whole trajectories whose linearised likelihood is not that of the engine."""
+    """A fit of whole trajectories whose linearised likelihood differs from the engine's."""
 
 
 class UninformedWarning(UserWarning):
-    """A fit in which the data say nothing about a parameter: its posterior is its prior."""
+    """A fit whose data do not inform a parameter: its posterior is its prior."""
 
 
 class PriorWarning(UserWarning):
-    """A recording that the declared prior could not have made: units, or hyper-parameters."""
+    """A recording that is improbable under the prior: check units and hyper-parameters."""
 
 
 class RefitWarning(UserWarning):
-    """An update for which the earlier draws were no use, so that all data were fitted anew."""
+    """An update that could not use the earlier draws, so that all data were fitted again."""
 
 
 class MeetingWarning(UserWarning):
-    """A fit in which bodies meet that were thought apart: it was made again with them together."""
+    """A fit that was repeated because bodies that were simulated apart meet."""
 
 
 class ResamplingWarning(UserWarning):

@@ -1,13 +1,18 @@
-"""Names, units and order of a body's state and of the wrench on it; differences of angles."""
+"""Names, units and order of a body's state and of the wrench on it; angles; array types."""
 
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 
 #: A body's state: pose and velocity of its origin in the world frame.
 STATE = ("x", "y", "theta", "vx", "vy", "omega")
 STATE_UNITS = ("m", "m", "rad", "m/s", "m/s", "rad/s")
-#: The part of the state that is a place.
+#: The part of the state that is a pose.
 POSE = STATE[:3]
 #: Where the state holds the angle, whose differences are wrapped.
 THETA = STATE.index("theta")
@@ -22,7 +27,7 @@ INPUT = (*WRENCH, *(f"previous_{name}" for name in WRENCH), "trajectory", "begin
 
 
 def wrapped(angle: Any) -> Any:
-    """An angle, or an array of any shape, in (-pi, pi] (rad).
+    """Return an angle, or an array of any shape, in (-pi, pi] (rad).
 
     Examples
     --------

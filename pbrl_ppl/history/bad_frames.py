@@ -1,21 +1,15 @@
 """Single bad frames of a recording: rows off the smooth curve through their neighbours."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from scipy.ndimage import maximum_filter1d
 
 from pbrl_ppl.history.history import History
-from pbrl_ppl.state import STATE, STATE_UNITS, THETA, wrapped
-
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
+from pbrl_ppl.state import STATE, STATE_UNITS, THETA, Bools, Floats, wrapped
 
 #: Rows on either side that a curve is fitted to: each width is tried.
 _WIDTHS = (3, 4, 5)
@@ -77,7 +71,7 @@ class BadFrame:
     rows: int
 
     def __str__(self) -> str:
-        """Say which measurement is left out, and why."""
+        """Return a sentence: which measurement is left out, and why."""
         return (
             f"{self.state} of {self.body} at t = {self.time:.4g} s of trajectory {self.trajectory}"
             f" is off by {abs(self.off):.2g} {self.unit} and left out (1 of {self.rows} rows)"
@@ -88,7 +82,7 @@ def bad_frames(history: History) -> Bools:
     """Return which measurements are single bad frames.
 
     A row, or two neighbouring rows, are bad if they are far off the curve through the rows before,
-    far off the one through the rows after, and far off the one through both, which must fit its own
+    far off the one through the rows after, and far off the one through both, which must fit these
     rows. After an impact a row is on one of the first two curves, so it is never called bad; nor is
     it where the body's other positions (or velocities) are not smooth, as in a contact, or where
     positions confirm a velocity. The scale is the median absolute deviation of the whole column, in
@@ -177,62 +171,46 @@ def without_measurements(history: History, off: Floats) -> tuple[History, list[B
         return history, []
     rows = int(dataset["n_rows"].sum())
     labels, clock = dataset["trajectory"].to_numpy().tolist(), dataset["clock"].to_numpy()
-    found = [
-        BadFrame(
-            labels[t], int(i), float(clock[t, i]), history.bodies[body], STATE[d],
-            float(off[t, i, body, d]), STATE_UNITS[d], rows,
-        )
-        for t, i, body, d in np.argwhere(bad)
-    ]  # fmt: skip
-    observed = np.where(bad, np.nan, dataset["observed"].to_numpy())
-    start = _start(dataset["start"].to_numpy(), observed, bad)
-    return History(
-        dataset.assign(
-            observed=dataset["observed"].copy(data=observed),
-            start=dataset["start"].copy(data=start),
-        )
-    ), found
-
-
-def _start(start: Floats, observed: Floats, bad: Bools) -> Floats:
-    """States to start from, without what was computed from bad frames."""
-    computed: Bools = ~np.isfinite(observed)
+    found = []
+    for t, i, body, d in np.argwhere(bad):
+        where = (labels[t], int(i), float(clock[t, i]), history.bodies[body], STATE[d])
+        found.append(BadFrame(*where, float(off[t, i, body, d]), STATE_UNITS[d], rows))
+    observed = dataset["observed"].where(~bad)
+    # start states lose what was computed from bad frames
+    computed: Bools = ~np.isfinite(observed.to_numpy())
     lost: Bools = computed & bad.any(axis=(2, 3), keepdims=True)
     near = maximum_filter1d(bad.any(axis=-1).astype(np.uint8), 2 * _REACH + 1, axis=1) > 0
     never = computed.all(axis=(0, 1)) & (np.arange(len(STATE)) >= len(STATE) // 2)
     lost |= near[..., None] & never
-    return np.where(lost, np.nan, start)
+    return History(dataset.assign(observed=observed, start=dataset["start"].where(~lost))), found
 
 
 def _deviations(history: History) -> Floats:
-    """How far bad frames are off; NaN elsewhere, shape (trajectory, time, body, state)."""
+    """Return how far bad frames are off; NaN elsewhere, shape (trajectory, time, body, state)."""
     observed = history.dataset["observed"].to_numpy()
     dt = float(history.dataset.attrs["time_step"])
     result = np.full(observed.shape, np.nan)
-    for body in np.flatnonzero(~history.dataset["kinematic"].to_numpy()):
-        for kind in (slice(0, 3), slice(3, 6)):
-            for gap, width in product(range(1, _LONGEST + 1), _WIDTHS):
-                kept = np.where(np.isfinite(result[:, :, body]), np.nan, observed[:, :, body])
-                columns = [
-                    _off(kept[..., d], width, gap, angle=d == THETA)
-                    for d in range(len(STATE))[kind]
-                ]
-                first, rough = (np.stack(each, axis=2) for each in zip(*columns, strict=True))
-                # a contact changes several coordinates at once
-                first[rough.sum(axis=2, keepdims=True) > rough] = np.nan
-                off = first[..., 0]
-                for k in range(1, gap):
-                    late = np.roll(first[..., k], k, axis=1)
-                    off = np.where(np.isfinite(off), off, late)
-                if kind.start:
-                    off[_happened(kept, off, dt)] = np.nan
-                own = result[:, :, body, kind]
-                own[...] = np.where(np.isfinite(own), own, off)
+    bodies = np.flatnonzero(~history.dataset["kinematic"].to_numpy())
+    for body, velocities in product(bodies, (False, True)):
+        columns = range(3, 6) if velocities else range(3)
+        found = result[:, :, body, columns.start : columns.stop]
+        for gap, width in product(range(1, _LONGEST + 1), _WIDTHS):
+            kept = np.where(np.isfinite(result[:, :, body]), np.nan, observed[:, :, body])
+            each = [_off(kept[..., d], width, gap, angle=d == THETA) for d in columns]
+            first, rough = (np.stack(one, axis=2) for one in zip(*each, strict=True))
+            # a contact changes several coordinates at once
+            first[rough.sum(axis=2, keepdims=True) > rough] = np.nan
+            off = first[..., 0]
+            for k in range(1, gap):
+                off = np.where(np.isfinite(off), off, np.roll(first[..., k], k, axis=1))
+            if velocities:
+                off[_happened(kept, off, dt)] = np.nan
+            found[...] = np.where(np.isfinite(found), found, off)
     return result
 
 
 def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, Bools]:
-    """How far neighbouring rows are off, and where the rows around them are not smooth.
+    """Return how far neighbouring rows are off, and where the rows around them are not smooth.
 
     Parameters
     ----------
@@ -261,17 +239,17 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
     rows = windows[trajectory, first]
     if not len(rows):
         return result, rough
-    middle, left, right = slice(width, width + gap), slice(width), slice(width, None)
+    middle = slice(width, width + gap)
     place = np.arange(span) - width - (gap - 1) / 2
     there, other = place[middle], np.delete(place, middle)
     sides = np.delete(rows, middle, axis=1)
     sides = np.unwrap(sides, axis=1) if angle else sides
     least = finest_step(column)
 
-    def off_curve(own: slice, degree: int) -> tuple[Floats, Floats, Floats]:
-        """Rows less the curve through the others; the same in standard deviations; the scale."""
-        predict = np.vander(there, degree + 1) @ np.linalg.pinv(np.vander(other[own], degree + 1))
-        off = rows[:, middle] - sides[:, own] @ predict.T
+    def off_curve(side: slice, degree: int) -> tuple[Floats, Floats, Floats]:
+        """Return the rows less a curve, that over its standard error, and that over the scale."""
+        predict = np.vander(there, degree + 1) @ np.linalg.pinv(np.vander(other[side], degree + 1))
+        off = rows[:, middle] - sides[:, side] @ predict.T
         off = wrapped(off) if angle else off
         size = np.abs(off) / np.sqrt(1.0 + (predict**2).sum(axis=1))
         scale = max(_GAUSSIAN * float(np.median(size)), least)
@@ -279,11 +257,11 @@ def _off(column: Floats, width: int, gap: int, *, angle: bool) -> tuple[Floats, 
 
     off, size, far = off_curve(slice(None), _BOTH_SIDES)
     powers = np.vander(other, _BOTH_SIDES + 1)
-    left_over = sides - sides @ (powers @ np.linalg.pinv(powers)).T
-    misfit = np.sqrt((left_over**2).sum(axis=1) / (len(other) - _BOTH_SIDES - 1))
+    remainder = sides - sides @ (powers @ np.linalg.pinv(powers)).T
+    misfit = np.sqrt((remainder**2).sum(axis=1) / (len(other) - _BOTH_SIDES - 1))
     good = ((far > _FAR) & (size > _FAR * misfit[:, None])).all(axis=1)
-    for own in (left, right):
-        off_side, _, far = off_curve(own, _ONE_SIDE)
+    for side in (slice(width), slice(width, None)):
+        off_side, _, far = off_curve(side, _ONE_SIDE)
         apart = wrapped(off_side - off) if angle else off_side - off
         agree = np.abs(apart) <= _AGREE * np.abs(off)
         good &= ((far > _FAR_OF_SIDE) & agree).all(axis=1)
@@ -315,7 +293,7 @@ def _happened(state: Floats, off: Floats, dt: float) -> Bools:
 
 
 def finest_step(column: Floats) -> float:
-    """Finest step between a column's values: what quantisation or rounding may be off by."""
+    """Return the finest step between a column's values: its quantisation or rounding."""
     values = np.unique(column[np.isfinite(column)])
     if len(values) < 2:
         return np.inf

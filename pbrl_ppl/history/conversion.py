@@ -1,14 +1,15 @@
-"""Tables of others: their column names and units, turned into a history's."""
-
-from __future__ import annotations
+"""Tables of other programs: column names, units and time steps turned into a history's."""
 
 from collections.abc import Mapping
+from typing import TypedDict, Unpack
 
 import numpy as np
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.files import COLUMNS
+from pbrl_ppl.history.resampling import resampled
+from pbrl_ppl.history.rows import with_clean_names
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE, WRENCH
 
@@ -18,28 +19,24 @@ _ANGLE = {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180, "rev": 2 * np.pi}
 _FORCE = {"N": 1.0, "mN": 1e-3, "kN": 1e3, "lbf": 4.4482216152605}
 
 
-def _rates(of: Mapping[str, float]) -> dict[str, float]:
-    return {f"{a}/{b}": size / time for a, size in of.items() for b, time in _TIME.items()}
+def _rates(units: Mapping[str, float]) -> dict[str, float]:
+    return {f"{a}/{b}": size / time for a, size in units.items() for b, time in _TIME.items()}
 
 
-_TORQUE = {
-    f"{a}{mark}{b}": force * length
-    for a, force in _FORCE.items()
-    for b, length in _LENGTH.items()
-    for mark in (" ", "", "*")
-}
 #: What each column may be measured in, in SI units.
 _UNITS: Mapping[str, Mapping[str, float]] = {
     "time": _TIME,
-    "x": _LENGTH,
-    "y": _LENGTH,
+    **dict.fromkeys(("x", "y"), _LENGTH),
     "theta": _ANGLE,
-    "vx": _rates(_LENGTH),
-    "vy": _rates(_LENGTH),
+    **dict.fromkeys(("vx", "vy"), _rates(_LENGTH)),
     "omega": _rates(_ANGLE) | {"rpm": 2 * np.pi / 60},
-    "force_x": _FORCE,
-    "force_y": _FORCE,
-    "torque": _TORQUE,
+    **dict.fromkeys(("force_x", "force_y"), _FORCE),
+    "torque": {
+        f"{a}{mark}{b}": force * length
+        for a, force in _FORCE.items()
+        for b, length in _LENGTH.items()
+        for mark in (" ", "", "*")
+    },
 }
 
 
@@ -60,22 +57,17 @@ def renamed(
         from a body's column, such as ``{"cart.x": "cart_px"}``. Columns that have a history's name
         already need not be named; without a trajectory's column, there is one trajectory.
     source : str
-        What to call the table in messages.
+        Name of the table in messages.
 
     Raises
     ------
     HistoryError
         If a column or a body is unknown, or one body of several has no columns.
     """
-    if any(name is not None for name in frame.index.names):
-        frame = frame.reset_index()
-    frame = frame.set_axis([str(name).strip() for name in frame.columns], axis=1)
-    if frame.columns.has_duplicates:
-        name = frame.columns[frame.columns.duplicated()][0]
-        raise HistoryError(f'{source}: column "{name}" is there twice; drop one')
+    frame = with_clean_names(frame, source)
     names = [body.name for body in scene.moving]
     shared: dict[str, str | float] = {name: name for name in COLUMNS if name in frame}
-    own: dict[str, dict[str, str | float]] = {}
+    by_body: dict[str, dict[str, str | float]] = {}
     for key, column in columns.items():
         body, dot, name = key.rpartition(".")
         if name not in COLUMNS or (dot and name not in (*STATE, *WRENCH)):
@@ -91,15 +83,15 @@ def renamed(
                 f'{source}: it has no column "{column}" for {key}'
                 f"{nearest(column, list(frame.columns))} It has {', '.join(frame.columns)}"
             )
-        (own.setdefault(body, {}) if dot else shared)[name] = column
+        (by_body.setdefault(body, {}) if dot else shared)[name] = column
     shared.setdefault("trajectory", 0)
-    if own:
-        if lacking := [name for name in names if name not in own]:
+    if by_body:
+        if lacking := [name for name in names if name not in by_body]:
             raise HistoryError(
-                f"columns: {lacking[0]} has none, and {next(iter(own))} has; name each body's"
+                f"columns: {lacking[0]} has none, and {next(iter(by_body))} has; name each body's"
             )
         shared.pop("body", None)
-        parts = [_picked(frame, shared | own[name]).assign(body=name) for name in names]
+        parts = [_picked(frame, shared | by_body[name]).assign(body=name) for name in names]
         # side by side in a row is one below the other in a history
         return pd.concat(parts).sort_index(kind="stable").reset_index(drop=True)
     if len(names) == 1:
@@ -108,7 +100,7 @@ def renamed(
 
 
 def _picked(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> pd.DataFrame:
-    """The columns by their new names; what is no column is the same on all rows."""
+    """Return the columns by their new names; other values are the same on all rows."""
     frame = frame.reset_index(drop=True)
     return pd.DataFrame(
         {
@@ -156,3 +148,35 @@ def in_si(frame: pd.DataFrame, units: Mapping[str, str]) -> pd.DataFrame:
         # what is no number stays, for the message that says so
         frame[name] = (values * _UNITS[name][unit]).where(values.notna(), frame[name])
     return frame
+
+
+class Reading(TypedDict, total=False):
+    """Options of :meth:`History.load` for tables of other programs.
+
+    Attributes
+    ----------
+    columns : mapping of str to str or float
+        The table's own column names, ``{"x": "pos_x"}``, or a number that holds on all rows,
+        ``{"force_x": 0.0}``; ``{"cart.x": "cart_px"}`` with several bodies in a row. Columns that
+        are neither named here nor a history's are left out.
+    units : mapping of str to str
+        What columns are measured in, if not SI units: ``{"x": "mm", "theta": "deg"}``.
+    resample : bool
+        Whether uneven samples are interpolated every ``time_step`` of the scene, with a
+        `ResamplingWarning` that says what this does to the noise.
+    """
+
+    columns: Mapping[str, str | float] | None
+    units: Mapping[str, str] | None
+    resample: bool
+
+
+def as_history(
+    frame: pd.DataFrame, scene: Scene, source: str, **reading: Unpack[Reading]
+) -> pd.DataFrame:
+    """Return a table with a history's column names, in SI units, resampled if asked."""
+    if columns := reading.get("columns"):
+        frame = renamed(frame, scene, columns, source)
+    if units := reading.get("units"):
+        frame = in_si(frame, units)
+    return resampled(frame, scene, source) if reading.get("resample") else frame

@@ -1,22 +1,16 @@
-"""Velocity columns that are no measurements of their row: computed from positions, or late."""
-
-from __future__ import annotations
+"""Velocity columns that were computed from positions, or lag them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.stats import t as t_distribution
 
-from pbrl_ppl.history.angles import unwrapped
 from pbrl_ppl.history.bad_frames import finest_step
 from pbrl_ppl.history.filters import Runs, computed_by, position_noise
 from pbrl_ppl.history.history import History
-from pbrl_ppl.state import STATE, THETA, wrapped
-
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
+from pbrl_ppl.history.kinematics import unwrapped
+from pbrl_ppl.state import STATE, THETA, Floats, wrapped
 
 #: An angle that looks noisier than this (rad) turns too far between rows to be followed.
 _WRAPPED = 0.5
@@ -24,7 +18,7 @@ _WRAPPED = 0.5
 _SHORTEST = 5
 #: Error of a velocity at the end of a quadratic of five positions, in their errors a time step.
 _AT_AN_END = 1.1
-#: A lag matters from this share of the time step on, and is told if significant at this p.
+#: A lag matters from this share of the time step on, and is reported if significant at this p.
 _MATERIAL, _ALARM = 0.05, 1e-4
 #: Steps to a lag of several rows, at most.
 _STEPS = 20
@@ -67,7 +61,7 @@ class UnusedVelocity:
 
     @property
     def sentence(self) -> str:
-        """The column, how it was computed or by how much it lags, and that it is not used."""
+        """Sentence: the column, how it was computed or by how much it lags."""
         name, late = f"{self.state} of {self.body}", f"{1e3 * abs(self.lag):.3g} ms"
         if self.computed_by is None:
             verb = "lags" if self.lag > 0 else "leads"
@@ -177,10 +171,10 @@ def velocity_lag(runs: Runs, dt: float) -> float:
 
 
 def _shifted(runs: Runs, dt: float, shift: int) -> tuple[float, bool]:
-    """Lag (rows) linearised about ``shift`` rows; whether it is materially other than that.
+    """Return the lag (rows) linearised about ``shift`` rows, and whether it differs materially.
 
-    The instrument's covariance with what is left at the least lag that matters is tested, which
-    needs no lag that is known well (Anderson and Rubin's test).
+    The instrument's covariance with the residual at the least lag that matters is tested, which
+    needs no accurate lag (Anderson and Rubin's test).
     """
     columns: list[list[Floats]] = [[], [], [], [], []]
     for position, rate in runs:
@@ -194,15 +188,17 @@ def _shifted(runs: Runs, dt: float, shift: int) -> tuple[float, bool]:
     if sum(map(len, columns[0])) < _ENOUGH:
         return np.nan, False
     y, mean, curve, x, z = (np.concatenate(each) for each in columns)
-    beside = np.linalg.svd(np.stack([np.ones(len(y)), mean, curve], axis=1), full_matrices=False)[0]
-    y, x, z = (each - beside @ (beside.T @ each) for each in (y, x, z))
+    basis = np.linalg.svd(np.stack([np.ones(len(y)), mean, curve], axis=1), full_matrices=False)[0]
+    y, x, z = (each - basis @ (basis.T @ each) for each in (y, x, z))
     slope, square, dof = float(z @ x), float(z @ z), len(y) - 4
     if not slope > 0 or not square > 0:
         return np.nan, False
     lag = float(z @ y) / slope
     rest = y - np.copysign(_MATERIAL, lag) * x
-    left = rest - float(z @ rest) / square * z
-    spread = max(float(left @ left) / dof * square, float((z * left) @ (z * left)))  # in collisions
+    residual = rest - float(z @ rest) / square * z
+    spread = max(  # the second in collisions
+        float(residual @ residual) / dof * square, float((z * residual) @ (z * residual))
+    )
     error = np.sqrt(2 * spread)
     bound = float(t_distribution.isf(_ALARM / 2, dof)) * error
     found = abs(lag) > _MATERIAL and abs(float(z @ rest)) > max(bound, _TINY * slope)
@@ -210,7 +206,7 @@ def _shifted(runs: Runs, dt: float, shift: int) -> tuple[float, bool]:
 
 
 def measurement_noise(history: History) -> Floats:
-    """Standard deviation of measuring each state, from kinematics alone, shape (body, state).
+    """Return the measurement noise of each state, from kinematics alone, shape (body, state).
 
     Zero where nothing is known. It is no more than third differences show, so that a position in
     another unit than its velocity does not look noisy; and what they show where no velocity was
@@ -239,7 +235,7 @@ def measurement_noise(history: History) -> Floats:
 
 
 def _runs(history: History, body: int, d: int) -> Runs:
-    """Positions of a dimension and their rates, in rows between gaps of either."""
+    """Return positions of a dimension and their rates, in rows between gaps of either."""
     observed = history.dataset["observed"].to_numpy()[:, :, body]
     dt = float(history.dataset.attrs["time_step"])
     runs: Runs = []

@@ -3,20 +3,180 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.bends import BESIDE, LEAST, Column
-from pbrl_ppl.history.digest import hashed
-from pbrl_ppl.history.history import History
+from pbrl_ppl.history.history import History, hashed
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import THETA
+from pbrl_ppl.state import THETA, Floats
 
-Floats = npt.NDArray[np.float64]
+#: Rows at rest, at least, and rows of motion beside them that are looked at, at least and at most.
+LEAST, BESIDE, _MOST = 3, 6, 200
+#: Rows of motion that are looked at, over those at rest: each is tried.
+_LENGTHS = (1, 2, 4)
+#: Measurement noises within which a body is at rest.
+_STILL = 4.0
+#: A bend is one if it takes this much off the sum of squares of a cubic, in variances of the noise,
+#: and this share of it.
+_CERTAIN, _SHARE = 100.0, 0.9
+#: A cubic must fit the end this many times worse than it fits the median window of all rows.
+_OUTSIDE = 2.5
+#: A change of velocity in standard errors, and over the 90th percentile of all rows' changes.
+_ABRUPT, _LARGE = 8.0, 4.0
+#: Places of a bend that are tried, at most.
+_PLACES = 60
+#: A moment of release may fit worse than the best by so much (in variances): its upper limit.
+_LIMIT = 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """Positions of a dimension in all trajectories: their noise, and their changes of velocity."""
+
+    series: list[Floats]
+    noise: float
+    change: float
+
+    @classmethod
+    def of(cls, series: list[Floats]) -> Column | None:
+        """Return the column of series; None where nothing moves or rows are too few.
+
+        Noise comes from fourth differences, changes of velocity from second ones.
+        """
+        longer = [np.diff(own, 4) for own in series if len(own) > 4]
+        if not longer or not any(np.ptp(own) > 0 for own in series):
+            return None
+        every = np.concatenate(series)
+        steps = np.diff(np.unique(every))
+        rounding = 1e-9 * float(np.abs(every).max())
+        finest = float(steps[steps > rounding].min()) if (steps > rounding).any() else 0.0
+        noise = 1.4826 * float(np.median(np.abs(np.concatenate(longer)))) / np.sqrt(70.0)
+        second = np.concatenate([np.diff(own, 2) for own in series])
+        noise = max(noise, finest / np.sqrt(12), rounding)
+        # of independent errors the second differences have six times the variance
+        change = float(np.quantile(np.abs(second), 0.9)) ** 2 - 6 * (1.8 * noise) ** 2
+        return cls(series, noise, float(np.sqrt(max(change, 0.0))))
+
+    def held(self, own: Floats, push: Floats) -> int:
+        """Return the rows at rest at the beginning, before it moves off without a command."""
+        still = self._still(own)
+        if not LEAST <= still < len(own) - BESIDE:
+            return 0
+        skip = max(0, still - _MOST)  # of a long rest its last rows are enough
+        still -= skip
+        for window in _windows(own[skip:], still):
+            if push[: skip + len(window)].any():
+                break
+            places = np.linspace(2, still, min(2 * still - 3, _PLACES))
+            bend = self._bend(window, places, 3, rest=True, abrupt=False)
+            if bend is not None and bend.place >= LEAST - 1:
+                return skip + int(np.ceil(bend.latest))
+        return 0
+
+    def stopped(self, own: Floats, push: Floats) -> int:
+        """Return the rows at the end after an abrupt change of velocity with constant commands."""
+        back = own[::-1]
+        still = self._still(back)
+        n = len(own)
+        tries = [(min(max(LEAST, n // 4), _MOST), 0, False)]
+        if LEAST <= still < n - BESIDE:
+            skip = max(0, still - _MOST)
+            tries.append((still - skip, skip, True))
+        best, rows = None, 0
+        for longest, skip, rest in tries:
+            places = np.linspace(1.5, longest, min(2 * longest - 2, _PLACES))
+            for window in _windows(back[skip:], longest):
+                if np.ptp(push[n - skip - len(window) : -1], axis=0).any():
+                    continue
+                bend = self._bend(window, places, 2, rest=rest, abrupt=True)
+                if bend is None or abs(bend.jump) < _LARGE * self.change:
+                    continue
+                if bend.certainty < _ABRUPT:
+                    continue
+                if best is None or bend.certainty > best.certainty:
+                    # rows after the moment of the stop: in reversed time those before it
+                    best, rows = bend, skip + int(np.floor(bend.latest)) + 1
+        return rows
+
+    def _still(self, own: Floats) -> int:
+        """Return the number of rows at the beginning that stay within the noise of their mean."""
+        mean = np.cumsum(own) / np.arange(1, len(own) + 1)
+        off = np.abs(own - mean) > _STILL * self.noise
+        return int(np.argmax(off)) if off.any() else len(own)
+
+    def _bend(
+        self, window: Floats, places: Floats, degree: int, *, rest: bool, abrupt: bool
+    ) -> Bend | None:
+        """Return the best bend, if no smoother motion fits as well and it is unlike other rows.
+
+        Smoother is a cubic; than an abrupt change of velocity also one of the acceleration, as
+        where dry friction ends a motion.
+        """
+        n = len(window)
+        time = np.arange(n, dtype=float)
+        cubic = np.vander(time / n, 4)
+        smooth = np.eye(n) - cubic @ np.linalg.pinv(cubic)
+        without = float(((smooth @ window) ** 2).sum())
+        for place in np.linspace(1, n - 2, min(2 * n, _PLACES)) if abrupt else ():
+            parts = [time, time**2, np.maximum(time - place, 0.0) ** 2]
+            without = min(without, _fitted(window, parts)[2])
+        bends, powers = [], range(2 if rest else 1, degree + 1)
+        for place in places:
+            after = np.maximum(time - place, 0.0)
+            more = [(after if rest else time) ** k for k in powers]
+            jump, error, left = _fitted(window, [after, *more])
+            free = max(n - len(more) - 3, 1)
+            error *= max(self.noise, float(np.sqrt(left / free)))
+            bends.append(Bend(float(place), float(place), jump, error, left))
+        best = min(bends, key=lambda bend: bend.left)
+        variance = max(self.noise**2, best.left / max(n - 5, 1))
+        if without - best.left < _CERTAIN * variance or best.left > (1 - _SHARE) * without:
+            return None
+        elsewhere = [
+            ((np.lib.stride_tricks.sliding_window_view(own, n) @ smooth) ** 2).sum(axis=1)
+            for own in self.series
+            if len(own) >= n
+        ]
+        if without < _OUTSIDE**2 * float(np.median(np.concatenate(elsewhere))):
+            return None
+        near = [bend.place for bend in bends if bend.left < best.left + _LIMIT * variance]
+        return replace(best, latest=max(near))
+
+
+@dataclass(frozen=True)
+class Bend:
+    """A bend at a row (a fraction): its latest place, its jump of velocity with standard error."""
+
+    place: float
+    latest: float
+    jump: float
+    error: float
+    left: float
+
+    @property
+    def certainty(self) -> float:
+        """Jump over its standard error."""
+        return abs(self.jump) / self.error
+
+
+def _fitted(window: Floats, parts: list[Floats]) -> tuple[float, float, float]:
+    """Return the first part's size, its error at a noise of one, and the sum of squares left."""
+    design = np.stack([*parts, np.ones(len(window))], axis=1)
+    inverse = np.linalg.pinv(design)
+    size = inverse @ window
+    left = float(((window - design @ size) ** 2).sum())
+    return float(size[0]), float(np.linalg.norm(inverse[0])), left
+
+
+def _windows(own: Floats, still: int) -> list[Floats]:
+    """Return beginnings of a series: the rows at rest, and more and more beside them."""
+    beside = (int(np.clip(times * still, BESIDE, _MOST)) for times in _LENGTHS)
+    return [own[: still + each] for each in beside if still + each <= len(own)]
+
 
 HELD, STOPPED = "held", "stopped"
 #: Rows on either side that a velocity estimated for ``start`` looks at.
@@ -60,7 +220,7 @@ class End:
     what: str
 
     def __str__(self) -> str:
-        """Say which rows, and why."""
+        """Return a sentence: which rows, and why."""
         where = f"{'first' if self.first else 'last'} {self.rows} rows of trajectory"
         said = f"is held in the {where}" if self.first else f"stops abruptly before the {where}"
         return f"{self.body} {said} {self.trajectory} (t = {self.begin:.4g} to {self.end:.4g} s)"
@@ -96,37 +256,31 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     dataset = history.dataset
     observed, clock = dataset["observed"].to_numpy(), dataset["clock"].to_numpy()
     action = np.nan_to_num(dataset["action"].to_numpy())
-    dt = float(dataset.attrs["time_step"])
     follows = dataset["kinematic"].to_numpy()
     labels, n_rows = dataset["trajectory"].to_numpy().tolist(), dataset["n_rows"].to_numpy()
     found: dict[tuple[int, bool], End] = {}
-    for body in np.flatnonzero(~follows):
-        for d in range(3):
-            series = [_filled(observed[t, :n, body, d], angle=d == THETA)
-                      for t, n in enumerate(n_rows)]  # fmt: skip
-            column = Column.of([each for each in series if each is not None])
-            if column is None:
+    for body, d in product(np.flatnonzero(~follows), range(3)):
+        series = [_filled(observed[t, :n, body, d], d == THETA) for t, n in enumerate(n_rows)]
+        column = Column.of([each for each in series if each is not None])
+        for t, own in enumerate(series):
+            if own is None or column is None:
                 continue
-            for t, own in enumerate(series):
-                if own is None:
+            n = len(own)
+            push = action[t, :n][:, ~follows].reshape(n, -1)
+            others = np.delete(observed[t, :n], body, axis=1)[..., :3]
+            for first in (True, False):
+                rows = column.held(own, push) if first else column.stopped(own, push)
+                if rows <= (found[t, first].rows if (t, first) in found else 0):
                     continue
-                n = len(own)
-                push = action[t, :n][:, ~follows].reshape(n, -1)
-                for first in (True, False):
-                    rows = column.held(own, push) if first else column.stopped(own, push)
-                    others = np.delete(observed[t, :n], body, axis=1)[..., :3]
-                    if rows and (
-                        _moves(others[: 2 * rows + BESIDE])
-                        if first
-                        else _near(scene, int(body), observed[t, :n], n - rows, dt)
-                    ):
-                        rows = 0
-                    if rows > (found[t, first].rows if (t, first) in found else 0):
-                        times = clock[t, :rows] if first else clock[t, n - rows : n]
-                        found[t, first] = End(
-                            labels[t], first, rows, float(times[0]), float(times[-1]),
-                            history.bodies[body], HELD if first else STOPPED,
-                        )  # fmt: skip
+                if first:
+                    explained = _moves(others[: 2 * rows + BESIDE])
+                else:
+                    explained = _near(scene, int(body), observed[t, :n], n - rows)
+                if not explained:
+                    times = clock[t, :rows] if first else clock[t, n - rows : n]
+                    begin, end = float(times[0]), float(times[-1])
+                    what, name = HELD if first else STOPPED, history.bodies[body]
+                    found[t, first] = End(labels[t], first, rows, begin, end, name, what)
     return [found[key] for key in sorted(found, key=lambda key: (key[0], not key[1]))]
 
 
@@ -199,8 +353,8 @@ def trimmed(history: History, ends: Iterable[End]) -> History:
     return History(hashed(result))
 
 
-def _filled(values: Floats, *, angle: bool) -> Floats | None:
-    """Values with gaps interpolated, an angle without jumps; None with gaps at an end, or many."""
+def _filled(values: Floats, angle: bool) -> Floats | None:
+    """Return values with gaps interpolated, an angle without jumps; None with too many gaps."""
     known = np.flatnonzero(np.isfinite(values))
     if len(known) < max(2 * BESIDE, 0.8 * len(values)):
         return None
@@ -211,36 +365,33 @@ def _filled(values: Floats, *, angle: bool) -> Floats | None:
 
 
 def _moves(states: Floats) -> bool:
-    """Whether any body of shape (time, body, 3) moves: it may be what sets others moving."""
+    """Return whether any body of shape (time, body, 3) moves, and may set others moving."""
     with np.errstate(invalid="ignore"):
         spread = np.fmax.reduce(states, axis=0) - np.fmin.reduce(states, axis=0)
     return bool((np.nan_to_num(spread) > 0).any())
 
 
-def _near(scene: Scene, body: int, states: Floats, row: int, dt: float) -> bool:
-    """Whether something is near enough at a row to be met: a wall, or another body."""
-    bodies = scene.moving
-    own = states[max(row - 2, 0) : row + 2, body, :2]
+def _near(scene: Scene, body: int, states: Floats, row: int) -> bool:
+    """Return whether a wall, another body or a joint may have stopped a body at a row."""
+    moving = scene.moving
+    places = states[max(row - 2, 0) : row + 2, :, :2]
+    own = places[:, body]
     if not np.isfinite(own).all():
-        return False  # a hinged body, of which the angle was measured
+        return False  # a hinged body with a measured angle alone
     speed = np.abs(np.diff(own, axis=0)).max() if len(own) > 1 else 0.0
-    reach = (1 + _REACH) * bodies[body].shape.bounding_radius + 2 * float(speed)
+    reach = (1 + _REACH) * moving[body].shape.bounding_radius + 2 * float(speed)
     for wall in scene.walls:
         start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
         along = np.clip((own - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
         if (np.linalg.norm(own - start - along[:, None] * way, axis=1) < reach).any():
             return True
-    for other, shape in enumerate(bodies):
-        if other != body:
-            place = states[max(row - 2, 0) : row + 2, other, :2]
-            far = np.linalg.norm(own - place, axis=1)
-            if not (far > reach + (1 + _REACH) * shape.shape.bounding_radius).all():
-                return True
-    for static in (each for each in scene.bodies if each.static and each.pose is not None):
-        far = np.linalg.norm(own - np.array(static.pose or ())[:2], axis=1)
-        if (far < reach + (1 + _REACH) * static.shape.bounding_radius).any():
+    others = [(each, places[:, i]) for i, each in enumerate(moving) if i != body]
+    others += [(each, np.array(each.pose)[:2]) for each in scene.bodies if each.static]
+    for other, place in others:
+        far = np.linalg.norm(own - place, axis=1)
+        if not (far > reach + (1 + _REACH) * other.shape.bounding_radius).all():
             return True
     return any(
-        joint.kind == "distance" and bodies[body].name in (joint.bodies or ())
+        joint.traits.stops_bodies and moving[body].name in (joint.bodies or ())
         for joint in scene.joints
     )

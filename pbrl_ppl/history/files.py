@@ -1,21 +1,19 @@
 """Files of histories: CSV, Parquet and NetCDF to a table, and back, written atomically."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import secrets
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
-from pbrl_ppl.state import STATE, WRENCH
+from pbrl_ppl.state import STATE, WRENCH, Floats
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
 SUFFIXES = (".csv", ".parquet", ".nc")
@@ -32,41 +30,41 @@ def read_table(path: Path, names: Mapping[str, object] | None = None) -> pd.Data
     Parameters
     ----------
     path : Path
-        Its suffix says its kind.
+        The suffix is its format.
     names : mapping of str to object, optional
-        Its values are columns of the file that have names of their own.
+        Its values are names of columns of numbers, as of `Reading`.
 
     Raises
     ------
     HistoryError
         If the file is missing, of an unknown kind, or damaged.
     """
-    others = tuple(each for each in (names or {}).values() if isinstance(each, str))
-    readers: dict[str, Callable[[Path], pd.DataFrame]] = {
-        ".csv": partial(_read_csv, others=others),
-        ".parquet": _read_parquet,
-        ".nc": _read_netcdf,
-    }
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
         raise HistoryError(
             f"history {path}: the suffix is {path.suffix!r}, expected one of "
             f"{', '.join(SUFFIXES)}; save it as one of these"
         )
     try:
-        return reader(path)
+        if suffix == ".csv":
+            return _read_csv(
+                path, [each for each in (names or {}).values() if isinstance(each, str)]
+            )
+        return _read_parquet(path) if suffix == ".parquet" else _read_netcdf(path)
     except FileNotFoundError:
         raise HistoryError(f"history {path}: there is no such file; check the path") from None
     except OSError as error:
         raise HistoryError(f"history {path}: cannot be read: {error}") from None
 
 
-def _read_csv(path: Path, others: tuple[str, ...]) -> pd.DataFrame:
+def _read_csv(path: Path, others: list[str]) -> pd.DataFrame:
     content = path.read_bytes()
     lines = content.removeprefix(b"\xef\xbb\xbf").splitlines()
     if not any(line.strip() for line in lines):
         raise HistoryError(f"history {path}: the file is empty; expected a header and rows")
-    separator, decimal = _separators(lines[0], content)
+    # a spreadsheet may write "1,5;2,0"
+    separator = next((mark for mark in (b",", b";", b"\t") if mark in lines[0]), b",")
+    decimal = "," if separator != b"," and b"," in content else "."
     # pandas fills short rows with blanks without a word: a file that was cut off would pass.
     if b'"' not in content:
         cells = lines[0].count(separator) + 1
@@ -99,12 +97,6 @@ def _read_csv(path: Path, others: tuple[str, ...]) -> pd.DataFrame:
     return frame
 
 
-def _separators(header: bytes, content: bytes) -> tuple[bytes, str]:
-    """What separates cells and decimals: a spreadsheet may write ``1,5;2,0``."""
-    separator = next((mark for mark in (b",", b";", b"\t") if mark in header), b",")
-    return separator, "," if separator != b"," and b"," in content else "."
-
-
 def _read_parquet(path: Path) -> pd.DataFrame:
     with path.open("rb") as file:
         try:
@@ -120,12 +112,12 @@ def _read_netcdf(path: Path) -> pd.DataFrame:
             dataset = stored.load()
     except Exception as error:  # HDF5 raises many kinds on a damaged file
         raise HistoryError(f"history {path}: not a NetCDF file: {error}") from None
-    dims = {
-        "observed": ("trajectory", "time", "body", "state"),
-        "action": ("trajectory", "time", "body", "wrench"),
-        "clock": ("trajectory", "time"),
-    }
-    for name, expected in dims.items():
+    for name, last in (
+        ("observed", ("body", "state")),
+        ("action", ("body", "wrench")),
+        ("clock", ()),
+    ):
+        expected = ("trajectory", "time", *last)
         got = dataset[name].dims if name in dataset else None
         if got != expected:
             raise HistoryError(
@@ -137,21 +129,45 @@ def _read_netcdf(path: Path) -> pd.DataFrame:
 
 def to_table(dataset: xr.Dataset) -> pd.DataFrame:
     """Return one row for each (trajectory, step, body) of a history's dataset."""
-    clock = dataset["clock"].to_numpy()
+    names = ("trajectory", "clock", "body", "observed", "action", "state", "wrench")
+    return as_table(*(dataset[name].to_numpy() for name in names))
+
+
+def as_table(
+    labels: npt.NDArray[Any],
+    clock: Floats,
+    bodies: npt.NDArray[Any],
+    state: Floats,
+    action: Floats,
+    states: Iterable[str] = STATE,
+    wrenches: Iterable[str] = WRENCH,
+) -> pd.DataFrame:
+    """Return one row for each (trajectory, step, body) of arrays.
+
+    Parameters
+    ----------
+    labels : ndarray
+        Of the trajectories, shape (trajectory,).
+    clock : ndarray
+        Times (s), shape (trajectory, step); steps without a time are left out.
+    bodies : ndarray
+        Names, shape (body,).
+    state, action : ndarray
+        Shape (trajectory, step, body, 6) and (trajectory, step, body, 3), SI units.
+    states, wrenches : iterable of str
+        Names along the last axes.
+    """
     trajectory, step = np.nonzero(~np.isnan(clock))
-    bodies = np.asarray(dataset["body"].to_numpy(), dtype=object)
-    labels = dataset["trajectory"].to_numpy()
     k = len(bodies)
     columns = {
         "trajectory": np.repeat(labels[trajectory], k),
         "step": np.repeat(step, k),
         "time": np.repeat(clock[trajectory, step], k),
-        "body": np.tile(bodies, len(step)),
+        "body": np.tile(bodies.astype(object), len(step)),
     }
-    for variable, dim in (("observed", "state"), ("action", "wrench")):
-        rows = dataset[variable].to_numpy()[trajectory, step].reshape(len(step) * k, -1)
-        for name, column in zip(dataset[dim].to_numpy(), rows.T, strict=True):
-            columns[str(name)] = column
+    for names, values in ((states, state), (wrenches, action)):
+        rows = values[trajectory, step].reshape(len(step) * k, -1)
+        columns |= zip(map(str, names), rows.T, strict=True)
     return pd.DataFrame(columns)
 
 
@@ -168,15 +184,15 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
         raise OutputError(
             f"history {path}: the suffix is {path.suffix!r}, expected one of {', '.join(SUFFIXES)}"
         )
-    if suffix == ".csv":
-        table = to_table(dataset)
-        write_atomically(path, lambda to: table.to_csv(to, index=False, lineterminator="\n"))
-    elif suffix == ".parquet":
-        table = to_table(dataset)
-        write_atomically(path, lambda to: table.to_parquet(to, index=False))
-    else:
+    if suffix == ".nc":
         measured = dataset[["observed", "action", "clock", "n_rows"]]
         write_atomically(path, lambda to: measured.to_netcdf(to, engine="h5netcdf"))
+        return
+    table = to_table(dataset)
+    if suffix == ".csv":
+        write_atomically(path, lambda to: table.to_csv(to, index=False, lineterminator="\n"))
+    else:
+        write_atomically(path, lambda to: table.to_parquet(to, index=False))
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> None:

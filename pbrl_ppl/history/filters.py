@@ -1,17 +1,15 @@
 """Linear filters by which loggers compute velocities from positions, and the test for each."""
 
-from __future__ import annotations
-
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from math import comb
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import savgol_coeffs
 from scipy.stats import f as f_distribution
 
-Floats = npt.NDArray[np.float64]
+from pbrl_ppl.state import Floats
+
 #: Positions and velocities of rows without gaps, m and m/s or rad and rad/s.
 Runs = list[tuple[Floats, Floats]]
 
@@ -66,10 +64,11 @@ class Filter:
 
 @dataclass(frozen=True)
 class Match:
-    """A filter that gives a velocity, and by how much (s) it is late."""
+    """A filter that gives a velocity, its delay (s), and its misfit over the bound of noise."""
 
     name: str
     lag: float
+    misfit: float = field(repr=False)
 
 
 @lru_cache(maxsize=1)
@@ -85,13 +84,15 @@ def known_filters() -> tuple[Filter, ...]:
         Filter("forward differences", (0, 1), (-1.0, 1.0)),
         Filter("backward differences", (-1, 0), (-1.0, 1.0)),
         Filter("central differences", (-1, 1), (-0.5, 0.5)),
+        *(
+            Filter(f"backward differences over {m} rows", (-m, 0), (-1 / m, 1 / m))
+            for m in range(2, 11)
+        ),
+        *(
+            Filter(f"central differences over {2 * m} rows", (-m, m), (-0.5 / m, 0.5 / m))
+            for m in range(2, 6)
+        ),
     ]
-    for m in range(2, 11):
-        name = f"backward differences over {m} rows"
-        filters.append(Filter(name, (-m, 0), (-1 / m, 1 / m)))
-    for m in range(2, 6):
-        name = f"central differences over {2 * m} rows"
-        filters.append(Filter(name, (-m, m), (-0.5 / m, 0.5 / m)))
     for window in range(5, 22, 2):
         half = window // 2
         for order, orders in ((2, "2"), (4, "3 or 4")):  # of odd windows, 3 and 4 are the same
@@ -101,27 +102,26 @@ def known_filters() -> tuple[Filter, ...]:
     return tuple(filters)
 
 
-def _around(before: int, after: int) -> tuple[int, ...]:
-    return tuple(range(-before, after + 1))
+def _fitted(name: str, before: int, after: int, *rates: tuple[int, ...]) -> Filter:
+    return Filter(name, tuple(range(-before, after + 1)), rates=rates)
 
 
-#: Filters of which coefficients are fitted, the fewest first: exponential smoothing and Butterworth
+#: Filters with fitted coefficients, the fewest first: exponential smoothing and Butterworth
 #: low-passes of a difference, causal and forward-backward, and any finite filter.
 FITTED = (
-    Filter("a finite filter of 5 rows", _around(2, 2)),
-    Filter("a causal first-order low-pass of differences", _around(2, 1), (), ((-1,),)),
-    Filter("a zero-phase first-order low-pass of differences", _around(2, 2), (), ((-1, 1),)),
-    Filter("a causal second-order low-pass of differences", _around(3, 1), (), ((-1,), (-2,))),
-    Filter(
-        "a zero-phase second-order low-pass of differences", _around(3, 3), (), ((-1, 1), (-2, 2))
+    _fitted("a finite filter of 5 rows", 2, 2),
+    _fitted("a causal first-order low-pass of differences", 2, 1, (-1,)),
+    _fitted("a zero-phase first-order low-pass of differences", 2, 2, (-1, 1)),
+    _fitted("a causal second-order low-pass of differences", 3, 1, (-1,), (-2,)),
+    _fitted("a zero-phase second-order low-pass of differences", 3, 3, (-1, 1), (-2, 2)),
+    replace(
+        _fitted(f"a finite filter of {2 * _REACH + 1} rows", _REACH, _REACH), rows=_ROWS_LONGEST
     ),
-    Filter(f"a finite filter of {2 * _REACH + 1} rows", _around(_REACH, _REACH), (), (),
-           _ROWS_LONGEST),
-)  # fmt: skip
+)
 
 
 def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
-    """Return variances of positions and of velocities, from what kinematics leave of measured ones.
+    """Return the noise variances of positions and of velocities, from their kinematic residuals.
 
     The mean of two neighbouring velocities differs from the difference quotient between them by
     noise alone. Second differences take off what a smooth acceleration leaves. Of those,
@@ -155,7 +155,7 @@ def position_noise(runs: Runs, dt: float) -> tuple[float, float]:
 def computed_by(runs: Runs, dt: float) -> Match | None:
     """Return the filter that computed velocities from positions, or None.
 
-    A velocity with a noise of its own differs from a filter of noisy positions with weights ``w``
+    A velocity with independent noise differs from a filter of noisy positions with weights ``w``
     by a variance of at least ``|w|^2 s^2``, ``s`` being the positions' noise. A computed velocity
     does not. The ratio of what a filter leaves to that bound is compared with the lower tail of the
     F distribution (1e-5 for each filter), degrees of freedom corrected for serial correlation.
@@ -180,19 +180,17 @@ def computed_by(runs: Runs, dt: float) -> Match | None:
     least, most = _noise_bounds(runs)
     noise = min(max(position_noise(runs, dt)[0], least), most)
     shown = sum(max(len(position) - 3, 0) for position, _ in runs) / _correlation([-1, 3, -3, 1])
-    found = [(_tested(each, runs, dt, noise, shown, total), each) for each in known_filters()]
-    matches = [(left, each) for left, each in found if left is not None]
-    if matches:
-        (_, match), each = min(matches, key=lambda one: one[0][0])
-        return match
+    found = [_tested(each, runs, dt, noise, shown, total) for each in known_filters()]
+    if matches := [match for match in found if match is not None]:
+        return min(matches, key=lambda match: match.misfit)
     for each in FITTED:
-        if (fitted := _tested(each, runs, dt, noise, shown, total)) is not None:
-            return fitted[1]
+        if match := _tested(each, runs, dt, noise, shown, total):
+            return match
     return None
 
 
 def _noise_bounds(runs: Runs) -> tuple[float, float]:
-    """Variance of positions' noise from positions alone: at least, and at most.
+    """Return bounds of the variance of positions' noise, from positions alone.
 
     Kinematics do not tell it where a velocity is late, which leaves more than noise does, and tell
     too much where bodies collide: high differences of smooth positions leave noise, their median
@@ -211,58 +209,60 @@ def _noise_bounds(runs: Runs) -> tuple[float, float]:
 
 
 def _tested(
-    own: Filter, runs: Runs, dt: float, noise: float, shown: float, total: float
-) -> tuple[float, Match] | None:
-    """What a filter leaves, as a share of the bound, and the match; None if it does not match."""
-    before = -min(own.places + tuple(min(group) for group in own.rates))
-    after = max(own.places + tuple(max(group) for group in own.rates))
+    candidate: Filter, runs: Runs, dt: float, noise: float, shown: float, total: float
+) -> Match | None:
+    """Return the match of a filter; None if its misfit is above the bound."""
+    before = -min(candidate.places + tuple(min(group) for group in candidate.rates))
+    after = max(candidate.places + tuple(max(group) for group in candidate.rates))
     places, rates, middle = [], [], []
     for position, rate in runs:
         k = np.arange(max(before, 0), len(position) - max(after, 0))
         if len(k):
-            places.append(position[k[:, None] + own.places] - position[k, None])
-            groups = [rate[k[:, None] + group].sum(axis=1) for group in own.rates]
+            places.append(position[k[:, None] + candidate.places] - position[k, None])
+            groups = [rate[k[:, None] + group].sum(axis=1) for group in candidate.rates]
             rates.append(np.array(groups).T.reshape(len(k), len(groups)))
             middle.append(rate[k])
     if not middle:
         return None
     x, v, y = np.concatenate(places), np.concatenate(rates), np.concatenate(middle)
-    if own.weights:
-        a, b, errors = np.zeros(0), np.array(own.weights) / dt, np.zeros((0, len(y)))
+    if candidate.weights:
+        a, b, errors = np.zeros(0), np.array(candidate.weights) / dt, np.zeros((0, len(y)))
     else:
-        if len(y) < own.rows * (x.shape[1] - 1 + v.shape[1]):
+        if len(y) < candidate.rows * (x.shape[1] - 1 + v.shape[1]):
             return None
-        middle_one = own.places.index(0)
+        middle_one = candidate.places.index(0)
         inverse = np.linalg.pinv(np.hstack([v, np.delete(x, middle_one, axis=1) / dt]))
         errors = inverse[v.shape[1] :] / dt
         errors = np.insert(errors, middle_one, -errors.sum(axis=0), axis=0)
         a, b = inverse[: v.shape[1]] @ y, errors @ y
-        ends = (sum((-1.0) ** row for row in group) for group in own.rates)
+        ends = (sum((-1.0) ** row for row in group) for group in candidate.rates)
         if 1 - sum(weight * end for weight, end in zip(a, ends, strict=True)) < _POLE:
             return None
-    dof = len(y) - (len(own.places) - 1 + len(a) if len(errors) else 0)
-    left = float(((y - v @ a - x @ b) ** 2).sum()) / dof
-    square = float(b @ b) - left * float((errors**2).sum())  # without the weights' own errors
+    dof = len(y) - (len(candidate.places) - 1 + len(a) if len(errors) else 0)
+    variance = float(((y - v @ a - x @ b) ** 2).sum()) / dof
+    square = float(b @ b) - variance * float((errors**2).sum())  # without the errors of the weights
     if not square > 0:
         return None
     share = min(_SHARE, float(f_distribution.ppf(_ALARM, dof / _correlation(b), max(shown, 1.0))))
-    exact = _EXACT if own.weights else _EXACT_FITTED if own.rows == _ROWS_LONGEST else 0.0
+    exact = (
+        _EXACT if candidate.weights else _EXACT_FITTED if candidate.rows == _ROWS_LONGEST else 0.0
+    )
     bound = max(share * square * noise, exact * total)
-    if not left < bound:
+    if not variance < bound:
         return None
-    return left / square, Match(own.name, _lag(own, a, b) * dt)
+    return Match(candidate.name, _lag(candidate, a, b) * dt, variance / square)
 
 
 def _correlation(weights: Floats | list[int]) -> float:
-    """Rows of filtered white noise per independent one, of squares."""
+    """Return how many squares of filtered white noise count as one independent square."""
     product = np.correlate(weights, weights, "full")
     return float(product @ product / product.max() ** 2)
 
 
-def _lag(own: Filter, a: Floats, b: Floats) -> float:
-    """Group delay of a differentiator at low frequency, in rows."""
-    row = np.array(own.places, dtype=float)
+def _lag(candidate: Filter, a: Floats, b: Floats) -> float:
+    """Return the group delay of a differentiator at low frequency, in rows."""
+    row = np.array(candidate.places, dtype=float)
     lag = -float(b @ row**2) / (2 * float(b @ row))
-    for weight, group in zip(a, own.rates, strict=True):
-        lag -= float(weight) * sum(group) / (1 - sum(a * [len(each) for each in own.rates]))
+    for weight, group in zip(a, candidate.rates, strict=True):
+        lag -= float(weight) * sum(group) / (1 - sum(a * [len(each) for each in candidate.rates]))
     return round(float(lag), 6) + 0.0

@@ -2,29 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Unpack
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.digest import hashed
-from pbrl_ppl.history.files import read_table, to_table, write_dataset
-from pbrl_ppl.history.paths import kinematic_bodies, path_velocities
-from pbrl_ppl.history.pieces import cut
-from pbrl_ppl.history.reading import Reading, as_history
+from pbrl_ppl.history.conversion import Reading, as_history
+from pbrl_ppl.history.files import as_table, read_table, to_table, write_dataset
+from pbrl_ppl.history.kinematics import complete_start, kinematic_bodies, path_velocities
 from pbrl_ppl.history.rows import arrays
-from pbrl_ppl.history.start import complete_start
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
-
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
+from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -158,23 +152,20 @@ class History:
         start, assumed = complete_start(table.state, scene)
         if estimate_velocities:  # of positions that were measured, or that hinges give
             assumed[:, 3:] &= assumed[:, :3]
-        state_dims = ("trajectory", "time", "body", "state")
-        state_units = {"units": ", ".join(STATE_UNITS)}
-        wrench_units = {"units": ", ".join(WRENCH_UNITS)}
+        n, k = len(table.n_rows), len(scene.moving)
+        rows = ("trajectory", "time", "body")
+        states, wrenches = ({"units": ", ".join(each)} for each in (STATE_UNITS, WRENCH_UNITS))
+        before = np.zeros((n, k, len(WRENCH)))
         dataset = xr.Dataset(
             {
-                "observed": (state_dims, table.state, state_units),
-                "action": (("trajectory", "time", "body", "wrench"), table.action, wrench_units),
-                "start": (state_dims, start, state_units),
+                "observed": ((*rows, "state"), table.state, states),
+                "action": ((*rows, "wrench"), table.action, wrenches),
+                "start": ((*rows, "state"), start, states),
                 "assumed": (("body", "state"), assumed),
                 "clock": (("trajectory", "time"), table.clock, {"units": "s"}),
                 "n_rows": ("trajectory", table.n_rows),
-                "number": ("trajectory", np.arange(float(len(table.n_rows)))),
-                "before": (
-                    ("trajectory", "body", "wrench"),
-                    np.zeros((len(table.n_rows), len(scene.moving), len(WRENCH))),
-                    wrench_units,
-                ),
+                "number": ("trajectory", np.arange(float(n))),
+                "before": (("trajectory", "body", "wrench"), before, wrenches),
             },
             coords={
                 "trajectory": table.labels,
@@ -205,10 +196,10 @@ class History:
     def segments(self, horizon: int = 1) -> Segments:
         """Cut every trajectory into pieces of ``horizon`` intervals that do not overlap.
 
-        Pieces start where the state is complete. What is left over at a trajectory's end is
-        dropped, but a trajectory that gives no whole piece gives one that its end cuts short:
-        nothing is measured after it. So bodies that were seen before and after a long push need a
-        horizon as long as the longest trajectory.
+        Pieces start where the state is complete. The rest at a trajectory's end is dropped, but a
+        trajectory that gives no whole piece gives one that its end cuts short: nothing is measured
+        after it. So bodies that were seen before and after a long push need a horizon as long as
+        the longest trajectory.
 
         Raises
         ------
@@ -220,7 +211,7 @@ class History:
         intervals = self.dataset["n_rows"].to_numpy() - 1
         start = self.dataset["start"].to_numpy()
         complete = np.isfinite(start).all(axis=(-1, -2))
-        trajectory, step = cut(complete, intervals, int(horizon))
+        trajectory, step = _cut(complete, intervals, int(horizon))
         if not len(step):
             raise HistoryError(
                 f"no segment of {horizon} intervals starts from a complete state; use another "
@@ -230,7 +221,7 @@ class History:
         rows = step[:, None] + np.arange(horizon)
         after = rows >= intervals[trajectory][:, None]
         rows = np.where(after, 0, rows)
-        inputs = self._inputs(self._actions())[trajectory[:, None], rows]
+        inputs = self._inputs()[trajectory[:, None], rows]
         observed = self.dataset["observed"].to_numpy()[trajectory[:, None], rows + 1]
         inputs[after, :, :6], inputs[after, :, 6:] = 0.0, np.inf
         observed[after] = np.nan
@@ -249,34 +240,30 @@ class History:
         intervals = self.dataset["n_rows"].to_numpy() - 1
         trajectory = np.repeat(np.arange(len(intervals)), intervals)
         step = np.concatenate([np.arange(n) for n in intervals])
-        inputs = self._inputs(self._actions())[trajectory, step][:, None]
+        inputs = self._inputs()[trajectory, step][:, None]
         observed = states[trajectory, step + 1][:, None].copy()
         observed[:, :, self.dataset["kinematic"].to_numpy()] = np.nan
         actions = inputs[..., : len(WRENCH)]
         return Segments(states[trajectory, step], actions, observed, trajectory, step, inputs)
 
-    def _actions(self) -> Floats:
-        """Wrenches, of kinematic bodies velocities, shape (trajectory, time, body, 3)."""
-        follows = self.dataset["kinematic"].to_numpy()
-        poses = self.dataset["start"].to_numpy()[:, :, follows, :3]
-        action = self.dataset["action"].to_numpy().copy()
-        time_step = float(self.dataset.attrs["time_step"])
-        action[:, :-1, follows] = path_velocities(poses, time_step)
-        return action
-
-    def _inputs(self, action: Floats) -> Floats:
-        """What acts in each interval, shape (trajectory, interval, body, input)."""
-        before = self.dataset["before"].to_numpy()[:, None]
+    def _inputs(self) -> Floats:
+        """Return all that acts in each interval, shape (trajectory, interval, body, input)."""
+        data = self.dataset
+        follows = data["kinematic"].to_numpy()
+        action = data["action"].to_numpy().copy()
+        poses = data["start"].to_numpy()[:, :, follows, :3]
+        action[:, :-1, follows] = path_velocities(poses, float(data.attrs["time_step"]))
+        before = data["before"].to_numpy()[:, None]
         previous = np.concatenate([before, action[:, :-1]], axis=1)
-        clock = self.dataset["clock"].to_numpy()
+        clock = data["clock"].to_numpy()
         end = np.pad(clock[:, 1:], ((0, 0), (0, 1)), constant_values=np.nan)
-        number = np.broadcast_to(self.dataset["number"].to_numpy()[:, None], clock.shape)
+        number = np.broadcast_to(data["number"].to_numpy()[:, None], clock.shape)
         when = np.stack([number, clock, end], axis=-1)[:, :, None]
         when = np.broadcast_to(when, (*action.shape[:-1], 3))
         return np.concatenate([action, previous, when], axis=-1)
 
     def split(self, test_fraction: float = 0.25, seed: int = 0) -> tuple[History, History]:
-        """Return a part to train on and a part to test on, of whole trajectories.
+        """Return a training and a test history, each of whole trajectories.
 
         Raises
         ------
@@ -346,3 +333,96 @@ class History:
             f"History({self.n_trajectories} trajectories, {self.n_transitions} transitions, "
             f"bodies {', '.join(self.bodies)}, sha256 {self.data_sha256[:12]})"
         )
+
+
+def hashed(dataset: xr.Dataset) -> xr.Dataset:
+    """Return the dataset with the hash of its measured arrays among its attributes."""
+    digest = hashlib.sha256()
+    for name in ("trajectory", "body"):
+        digest.update("\0".join(map(str, dataset[name].to_numpy())).encode())
+        digest.update(b"\1")
+    digest.update(dataset["n_rows"].to_numpy().astype("<i8").tobytes())
+    for name in ("clock", "observed", "action"):
+        values = dataset[name].to_numpy()
+        # One NaN and one zero: both have several bit patterns.
+        canonical = np.where(np.isnan(values), np.nan, values + 0.0)
+        digest.update(np.ascontiguousarray(canonical, dtype="<f8").tobytes())
+    return dataset.assign_attrs(data_sha256=digest.hexdigest())
+
+
+def _cut(complete: Bools, intervals: Ints, horizon: int) -> tuple[Ints, Ints]:
+    """Return the trajectory and the first step of pieces that do not overlap.
+
+    A piece starts at the first complete state after the piece before it, and must end within its
+    trajectory. A trajectory too short for any has one that its end cuts short.
+
+    Parameters
+    ----------
+    complete : ndarray
+        Whether a piece may start there, shape (trajectory, time).
+    intervals : ndarray
+        Number of intervals of each trajectory, shape (trajectory,).
+    horizon : int
+        Intervals of a piece.
+
+    Examples
+    --------
+    >>> _cut(np.array([[True] * 6, [False, True, True, False, False, False]]), np.array([5, 3]), 2)
+    (array([0, 0, 1]), array([0, 2, 1]))
+    """
+    pieces: list[tuple[int, int]] = []
+    for trajectory, count in enumerate(intervals):
+        free = 0
+        for step in np.flatnonzero(complete[trajectory, :count]).tolist():
+            if step >= free and (step + horizon <= count or not free):
+                pieces.append((trajectory, step))
+                free = step + horizon
+    places = np.array(pieces, dtype=np.int64).reshape(-1, 2)
+    return places[:, 0], places[:, 1]
+
+
+def from_segments(scene: Scene, start: Floats, actions: Floats, observed: Floats) -> History:
+    """Return a history of segments; arguments as of :func:`segment_rows`.
+
+    Actions of shape (n, H, body, 9) are inputs as in :data:`pbrl_ppl.state.INPUT`: they also hold
+    the wrench of the interval before, and times.
+    """
+    wrench = actions[..., : len(WRENCH)]
+    history = History.from_dataframe(segment_rows(scene, start, wrench, observed), scene)
+    if actions.shape[-1] == len(WRENCH):
+        return history
+    number, begin, end = np.moveaxis(actions[:, :, 0, 6:], -1, 0)
+    data = history.dataset
+    return History(
+        data.assign(
+            before=data["before"].copy(data=actions[:, 0, :, 3:6]),
+            number=data["number"].copy(data=number[:, 0]),
+            clock=data["clock"].copy(data=np.concatenate([begin, end[:, -1:]], axis=1)),
+        )
+    )
+
+
+def segment_rows(scene: Scene, start: Floats, actions: Floats, observed: Floats) -> pd.DataFrame:
+    """Return a history's rows with one trajectory a segment, each from its start state.
+
+    Parameters
+    ----------
+    scene : Scene
+        Names the bodies and the time step.
+    start : ndarray
+        Complete start states, shape (n, body, 6), SI units.
+    actions : ndarray
+        Wrenches, shape (n, H, body, 3); of a kinematic body its velocities.
+    observed : ndarray
+        Next states, shape (n, H, body, 6), NaN where missing.
+    """
+    n, h, k = actions.shape[:3]
+    states = np.concatenate([start[:, None], observed], axis=1)
+    wrenches = np.concatenate([actions, np.full((n, 1, k, len(WRENCH)), np.nan)], axis=1)
+    follows = kinematic_bodies(scene)
+    path = scene.time_step * np.cumsum(actions[:, :, follows], axis=1)
+    states[:, 1:, follows, :3] = start[:, None, follows, :3] + path
+    wrenches[:, :, follows] = np.nan
+    clock = np.broadcast_to(scene.time_step * np.arange(h + 1), (n, h + 1))
+    names = np.array([body.name for body in scene.moving])
+    return as_table(np.arange(n), clock, names, states, wrenches)

@@ -1,29 +1,24 @@
-"""Rollouts of MuJoCo to a history: arrays of qpos, qvel and ctrl, of bodies that move in a plane.
+"""Histories of MuJoCo rollouts: arrays of qpos, qvel and ctrl, of bodies that move in a plane.
 
-MuJoCo itself is not imported: a model's arrays say all.
+MuJoCo itself is not imported: a model's arrays are enough.
 """
-
-from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history.files import as_table
 from pbrl_ppl.history.history import History
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, WRENCH
-
-Floats = npt.NDArray[np.float64]
+from pbrl_ppl.state import STATE, WRENCH, Floats
 
 #: A plane's axes in MuJoCo's world, and its normal: a top view, and a side view.
 _PLANES = {"xy": np.eye(3), "xz": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
-#: mjtJoint, mjtTrn, mjtGain, mjtBias, mjtDyn as numbers, as mjmodel.h has them.
+#: mjtJoint as numbers, as in mjmodel.h.
 _FREE, _SLIDE, _HINGE = 0, 2, 3
-_TO_JOINT, _FIXED, _NONE = 0, 0, 0
 #: How far out of the plane is out of it (of a unit vector, or m).
 _FLAT = 1e-3
 
@@ -52,10 +47,10 @@ def from_mujoco(
     time_step: float | None = None,
     estimate_velocities: bool = False,
 ) -> History:
-    """Make a history of MuJoCo rollouts of bodies that move in a plane.
+    """Return a history of MuJoCo rollouts of bodies that move in a plane.
 
     Bodies go by their names in the model. A body has slide joints along the plane's axes, a hinge
-    about its normal, or a free joint; of what has no joint of its own nothing is measured, so a
+    about its normal, or a free joint; a coordinate without a joint is not measured, so a
     pendulum's hinge gives its angle and rate. A scene's body has its origin where MuJoCo's body
     frame is: put that at the shape's centroid, unless a hinge alone holds it.
 
@@ -115,69 +110,67 @@ def from_mujoco(
             f"rows are {step:g} s apart and the scene's time_step is {scene.time_step:g} s;"
             " expected a whole number of rows a step; change the scene's, or give time_step"
         )
-    bodies = [body.name for body in scene.moving]
-    joints = {name: _joints(model, name, _PLANES[plane]) for name in bodies}
-    state = np.full((n, rows, len(bodies), len(STATE)), np.nan)
-    for place, name in enumerate(bodies):
-        base = _PLANES[plane][:2] @ np.asarray(model.body(name).pos)
-        _fill(state[:, :, place], joints[name], positions, velocities, base, _PLANES[plane], name)
+    axes = _PLANES[plane]
+    joints = {body.name: _joints(model, body.name, axes) for body in scene.moving}
+    k = len(joints)
+    state = np.full((n, rows, k, len(STATE)), np.nan)
+    for i, (name, held) in enumerate(joints.items()):
+        origin = axes[:2] @ np.asarray(model.body(name).pos)
+        if not _fill(state[:, :, i], held, positions, velocities, origin, axes):
+            raise HistoryError(
+                f'body "{name}" leaves the plane; expected one that moves in it alone'
+            )
     if ctrl is not None and wrench is not None:
         raise HistoryError("ctrl and wrench are both given; expected one of them")
-    acts = np.zeros((n, rows, len(bodies), len(WRENCH)))
+    action = np.zeros((n, rows, k, len(WRENCH)))
     if ctrl is not None:
-        acts = _pushes(model, joints, _batched(ctrl, model.nu, "ctrl", "nu"))
+        action = _motor_wrenches(model, joints, _batched(ctrl, model.nu, "ctrl", "nu"))
     elif wrench is not None:
         flat = np.asarray(wrench, dtype=float)
         flat = flat.reshape(*flat.shape[:-2], -1) if flat.ndim > 2 else flat
-        acts = _batched(flat, len(bodies) * len(WRENCH), "wrench", "3 a body")
-        acts = acts.reshape(*acts.shape[:2], len(bodies), len(WRENCH))
-    if acts.shape[0] != n or acts.shape[1] not in (rows, rows - 1):
+        action = _batched(flat, k * len(WRENCH), "wrench", "3 a body")
+        action = action.reshape(*action.shape[:2], k, len(WRENCH))
+    if action.shape[0] != n or action.shape[1] not in (rows, rows - 1):
         raise HistoryError(
-            f"ctrl or wrench has {acts.shape[:2]} trajectories and rows, expected {(n, rows)}, as"
+            f"ctrl or wrench has {action.shape[:2]} trajectories and rows, expected {(n, rows)}, as"
             " qpos, or one row less"
         )
     kept = (rows - 1) // every
     if kept < 1:
         raise HistoryError(f"{rows} rows are less than a step of {every} rows and its end")
     # the mean keeps the impulse where the command changes within a step
-    mean = acts[:, : kept * every].reshape(n, kept, every, len(bodies), len(WRENCH)).mean(axis=2)
-    mean = np.concatenate([mean, np.full((n, 1, *mean.shape[2:]), np.nan)], axis=1)
+    mean = action[:, : kept * every].reshape(n, kept, every, k, len(WRENCH)).mean(axis=2)
+    mean = np.concatenate([mean, np.full((n, 1, k, len(WRENCH)), np.nan)], axis=1)
+    clock = np.broadcast_to(np.arange(kept + 1) * scene.time_step, (n, kept + 1))
     state = state[:, : kept * every + 1 : every]
-    trajectory, row, body = np.indices(state.shape[:3]).reshape(3, -1)
-    table = {
-        "trajectory": trajectory,
-        "step": row,
-        "time": row * scene.time_step,
-        "body": np.array(bodies)[body],
-        **dict(zip(STATE, state.reshape(-1, len(STATE)).T, strict=True)),
-        **dict(zip(WRENCH, mean.reshape(-1, len(WRENCH)).T, strict=True)),
-    }
+    table = as_table(np.arange(n), clock, np.array(list(joints)), state, mean)
     return History.from_dataframe(
-        pd.DataFrame(table), scene, estimate_velocities=estimate_velocities, source="MuJoCo rollout"
+        table, scene, estimate_velocities=estimate_velocities, source="MuJoCo rollout"
     )
 
 
-def _batched(values: npt.ArrayLike, width: int, name: str, of: str) -> Floats:
-    """An array as (trajectory, row, width)."""
+def _batched(values: npt.ArrayLike, width: int, name: str, symbol: str) -> Floats:
+    """Return an array as (trajectory, row, width)."""
     array = np.asarray(values, dtype=float)
     array = array[None] if array.ndim == 2 else array
     if array.ndim != 3 or array.shape[-1] != width:
         raise HistoryError(
-            f"{name} has shape {np.shape(values)}, expected (trajectory, row, {width}): {of} of the"
-            " model"
+            f"{name} has shape {np.shape(values)}, expected (trajectory, row, {width}): {symbol} of"
+            " the model"
         )
     return array
 
 
 def _joints(model: Any, name: str, axes: Floats) -> list[_Joint]:
-    """A body's own joints, each along one of the plane's axes."""
+    """Return a body's joints, each along one of the plane's axes."""
     try:
         body = model.body(name)
     except KeyError:
         raise HistoryError(
             f'the MuJoCo model has no body "{name}"; name its bodies as the scene does'
         ) from None
-    first, count = int(np.ravel(body.jntadr)[0]), int(np.ravel(body.jntnum)[0])
+    numbers = (body.jntadr, body.jntnum, body.parentid)
+    first, count, parent = (int(np.ravel(number)[0]) for number in numbers)
     found = []
     for number in range(first, first + count):
         kind = int(model.jnt_type[number])
@@ -197,13 +190,13 @@ def _joints(model: Any, name: str, axes: Floats) -> list[_Joint]:
         reference = float(model.qpos0[place])
         found.append(_Joint(number, kind, axis, place, rate, reference))
     slides = [joint for joint in found if joint.kind == _SLIDE]
-    turns = np.abs(np.asarray(model.body(name).quat)[1:]).max()
+    turns = np.abs(np.asarray(body.quat)[1:]).max()
     if len(slides) == 1 or (found and found[0].kind != _FREE and turns > _FLAT):
         raise HistoryError(
             f'body "{name}": expected slides along both axes or none, and a body that is not'
             " turned in the model; a free joint has all"
         )
-    if slides and int(np.ravel(model.body(name).parentid)[0]) != 0:
+    if slides and parent != 0:
         raise HistoryError(
             f'body "{name}" slides on another body; expected one that slides in the world'
         )
@@ -211,65 +204,56 @@ def _joints(model: Any, name: str, axes: Floats) -> list[_Joint]:
 
 
 def _fill(
-    state: Floats,
-    joints: list[_Joint],
-    qpos: Floats,
-    qvel: Floats,
-    base: Floats,
-    axes: Floats,
-    name: str,
-) -> None:
-    """Fill one body's states (trajectory, row, 6) in place with what its joints say."""
+    state: Floats, joints: list[_Joint], qpos: Floats, qvel: Floats, origin: Floats, axes: Floats
+) -> bool:
+    """Fill a body's states (trajectory, row, 6) in place; return whether it stays in the plane."""
     if any(joint.kind == _SLIDE for joint in joints):
-        state[..., :2], state[..., 3:5] = base, 0.0
+        state[..., :2], state[..., 3:5] = origin, 0.0
     for joint in joints:
         at, rate = joint.position, joint.velocity
+        moved = qpos[..., at] - joint.reference
         if joint.kind == _FREE:
             place = qpos[..., at : at + 3] @ axes.T
-            quat, spin = qpos[..., at + 3 : at + 7], qvel[..., rate + 3 : rate + 6] @ axes.T
-            turn = quat[..., 1:] @ axes.T
+            turn = qpos[..., at + 4 : at + 7] @ axes.T
             drift = np.ptp(place[..., 2], axis=1).max() if place.size else 0.0
             if np.abs(turn[..., :2]).max() > _FLAT or drift > _FLAT:
-                raise HistoryError(
-                    f'body "{name}" leaves the plane; expected one that moves in it alone'
-                )
+                return False
             state[..., :2] = place[..., :2]
-            state[..., 2] = 2 * np.arctan2(turn[..., 2], quat[..., 0])
+            state[..., 2] = 2 * np.arctan2(turn[..., 2], qpos[..., at + 3])
             state[..., 3:5] = (qvel[..., rate : rate + 3] @ axes.T)[..., :2]
-            state[..., 5] = spin[..., 2]
+            state[..., 5] = (qvel[..., rate + 3 : rate + 6] @ axes.T)[..., 2]
         elif joint.kind == _SLIDE:
-            moved = qpos[..., at] - joint.reference
             state[..., :2] += moved[..., None] * joint.axis[:2]
             state[..., 3:5] += qvel[..., rate, None] * joint.axis[:2]
         else:
-            state[..., 2] = (qpos[..., at] - joint.reference) * joint.axis[2]
+            state[..., 2] = moved * joint.axis[2]
             state[..., 5] = qvel[..., rate] * joint.axis[2]
+    return True
 
 
-def _pushes(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
-    """Wrenches of motors at joints, shape (trajectory, row, body, 3)."""
-    holder = {j.number: (place, j) for place, own in enumerate(joints.values()) for j in own}
+def _motor_wrenches(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
+    """Return the wrenches of motors at joints, shape (trajectory, row, body, 3)."""
+    holder = {joint.number: (i, joint) for i, held in enumerate(joints.values()) for joint in held}
     wrench = np.zeros((*ctrl.shape[:2], len(joints), len(WRENCH)))
+    # a motor has a fixed gain, no bias, no dynamics, and acts on a joint
+    kinds = (model.actuator_gaintype, model.actuator_biastype, model.actuator_dyntype)
     for number in range(ctrl.shape[-1]):
-        kinds = (model.actuator_gaintype[number], model.actuator_biastype[number],
-                 model.actuator_dyntype[number], model.actuator_trntype[number])  # fmt: skip
-        place, joint = holder.get(int(model.actuator_trnid[number, 0]), (-1, None))
-        if joint is None or joint.kind == _FREE or tuple(map(int, kinds)) != (
-            _FIXED, _NONE, _NONE, _TO_JOINT
-        ):  # fmt: skip
+        is_motor = not any(kind[number] for kind in (*kinds, model.actuator_trntype))
+        body, joint = holder.get(int(model.actuator_trnid[number, 0]), (-1, None))
+        if not is_motor or joint is None or joint.kind == _FREE:
             raise HistoryError(
                 f"actuator {number} is no motor of a slide or hinge of the scene's bodies; give"
                 " wrench in place of ctrl"
             )
-        value = ctrl[..., number]
+        force = ctrl[..., number]
         if model.actuator_ctrllimited[number]:
-            value = np.clip(value, *model.actuator_ctrlrange[number])
-        force = value * model.actuator_gainprm[number, 0]
+            force = np.clip(force, *model.actuator_ctrlrange[number])
+        force = force * model.actuator_gainprm[number, 0]
         if model.actuator_forcelimited[number]:
             force = np.clip(force, *model.actuator_forcerange[number])
         force = force * model.actuator_gear[number, 0]
         if joint.kind == _SLIDE:
-            wrench[:, :, place, :2] += force[..., None] * joint.axis[:2]
+            wrench[:, :, body, :2] += force[..., None] * joint.axis[:2]
         else:
-            wrench[:, :, place, 2] += force * joint.axis[2]
+            wrench[:, :, body, 2] += force * joint.axis[2]
     return wrench

@@ -1,28 +1,22 @@
 """Irregular time stamps: a table resampled to even steps, and what that does to it."""
 
-from __future__ import annotations
-
 import warnings
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 from scipy.interpolate import CubicHermiteSpline, CubicSpline
 
 from pbrl_ppl.errors import HistoryError, ResamplingWarning
-from pbrl_ppl.history.angles import unwrapped
-from pbrl_ppl.history.cells import Rows, read_rows
-from pbrl_ppl.history.rows import TIME_TOLERANCE
+from pbrl_ppl.history.files import as_table
+from pbrl_ppl.history.kinematics import unwrapped
+from pbrl_ppl.history.rows import TIME_TOLERANCE, Rows, read_rows
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, THETA, WRENCH
+from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, Ints
 
-Floats = npt.NDArray[np.float64]
-Ints = npt.NDArray[np.int64]
-
-#: Time steps that are interpolated across (not a lost sample), and that may be unseen at most.
+#: Time steps that are interpolated across (not a lost sample), and that may be missing at most.
 REACH, LONGEST = 1.9, 5.0
-#: Time steps that samples may be apart in the mean: with fewer samples than rows, rows are made up.
+#: Mean time steps between samples, at most: with fewer samples than rows, rows are made up.
 _COARSEST = 1.1
 #: A velocity this near to a difference quotient (a share of its spread) is one.
 _QUOTIENT = 1e-3
@@ -53,9 +47,9 @@ def resampled(frame: pd.DataFrame, scene: Scene, source: str) -> pd.DataFrame:
     frame : pandas.DataFrame
         With a history's columns, in SI units.
     scene : Scene
-        Says the time step and the bodies.
+        Its time step and bodies are used.
     source : str
-        What to call the table in messages.
+        Name of the table in messages.
 
     Raises
     ------
@@ -69,136 +63,131 @@ def resampled(frame: pd.DataFrame, scene: Scene, source: str) -> pd.DataFrame:
         What was done, and what it does to the noise.
     """
     rows, dt = read_rows(frame, scene, source), scene.time_step
-    tracks = _tracks(rows, scene)
-    spacing = np.concatenate([np.diff(track.time) for track in tracks.values()])
+    tracks = [_tracks(rows, label, scene) for label in range(len(rows.labels))]
+    spacing = np.concatenate([np.diff(track.time) for bodies in tracks for track in bodies])
     if not spacing.size or (np.abs(spacing - dt) <= TIME_TOLERANCE * dt).all():
         return frame
-    _check(rows, tracks, dt)
-    quotients = _quotients(tracks, scene)
+    _check_spacing(rows, tracks, dt)
+    quotients = np.array([_quotients(each) for each in zip(*tracks, strict=True)])
+    names = np.array([body.name for body in scene.moving], dtype=object)
     parts: list[pd.DataFrame] = []
     weights, empty = [], 0
-    for label in range(len(rows.labels)):
-        own = {body: tracks[label, body] for body in range(len(scene.moving))
-               if (label, body) in tracks}  # fmt: skip
-        begin = max(track.time[0] for track in own.values())
-        end = min(track.time[-1] for track in own.values())
+    for label, bodies in zip(rows.labels, tracks, strict=True):
+        begin = max(track.time[0] for track in bodies)
+        end = min(track.time[-1] for track in bodies)
         n = int((end - begin) / dt + _SAME) + 1
         if n < 2:
             raise HistoryError(
-                f"{source}: trajectory {rows.labels[label]} is {end - begin:.3g} s long, less than"
-                f" a time step of {dt:g} s; drop it"
+                f"{source}: trajectory {label} is {end - begin:.3g} s long, less than a time step"
+                f" of {dt:g} s; drop it"
             )
         grid = begin + dt * np.arange(n)
-        bodies = []
-        for body, track in own.items():
-            state = _states(track, grid, dt)
-            measured = ~np.isnan(track.state).all(axis=0)
-            empty += int(np.isnan(state[:, measured]).any(axis=1).sum())
-            state[:, quotients[body]] = np.nan
-            weights.append(_weights(track.time, grid, dt))
-            bodies.append(
-                pd.DataFrame(
-                    {
-                        "trajectory": rows.labels[label],
-                        "step": np.arange(n),
-                        "time": grid,
-                        "body": scene.moving[body].name,
-                        **dict(zip(STATE, state.T, strict=True)),
-                        **dict(zip(WRENCH, _held(track, grid).T, strict=True)),
-                    }
-                )
-            )
-        parts.append(pd.concat(bodies).sort_values("step", kind="stable"))
+        state = np.stack([_states(track, grid, dt) for track in bodies], axis=1)
+        measured = np.array([~np.isnan(track.state).all(axis=0) for track in bodies])
+        empty += int((np.isnan(state) & measured).any(axis=2).sum())
+        state[:, quotients] = np.nan
+        action = np.stack([_mean_wrenches(track, grid) for track in bodies], axis=1)
+        weights += [_weights(track.time, grid, dt) for track in bodies]
+        one = np.array([label], dtype=object)
+        parts.append(as_table(one, grid[None], names, state[None], action[None]))
     table = pd.concat(parts)
-    lost = [f"{STATE[d]} of {scene.moving[b].name}" for b, d in zip(*np.nonzero(quotients),
-            strict=True)]  # fmt: skip
-    message = _in_words(source, spacing, dt, len(rows.time), len(table), weights, empty, lost)
+    message = (
+        f"{source}: samples are {spacing.min():.4g} to {spacing.max():.4g} s apart (median"
+        f" {np.median(spacing):.4g} s), not {dt:g} s: {len(rows.time)} rows were resampled to"
+        f" {len(table)}{_noise_in_words(weights)}"
+    )
+    if empty:
+        message += f"; {empty} rows have empty cells, in gaps of more than {REACH * dt:.4g} s"
+    if quotients.any():
+        lost = ", ".join(f"{STATE[d]} of {names[body]}" for body, d in np.argwhere(quotients))
+        message += (
+            f"; {lost}: difference quotients of the positions, no measurements, and left empty"
+            " (--estimate-velocities, estimate_velocities=True)"
+        )
     warnings.warn(message, ResamplingWarning, stacklevel=4)
     return table.reset_index(drop=True)
 
 
-def _tracks(rows: Rows, scene: Scene) -> dict[tuple[int, int], _Track]:
-    """Rows by trajectory and body, each with times that rise."""
-    tracks = {}
-    for label in range(len(rows.labels)):
-        for body in range(len(scene.moving)):
-            row = np.flatnonzero((rows.trajectory == label) & (rows.body == body))
-            if not row.size:
-                raise HistoryError(
-                    f'history: body "{scene.moving[body].name}" has no rows in trajectory'
-                    f" {rows.labels[label]}; add them, or drop the trajectory"
-                )
-            time = rows.time[row]
-            back = np.flatnonzero(np.diff(time) <= 0)
-            if back.size:
-                at = int(row[back[0] + 1])
-                raise HistoryError(
-                    f"{rows.at(at)}: time does not rise in {rows.of(at)}: {rows.time[at]:.6g} s"
-                    f" after {time[back[0]]:.6g} s; sort the rows, drop duplicates"
-                )
-            action = rows.action[row]
-            if not scene.moving[body].kinematic and np.isnan(action[:-1]).any():
-                at = int(row[np.isnan(action[:-1]).any(axis=1).argmax()])
-                raise HistoryError(
-                    f"{rows.at(at)}: a wrench is empty in {rows.of(at)}; expected numbers on every"
-                    " row but the last; write 0 where nothing pushed"
-                )
-            tracks[label, body] = _Track(time, rows.state[row], action, row)
+def _tracks(rows: Rows, label: int, scene: Scene) -> list[_Track]:
+    """Return the rows of a trajectory by body, each with times that rise."""
+    tracks = []
+    for position, body in enumerate(scene.moving):
+        row = np.flatnonzero((rows.trajectory == label) & (rows.body == position))
+        if not row.size:
+            raise HistoryError(
+                f'history: body "{body.name}" has no rows in trajectory {rows.labels[label]}; add'
+                " them, or drop the trajectory"
+            )
+        time, action = rows.time[row], rows.action[row]
+        for back in np.flatnonzero(np.diff(time) <= 0):
+            at = int(row[back + 1])
+            raise rows.error(
+                at,
+                f"time does not rise in {rows.trajectory_of(at)}: {rows.time[at]:.6g} s after"
+                f" {time[back]:.6g} s; sort the rows, drop duplicates",
+            )
+        missing = np.isnan(action[:-1]).any(axis=1)
+        if missing.any() and not body.kinematic:
+            at = int(row[missing.argmax()])
+            raise rows.error(
+                at,
+                f"a wrench is empty in {rows.trajectory_of(at)}; expected numbers on every row but"
+                " the last; write 0 where nothing pushed",
+            )
+        tracks.append(_Track(time, rows.state[row], action, row))
     return tracks
 
 
-def _check(rows: Rows, tracks: dict[tuple[int, int], _Track], dt: float) -> None:
-    """Refuse what would have to be made up."""
-    for track in tracks.values():
-        if len(track.time) < 2:
-            continue
+def _check_spacing(rows: Rows, tracks: list[list[_Track]], dt: float) -> None:
+    """Refuse samples that are too far apart, and gaps that are too long."""
+    for track in (track for bodies in tracks for track in bodies if len(track.time) > 1):
         spacing = np.diff(track.time)
-        worst = int(spacing.argmax())
+        worst, median = int(spacing.argmax()), np.median(spacing)
         row = int(track.row[worst + 1])
-        if np.median(spacing) > _COARSEST * dt:
-            raise HistoryError(
-                f"{rows.at(row)}: samples of {rows.of(row)} are {np.median(spacing):.4g} s apart,"
-                f" more than the time step of {dt:g} s, so that resampling would make rows up;"
-                f" give a time step of at least {np.median(spacing):.4g} s"
+        if median > _COARSEST * dt:
+            raise rows.error(
+                row,
+                f"samples of {rows.trajectory_of(row)} are {median:.4g} s apart, more than the time"
+                f" step of {dt:g} s, so that resampling would make rows up; give a time step of at"
+                f" least {median:.4g} s",
             )
         if spacing[worst] > LONGEST * dt:
-            raise HistoryError(
-                f"{rows.at(row)}: {spacing[worst]:.4g} s since the sample before in {rows.of(row)},"
-                f" more than {LONGEST:g} time steps of {dt:g} s; give the rows after the gap a"
-                " trajectory of their own"
+            raise rows.error(
+                row,
+                f"{spacing[worst]:.4g} s since the sample before in {rows.trajectory_of(row)}, more"
+                f" than {LONGEST:g} time steps of {dt:g} s; give the rows after the gap a"
+                " trajectory of their own",
             )
 
 
-def _quotients(tracks: dict[tuple[int, int], _Track], scene: Scene) -> npt.NDArray[np.bool_]:
-    """Which velocities are difference quotients of the positions, shape (body, 6).
+def _quotients(tracks: tuple[_Track, ...]) -> Bools:
+    """Return which velocities of a body are difference quotients of its positions, shape (6,).
 
-    After interpolation at uneven places they would pass for measurements of their own.
+    After interpolation at uneven times they would look like independent measurements.
     """
-    found = np.zeros((len(scene.moving), len(STATE)), dtype=bool)
-    for body in range(len(scene.moving)):
-        own = [track for (_, each), track in tracks.items() if each == body]
-        for d in range(3, len(STATE)):
-            off: list[list[Floats]] = [[], [], []]
-            rates = []
-            for track in own:
-                place, rate = track.state[:, d - 3], track.state[:, d]
-                if len(place) < 3 or not np.isfinite([place, rate]).all():
-                    continue
-                place = unwrapped(track.time, place, rate) if d - 3 == THETA else place
-                one = np.diff(place) / np.diff(track.time)
-                two = (place[2:] - place[:-2]) / (track.time[2:] - track.time[:-2])
-                for kind, quotient in enumerate((one[:-1], two, one[1:])):
-                    off[kind].append(rate[1:-1] - quotient)
-                rates.append(rate[1:-1])
-            if rates and (spread := float(np.concatenate(rates).std())) > 0:
-                # at the ends and in gaps they may be anything
-                left = min(float(np.quantile(np.abs(np.concatenate(each)), 0.95)) for each in off)
-                found[body, d] = left < _QUOTIENT * spread
+    found = np.zeros(len(STATE), dtype=bool)
+    for d in range(3, len(STATE)):
+        off: list[list[Floats]] = [[], [], []]
+        rates = []
+        for track in tracks:
+            place, rate = track.state[:, d - 3], track.state[:, d]
+            if len(place) < 3 or not np.isfinite([place, rate]).all():
+                continue
+            place = unwrapped(track.time, place, rate) if d - 3 == THETA else place
+            one = np.diff(place) / np.diff(track.time)
+            two = (place[2:] - place[:-2]) / (track.time[2:] - track.time[:-2])
+            for kind, quotient in enumerate((one[:-1], two, one[1:])):
+                off[kind].append(rate[1:-1] - quotient)
+            rates.append(rate[1:-1])
+        if rates and (spread := float(np.concatenate(rates).std())) > 0:
+            # at the ends and in gaps they may be anything
+            misfit = min(float(np.quantile(np.abs(np.concatenate(each)), 0.95)) for each in off)
+            found[d] = misfit < _QUOTIENT * spread
     return found
 
 
 def _states(track: _Track, grid: Floats, dt: float) -> Floats:
-    """States at the grid's times, shape (step, 6); NaN in gaps."""
+    """Return the states at the grid's times, shape (step, 6); NaN in gaps."""
     result = np.full((len(grid), len(STATE)), np.nan)
     for d in range(len(STATE)):
         finite = np.flatnonzero(np.isfinite(track.state[:, d]))
@@ -216,7 +205,7 @@ def _states(track: _Track, grid: Floats, dt: float) -> Floats:
 
 
 def _interpolated(time: Floats, values: Floats, rate: Floats | None, grid: Floats) -> Floats:
-    """A run of samples at the grid's times; a position's ``rate`` is used where it is whole."""
+    """Return a run of samples at the grid's times; a position's ``rate`` is used where complete."""
     grid = np.clip(grid, time[0], time[-1])
     if rate is None or len(time) < 2:
         return np.interp(grid, time, values)
@@ -227,8 +216,11 @@ def _interpolated(time: Floats, values: Floats, rate: Floats | None, grid: Float
     return np.asarray(CubicSpline(time, values)(grid))
 
 
-def _held(track: _Track, grid: Floats) -> Floats:
-    """Mean wrench of each step, held from sample to sample, shape (step, 3); none on the last."""
+def _mean_wrenches(track: _Track, grid: Floats) -> Floats:
+    """Return the mean wrench of each step, shape (step, 3); NaN on the last.
+
+    A wrench is held from sample to sample.
+    """
     impulse = np.cumsum(track.action[:-1] * np.diff(track.time)[:, None], axis=0)
     impulse = np.concatenate([np.zeros((1, len(WRENCH))), impulse])
     at = np.stack([np.interp(grid, track.time, column) for column in impulse.T], axis=1)
@@ -237,7 +229,7 @@ def _held(track: _Track, grid: Floats) -> Floats:
 
 
 def _weights(time: Floats, grid: Floats, dt: float) -> tuple[Floats, Ints]:
-    """Share of the later sample in each step's linear interpolation, and which the earlier is."""
+    """Return the later sample's share in each interpolated step, and the earlier sample's index."""
     before = np.clip(np.searchsorted(time, grid, side="right") - 1, 0, max(len(time) - 2, 0))
     after = np.minimum(before + 1, len(time) - 1)
     width = np.where(after > before, time[after] - time[before], 1.0)
@@ -247,44 +239,25 @@ def _weights(time: Floats, grid: Floats, dt: float) -> tuple[Floats, Ints]:
     return share, before.astype(np.int64)
 
 
-def _in_words(
-    source: str,
-    spacing: Floats,
-    dt: float,
-    n_before: int,
-    n_after: int,
-    weights: list[tuple[Floats, Ints]],
-    empty: int,
-    lost: list[str],
-) -> str:
-    """What was irregular, what was done, and what follows."""
+def _noise_in_words(weights: list[tuple[Floats, Ints]]) -> str:
+    """Return what interpolation does to the noise, in words."""
     share = np.concatenate([each for each, _ in weights])
     between = (share > 0) & (share < 1)
-    left = np.sqrt(((1 - share) ** 2 + share**2).mean())
+    remaining = np.sqrt(((1 - share) ** 2 + share**2).mean())
     shared, pairs = 0, 0
     for each, before in weights:
         first, last = before + (each == 1), before + (each > 0)
         shared += int((last[:-1] >= first[1:]).sum())
         pairs += len(before) - 1
-    text = (
-        f"{source}: samples are {spacing.min():.4g} to {spacing.max():.4g} s apart (median"
-        f" {np.median(spacing):.4g} s), not {dt:g} s: {n_before} rows were resampled to {n_after}"
-    )
+    text = ""
     if between.any():
         text += (
             f"; {between.mean():.0%} are interpolated (positions by cubics, velocities linearly;"
-            f" wrenches are means), which leaves {left:.0%} of the velocities' noise"
+            f" wrenches are means), which leaves {remaining:.0%} of the velocities' noise"
         )
     if shared:
         text += (
             f"; {shared / pairs:.0%} of neighbouring rows share a sample: their errors are less"
             " independent than they look, and intervals come out too narrow"
-        )
-    if empty:
-        text += f"; {empty} rows have empty cells, in gaps of more than {REACH * dt:.4g} s"
-    if lost:
-        text += (
-            f"; {', '.join(lost)}: difference quotients of the positions, no measurements, and"
-            " left empty (--estimate-velocities, estimate_velocities=True)"
         )
     return text

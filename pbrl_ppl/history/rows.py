@@ -1,22 +1,173 @@
-"""Rows of a history to arrays: every rule that a table of measurements must keep."""
+"""Rows of a history's table: names, cells and times checked, and arrays made of them."""
 
-from __future__ import annotations
-
+import re
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import pandas as pd
 
 from pbrl_ppl.errors import HistoryError
-from pbrl_ppl.history.cells import Floats, Ints, Rows, read_rows
-from pbrl_ppl.history.paths import check_paths, kinematic_bodies
-from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import WRENCH
+from pbrl_ppl.history.files import COLUMNS
+from pbrl_ppl.history.kinematics import kinematic_bodies
+from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
+#: How far an interval may be from the scene's time step, as a share of it.
 TIME_TOLERANCE = 0.01
-"""How far an interval may be from the scene's time step, as a share of it."""
+#: Largest absolute value of a state or wrench, in SI units.
+_LARGEST = 1e9
+_INTEGER = re.compile(r"(-?(?:0|[1-9]\d{0,17}))(?:\.0*)?")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Columns of a table without its blank rows; ``line`` is each row's number in the file."""
+
+    line: Ints
+    labels: list[Any]
+    trajectory: Ints
+    body: Ints
+    step: Ints | None
+    time: Floats
+    state: Floats
+    action: Floats
+
+    def error(self, row: int, message: str) -> HistoryError:
+        """Return an error that names the row of the file."""
+        return HistoryError(f"history row {self.line[row]}: {message}")
+
+    def trajectory_of(self, row: int) -> str:
+        """Return the name of a row's trajectory, for messages."""
+        return f"trajectory {self.labels[self.trajectory[row]]}"
+
+
+def with_clean_names(frame: pd.DataFrame, source: str) -> pd.DataFrame:
+    """Return a table with a named index as columns, and names that are different text.
+
+    Raises
+    ------
+    HistoryError
+        If a name is there twice.
+    """
+    if any(name is not None for name in frame.index.names):
+        frame = frame.reset_index()
+    frame = frame.set_axis([str(name).strip() for name in frame.columns], axis=1)
+    if frame.columns.has_duplicates:
+        name = frame.columns[frame.columns.duplicated()][0]
+        raise HistoryError(f'{source}: column "{name}" is there twice; drop one')
+    return frame
+
+
+def read_rows(frame: pd.DataFrame, scene: Scene, source: str) -> Rows:
+    """Return a table's rows after a check of the columns' names and of each cell.
+
+    Raises
+    ------
+    HistoryError
+        If a column is unknown or missing, or a cell is not what its column needs.
+    """
+    frame = with_clean_names(frame, source)
+    for name in frame:
+        if name not in COLUMNS:
+            raise HistoryError(
+                f'{source}: unknown column "{name}"{nearest(name, COLUMNS)} '
+                f"Rename or drop it; the columns are {', '.join(COLUMNS)}"
+            )
+    required = ("trajectory", "time", "body", *WRENCH)
+    if missing := [name for name in required if name not in frame]:
+        raise HistoryError(
+            f"{source}: missing column(s) {', '.join(missing)}; expected {', '.join(COLUMNS)} "
+            "(step is optional)"
+        )
+    blank = (frame.isna() | (frame.astype(object) == "")).to_numpy(dtype=bool).all(axis=1)
+    filled = np.flatnonzero(~blank)
+    line, frame = filled + 2, frame.iloc[filled].reset_index(drop=True)
+    if not len(frame):
+        raise HistoryError(f"{source}: it has no rows; expected one for each body at each step")
+
+    labels, trajectory = _trajectories(frame["trajectory"], line)
+    body = _bodies(frame["body"], line, scene)
+    where = [f"in trajectory {labels[i]}" for i in trajectory]
+    number = {name: np.full(len(frame), np.nan) for name in ("time", *STATE, *WRENCH)} | {
+        name: _numbers(frame[name], line, where)
+        for name in frame.columns.difference(["trajectory", "body"], sort=False)
+    }
+    for name in ("time", "step"):
+        if np.isnan(number.get(name, 0.0)).any():
+            row = int(np.isnan(number[name]).argmax())
+            raise HistoryError(
+                f"history row {line[row]}: {name} is empty {where[row]}; expected a number; fill it"
+                " in or drop the row"
+            )
+    step = number.get("step")
+    if step is not None and (broken := (step != np.round(step)) | (np.abs(step) > 2**53)).any():
+        row = int(broken.argmax())
+        raise HistoryError(
+            f"history row {line[row]}: step is {step[row]} {where[row]}; expected a whole number"
+        )
+    whole = None if step is None else step.astype(np.int64)
+    state, action = (np.stack([number[name] for name in names], 1) for names in (STATE, WRENCH))
+    return Rows(line, labels, trajectory, body, whole, number["time"], state, action)
+
+
+def _trajectories(column: pd.Series, line: Ints) -> tuple[list[Any], Ints]:
+    """Return the labels in order of appearance (integers where all are) and each row's code."""
+    text = [str(cell).strip() for cell in column.astype(object).where(column.notna(), "")]
+    if "" in text:
+        raise HistoryError(
+            f"history row {line[text.index('')]}: trajectory is empty; expected a number or a name;"
+            " fill it in"
+        )
+    whole = [_INTEGER.fullmatch(label) for label in text]
+    labels: list[Any] = [int(match[1]) for match in whole if match] if all(whole) else text
+    codes, unique = pd.factorize(np.array(labels, dtype=object))
+    return unique.tolist(), codes.astype(np.int64)
+
+
+def _bodies(column: pd.Series, line: Ints, scene: Scene) -> Ints:
+    """Return each row's position among the scene's moving bodies."""
+    known = [body.name for body in scene.moving]
+    names = [str(name).strip() for name in column.astype(object).where(column.notna(), "")]
+    for row, name in enumerate(names):
+        if name not in known:
+            if name in [body.name for body in scene.bodies]:
+                cure = "it is static there; drop its rows or set static = false"
+            else:
+                cure = f"the scene has {', '.join(known)}{nearest(name, known)}"
+            raise HistoryError(
+                f'history row {line[row]}: body "{name}" does not move in the scene; {cure}'
+            )
+    for name in known:
+        if name not in names:
+            raise HistoryError(
+                f'history: body "{name}" of the scene has no rows; record it, or drop it from the '
+                "scene or make it static"
+            )
+    return np.array([known.index(name) for name in names], dtype=np.int64)
+
+
+def _numbers(column: pd.Series, line: Ints, where: list[str]) -> Floats:
+    """Return a column as floats, NaN where empty."""
+    if column.dtype.kind in "bmMc":
+        values = np.full(len(column), np.nan)
+    else:
+        numeric = pd.to_numeric(column, errors="coerce")
+        values = np.array(numeric.to_numpy(dtype=np.float64, na_value=np.nan))
+    suspect = np.isnan(values) & column.notna().to_numpy(dtype=bool)
+    for row in np.flatnonzero(suspect):
+        if str(column[row]).strip().lower() not in ("", "nan"):
+            raise HistoryError(
+                f"history row {line[row]}: {column.name} is {str(column[row])!r} {where[row]};"
+                " expected a number or an empty cell; correct it"
+            )
+    limit = np.inf if column.name in ("time", "step") else _LARGEST
+    for row in np.flatnonzero(np.isinf(values) | (np.abs(values) > limit)):
+        raise HistoryError(
+            f"history row {line[row]}: {column.name} is {values[row]} {where[row]}; expected a"
+            f" finite number of at most {_LARGEST:g}; empty the cell if it was not measured"
+        )
+    return values
 
 
 @dataclass(frozen=True)
@@ -40,7 +191,7 @@ def arrays(frame: pd.DataFrame, scene: Scene, source: str) -> Arrays:
     scene : Scene
         The bodies and the time step that are expected.
     source : str
-        What to call the table in messages about the whole of it.
+        Name of the table in messages about the whole of it.
 
     Raises
     ------
@@ -51,116 +202,111 @@ def arrays(frame: pd.DataFrame, scene: Scene, source: str) -> Arrays:
     # Trajectories may alternate in the file; inside each one, the file's order counts.
     order = np.argsort(rows.trajectory, kind="stable")
     first, position = _steps(rows, order, scene)
-    k = len(scene.moving)
-    starts = np.flatnonzero(first)
     n_rows = np.zeros(len(rows.labels), dtype=np.int64)
     np.maximum.at(n_rows, rows.trajectory, position + 1)
-    _complete(rows, scene, position, n_rows)
-    check_paths(rows, scene)
-    shape = (len(rows.labels), int(n_rows.max()), k)
-    state = np.full((*shape, 6), np.nan)
-    action = np.full((*shape, 3), np.nan)
+    _check_complete(rows, scene, position, n_rows)
+    shape = (len(n_rows), int(n_rows.max()), len(scene.moving))
+    state, action = (np.full((*shape, len(names)), np.nan) for names in (STATE, WRENCH))
     clock = np.full(shape[:2], np.nan)
-    where = (rows.trajectory, position, rows.body)
-    state[where] = rows.state
-    action[where] = rows.action
-    head = order[starts]
+    state[rows.trajectory, position, rows.body] = rows.state
+    action[rows.trajectory, position, rows.body] = rows.action
+    head = order[first]
     clock[rows.trajectory[head], position[head]] = rows.time[head]
-    # What a last row commands belongs to an interval that was not measured.
+    # A last row's wrench acts in an interval that was not measured.
     action[np.arange(len(n_rows)), n_rows - 1] = np.nan
     return Arrays(rows.labels, n_rows, clock, state, action)
 
 
-def _steps(rows: Rows, order: Ints, scene: Scene) -> tuple[npt.NDArray[np.bool_], Ints]:
+def _steps(rows: Rows, order: Ints, scene: Scene) -> tuple[Bools, Ints]:
     """Return where a step begins (in ``order``), and each row's step counted from 0."""
     dt = scene.time_step
     tolerance = TIME_TOLERANCE * dt
     time, trajectory = rows.time[order], rows.trajectory[order]
-    begins = np.ones(len(order), dtype=bool)
-    begins[1:] = trajectory[1:] != trajectory[:-1]
+    inside = np.diff(trajectory, prepend=-1) == 0
     change = np.diff(time, prepend=time[0])
     if rows.step is None:
-        first = begins | (np.abs(change) > tolerance)
-        jump = np.where(first, 1, 0)
+        first = ~inside | (np.abs(change) > tolerance)
+        jump = first.astype(np.int64)
     else:
-        step = rows.step[order]
-        jump = np.diff(step, prepend=step[0])
-        first = begins | (jump != 0)
-    inside = ~begins
+        jump = np.diff(rows.step[order], prepend=rows.step[order[0]])
+        first = ~inside | (jump != 0)
     group = np.cumsum(first) - 1
-    pair = group * len(scene.moving) + rows.body[order]
-    again = np.ones(len(order), dtype=bool)
-    again[np.unique(pair, return_index=True)[1]] = False
+    again = pd.Series(group * len(scene.moving) + rows.body[order]).duplicated().to_numpy()
     # In the order of the cures: rows out of order or twice look like gaps further on.
-    problems = {
-        "back": inside & (change < np.where(first, 0.0, -tolerance)),
-        "again": again,
-        "step back": inside & (jump < 0),
-        "skip": inside & (jump > 1),
-        "two times": inside & ~first & (change > tolerance),
-        "unequal": inside & first & (np.abs(change - dt) > tolerance),
+    rules = {
+        "time goes back by {back:.6g} s in {where}; sort the rows or drop the duplicate": inside
+        & (change < np.where(first, 0.0, -tolerance)),
+        'a second row of body "{body}" at {moment} in {where}; expected one; drop the'
+        " duplicate": again,
+        "step goes back from {before} to {step} in {where}; sort the rows": inside & (jump < 0),
+        "step skips from {before} to {step} in {where}; expected {next}; record every step, or give"
+        " the rows after the gap a trajectory of their own": inside & (jump > 1),
+        "step {step} has two times, {change:.6g} s apart, in {where}; expected one; give every body"
+        " the same time at a step": inside & ~first & (change > tolerance),
+        "{change:.6g} s since the step before in {where}; expected {dt:.6g} s, the scene's"
+        " time_step, within 1 %; correct time_step, or have the history resampled (resample=True,"
+        " --time-step)": inside & first & (np.abs(change - dt) > tolerance),
     }
-    for kind, broken in problems.items():
-        if broken.any():
-            places = np.flatnonzero(broken)
-            place = int(places[np.argmin(order[places])])
-            row = int(order[place])
-            _raise_time(rows, row, kind, float(change[place]), int(jump[place]), scene)
-    start = np.maximum.accumulate(np.where(begins, group, 0))
+    for message, broken in rules.items():
+        if not broken.any():
+            continue
+        places = np.flatnonzero(broken)
+        place = int(places[np.argmin(order[places])])
+        row = int(order[place])
+        step = 0 if rows.step is None else int(rows.step[row])
+        before = step - int(jump[place])
+        words = {"where": rows.trajectory_of(row), "body": scene.moving[rows.body[row]].name}
+        words["moment"] = f"time {time[place]:.6g} s" if rows.step is None else f"step {step}"
+        numbers = {"change": change[place], "back": -change[place], "dt": dt}
+        steps = {"step": step, "before": before, "next": before + 1}
+        raise rows.error(row, message.format(**words, **numbers, **steps))
     position = np.empty(len(order), dtype=np.int64)
-    position[order] = group - start
+    position[order] = group - np.maximum.accumulate(np.where(inside, 0, group))
     return first, position
 
 
-def _raise_time(rows: Rows, row: int, kind: str, change: float, jump: int, scene: Scene) -> None:
-    at, of = rows.at(row), rows.of(row)
-    step = 0 if rows.step is None else int(rows.step[row])
-    moment = f"time {rows.time[row]:.6g} s" if rows.step is None else f"step {step}"
-    name = scene.moving[rows.body[row]].name
-    dt = scene.time_step
-    messages = {
-        "back": f"time goes back by {-change:.6g} s in {of}; sort the rows or drop the duplicate",
-        "again": f'a second row of body "{name}" at {moment} in {of}; expected one; drop the '
-        "duplicate",
-        "step back": f"step goes back from {step - jump} to {step} in {of}; sort the rows",
-        "skip": f"step skips from {step - jump} to {step} in {of}; expected {step - jump + 1}; "
-        "record every step, or give the rows after the gap a trajectory of their own",
-        "two times": f"step {step} has two times, {change:.6g} s apart, in {of}; expected one; "
-        "give every body the same time at a step",
-        "unequal": f"{change:.6g} s since the step before in {of}; expected {dt:.6g} s, the "
-        "scene's time_step, within 1 %; correct time_step, or have the history resampled "
-        "(resample=True, --time-step)",
-    }
-    raise HistoryError(f"{at}: {messages[kind]}")
-
-
-def _complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> None:
-    """Check that each body is there at each step, with an action before the last."""
+def _check_complete(rows: Rows, scene: Scene, position: Ints, n_rows: Ints) -> None:
+    """Refuse a history that lacks a body's row, a wrench before the last row, or a path's pose."""
     names = [body.name for body in scene.moving]
-    k = len(names)
-    offset = np.cumsum(n_rows) - n_rows
-    cell = (offset[rows.trajectory] + position) * k + rows.body
     for i in np.flatnonzero(n_rows < 2):
-        row = int(np.flatnonzero(rows.trajectory == i)[0])
-        raise HistoryError(
-            f"{rows.at(row)}: {rows.of(row)} has 1 step; expected at least 2, a state and the one "
-            "after it; drop the trajectory"
+        row = int((rows.trajectory == i).argmax())
+        raise rows.error(
+            row,
+            f"{rows.trajectory_of(row)} has 1 step; expected at least 2, a state and the one after"
+            " it; drop the trajectory",
         )
-    if len(cell) < n_rows.sum() * k:
-        gap = int(np.setdiff1d(np.arange(n_rows.sum() * k), cell)[0])
-        row = int(np.flatnonzero(cell // k == gap // k)[0])
-        raise HistoryError(
-            f'{rows.at(row)}: body "{names[gap % k]}" has no row at time {rows.time[row]:.6g} s in '
-            f"{rows.of(row)}; expected one of each body at each step; add it, with empty cells for "
-            "what was not measured"
+    offset = np.cumsum(n_rows) - n_rows
+    moment = offset[rows.trajectory] + position
+    cell = moment * len(names) + rows.body
+    for gap in np.setdiff1d(np.arange(n_rows.sum() * len(names)), cell):
+        row = int((moment == gap // len(names)).argmax())
+        raise rows.error(
+            row,
+            f'body "{names[gap % len(names)]}" has no row at time {rows.time[row]:.6g} s in '
+            f"{rows.trajectory_of(row)}; expected one of each body at each step; add it, with empty"
+            " cells for what was not measured",
         )
-    pushed = ~kinematic_bodies(scene)[rows.body]  # a kinematic body's path is its action
+    kinematic = kinematic_bodies(scene)[rows.body]
     before_last = position < n_rows[rows.trajectory] - 1
-    empty = np.isnan(rows.action) & (before_last & pushed)[:, None]
-    if empty.any():
-        row, column = (int(i) for i in np.argwhere(empty)[0])
-        raise HistoryError(
-            f'{rows.at(row)}: {WRENCH[column]} of body "{names[rows.body[row]]}" is empty in '
-            f"{rows.of(row)}; expected a number on every row but the last; write 0 where nothing "
-            "pushed"
-        )
+    needed = (
+        (
+            rows.action,
+            before_last & ~kinematic,
+            WRENCH,
+            "on every row but the last; write 0 where nothing pushed",
+        ),
+        (
+            rows.state[:, :3],
+            kinematic,
+            STATE,
+            "on every row: the body is kinematic and follows its path; fill it in (theta of a round"
+            " body may be 0 throughout)",
+        ),
+    )
+    for values, required, columns, cure in needed:
+        for row, column in np.argwhere(np.isnan(values) & required[:, None]):
+            raise rows.error(
+                row,
+                f'{columns[column]} of body "{names[rows.body[row]]}" is empty in '
+                f"{rows.trajectory_of(row)}; expected a number {cure}",
+            )

@@ -1,6 +1,5 @@
 """Phi: priors as data, the layout of the parameter vector, the wheel's symmetry."""
 
-from pbrl_ppl.parameters.differences import differentiate
 from pbrl_ppl.parameters.layout import (
     BODY_PARAMETERS,
     JOINT_ANCHORS,
@@ -13,6 +12,7 @@ from pbrl_ppl.parameters.library import ParameterLibrary
 from pbrl_ppl.parameters.priors import (
     Prior,
     box,
+    differentiate,
     inside,
     prior_draws,
     prior_residual,

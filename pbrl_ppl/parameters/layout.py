@@ -7,24 +7,15 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters.priors import Prior
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Bools, Floats
 
 #: Table 1's names for one body, in the order of Eq. 8, with units.
-BODY_PARAMETERS: Mapping[str, str] = {
-    "mass": "kg",
-    "r": "1",
-    "mu_c": "1",
-    "w_x": "m",
-    "w_y": "m",
-    "w_theta": "rad",
-    "mu_x": "1",
-    "mu_y": "1",
-}
+BODY_PARAMETERS: Mapping[str, str] = dict(
+    mass="kg", r="1", mu_c="1", w_x="m", w_y="m", w_theta="rad", mu_x="1", mu_y="1"
+)
 WHEEL_PARAMETERS = ("w_x", "w_y", "w_theta", "mu_x", "mu_y")
 #: Table 1's names for one joint: which bodies it joins, and where in each one's frame, with units.
 JOINT_INDICES = ("i_a", "i_b")
@@ -77,24 +68,19 @@ class Layout:
     blocks: tuple[Block, ...]
 
     def __getstate__(self) -> dict[str, object]:
-        """The blocks; what follows from them is found again."""
+        """Return the blocks alone: cached properties are computed again."""
         return {"blocks": self.blocks}
 
     def subset(self, owners: Iterable[str]) -> Layout:
-        """The parameters of these bodies and joints alone."""
-        kept = set(owners)
-        blocks = []
+        """Return the layout of the parameters of these bodies and joints alone."""
+        kept, blocks = set(owners), []
         for block in self.blocks:
-            of = [i for i, owner in enumerate(block.owners) if owner in kept]
-            if of:
-                blocks.append(
-                    replace(
-                        block,
-                        owners=tuple(block.owners[i] for i in of),
-                        priors=tuple(block.priors[i] for i in of),
-                        conditional=tuple(block.conditional[i] for i in of if block.conditional),
-                    )
-                )
+            places = [i for i, owner in enumerate(block.owners) if owner in kept]
+            if places:
+                conditional = tuple(block.conditional[i] for i in places if block.conditional)
+                names = tuple(block.owners[i] for i in places)
+                priors = tuple(block.priors[i] for i in places)
+                blocks.append(replace(block, owners=names, priors=priors, conditional=conditional))
         return Layout(tuple(blocks))
 
     @cached_property
@@ -113,13 +99,15 @@ class Layout:
         return tuple(prior for block in self.blocks for prior in block.priors)
 
     @property
-    def bounds(self) -> tuple[Array, Array]:
+    def bounds(self) -> tuple[Floats, Floats]:
         """Lower and upper end of each entry's support, shape (p,) each."""
         support = np.array([prior.support for prior in self.priors]).reshape(-1, 2)
         return support[:, 0], support[:, 1]
 
-    def supports(self, phi: Array) -> tuple[Array, Array]:
-        """Ends of each entry's support at phi, shape (n, p) each; an anchor's depend on its index.
+    def supports(self, phi: Floats) -> tuple[Floats, Floats]:
+        """Return the ends of each entry's support at phi, shape (n, p) each.
+
+        An anchor's support depends on its index.
 
         Parameters
         ----------
@@ -133,8 +121,8 @@ class Layout:
             lower[:, place], upper[:, place] = held.T
         return lower, upper
 
-    def log_prior(self, phi: Array) -> Array:
-        """Log-density of each entry under its prior; an anchor's prior depends on its index.
+    def log_prior(self, phi: Floats) -> Floats:
+        """Return the log-density of each entry; an anchor's prior depends on its index.
 
         Parameters
         ----------
@@ -156,38 +144,38 @@ class Layout:
         return result
 
     def _conditional(self) -> Iterator[tuple[int, int, tuple[Prior, ...]]]:
-        """Place of each anchor of unknown bodies, place of its index, and its alternatives."""
+        """Yield the places of each anchor of unknown bodies and of its index, and its priors."""
         for block in self.blocks:
             side = f"i_{block.name[0]}"
             for owner, conditional in zip(block.owners, block.conditional, strict=False):
                 if f"{side}[{owner}]" in self.labels:
                     yield self.index(block.name, owner), self.index(side, owner), conditional
 
-    def scale(self, phi: Array) -> Array:
-        """Scale of each entry of phi, for step sizes, shape (p,); zero of a discrete one."""
+    def scale(self, phi: Floats) -> Floats:
+        """Return the scale of each entry of phi for step sizes, shape (p,); 0 if discrete."""
         least = np.array(
             [0.0 if prior.discrete else min(prior.sigma, 1.0) for prior in self.priors]
         )
         return np.where(self.discrete, 0.0, np.maximum(np.abs(phi), 0.1 * least))
 
     def slices(self) -> Iterator[tuple[Block, slice]]:
-        """Each block with its place in the vector."""
+        """Yield each block with its place in the vector."""
         begin = 0
         for block in self.blocks:
             yield block, slice(begin, begin + len(block.owners))
             begin += len(block.owners)
 
     @property
-    def discrete(self) -> NDArray[np.bool_]:
+    def discrete(self) -> Bools:
         """Which entries are discrete, indices of names, shape (p,)."""
         return np.array([prior.discrete for prior in self.priors], dtype=bool)
 
     def owner_kind(self, place: int) -> str:
-        """Whether an entry belongs to a ``body`` or a ``joint``."""
+        """Return whether an entry belongs to a ``body`` or a ``joint``."""
         return [block.of for block in self.blocks for _ in block.owners][place]
 
     def index(self, name: str, owner: str) -> int:
-        """Place of one parameter of one body, or joint, in the vector.
+        """Return the place of a parameter of a body, or joint, in the vector.
 
         Raises
         ------
@@ -201,8 +189,8 @@ class Layout:
             )
         return self.labels.index(label)
 
-    def to_vector(self, values: Mapping[str, object]) -> Array:
-        """Stack named values, scalars or (owner,) arrays, into the vector phi, shape (p,).
+    def to_vector(self, values: Mapping[str, object]) -> Floats:
+        """Return the vector phi, shape (p,), of named values, scalars or (owner,) arrays.
 
         Raises
         ------
@@ -222,17 +210,17 @@ class Layout:
             vector[place] = value.ravel()
         return vector
 
-    def from_layout(self, other: Layout, phi: Array) -> Array:
-        """Values of another layout's parameters, priors' centres of those it lacks, shape (p,)."""
+    def from_layout(self, other: Layout, phi: Floats) -> Floats:
+        """Return another layout's values, priors' centres where it has none, shape (p,)."""
         known = dict(zip(other.labels, phi.tolist(), strict=True))
         pairs = zip(self.labels, self.priors, strict=True)
         return np.array([known.get(label, prior.centre) for label, prior in pairs])
 
-    def to_vectors(self, draws: Mapping[str, Array], n: int) -> Array:
-        """Stack ``n`` named draws, shape (n, owner) each, into vectors, shape (n, p)."""
+    def to_vectors(self, draws: Mapping[str, Floats], n: int) -> Floats:
+        """Return vectors, shape (n, p), of ``n`` named draws, shape (n, owner) each."""
         columns = [draws[block.name].reshape(n, -1) for block in self.blocks]
         return np.concatenate([np.zeros((n, 0)), *columns], axis=1)
 
-    def to_dict(self, vector: Array) -> dict[str, Array]:
-        """Split phi, shape (..., p), into named arrays, shape (..., owner)."""
+    def to_dict(self, vector: Floats) -> dict[str, Floats]:
+        """Return named arrays, shape (..., owner), of phi, shape (..., p)."""
         return {block.name: vector[..., place] for block, place in self.slices()}

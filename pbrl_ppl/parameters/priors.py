@@ -1,19 +1,15 @@
-"""A univariate prior as data, and several of them as a space to search in."""
+"""Univariate priors as data, several of them as a space to search in, and derivatives."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import i0e
 from scipy.stats import truncnorm
 
 from pbrl_ppl.errors import ParameterError
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: How far (in sigmas) mu may lie outside the support: farther out, densities lose their digits.
 _FARTHEST = 30.0
@@ -106,7 +102,7 @@ class Prior:
         return self.family == "categorical"
 
     @property
-    def probabilities(self) -> Array:
+    def probabilities(self) -> Floats:
         """Probabilities of a discrete prior's numbers from ``lower`` up, shape (number,)."""
         n = int(self.upper - self.lower) + 1
         weights = np.array(self.weights or (1.0,) * n)
@@ -128,8 +124,8 @@ class Prior:
             return self.lower
         return float(np.clip(self.mu, *self.support))
 
-    def residual(self, x: Array) -> Array:
-        """Least-squares residual: half its square is the negative log-density up to a constant.
+    def residual(self, x: Floats) -> Floats:
+        """Return the residual: half its square is the negative log-density up to a constant.
 
         Parameters
         ----------
@@ -151,8 +147,8 @@ class Prior:
             return np.asarray(2.0 * np.sqrt(self.kappa) * np.sin((x - self.mu) / 2.0))
         return np.asarray((x - self.mu) / self.sigma)
 
-    def log_density(self, x: Array) -> Array:
-        """Logarithm of the normalised density, minus infinity outside the support.
+    def log_density(self, x: Floats) -> Floats:
+        """Return the logarithm of the normalised density, minus infinity outside the support.
 
         Parameters
         ----------
@@ -195,8 +191,8 @@ class Prior:
             return float(law.logpdf(centre) + 0.5 * self.residual(np.array(centre)) ** 2)
         return normal
 
-    def sample(self, rng: np.random.Generator, size: int) -> Array:
-        """Draw values; ``size`` of them."""
+    def sample(self, rng: np.random.Generator, size: int) -> Floats:
+        """Return ``size`` draws."""
         if self.family == "log_normal":
             return rng.lognormal(self.mu, self.sigma, size)
         if self.family == "von_mises":
@@ -213,32 +209,66 @@ class Prior:
         return rng.normal(self.mu, self.sigma, size)
 
 
-def prior_draws(priors: Sequence[Prior], rng: np.random.Generator, n: int) -> Array:
-    """Independent draws from each prior, shape (n, p)."""
+def prior_draws(priors: Sequence[Prior], rng: np.random.Generator, n: int) -> Floats:
+    """Return independent draws from each prior, shape (n, p)."""
     return np.stack([prior.sample(rng, n) for prior in priors], axis=1)
 
 
-def prior_residual(priors: Sequence[Prior], phi: Array) -> Array:
-    """Each prior's least-squares residual, shape (..., p)."""
+def prior_residual(priors: Sequence[Prior], phi: Floats) -> Floats:
+    """Return each prior's least-squares residual, shape (..., p)."""
     columns = [prior.residual(phi[..., i]) for i, prior in enumerate(priors)]
     return np.stack(columns, axis=-1) if columns else np.zeros_like(phi)
 
 
-def prior_slopes(priors: Sequence[Prior], phi: Array) -> Array:
-    """Derivative of each prior's residual by its parameter, shape (p,)."""
+def prior_slopes(priors: Sequence[Prior], phi: Floats) -> Floats:
+    """Return the derivative of each prior's residual by its parameter, shape (p,)."""
     step = 1e-6 * np.maximum(np.abs(phi), 1e-3)
     return (prior_residual(priors, phi + step) - prior_residual(priors, phi - step)) / (2 * step)
 
 
-def inside(priors: Sequence[Prior], phi: Array) -> Array:
-    """Move values just inside their supports, shape (..., p)."""
+def inside(priors: Sequence[Prior], phi: Floats) -> Floats:
+    """Return values moved just inside their supports, shape (..., p)."""
     lower, upper = box(priors)
     return np.clip(phi, lower, upper)
 
 
-def box(priors: Sequence[Prior]) -> tuple[Array, Array]:
-    """Bounds of the search: the supports, less a margin; whole numbers may be at either end."""
+def box(priors: Sequence[Prior]) -> tuple[Floats, Floats]:
+    """Return the bounds of a search: the supports less a margin, which discrete priors lack."""
     support = np.array([prior.support for prior in priors]).reshape(-1, 2)
     width = np.where(np.isfinite(np.ptp(support, axis=1)), np.ptp(support, axis=1), 1.0)
     width[[prior.discrete for prior in priors]] = 0.0
     return support[:, 0] + _MARGIN * width, support[:, 1] - _MARGIN * width
+
+
+def differentiate(
+    function: Callable[[Floats], Floats], point: Floats, steps: Floats, lower: Floats, upper: Floats
+) -> Floats:
+    """Return a derivative by finite differences: central, or one-sided at a bound.
+
+    Parameters
+    ----------
+    function : callable
+        Takes points of shape (2 p, p), gives values of shape (2 p, ...).
+    point, steps, lower, upper : ndarray
+        Point, step and bounds of each parameter, shape (p,); a step of zero leaves its column zero.
+
+    Returns
+    -------
+    ndarray
+        Shape (..., p).
+
+    Examples
+    --------
+    >>> x, far = np.array([3.0]), np.array([np.inf])
+    >>> differentiate(lambda points: points[:, 0] ** 2, x, np.array([1e-4]), -far, far).round(6)
+    array([6.])
+    """
+    forward = np.minimum(point + steps, upper)
+    backward = np.maximum(point - steps, lower)
+    p = len(point)
+    points = np.tile(point, (2 * p, 1))
+    points[np.arange(p), np.arange(p)] = forward
+    points[p + np.arange(p), np.arange(p)] = backward
+    values = function(points)
+    width = np.maximum(forward - backward, 1e-300)
+    return np.asarray(np.moveaxis(values[:p] - values[p:], 0, -1) / width)

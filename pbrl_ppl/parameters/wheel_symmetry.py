@@ -6,8 +6,6 @@ equal in both frictions: there, which description a draw has means nothing, and 
 onto one. Elsewhere each description keeps the probability that the prior gives it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -18,10 +16,7 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.parameters.layout import Layout
 from pbrl_ppl.parameters.priors import Prior
-from pbrl_ppl.state import wrapped
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Floats, wrapped
 
 #: The parameters that the symmetry mixes: w_theta and w_theta + pi/2 with mu_x, mu_y swapped.
 MIXED = ("w_theta", "mu_x", "mu_y")
@@ -33,7 +28,7 @@ _ROUNDS = 20
 
 @dataclass(frozen=True)
 class Wheel:
-    """A wheel of which angle and both frictions are unknown; with one known there is no symmetry.
+    """A wheel with unknown angle and frictions; with one of them known there is no symmetry.
 
     Parameters
     ----------
@@ -57,8 +52,8 @@ class Wheel:
             return 4
         return 1 if mu_x == mu_y else 2
 
-    def turned(self, phi: Array, turns: Ints | int) -> Array:
-        """Phi, shape (..., p), with this wheel described so many quarter turns on, shape (...)."""
+    def turned(self, phi: Floats, turns: NDArray[np.intp] | int) -> Floats:
+        """Return phi, shape (..., p), with the wheel described this many quarter turns on."""
         phi, (angle, x, y) = phi.copy(), self.places
         odd = np.asarray(turns) % 2 == 1
         phi[..., angle] = wrapped(phi[..., angle] + np.asarray(turns) * np.pi / 2)
@@ -66,8 +61,8 @@ class Wheel:
         phi[..., x], phi[..., y] = np.where(odd, mu_y, mu_x), np.where(odd, mu_x, mu_y)
         return phi
 
-    def log_priors(self, phi: Array, count: int = 4) -> Array:
-        """Log-prior of the wheel described 0, 1, ... quarter turns on, shape (count, ...)."""
+    def log_priors(self, phi: Floats, count: int = 4) -> Floats:
+        """Return the wheel's log-prior 0, 1, ... quarter turns on, shape (count, ...)."""
         return np.array(
             [
                 sum(
@@ -80,7 +75,7 @@ class Wheel:
 
 
 def wheels(layout: Layout) -> tuple[Wheel, ...]:
-    """Wheels that have four equal descriptions, whatever the prior makes of them."""
+    """Return the wheels that have four descriptions of equal likelihood."""
     places = {label: i for i, label in enumerate(layout.labels)}
     priors, found = layout.priors, []
     owners = {owner: None for b in layout.blocks if b.of == "body" for owner in b.owners}
@@ -93,8 +88,8 @@ def wheels(layout: Layout) -> tuple[Wheel, ...]:
     return tuple(found)
 
 
-def fold_draws(layout: Layout, draws: Mapping[str, Array]) -> dict[str, Array]:
-    """Fold the draws of every wheel onto one of the descriptions that its prior cannot tell apart.
+def fold_draws(layout: Layout, draws: Mapping[str, Floats]) -> dict[str, Floats]:
+    """Return draws with every wheel folded onto one description of equal prior probability.
 
     Parameters
     ----------
@@ -127,8 +122,8 @@ def fold_draws(layout: Layout, draws: Mapping[str, Array]) -> dict[str, Array]:
     return folded
 
 
-def gathered(layout: Layout, phi: Array) -> Array:
-    """Draws (draw, p) with all wheels on one hill of the likelihood, whatever the prior."""
+def gathered(layout: Layout, phi: Floats) -> Floats:
+    """Return draws (draw, p) with all wheels at one mode of the likelihood, for any prior."""
     phi = phi.copy()
     for wheel in wheels(layout):
         places = list(wheel.places)
@@ -137,8 +132,8 @@ def gathered(layout: Layout, phi: Array) -> Array:
     return phi
 
 
-def fold_wheels(layout: Layout, phi: Array) -> Array:
-    """Choose one of the descriptions that a wheel's prior cannot tell apart, for each draw alone.
+def fold_wheels(layout: Layout, phi: Floats) -> Floats:
+    """Return each draw in one of the descriptions of a wheel with equal prior probability.
 
     Namely the one with mu_x <= mu_y and w_theta in (-pi/2, pi/2]; the latter alone where the
     frictions' priors differ; none where that of w_theta is not uniform.
@@ -166,8 +161,8 @@ def fold_wheels(layout: Layout, phi: Array) -> Array:
     return phi
 
 
-def likeliest(layout: Layout, phi: Array) -> Array:
-    """Each wheel's most probable description; of equally probable ones as by `fold_wheels`.
+def likeliest(layout: Layout, phi: Floats) -> Floats:
+    """Return each wheel in its most probable description; ties go as in `fold_wheels`.
 
     Parameters
     ----------
@@ -182,8 +177,8 @@ def likeliest(layout: Layout, phi: Array) -> Array:
     return fold_wheels(layout, phi)
 
 
-def beside(layout: Layout, phi: Array, others: Array) -> Array:
-    """Describe every wheel as others are described, where its prior cannot tell that apart.
+def beside(layout: Layout, phi: Floats, others: Floats) -> Floats:
+    """Map each draw to the same symmetry branch as other draws, where the prior is symmetric.
 
     Parameters
     ----------
@@ -203,8 +198,8 @@ def beside(layout: Layout, phi: Array, others: Array) -> Array:
     return phi
 
 
-def change_from(layout: Layout, phi: Array, origin: Array) -> Array:
-    """Change from an origin, wheels described and angles counted as is nearest to the origin.
+def change_from(layout: Layout, phi: Floats, origin: Floats) -> Floats:
+    """Return the change from an origin, with wheels and angles as near to it as possible.
 
     The engine does the same for all of these, whatever their prior says.
 
@@ -236,14 +231,14 @@ def change_from(layout: Layout, phi: Array, origin: Array) -> Array:
     return change
 
 
-def _points(values: Array) -> Array:
-    """Wheels (..., 3) as points (..., 4) that are near where the wheels are alike."""
+def _points(values: Floats) -> Floats:
+    """Return wheels (..., 3) as points (..., 4) that are close where the wheels are alike."""
     angle = values[..., 0]
     return np.stack([np.cos(angle), np.sin(angle), values[..., 1], values[..., 2]], axis=-1)
 
 
-def redescribed(layout: Layout, phi: Array, rng: np.random.Generator) -> Array:
-    """Draw each wheel's description anew from the prior, given which wheel it is.
+def redescribed(layout: Layout, phi: Floats, rng: np.random.Generator) -> Floats:
+    """Return draws with each wheel's description drawn from its conditional prior.
 
     The likelihood being the same for all, that is a Gibbs step of the posterior: draws of it stay
     draws of it, and chains need not cross from one description to another by themselves. Where
@@ -266,8 +261,8 @@ def redescribed(layout: Layout, phi: Array, rng: np.random.Generator) -> Array:
     return phi
 
 
-def evened(layout: Layout, phi: Array) -> Array:
-    """Correction of the log-prior that makes a wheel's four descriptions equally probable.
+def evened(layout: Layout, phi: Floats) -> Floats:
+    """Return the change of log-prior that makes a wheel's four descriptions equally probable.
 
     A chain then needs to see one of them only; `redescribed` gives each its own share.
 
@@ -293,8 +288,8 @@ def evened(layout: Layout, phi: Array) -> Array:
     return result
 
 
-def _fold(angle: Array, mu_x: Array, mu_y: Array, period: int) -> tuple[Array, Array, Array]:
-    """Each draw's description that is nearest to the mean of them all, of those ``period`` apart.
+def _fold(angle: Floats, mu_x: Floats, mu_y: Floats, period: int) -> tuple[Floats, Floats, Floats]:
+    """Return each draw in the description nearest to the mean, of those ``period`` apart.
 
     Where all four may be chosen, mu_x <= mu_y on average.
     """

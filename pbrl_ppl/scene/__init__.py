@@ -1,4 +1,4 @@
-"""What is declared: shapes, bodies, walls, joints; TOML to `Scene` and back."""
+"""Scenes: shapes, bodies, walls and joints as declared; TOML to `Scene` and back."""
 
 from pbrl_ppl.scene.checks import CONTACT_NAMES, nearest
 from pbrl_ppl.scene.scene import WORLD, Body, Joint, Point, Scene, Shape, Wall

@@ -1,10 +1,8 @@
 """Checks of a scene's values: each returns the value in canonical form or raises `SceneError`."""
 
-from __future__ import annotations
-
 import difflib
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Real
 from typing import Any
@@ -13,20 +11,15 @@ from pbrl_ppl.errors import SceneError
 from pbrl_ppl.state import STATE
 
 Point = tuple[float, float]
+Named = tuple[tuple[str, float], ...]
 
+#: The parameters of a body, in the order of Table 1.
 PARAMETER_NAMES = ("mass", "r", "mu_c", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
-"""The parameters of a body, in the order of Table 1."""
-
+#: Those of them that a contact needs: all that a kinematic body has.
 CONTACT_NAMES = ("r", "mu_c")
-"""Those of them that a contact needs: all that a kinematic body has."""
-
+#: Largest absolute value of a number and smallest positive one, in SI units: their products, such
+#: as inertias, stay far from the limits of floating-point numbers.
 LARGEST, SMALLEST = 1e9, 1e-12
-"""No number of a scene or a recording is larger, and no positive one of a scene smaller, in SI
-units: their products, such as inertias, stay far from where floating-point numbers end."""
-
-HYPER_NAMES = ("mu", "sigma", "kappa")
-INDEX_NAMES = ("i_a", "i_b")
-"""The indices of a joint of unknown bodies."""
 
 
 def nearest(name: object, known: Iterable[str]) -> str:
@@ -38,7 +31,7 @@ def nearest(name: object, known: Iterable[str]) -> str:
 
 @contextmanager
 def located(where: str) -> Iterator[None]:
-    """Say in a `SceneError` raised inside where it happened."""
+    """Prefix the message of a `SceneError` raised inside with its place."""
     try:
         yield
     except SceneError as error:
@@ -84,6 +77,14 @@ def not_negative(value: object, where: str) -> float:
     return number
 
 
+def unit_interval(value: object, where: str) -> float:
+    """Return a number from zero to one as a float."""
+    number = finite(value, where)
+    if not 0 <= number <= 1:
+        raise SceneError(f"{where} is {number}, expected between 0 and 1")
+    return number
+
+
 def flag(value: object, where: str) -> None:
     """Refuse what is not a boolean."""
     if not isinstance(value, bool):
@@ -119,88 +120,92 @@ def vector(value: object, length: int, where: str) -> Any:
     return numbers
 
 
-def _items(value: object, where: str) -> list[tuple[Any, Any]]:
-    """Return the pairs of a mapping, or of a tuple of pairs, refusing repeated names."""
+def _items(value: object, where: str) -> dict[Any, Any]:
+    """Return a mapping, or a tuple of pairs without repeated names, as a dict."""
     if isinstance(value, Mapping):
-        return list(value.items())
+        return dict(value)
     try:
         pairs = [(name, item) for name, item in value]  # type: ignore[attr-defined]
     except (TypeError, ValueError):
         raise SceneError(f"{where} is {value!r}, expected a table of names and values") from None
-    if len({name for name, _ in pairs}) < len(pairs):
+    if len(dict(pairs)) < len(pairs):
         raise SceneError(f"{where} gives one name twice; drop one")
-    return pairs
+    return dict(pairs)
 
 
-def known_parameters(value: object, where: str) -> tuple[tuple[str, float], ...]:
+def table(
+    value: object,
+    where: str,
+    known: Iterable[str],
+    check: Callable[[str, object, str], Any],
+    what: str = "key",
+    hint: str = "",
+) -> tuple[tuple[str, Any], ...]:
+    """Return the entries of a table in the order of the known names, each checked.
+
+    Parameters
+    ----------
+    value : object
+        A mapping, or pairs.
+    where : str
+        Name of the table, for messages.
+    known : iterable of str
+        Names that it may have.
+    check : callable
+        Takes the name, the value and where it is; returns the value in canonical form.
+    what, hint : str
+        What a name is, and an addition to the message about an unknown one.
+    """
+    items, known = _items(value, where), tuple(known)
+    for name in items:
+        if name not in known:
+            raise SceneError(f'unknown {what} "{name}" in {where}{nearest(name, known)}{hint}')
+    return tuple(
+        (name, check(name, items[name], f"{where}: {name}")) for name in known if name in items
+    )
+
+
+def known_parameters(value: object, where: str) -> Named:
     """Return the known parameters of a body in Table 1's order."""
-    known: dict[str, float] = {}
-    for name, item in _items(value, f"{where}: known"):
-        if name not in PARAMETER_NAMES:
-            raise SceneError(
-                f'unknown parameter "{name}" in known of {where}{nearest(name, PARAMETER_NAMES)}'
-            )
-        number = finite(item, f"{where}: known {name}")
-        if name == "mass":
-            positive(number, f"{where}: known mass")
-        if name == "r" and number < 0:
-            raise SceneError(f"{where}: known r is {number}, expected 0 or more")
-        if name.startswith("mu_") and not 0 <= number <= 1:
-            raise SceneError(f"{where}: known {name} is {number}, expected between 0 and 1")
-        known[name] = number
-    return tuple((name, known[name]) for name in PARAMETER_NAMES if name in known)
+
+    def check(name: str, item: object, at: str) -> float:
+        if name.startswith("mu_"):
+            return unit_interval(item, at)
+        return {"mass": positive, "r": not_negative}.get(name, finite)(item, at)
+
+    return table(value, f"known of {where}", PARAMETER_NAMES, check, "parameter")
 
 
-def stated_noise(value: object) -> tuple[tuple[str, float], ...]:
-    """Return the errors of measuring that are given, in the order of the state."""
-    noise: dict[str, float] = {}
-    for name, item in _items(value, "[noise]"):
-        if name not in STATE:
-            raise SceneError(f'unknown key "{name}" in [noise]{nearest(name, STATE)}')
-        noise[name] = positive(item, f"[noise]: {name}")
-    return tuple((name, noise[name]) for name in STATE if name in noise)
+def stated_noise(value: object) -> Named:
+    """Return the known standard deviations of measurement noise, in the order of the state."""
+    return table(value, "[noise]", STATE, lambda _, item, at: positive(item, at))
 
 
-def index_probabilities(
-    value: object, where: str
-) -> tuple[tuple[str, tuple[tuple[str, float], ...]], ...]:
-    """Return what a joint's first and second index may be: a probability each name."""
-    prior: dict[str, tuple[tuple[str, float], ...]] = {}
-    for index, table in _items(value, f"{where}: prior"):
-        if index not in INDEX_NAMES:
-            raise SceneError(
-                f'unknown index "{index}" in prior of {where}{nearest(index, INDEX_NAMES)}'
-            )
-        here = f"{where}: prior {index}"
-        given = {label(n, here): not_negative(p, f"{here} {n}") for n, p in _items(table, here)}
+def index_probabilities(value: object, where: str) -> tuple[tuple[str, Named], ...]:
+    """Return the probabilities of a joint's first and second body by name."""
+
+    def check(_: str, item: object, at: str) -> Named:
+        given = {label(n, at): not_negative(p, f"{at} {n}") for n, p in _items(item, at).items()}
         if not sum(given.values()) > 0:
-            raise SceneError(f"{here} has no name of a probability above 0; add one")
-        prior[index] = tuple(given.items())
-    return tuple((index, prior[index]) for index in INDEX_NAMES if index in prior)
+            raise SceneError(f"{at} has no name of a probability above 0; add one")
+        return tuple(given.items())
+
+    return table(value, f"prior of {where}", ("i_a", "i_b"), check, "index")
 
 
 def hyper_parameters(
     value: object, where: str, effects: tuple[str, ...]
-) -> tuple[tuple[str, tuple[tuple[str, float], ...]], ...]:
+) -> tuple[tuple[str, Named], ...]:
     """Return the priors' hyper-parameters of a body: in Table 1's order, then its effects'."""
-    prior: dict[str, tuple[tuple[str, float], ...]] = {}
-    for name, table in _items(value, f"{where}: prior"):
-        # which parameters an effect has is known where the catalogue is: `prior.build_layout`
-        if name not in PARAMETER_NAMES and not str(name).startswith(
-            tuple(f"{effect}_" for effect in effects)
-        ):
-            raise SceneError(
-                f'unknown parameter "{name}" in prior of {where}{nearest(name, PARAMETER_NAMES)}'
-                " (an effect's parameter needs the effect among the body's effects)"
-            )
-        hyper: dict[str, float] = {}
-        for key, item in _items(table, f"{where}: prior {name}"):
-            if key not in HYPER_NAMES:
-                raise SceneError(
-                    f'unknown key "{key}" in prior {name} of {where}{nearest(key, HYPER_NAMES)}'
-                )
-            check = {"mu": finite, "sigma": positive, "kappa": not_negative}[key]
-            hyper[key] = check(item, f"{where}: prior {name} {key}")
-        prior[name] = tuple((key, hyper[key]) for key in HYPER_NAMES if key in hyper)
-    order = (*PARAMETER_NAMES, *sorted(prior.keys() - set(PARAMETER_NAMES)))
-    return tuple((name, prior[name]) for name in order if name in prior)
+    checks = {"mu": finite, "sigma": positive, "kappa": not_negative}
+
+    def check(_: str, item: object, at: str) -> Named:
+        return table(item, at, checks, lambda key, number, place: checks[key](number, place))
+
+    # which parameters an effect has is known where the catalogue is: `prior.build_layout`
+    given = {str(name) for name in _items(value, f"prior of {where}")} - set(PARAMETER_NAMES)
+    declared = sorted(name for name in given if name.startswith(tuple(f"{e}_" for e in effects)))
+    hint = " (an effect's parameter needs the effect among the body's effects)"
+    return table(
+        value, f"prior of {where}", (*PARAMETER_NAMES, *declared), check, "parameter", hint
+    )

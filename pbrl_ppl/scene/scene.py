@@ -16,21 +16,22 @@ import numpy as np
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import toml as scene_toml
+from pbrl_ppl.scene.bodies import Body, Wall, check_classes
 from pbrl_ppl.scene.checks import (
-    PARAMETER_NAMES,
+    Named,
     Point,
-    finite,
+    flag,
     located,
     nearest,
+    not_negative,
     positive,
     stated_noise,
     vector,
 )
-from pbrl_ppl.scene.classes import check_classes
-from pbrl_ppl.scene.parts import WORLD, Body, Joint, Wall
+from pbrl_ppl.scene.joints import WORLD, Joint
 from pbrl_ppl.scene.shape import Shape
 
-__all__ = ["PARAMETER_NAMES", "WORLD", "Body", "Joint", "Point", "Scene", "Shape", "Wall"]
+__all__ = ["WORLD", "Body", "Joint", "Point", "Scene", "Shape", "Wall"]
 
 #: Engine steps a sample, at most: twice what `close_loop` goes to where data are that exact.
 MOST_SUBSTEPS = 1280
@@ -82,14 +83,12 @@ class Scene:
     substeps: int = 10
     walls: tuple[Wall, ...] = ()
     joints: tuple[Joint, ...] = ()
-    noise: tuple[tuple[str, float], ...] = ()
+    noise: Named = ()
     test_is_later: bool = True
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "gravity", vector(self.gravity, 2, "[world]: gravity"))
-        normal = finite(self.normal_gravity, "[world]: normal_gravity")
-        if normal < 0:
-            raise SceneError(f"[world]: normal_gravity is {normal}, expected 0 or more")
+        normal = not_negative(self.normal_gravity, "[world]: normal_gravity")
         object.__setattr__(self, "normal_gravity", normal)
         object.__setattr__(self, "time_step", positive(self.time_step, "[world]: time_step"))
         steps: Any = self.substeps
@@ -101,10 +100,7 @@ class Scene:
                 " prediction and take long; use fewer, or record with a shorter time_step"
             )
         object.__setattr__(self, "substeps", int(steps))
-        if not isinstance(self.test_is_later, bool):
-            raise SceneError(
-                f"[world]: test_is_later is {self.test_is_later!r}, expected true or false"
-            )
+        flag(self.test_is_later, "[world]: test_is_later")
         for key, kind in (("bodies", Body), ("walls", Wall), ("joints", Joint)):
             parts = tuple(getattr(self, key))
             for part in parts:
@@ -157,12 +153,12 @@ class Scene:
                     " is neither static nor kinematic"
                 )
             for body in self.bodies:
-                inferred_rod = not joint.known and joint.kind == "distance"
-                if inferred_rod and body.name in could and body.pose is None:
+                needs_pose = not joint.known and joint.traits.needs_reference_poses
+                if needs_pose and body.name in could and body.pose is None:
                     raise SceneError(
                         f'{where}: its anchors are to be inferred and body "{body.name}" has no'
-                        " pose; a distance joint keeps the distance that its anchors have in the"
-                        " reference pose: add pose = [x, y, theta] to the body"
+                        f" pose; a {joint.kind} joint keeps the distance that its anchors have in"
+                        " the reference pose: add pose = [x, y, theta] to the body"
                     )
 
     @classmethod
@@ -212,13 +208,9 @@ class Scene:
     def to_toml(self) -> str:
         """Return TOML text from which `from_toml` builds an equal scene."""
         world = ("gravity", "normal_gravity", "time_step", "substeps")
-        sections: list[tuple[str, dict[str, Any]]] = [
-            (
-                "[world]",
-                {key: getattr(self, key) for key in world}
-                | {"test_is_later": None if self.test_is_later else False},
-            )
-        ]
+        table: dict[str, Any] = {key: getattr(self, key) for key in world}
+        table["test_is_later"] = None if self.test_is_later else False
+        sections = [("[world]", table)]
         if self.noise:
             sections.append(("[noise]", dict(self.noise)))
         for body in self.bodies:
@@ -245,7 +237,7 @@ class Scene:
 
     @property
     def owners(self) -> dict[str, tuple[str, ...]]:
-        """Names of the moving bodies by what owns their parameters of Table 1: `Body.owner`."""
+        """Names of the moving bodies by the owner of their parameters: `Body.owner`."""
         found: dict[str, tuple[str, ...]] = {}
         for body in self.moving:
             found[body.owner] = (*found.get(body.owner, ()), body.name)
@@ -253,19 +245,19 @@ class Scene:
 
     @property
     def joinable(self) -> tuple[str, ...]:
-        """What the indices ``i_a``, ``i_b`` of an inferred joint count: dynamic bodies, world."""
+        """Names for the indices ``i_a``, ``i_b`` of an inferred joint: dynamic bodies, world."""
         return (*(body.name for body in self.dynamic), WORLD)
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """One name a joint: its own, or ``joint1``, ``joint2``, ... by its place in the file."""
+        """One name a joint: as given, or ``joint1``, ``joint2``, ... by its place in the file."""
         return tuple(
             joint.name or f"joint{number}" for number, joint in enumerate(self.joints, start=1)
         )
 
     @property
     def extent(self) -> tuple[float, float, float, float] | None:
-        """Where walls and reference poses are: ``x_min, x_max, y_min, y_max`` (m), if any are."""
+        """Extent of walls and reference poses: ``x_min, x_max, y_min, y_max`` (m), if any."""
         points = [end for wall in self.walls for end in (wall.start, wall.end)]
         for body in self.bodies:
             if body.pose is not None:

@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any
+from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene.checks import Point, nearest, positive, vector
-
-Floats = npt.NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Outline of a body in its own frame, whose origin is the centroid.
+    """Outline of a body in its frame, whose origin is the centroid.
 
     Attributes
     ----------
@@ -61,9 +59,8 @@ class Shape:
             if not given and kind == self.kind:
                 raise SceneError(f'shape: a {self.kind} needs "{key}"; add it')
         if self.size is not None:
-            width, height = vector(self.size, 2, "shape: size")
-            size = (positive(width, "shape: size"), positive(height, "shape: size"))
-            object.__setattr__(self, "size", size)
+            size = vector(self.size, 2, "shape: size")
+            object.__setattr__(self, "size", tuple(positive(s, "shape: size") for s in size))
         if self.radius is not None:
             object.__setattr__(self, "radius", positive(self.radius, "shape: radius"))
         if self.vertices is not None:
@@ -104,11 +101,10 @@ class Shape:
     @property
     def bounds(self) -> tuple[float, float, float, float]:
         """Extent in the body frame: ``x_min, x_max, y_min, y_max`` (m)."""
-        corners = self.outline
-        if corners is None:
+        if self.outline is None:
             radius = float(self.radius or 0.0)
             return (-radius, radius, -radius, radius)
-        x, y = zip(*corners, strict=True)
+        x, y = zip(*self.outline, strict=True)
         return (min(x), max(x), min(y), max(y))
 
     @property
@@ -153,24 +149,24 @@ def _check_polygon(value: object) -> tuple[Point, ...]:
     vertices: tuple[Point, ...] = tuple(vector(point, 2, where) for point in value)
     if len(vertices) < 3:
         raise SceneError(f"{where} has {len(vertices)} points, expected at least 3")
-    for i, same in enumerate(vertices):
-        if vertices.index(same) < i:
+    for number, point in enumerate(vertices, start=1):
+        if (first := vertices.index(point) + 1) < number:
             raise SceneError(
-                f"{where}: point {i + 1} is point {vertices.index(same) + 1} again; list each "
-                "corner once (the outline closes by itself)"
+                f"{where}: point {number} is point {first} again; list each corner once (the"
+                " outline closes by itself)"
             )
-    crossing = _self_intersection(np.array(vertices))
-    if crossing is not None:
+    corners = np.array(vertices)
+    if crossing := _self_intersection(corners):
         raise SceneError(
             f"{where}: edges {crossing[0] + 1} and {crossing[1] + 1} meet; list the corners in "
             "order round the outline"
         )
-    size = float(np.ptp(np.array(vertices), axis=0).max())
+    size = float(np.ptp(corners, axis=0).max())
     area, centroid, _ = _moments(vertices)
     if abs(area) <= 1e-12 * size**2:
         raise SceneError(f"{where}: the polygon has no area; move its points apart")
     if np.abs(centroid).max() > 1e-6 * size:
-        x, y = (float(c) for c in centroid)
+        x, y = centroid
         raise SceneError(
             f"{where}: the centroid is at ({x:.9g}, {y:.9g}), expected the origin of the body's "
             f"frame; subtract ({x:.9g}, {y:.9g}) from every vertex"
@@ -180,33 +176,26 @@ def _check_polygon(value: object) -> tuple[Point, ...]:
 
 def _self_intersection(a: Floats) -> tuple[int, int] | None:
     """Return the first two edges that touch other than at a shared corner, or None."""
-    n = len(a)
 
-    def side(o: Any, u: Any, v: Any) -> float:
+    def side(o: Floats, u: Floats, v: Floats) -> float:
         return float((u[0] - o[0]) * (v[1] - o[1]) - (u[1] - o[1]) * (v[0] - o[0]))
 
-    def between(o: Any, u: Any, v: Any) -> bool:
+    def between(o: Floats, u: Floats, v: Floats) -> bool:
         return bool(np.all(np.minimum(o, u) <= v) and np.all(v <= np.maximum(o, u)))
 
-    for i in range(n):
-        o, u = a[i], a[(i + 1) % n]
-        for j in range(i + 1, n):
-            v, w = a[j], a[(j + 1) % n]
-            if j == i + 1 or (j + 1) % n == i:
-                # Neighbours share a corner; they meet elsewhere only when one folds back.
-                corner, first, second = (u, o, w) if j == i + 1 else (o, u, v)
-                folded = (
-                    side(corner, first, second) == 0
-                    and float((first - corner) @ (second - corner)) > 0
-                )
-                if folded:
-                    return i, j
-                continue
-            d = (side(o, u, v), side(o, u, w), side(v, w, o), side(v, w, u))
-            if d[0] * d[1] < 0 and d[2] * d[3] < 0:
+    n = len(a)
+    for i, j in combinations(range(n), 2):
+        o, u, v, w = a[i], a[(i + 1) % n], a[j], a[(j + 1) % n]
+        if j == i + 1 or (j + 1) % n == i:
+            # Neighbours share a corner; they meet elsewhere only when one folds back.
+            corner, first, second = (u, o, w) if j == i + 1 else (o, u, v)
+            along = float((first - corner) @ (second - corner))
+            if side(corner, first, second) == 0 and along > 0:
                 return i, j
-            points = ((o, u, v), (o, u, w), (v, w, o), (v, w, u))
-            for s, (from_, to, at) in zip(d, points, strict=True):
-                if s == 0 and between(from_, to, at):
-                    return i, j
+            continue
+        ends = ((o, u, v), (o, u, w), (v, w, o), (v, w, u))
+        d = [side(*each) for each in ends]
+        crosses = d[0] * d[1] < 0 and d[2] * d[3] < 0
+        if crosses or any(s == 0 and between(*each) for s, each in zip(d, ends, strict=True)):
+            return i, j
     return None

@@ -1,7 +1,5 @@
 """Scenes as TOML: documents read with every key checked, and values written."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib
@@ -14,29 +12,23 @@ from pbrl_ppl.state import STATE
 
 Table = dict[str, Any]
 
-KEYS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
-    "the file": (("world",), ("noise", "body", "wall", "joint")),
-    "[world]": (
-        ("time_step",),
-        ("gravity", "normal_gravity", "substeps", "test_is_later", "joints"),
-    ),
-    "[noise]": ((), STATE),
+#: Required and optional keys of each table.
+KEYS: dict[str, tuple[str, str]] = {
+    "the file": ("world", "noise body wall joint"),
+    "[world]": ("time_step", "gravity normal_gravity substeps test_is_later joints"),
+    "[noise]": ("", " ".join(STATE)),
     "body": (
-        ("name", "shape"),
-        (
-            *("wheel", "static", "kinematic", "known", "prior", "effects", "pose"),
-            *("class", "attributes"),
-        ),
+        "name shape",
+        "wheel static kinematic known prior effects pose class attributes",
     ),
-    "shape": (("kind",), ("size", "radius", "vertices")),
-    "wall": (("from", "to"), ()),
-    "joint": (("kind",), ("bodies", "anchor_a", "anchor_b", "known", "name", "prior")),
+    "shape": ("kind", "size radius vertices"),
+    "wall": ("from to", ""),
+    "joint": ("kind", "bodies anchor_a anchor_b known name prior"),
 }
-"""Required and optional keys of each table."""
 
 
 def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
-    """Return ``[world]`` with the noise, and for each array where a table is and the table.
+    """Return ``[world]`` with the noise, and the tables of each array with their places.
 
     Raises
     ------
@@ -48,22 +40,22 @@ def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise SceneError(f"not TOML: {error}") from None
-    _check_keys(document, "the file", *KEYS["the file"])
-    _check_keys(document["world"], "[world]", *KEYS["[world]"])
+    _check_keys(document, "the file")
+    _check_keys(document["world"], "[world]")
     if (joints := document["world"].get("joints", "any")) != "any":
         raise SceneError(
             f'[world]: joints is {joints!r}, expected "any" (any two bodies, or a body and the'
             " world, may be joined by a rod); declare those that are there as [[joint]]"
         )
     noise = document.get("noise", {})
-    _check_keys(noise, "[noise]", *KEYS["[noise]"])
+    _check_keys(noise, "[noise]")
     arrays: dict[str, list[tuple[str, Table]]] = {}
     for key in ("body", "wall", "joint"):
         arrays[key] = list(_tables(document, key))
         for where, table in arrays[key]:
-            _check_keys(table, where, *KEYS[key])
+            _check_keys(table, where, key)
             if key == "body":
-                _check_keys(table["shape"], f"shape of {where}", *KEYS["shape"])
+                _check_keys(table["shape"], f"shape of {where}", "shape")
     return {**document["world"], "noise": noise}, arrays
 
 
@@ -76,11 +68,10 @@ def write(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> str:
     return "\n".join(parts)
 
 
-def _check_keys(
-    table: object, where: str, required: Sequence[str], optional: Sequence[str]
-) -> None:
-    """Refuse a table with unknown keys or without the required ones."""
-    known = (*required, *optional)
+def _check_keys(table: object, where: str, kind: str = "") -> None:
+    """Refuse a table with unknown keys or without the required ones of its kind."""
+    required, optional = (keys.split() for keys in KEYS[kind or where])
+    known = required + optional
     if not isinstance(table, Mapping):
         raise SceneError(f"{where} is {table!r}, expected a table of {', '.join(known)}")
     for key in table:
@@ -92,7 +83,7 @@ def _check_keys(
 
 
 def _tables(document: Table, key: str) -> Iterator[tuple[str, Table]]:
-    """Yield where it is and the table, for each of an array of tables."""
+    """Yield the place and the table, for each of an array of tables."""
     array = document.get(key, [])
     if not isinstance(array, list):
         raise SceneError(f"{key} is not an array of tables; write [[{key}]], with two brackets")
@@ -111,16 +102,13 @@ def _value(item: Any) -> str:
         # TOML's basic strings take JSON's escapes, except that DEL must be escaped in TOML.
         return json.dumps(item, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(item, Mapping):
-        return _inline(item)
+        pairs = [
+            f"{_key(key)} = {_value(value)}" for key, value in item.items() if value is not None
+        ]
+        return "{ " + ", ".join(pairs) + " }" if pairs else "{}"
     if isinstance(item, tuple | list):
         return "[" + ", ".join(_value(part) for part in item) + "]"
     return repr(item)
-
-
-def _inline(table: Mapping[str, Any]) -> str:
-    """Return an inline table; entries that are None are left out."""
-    pairs = [f"{_key(key)} = {_value(item)}" for key, item in table.items() if item is not None]
-    return "{ " + ", ".join(pairs) + " }" if pairs else "{}"
 
 
 def _key(name: str) -> str:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
+from pbrl_ppl.scene.joints import JOINT_KINDS
 from tests.helpers.places import RECORDED
 
 pytestmark = pytest.mark.one_stack
@@ -244,7 +245,7 @@ def scenes(draw: st.DrawFn) -> Scene:
     ]
     bodies.append(Body("w" + max(movers), draw(shapes), static=True, pose=(*draw(pairs), 1)))
     walls = [Wall(a, b) for a, b in draw(st.lists(st.tuples(pairs, pairs))) if a != b]
-    kinds = st.sampled_from(["hinge", "distance"])
+    kinds = st.sampled_from(sorted(JOINT_KINDS))
     weights = st.dictionaries(st.sampled_from(["world", *movers]), size, min_size=1)
     indices = st.fixed_dictionaries({}, optional={"i_a": weights, "i_b": weights})
     two, maybe = st.just(("world", movers[0])), st.none() | pairs
@@ -296,8 +297,8 @@ def edited(old: str, new: str) -> str:
         (edited("anchor_a", "anchor_A"), r'"anchor_A" in \[\[joint\]\] number 1.*"anchor_a"'),
         (edited("mass", "mas"), 'parameter "mas" in known of body "cart"; did you mean "mass"'),
         (edited("{ r = {", "{ rr = {"), 'parameter "rr" in prior of body "cart"; did you mean "r"'),
-        (edited("mu = 2.0", "mean = 2.0"), 'key "mean" in prior r of body "cart"; did you mean'),
-        (edited("sigma = 0.5", "sigma = 0"), "prior r sigma is 0.0, expected more than 0"),
+        (edited("mu = 2.0", "mean = 2.0"), 'key "mean" in prior of body "cart": r; did you mean'),
+        (edited("sigma = 0.5", "sigma = 0"), "prior of .*r: sigma is 0.0, expected more than 0"),
         (edited("time_step = 0.1", ""), r'\[world\] has no "time_step"'),
         (edited("time_step = 0.1", "time_step = 0"), "time_step is 0.0, expected more than 0"),
         (edited("time_step = 0.1", "time_step = true"), "time_step is True, expected a number"),
@@ -313,10 +314,10 @@ def edited(old: str, new: str) -> str:
         (edited("size = [1, 0.6]", "size = [1, -0.6]"), "size is -0.6, expected more than 0"),
         (edited("size = [1, 0.6]", "size = [1]"), "size has 1 numbers, expected 2"),
         (edited(", size = [1, 0.6]", ""), 'a box needs "size"'),
-        (edited("mass = 2", "mass = 0"), "known mass is 0.0"),
-        (edited("mass = 2", "mass = false"), "known mass is False, expected a number"),
-        (edited("mass = 2", "mass = nan"), "known mass is nan, expected a finite"),
-        (edited("mu_c = 0.2", "mu_c = 1.2"), "known mu_c is 1.2, expected between 0 and 1"),
+        (edited("mass = 2", "mass = 0"), "known of .*: mass is 0.0"),
+        (edited("mass = 2", "mass = false"), "known of .*: mass is False, expected a number"),
+        (edited("mass = 2", "mass = nan"), "known of .*: mass is nan, expected a finite"),
+        (edited("mu_c = 0.2", "mu_c = 1.2"), "known of .*: mu_c is 1.2, expected between 0 and 1"),
         (edited("mu_c = 0.2", "r = 0.2"), "r is in both known and prior"),
         (edited("wheel = true", "wheel = 1"), "wheel is 1, expected true or false"),
         (edited("wheel = true", "wheel = true\nstatic = true\npose = [0, 0, 0]"), "static body"),
@@ -471,8 +472,8 @@ def test_kinematic_bodies_have_nothing_that_forces_act_on(options, message) -> N
         ("[1, 0.6]", "[{0}, {0}]", "size"),
         ("time_step = 0.1", "time_step = {0}", "time_step"),
         ("normal_gravity = 9.81", "normal_gravity = 9.81\nsubsteps = {0}", "substeps"),
-        ("mass = 2", "mass = {0}", "known mass"),
-        ("sigma = 0.5", "sigma = {0}", "prior r sigma"),
+        ("mass = 2", "mass = {0}", "mass"),
+        ("sigma = 0.5", "sigma = {0}", "r: sigma"),
         ("[[wall]]", "[noise]\nx = {0}\n[[wall]]", r"\[noise\]: x"),
     ],
 )

@@ -1,4 +1,4 @@
-"""Wrong units of positions or of velocities are recognised by the factor between them."""
+"""Wrong units are recognised by the factor between positions and velocities; gaps are found."""
 
 import re
 
@@ -6,9 +6,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pbrl_ppl.history import History, unit_mismatches
+from pbrl_ppl.history import History, longest_gap, unit_mismatches, unseen
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS
+from tests.helpers.pushes import SCENE, pushed, rows
 
 pytestmark = pytest.mark.one_stack
 
@@ -97,3 +98,23 @@ def test_few_rows_say_nothing() -> None:
     frame = recorded((1, 1, DEGREES, 1, 1, 1), n=1).to_dataframe()
     frame = frame[frame["step"] < 5]
     assert unit_mismatches(History.from_dataframe(frame, PUCK)) == ()
+
+
+def test_a_block_that_was_seen_before_and_after_a_push() -> None:
+    _, history = pushed(steps=(4, 6))
+    hidden = np.zeros((2, 6, 2), dtype=bool)
+    hidden[0, 1:3, 0] = hidden[1, 1:5, 0] = True  # the block; the finger's path is given
+    np.testing.assert_array_equal(unseen(history), hidden)
+    assert longest_gap(history) == 5
+
+
+def test_rows_that_are_lost_now_and_then_do_not_make_a_recording_sparse() -> None:
+    table = rows(steps=(30,))
+    state = ["x", "y", "theta", "vx", "vy", "omega"]
+    seen = (table["body"] == "finger") | ~table["step"].between(10, 16)
+    finger = table.loc[table["body"] == "finger", state].to_numpy()
+    table.loc[table["body"] == "block", state] = np.nan_to_num(finger)
+    table.loc[~seen, state] = np.nan
+    history = History.from_dataframe(table, SCENE)
+    assert unseen(history).sum() == 7
+    assert longest_gap(history) == 1

@@ -1,24 +1,63 @@
-"""States that a segment may start from: what was measured, completed by hinges and derivatives."""
-
-from __future__ import annotations
+"""Kinematics of a history: angles, recorded paths, hinges, and complete start states."""
 
 import numpy as np
-import numpy.typing as npt
 from scipy.signal import savgol_filter
 
-from pbrl_ppl.history.paths import fill_path_velocities
 from pbrl_ppl.scene import WORLD, Point, Scene
-from pbrl_ppl.state import THETA
+from pbrl_ppl.state import THETA, Bools, Floats, wrapped
 
-Floats = npt.NDArray[np.float64]
-Bools = npt.NDArray[np.bool_]
+
+def unwrapped(time: Floats, angle: Floats, rate: Floats) -> Floats:
+    """Return angles without jumps of a turn; measured rates tell the turns between two rows.
+
+    Parameters
+    ----------
+    time, angle, rate : ndarray
+        Shape (n,): s, rad, rad/s. Rates that are not all finite are not used.
+
+    Examples
+    --------
+    >>> time = np.arange(4.0)
+    >>> unwrapped(time, np.array([0.0, 1.0, 2.0, 3.0]), np.full(4, 7.0)).round(3)
+    array([ 0.   ,  7.283, 14.566, 21.85 ])
+    """
+    if not np.isfinite(rate).all():
+        return np.asarray(np.unwrap(angle))
+    turned = np.cumsum(0.5 * np.diff(time) * (rate[1:] + rate[:-1]))
+    turned = np.concatenate([np.zeros(1), turned])
+    return np.asarray(np.unwrap(angle - turned) + turned)
+
+
+def kinematic_bodies(scene: Scene) -> Bools:
+    """Return which of the moving bodies are kinematic, shape (body,)."""
+    return np.array([body.kinematic for body in scene.moving], dtype=bool)
+
+
+def path_velocities(poses: Floats, time_step: float) -> Floats:
+    """Return the constant velocities that lead from each pose to the next.
+
+    Parameters
+    ----------
+    poses : ndarray
+        Shape (..., time, body, 3): x, y, theta (m, m, rad).
+    time_step : float
+        Between poses (s).
+
+    Returns
+    -------
+    ndarray
+        Shape (..., time - 1, body, 3): m/s, m/s, rad/s, the shorter way round.
+    """
+    change = np.diff(poses, axis=-3)
+    change[..., 2] = wrapped(change[..., 2])
+    return np.asarray(change / time_step)
 
 
 def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
-    """Return the states completed, and which columns of them rest on no measurement.
+    """Return states completed for a simulation to start from, and their columns without data.
 
-    Measured cells are kept. Hinges and paths give what follows from them; a position that was never
-    measured is that of the scene; velocities that were never measured are estimated from positions.
+    Measured values are kept. Hinges and paths give what follows from them; a position that was
+    never measured is that of the scene; velocities that were never measured are estimated.
 
     Parameters
     ----------
@@ -31,26 +70,35 @@ def complete_start(state: Floats, scene: Scene) -> tuple[Floats, Bools]:
     Returns
     -------
     start : (trajectory, time, body, 6) array
-        NaN in rows that do not have what others have.
+        NaN in rows without the measurements that other rows have.
     assumed : (body, 6) array of bool
         Columns that are estimated, or as in the scene.
     """
     start = state.copy()
-    fill_path_velocities(start, scene)
+    follows = kinematic_bodies(scene)
+    path = start[:, :, follows]
+    rate = path_velocities(path[..., :3], scene.time_step)
+    # the velocity of the interval that begins there, of a last row the one that ends
+    ahead = np.concatenate([rate, rate[:, -1:]], axis=1)
+    behind = np.concatenate([rate[:, :1], rate], axis=1)
+    start[:, :, follows, 3:] = _filled(path[..., 3:], _filled(ahead, behind))
     fill_hinges(start, scene)
     assumed: Bools = np.asarray(np.isnan(start).all(axis=(0, 1)))
-    hung = np.array([body.name in hung_bodies(scene) for body in scene.moving])
+    hung = hung_bodies(scene)
     for i, body in enumerate(scene.moving):
         pose = body.pose or (0.0, 0.0, 0.0)
         for d in np.flatnonzero(assumed[i, :3]):
-            if d == THETA or not hung[i]:
+            if d == THETA or body.name not in hung:
                 start[:, :, i, d] = pose[d]
     # The angular velocity first: hinges turn it into velocities.
-    estimate_rates(start, scene.time_step, (5,))
-    fill_hinges(start, scene)
-    estimate_rates(start, scene.time_step)
-    fill_hinges(start, scene)
+    for columns in ((5,), (3, 4)):
+        estimate_rates(start, scene.time_step, columns)
+        fill_hinges(start, scene)
     return start, assumed
+
+
+def _filled(values: Floats, others: Floats) -> Floats:
+    return np.where(np.isnan(values), others, values)
 
 
 def fill_hinges(start: Floats, scene: Scene) -> None:
@@ -62,21 +110,17 @@ def fill_hinges(start: Floats, scene: Scene) -> None:
         if parent in position:
             origin = start[:, :, position[parent]]
         else:
-            pose = (0.0, 0.0, 0.0) if parent == WORLD else scene.body(parent).pose
-            origin = np.broadcast_to(
-                np.array([*(pose or ()), 0.0, 0.0, 0.0]), (*start.shape[:2], 6)
-            )
+            pose = (0.0, 0.0, 0.0) if parent == WORLD else scene.body(parent).pose or ()
+            origin = np.broadcast_to(np.array([*pose, 0.0, 0.0, 0.0]), (*start.shape[:2], 6))
         body = start[:, :, position[child]]
         arm, arm_rate = lever(origin, at_parent)
-        own, own_rate = lever(body, at_child)
-        place = origin[..., :2] + arm - own
-        speed = origin[..., 3:5] + arm_rate - own_rate
-        for columns, filled in ((slice(0, 2), place), (slice(3, 5), speed)):
-            body[..., columns] = np.where(np.isnan(body[..., columns]), filled, body[..., columns])
+        child_arm, child_rate = lever(body, at_child)
+        body[..., :2] = _filled(body[..., :2], origin[..., :2] + arm - child_arm)
+        body[..., 3:5] = _filled(body[..., 3:5], origin[..., 3:5] + arm_rate - child_rate)
 
 
 def hung_bodies(scene: Scene) -> list[str]:
-    """Names of the moving bodies whose place follows from angles: hinges tie them to the world."""
+    """Return the dynamic bodies that hinges tie to the world: positions follow from angles."""
     moving = [body.name for body in scene.dynamic]
     reached = {WORLD, *(body.name for body in scene.bodies if body.static)}
     hung = []
@@ -96,21 +140,20 @@ def lever(state: Floats, anchor: Point) -> tuple[Floats, Floats]:
 
 
 def _hinge_order(scene: Scene) -> list[tuple[str, str, Point, Point]]:
-    """Return known hinges as (parent, child, anchors), breadth first from what is fixed."""
+    """Return known hinges as (parent, child, anchors), breadth first from static bodies."""
     edges = []
     for joint in scene.joints:
-        if joint.kind == "hinge" and joint.known and joint.bodies:
+        if joint.traits.pins_anchors and joint.known and joint.bodies:
             a, b = joint.bodies
             at_a, at_b = joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0)
             edges += [(a, b, at_a, at_b), (b, a, at_b, at_a)]
-    fixed = [WORLD, *(body.name for body in scene.bodies if body.static)]
-    reached, order = list(fixed), []
+    reached, order = [WORLD, *(body.name for body in scene.bodies if body.static)], []
     for parent in reached:  # the list grows while it is walked: that is the breadth-first queue
         for edge in edges:
             if edge[0] == parent and edge[1] not in reached:
                 order.append(edge)
                 reached.append(edge[1])
-    # Then chains that hang on a body whose position was measured.
+    # Then chains from a body whose position was measured.
     return order + [edge for _ in scene.bodies for edge in edges]
 
 
@@ -130,9 +173,8 @@ def estimate_rates(start: Floats, dt: float, columns: tuple[int, ...] = (3, 4, 5
         for column in columns:
             if not np.isnan(start[:, :, body, column]).all():
                 continue
-            for trajectory in range(start.shape[0]):
-                values = start[trajectory, :, body, column - 3]
-                start[trajectory, :, body, column] = _derivative(values, dt, angle=column == 5)
+            for states in start[:, :, body]:
+                states[:, column] = _derivative(states[:, column - 3], dt, angle=column == 5)
 
 
 def _derivative(values: Floats, dt: float, *, angle: bool) -> Floats:

@@ -1,27 +1,23 @@
-"""Parts of a scene: bodies, walls and joints, frozen and checked when they are built."""
+"""Bodies and walls of a scene, frozen and checked when they are built."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene.checks import (
     CONTACT_NAMES,
+    PARAMETER_NAMES,
+    Named,
     Point,
     flag,
     hyper_parameters,
-    index_probabilities,
     known_parameters,
     label,
     names,
-    nearest,
     vector,
 )
+from pbrl_ppl.scene.joints import WORLD
 from pbrl_ppl.scene.shape import Shape
-
-WORLD = "world"
-"""The name of the ground in a joint."""
 
 
 @dataclass(frozen=True)
@@ -75,8 +71,8 @@ class Body:
     wheel: bool = False
     static: bool = False
     kinematic: bool = False
-    known: tuple[tuple[str, float], ...] = ()
-    prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
+    known: Named = ()
+    prior: tuple[tuple[str, Named], ...] = ()
     effects: tuple[str, ...] = ()
     pose: tuple[float, float, float] | None = None
     object_class: str | None = None
@@ -89,8 +85,8 @@ class Body:
             raise SceneError(f'{where}: "world" is the name of the ground; call the body otherwise')
         if not isinstance(self.shape, Shape):
             raise SceneError(f"{where}: shape is {self.shape!r}, expected a Shape")
-        flag(self.wheel, f"{where}: wheel")
-        flag(self.static, f"{where}: static")
+        for key in ("wheel", "static", "kinematic"):
+            flag(getattr(self, key), f"{where}: {key}")
         object.__setattr__(self, "known", known_parameters(self.known, where))
         for key in ("effects", "attributes"):
             object.__setattr__(self, key, names(getattr(self, key), f"{where}: {key}"))
@@ -105,13 +101,12 @@ class Body:
             raise SceneError(f"{where}: it is static and has no pose; add pose = [x, y, theta]")
         if self.static and self.wheel:
             raise SceneError(f"{where}: a static body cannot have a wheel; drop one of the two")
-        flag(self.kinematic, f"{where}: kinematic")
         if self.kinematic:
             self._check_kinematic(where)
 
     @property
     def owner(self) -> str:
-        """What owns its parameters of Table 1: its class with its attributes, or itself."""
+        """Name of the owner of its parameters of Table 1: its class and attributes, or itself."""
         if self.object_class is None:
             return self.name
         listed = ", ".join(sorted(self.attributes))
@@ -122,7 +117,7 @@ class Body:
         for name in ("static", "wheel", "effects"):
             if getattr(self, name):
                 raise SceneError(
-                    f"{where}: it is kinematic, it goes where its path leads, and has {name} ="
+                    f"{where}: it is kinematic, follows its recorded path, and has {name} ="
                     f" {getattr(self, name)!r}; drop one of the two"
                 )
         for table in ("known", "prior"):
@@ -148,89 +143,56 @@ class Wall:
             raise SceneError(f"wall: from and to are both {list(self.start)}; its length is zero")
 
 
-@dataclass(frozen=True)
-class Joint:
-    """J_d: a joint between two bodies, or a body and the world; what is left out is inferred.
+def check_classes(bodies: Sequence[Body]) -> None:
+    """Check that names of classes differ from bodies', and that bodies can share parameters.
 
-    Attributes
+    Parameters
     ----------
-    kind : str
-        ``"distance"``, which keeps the distance that the anchors have in the bodies' reference
-        poses (zero is a hinge), or ``"hinge"``.
-    bodies : tuple of str, optional
-        Two names; ``"world"`` is the ground. None where which bodies it joins (the indices ``i_a``
-        and ``i_b`` of Table 1) is to be inferred.
-    anchor_a, anchor_b : tuple of float, optional
-        Where it holds the first and the second, each in that body's frame (m). Of a joint that is
-        not known these are the centres of the anchors' priors, or None for the default.
-    known : bool
-        Whether the anchors are given (True) or to be inferred.
-    name : str, optional
-        What its parameters are labelled with; by default its place in the scene: ``joint1``, ...
-    prior : tuple of (str, tuple of (str, float))
-        Of a joint of unknown bodies: probabilities of the indices by name, such as
-        ``{"i_a": {"cart": 0.7, "world": 0.3}}``, scaled to add up to one; a mapping of mappings is
-        accepted. Names left out have none; all are equally probable for an index left out.
+    bodies : sequence of Body
+        All bodies of a scene.
 
     Raises
     ------
     SceneError
-        If a kind, name or number is impossible, or a known joint lacks one.
-
-    Examples
-    --------
-    >>> Joint("hinge", known=False).bodies is None  # which bodies, and where, is to be inferred
-    True
+        If a class is called as another body or the world is, or bodies that share parameters differ
+        in what shapes these.
     """
-
-    kind: str
-    bodies: tuple[str, str] | None = None
-    anchor_a: Point | None = None
-    anchor_b: Point | None = None
-    known: bool = True
-    name: str | None = None
-    prior: tuple[tuple[str, tuple[tuple[str, float], ...]], ...] = ()
-
-    def __post_init__(self) -> None:
-        if self.name is not None:
-            label(self.name, "joint: name")
-        if self.kind not in ("hinge", "distance"):
-            raise SceneError(
-                f'joint: kind is {self.kind!r}, expected "hinge" or "distance"'
-                f"{nearest(self.kind, ('hinge', 'distance'))}"
-            )
-        flag(self.known, "joint: known")
-        if self.known and None in (self.bodies, self.anchor_a, self.anchor_b):
-            raise SceneError(
-                "joint: it lacks bodies, anchor_a or anchor_b; add them, or set known = false to"
-                " infer what is left out"
-            )
-        where = "joint"
-        if self.bodies is not None:
-            bodies = self._check_bodies(self.bodies)
-            where = f"joint of {bodies[0]} and {bodies[1]}"
-        object.__setattr__(self, "prior", index_probabilities(self.prior, where))
-        if self.prior and self.bodies is not None:
-            raise SceneError(
-                f"{where}: it has bodies and a prior of which they are; drop one of the two"
-            )
-        for key in ("anchor_a", "anchor_b"):
-            anchor = getattr(self, key)
-            if anchor is not None and self.bodies is None:
+    first: dict[str, Body] = {}
+    for body in bodies:
+        if body.object_class is None:
+            continue
+        where = f'body "{body.name}"'
+        others = [WORLD, *(other.name for other in bodies if other is not body)]
+        for name in (body.object_class, body.owner):
+            if name in others:
                 raise SceneError(
-                    f"{where}: it has {key} and no bodies; in which body's frame is the anchor? Add"
-                    f" bodies, or drop {key}"
+                    f'{where}: its class makes "{name}" the owner of its parameters, which is also'
+                    " the name of another body or of the ground; give the class another name"
                 )
-            if anchor is not None:
-                object.__setattr__(self, key, vector(anchor, 2, f"{where}: {key}"))
+        if body.static:
+            continue
+        other = first.setdefault(body.owner, body)
+        for key, mine, its in _differing(body, other):
+            raise SceneError(
+                f'{where}: it shares the parameters of class "{body.owner}" with body'
+                f' "{other.name}", and they differ in {key}: {mine} and {its}; make them equal, or'
+                " give one of them another class or attributes"
+            )
 
-    def _check_bodies(self, given: object) -> tuple[str, str]:
-        if isinstance(given, str) or not isinstance(given, Iterable):
-            raise SceneError(f"joint: bodies is {given!r}, expected two names")
-        bodies = tuple(label(name, "joint: bodies") for name in given)
-        if len(bodies) != 2:
-            raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
-        if bodies[0] == bodies[1]:
-            raise SceneError(f'joint: it joins "{bodies[0]}" with itself; name two bodies')
-        object.__setattr__(self, "bodies", bodies)
-        return bodies
+
+def _differing(body: Body, other: Body) -> list[tuple[str, object, object]]:
+    """Return what shapes the parameters and differs between two bodies: its name, both values."""
+
+    def shaping(one: Body) -> dict[str, object]:
+        # an effect's parameters belong to each body alone
+        prior = {name: dict(hyper) for name, hyper in one.prior if name in PARAMETER_NAMES}
+        return {
+            **{key: getattr(one, key) for key in ("object_class", "wheel", "kinematic")},
+            "known": dict(one.known),
+            "prior": prior,
+            "attributes": sorted(one.attributes),
+            "shape": one.shape if one.wheel else None,  # the wheel's place is bounded by it
+        }
+
+    pairs = zip(shaping(body).items(), shaping(other).values(), strict=True)
+    return [(key, mine, its) for (key, mine), its in pairs if mine != its]

@@ -1,0 +1,130 @@
+"""Joints of a scene, and the table of their kinds."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene.checks import Named, Point, flag, index_probabilities, label, nearest, vector
+
+#: The name of the ground in a joint.
+WORLD = "world"
+
+
+@dataclass(frozen=True)
+class JointKind:
+    """What the rest of the package needs to know of a kind of joint.
+
+    Attributes
+    ----------
+    pins_anchors : bool
+        Whether the anchors coincide, so that positions follow from angles and anchors.
+    needs_reference_poses : bool
+        Whether it keeps what the anchors' distance is in the bodies' reference poses.
+    stops_bodies : bool
+        Whether it explains an abrupt stop of a body at the end of a recording.
+    """
+
+    pins_anchors: bool = False
+    needs_reference_poses: bool = False
+    stops_bodies: bool = False
+
+
+#: The kinds of joints by name. A new kind needs an entry here and one in `pbrl_ppl.physics`.
+JOINT_KINDS: Mapping[str, JointKind] = {
+    "hinge": JointKind(pins_anchors=True),
+    "distance": JointKind(needs_reference_poses=True, stops_bodies=True),
+}
+
+
+@dataclass(frozen=True)
+class Joint:
+    """J_d: a joint between two bodies, or a body and the world; what is left out is inferred.
+
+    Attributes
+    ----------
+    kind : str
+        ``"distance"``, which keeps the distance that the anchors have in the bodies' reference
+        poses (zero is a hinge), or ``"hinge"``.
+    bodies : tuple of str, optional
+        Two names; ``"world"`` is the ground. None to infer which bodies it joins (the indices
+        ``i_a`` and ``i_b`` of Table 1).
+    anchor_a, anchor_b : tuple of float, optional
+        Where it holds the first and the second, each in that body's frame (m). Of a joint that is
+        not known these are the centres of the anchors' priors, or None for the default.
+    known : bool
+        Whether the anchors are given (True) or to be inferred.
+    name : str, optional
+        Label of its parameters; by default its place in the scene: ``joint1``, ...
+    prior : tuple of (str, tuple of (str, float))
+        Of a joint of unknown bodies: probabilities of the indices by name, such as
+        ``{"i_a": {"cart": 0.7, "world": 0.3}}``, scaled to add up to one; a mapping of mappings is
+        accepted. Names left out have none; all are equally probable for an index left out.
+
+    Raises
+    ------
+    SceneError
+        If a kind, name or number is impossible, or a known joint lacks one.
+
+    Examples
+    --------
+    >>> Joint("hinge", known=False).bodies is None  # the bodies and anchors are to be inferred
+    True
+    """
+
+    kind: str
+    bodies: tuple[str, str] | None = None
+    anchor_a: Point | None = None
+    anchor_b: Point | None = None
+    known: bool = True
+    name: str | None = None
+    prior: tuple[tuple[str, Named], ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.name is not None:
+            label(self.name, "joint: name")
+        if self.kind not in JOINT_KINDS:
+            expected = " or ".join(f'"{kind}"' for kind in JOINT_KINDS)
+            raise SceneError(
+                f"joint: kind is {self.kind!r}, expected {expected}"
+                f"{nearest(self.kind, JOINT_KINDS)}"
+            )
+        flag(self.known, "joint: known")
+        if self.known and None in (self.bodies, self.anchor_a, self.anchor_b):
+            raise SceneError(
+                "joint: it lacks bodies, anchor_a or anchor_b; add them, or set known = false to"
+                " infer what is left out"
+            )
+        where = "joint"
+        if self.bodies is not None:
+            bodies = _two_names(self.bodies)
+            object.__setattr__(self, "bodies", bodies)
+            where = f"joint of {bodies[0]} and {bodies[1]}"
+        object.__setattr__(self, "prior", index_probabilities(self.prior, where))
+        if self.prior and self.bodies is not None:
+            raise SceneError(f"{where}: it has bodies and a prior of them; drop one of the two")
+        for key in ("anchor_a", "anchor_b"):
+            anchor = getattr(self, key)
+            if anchor is not None and self.bodies is None:
+                raise SceneError(
+                    f"{where}: it has {key} and no bodies; in which body's frame is the anchor? Add"
+                    f" bodies, or drop {key}"
+                )
+            if anchor is not None:
+                object.__setattr__(self, key, vector(anchor, 2, f"{where}: {key}"))
+
+    @property
+    def traits(self) -> JointKind:
+        """What its kind implies."""
+        return JOINT_KINDS[self.kind]
+
+
+def _two_names(given: object) -> tuple[str, ...]:
+    """Return the names of a joint's bodies."""
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise SceneError(f"joint: bodies is {given!r}, expected two names")
+    bodies = tuple(label(name, "joint: bodies") for name in given)
+    if len(bodies) != 2:
+        raise SceneError(f"joint: bodies is {list(bodies)}, expected two names")
+    if bodies[0] == bodies[1]:
+        raise SceneError(f'joint: it joins "{bodies[0]}" with itself; name two bodies')
+    return bodies
