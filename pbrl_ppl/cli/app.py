@@ -10,18 +10,15 @@ from typing import Annotated
 import typer
 
 from pbrl_ppl.cli.calibrate import calibrate
-from pbrl_ppl.cli.check import check
+from pbrl_ppl.cli.check import check, criticise
 from pbrl_ppl.cli.close_loop import close_loop
-from pbrl_ppl.cli.criticise import criticise
 from pbrl_ppl.cli.doctor import doctor
-from pbrl_ppl.cli.fit import fit
+from pbrl_ppl.cli.fit import fit, update
 from pbrl_ppl.cli.new import new
-from pbrl_ppl.cli.plan import plan
+from pbrl_ppl.cli.plan import plan, suggest
 from pbrl_ppl.cli.report import report
 from pbrl_ppl.cli.simulate import simulate
-from pbrl_ppl.cli.suggest import suggest
 from pbrl_ppl.cli.terminal import BAD_INPUT, in_options, interrupted, warnings_in_a_line
-from pbrl_ppl.cli.update import update
 from pbrl_ppl.errors import PbrlError
 
 #: The commands, in the order of use, and an example of each for its help.

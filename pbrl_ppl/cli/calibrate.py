@@ -10,9 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.outputs import check_can_make
-from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
+from pbrl_ppl.cli.options import Columns, TimeStep, Units, load_own
 from pbrl_ppl.cli.terminal import (
     FAILED,
     AsJson,
@@ -21,7 +19,9 @@ from pbrl_ppl.cli.terminal import (
     SceneFile,
     Seed,
     Velocities,
+    check_can_make,
     interruptible,
+    print_json,
     stated_noise,
 )
 

@@ -11,8 +11,7 @@ from typing import Any
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.terminal import FAILED, AsJson, Quiet, interruptible, stages
+from pbrl_ppl.cli.terminal import FAILED, AsJson, Quiet, interruptible, print_json, stages
 
 #: The compiled and the plain path agree to rounding.
 _AGREE = 1e-9

@@ -8,10 +8,16 @@ from typing import Annotated
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.command_line import command_line
-from pbrl_ppl.cli.outputs import check_file
-from pbrl_ppl.cli.terminal import AsJson, Overwrite, Quiet, interruptible, stages
+from pbrl_ppl.cli.options import command_line
+from pbrl_ppl.cli.terminal import (
+    AsJson,
+    Overwrite,
+    Quiet,
+    check_file,
+    interruptible,
+    print_json,
+    stages,
+)
 from pbrl_ppl.errors import PosteriorError
 
 

@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.outputs import check_file
-from pbrl_ppl.cli.own_tables import Columns, Resample, Units, columns_of, units_of
+from pbrl_ppl.cli.options import Columns, Resample, Units, columns_of, units_of
 from pbrl_ppl.cli.terminal import (
     AsJson,
     Errors,
@@ -19,8 +17,10 @@ from pbrl_ppl.cli.terminal import (
     Quiet,
     Seed,
     Velocities,
+    check_file,
     interruptible,
     named_numbers,
+    print_json,
     stages,
 )
 from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError

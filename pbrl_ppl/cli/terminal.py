@@ -1,22 +1,29 @@
-"""Helpers of the commands: shared options, files, progress, interrupts, messages in a line."""
+"""Terminal and files: progress, interrupts, warnings, output, checks of output paths."""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import math
 import re
 import signal
 import sys
+import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
+
+from pbrl_ppl.errors import OutputError
 
 if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
@@ -199,3 +206,95 @@ def warnings_in_a_line(options: Collection[str] = ()) -> Iterator[None]:
         warnings.filterwarnings("ignore", message="PyTensor could not link to a BLAS")
         warnings.showwarning = show
         yield
+
+
+_WIDE = 160
+
+
+def print_json(contents: Mapping[str, Any]) -> None:
+    """Print one JSON object; numbers that are not finite become null."""
+    typer.echo(json.dumps(_plain(contents), indent=1, allow_nan=False))
+
+
+def print_table(title: str | None, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table whose first column is text; of the others, those that begin with < are too."""
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for i, name in enumerate(columns):
+        left = i == 0 or name.startswith("<")
+        table.add_column(
+            name.removeprefix("<"), justify="left" if left else "right", no_wrap=not left
+        )
+    for row in rows:
+        table.add_row(*row)
+    # a file or a pipe is as wide as it need be
+    width = None if sys.stdout.isatty() else _WIDE
+    Console(highlight=False, markup=False, width=width).print(table)
+
+
+def _plain(value: Any) -> Any:
+    """Values that JSON has."""
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):  # numpy's
+        value = value.tolist()
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return [_plain(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
+    """Refuse a file that has the wrong ending, exists already, or cannot be written.
+
+    Raises
+    ------
+    OutputError
+        Says which.
+    """
+    if path.suffix not in endings:
+        raise OutputError(f"{path}: expected a name that ends in {' or '.join(endings)}")
+    if path.is_dir():
+        raise OutputError(f"{path}: it is a folder; choose another name")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: it exists; choose another file, or pass --overwrite")
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: there is no folder {path.parent}; make it, or choose another")
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.stem}."):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror}); choose another file"
+        ) from None
+
+
+def check_can_make(folder: Path) -> None:
+    """Refuse a folder that cannot be made or written: it is tried, and nothing stays.
+
+    Raises
+    ------
+    OutputError
+        If it cannot.
+    """
+    made: list[Path] = []
+    try:
+        for each in reversed((folder, *folder.parents)):
+            if not each.exists():
+                each.mkdir()
+                made.append(each)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (NotADirectoryError, FileExistsError):
+        pass  # a file is in the way, and `report.check_folder` says which
+    except OSError as error:
+        raise OutputError(
+            f"output folder {folder}: it cannot be made or written ({error.strerror}); choose"
+            " another path"
+        ) from None
+    finally:
+        with contextlib.suppress(OSError):
+            for each in reversed(made):
+                each.rmdir()

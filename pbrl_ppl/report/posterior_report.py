@@ -22,20 +22,23 @@ from pbrl_ppl.posterior import (
     scalars,
     scene_of,
 )
-from pbrl_ppl.report.comparison_plots import (
+from pbrl_ppl.report.page import Source, Table, render_page
+from pbrl_ppl.report.posterior_plots import (
     MOST_PRIORS,
     coverage,
     most_dependent,
+    most_interesting,
     pareto_k,
     plot_pairs,
     plot_pareto,
     plot_predictions,
     plot_prior,
+    plot_rank,
+    plot_trace,
+    summary,
 )
-from pbrl_ppl.report.glossary import STATISTICS
-from pbrl_ppl.report.page import Source, Table, render_page
-from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
-from pbrl_ppl.report.posterior_rows import (
+from pbrl_ppl.report.posterior_tables import (
+    STATISTICS,
     parameter_table,
     posterior_rows,
     sampler_in_words,

@@ -15,12 +15,22 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.posterior import group
-from pbrl_ppl.report.effect_plots import HARDLY, MOST_CANDIDATES, plot_added, plot_candidates
-from pbrl_ppl.report.error_plots import plot_errors, plot_residuals, plot_rollout
-from pbrl_ppl.report.evidence import find_evidence
-from pbrl_ppl.report.evidence_plots import plot_evidence, plot_laws
-from pbrl_ppl.report.glossary import STATISTICS
-from pbrl_ppl.report.laws import find_laws
+from pbrl_ppl.report.effect_plots import (
+    HARDLY,
+    MOST_CANDIDATES,
+    plot_added,
+    plot_candidates,
+    plot_evidence,
+    plot_laws,
+)
+from pbrl_ppl.report.error_plots import (
+    plot_correlations,
+    plot_errors,
+    plot_growth,
+    plot_residuals,
+    plot_rollout,
+)
+from pbrl_ppl.report.evidence import find_evidence, find_laws
 from pbrl_ppl.report.loop_tables import (
     acceleration_table,
     candidate_table,
@@ -32,13 +42,13 @@ from pbrl_ppl.report.loop_tables import (
 from pbrl_ppl.report.motion import animation, held_out_motions
 from pbrl_ppl.report.page import Source, render_page
 from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
-from pbrl_ppl.report.posterior_rows import (
+from pbrl_ppl.report.posterior_tables import (
+    STATISTICS,
     parameter_table,
     posterior_rows,
     sampler_in_words,
     width_table,
 )
-from pbrl_ppl.report.residual_plots import plot_correlations, plot_growth
 from pbrl_ppl.report.scene_plots import plot_recording
 from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import (

@@ -9,9 +9,8 @@ from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import compare
-from pbrl_ppl.report.evidence import binned, find_evidence
-from pbrl_ppl.report.evidence_plots import plot_evidence, plot_laws
-from pbrl_ppl.report.laws import find_laws
+from pbrl_ppl.report.effect_plots import plot_evidence, plot_laws
+from pbrl_ppl.report.evidence import binned, find_evidence, find_laws
 from pbrl_ppl.report.motion import animation, distance, held_out_motions
 from tests.helpers.made_up import made_up
 from tests.helpers.revised import DRAG, recordings, revised, unexplained

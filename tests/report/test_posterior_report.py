@@ -11,7 +11,7 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import DATATREE, from_groups, groups, load_posterior
 from pbrl_ppl.report import page as page_module
 from pbrl_ppl.report import plot_rank, render_posterior
-from pbrl_ppl.report.comparison_plots import coverage, most_dependent, plot_pairs, plot_prior
+from pbrl_ppl.report.posterior_plots import coverage, most_dependent, plot_pairs, plot_prior
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import made_up_posterior
 from tests.helpers.revised import revised

@@ -1,7 +1,8 @@
-"""Options of histories that have names, units or time stamps of their own."""
+"""Options that commands share, and how they are read."""
 
 from __future__ import annotations
 
+import shlex
 import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -145,3 +146,27 @@ def without_ends(history: History, scene: Scene, source: str, *, trim: bool) -> 
     cure = "left out" if trim else "no command or contact explains it: --trim leaves the rows out"
     warnings.warn(f"{source}: {named}{more}: {cure}", stacklevel=2)
     return trimmed(history, ends) if trim else history
+
+
+def command_line(context: typer.Context) -> str:
+    """Write a command with its arguments and the options that are not at their defaults.
+
+    Parameters
+    ----------
+    context : typer.Context
+        Of the command; Typer gives it to a parameter of that type.
+    """
+    words = ["pbrl-ppl", str(context.info_name)]
+    options = []
+    for parameter in context.command.params:
+        value = context.params.get(str(parameter.name))
+        if value is None or value is False:
+            continue
+        if parameter.param_type_name == "argument":
+            words.append(str(value))
+        elif value is True:
+            options.append(parameter.opts[0])
+        else:
+            for each in value if isinstance(value, (list, tuple)) else (value,):
+                options += [parameter.opts[0], str(each)]
+    return shlex.join([*words, *options])
