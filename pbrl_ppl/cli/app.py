@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -66,6 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         actions are expected to tell apart, or some of many logs that failed; 2 for bad usage or bad
         input, with one message on stderr; 3 where chains have not converged; 130 if interrupted.
     """
+    os.environ.setdefault("MPLBACKEND", "Agg")  # commands show no windows
     argv = sys.argv[1:] if argv is None else list(argv)
     options = _options_of(argv)
     try:
@@ -83,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _options_of(argv: Sequence[str]) -> set[str]:
-    """Options of the command that is asked for, such as ``--draws``."""
+    """Return the options of the command that runs, such as ``--draws``."""
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     asked = next((word for word in argv if word in commands), None)
     return {name for option in commands[asked].params for name in option.opts} if asked else set()

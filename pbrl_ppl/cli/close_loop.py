@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -15,31 +14,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli.options import (
-    Columns,
-    TimeStep,
-    Units,
-    columns_of,
-    command_line,
-    load_own,
-    units_of,
-)
+from pbrl_ppl.cli import options
 from pbrl_ppl.cli.terminal import (
     FAILED,
     UNDECIDED,
-    AsJson,
-    Errors,
-    Quiet,
-    Seed,
-    Substeps,
-    Trim,
-    Velocities,
     check_can_make,
     interruptible,
-    named_numbers,
     print_json,
     stages,
-    stated_noise,
 )
 from pbrl_ppl.errors import OutputError
 
@@ -73,7 +55,7 @@ def close_loop(
             help="Held-out history; without it, a quarter of TRAIN's trajectories.",
         ),
     ] = None,
-    seed: Seed = 1,
+    seed: options.Seed = 1,
     overwrite: Annotated[
         bool,
         typer.Option(
@@ -81,7 +63,7 @@ def close_loop(
             help="Write to a folder that has content; with --many, run finished logs again.",
         ),
     ] = False,
-    substeps: Substeps = None,
+    substeps: options.Substeps = None,
     draws: Annotated[
         int | None, typer.Option(min=100, help="Posterior draws of each chain.")
     ] = None,
@@ -92,12 +74,12 @@ def close_loop(
             " the verdict then stands."
         ),
     ] = Method.METROPOLIS,
-    noise: Errors = None,
-    estimate_velocities: Velocities = False,
-    columns: Columns = None,
-    units: Units = None,
-    time_step: TimeStep = None,
-    trim: Trim = False,
+    noise: options.Noise = None,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    time_step: options.TimeStep = None,
+    trim: options.Trim = False,
     many: Annotated[
         Path | None,
         typer.Option(
@@ -119,8 +101,8 @@ def close_loop(
             " gets no name.",
         ),
     ] = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
@@ -134,32 +116,27 @@ def close_loop(
             raise typer.BadParameter("--trim is for one log; leave it, or --many")
         if learn_remainder:
             raise typer.BadParameter("--learn-remainder is for one log; leave it, or --many")
-        close_loop_many(
+        _close_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
-            method=method.value, noise=named_numbers(noise, "--noise", "x=0.002"),
-            columns=columns_of(columns or []), units=units_of(units or []), time_step=time_step,
-            estimate_velocities=estimate_velocities, command=command_line(context),
+            method=method.value, noise=options.noise_of(noise),
+            columns=options.columns_of(columns), units=options.units_of(units), time_step=time_step,
+            estimate_velocities=estimate_velocities, command=options.command_line(context),
         )  # fmt: skip
         return
     if scene is None or train is None:
         raise typer.BadParameter("expected SCENE and TRAIN, or --many MANIFEST")
     if jobs > 1 or scheduler is not None:
         raise typer.BadParameter("--jobs and --scheduler are for --many")
+    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         check_can_make(output)  # before the long work, which would be lost
         progress("reading the scene and the histories")
-        declared, histories = load_own(
-            scene, train, *([] if test is None else [test]),
-            estimate_velocities=estimate_velocities, columns=columns, units=units,
-            time_step=time_step, trim=trim,
-        )  # fmt: skip
-        declared = stated_noise(declared, noise)
-        if substeps is not None:
-            declared = declared.replace(substeps=substeps)
+        paths = [train] if test is None else [train, test]
+        declared, histories = options.load(
+            scene, paths, reading, time_step=time_step, noise=noise, substeps=substeps
+        )
         progress("loading the sampler")
-        # nobody is there to see a window
-        os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report
         from pbrl_ppl.criticism import NOT_CONVERGED
 
@@ -173,7 +150,9 @@ def close_loop(
             progress=progress,
         )
         progress("writing the report")
-        source = report.Source(str(scene), str(train), str(test or ""), command_line(context))
+        source = report.Source(
+            str(scene), str(train), str(test or ""), options.command_line(context)
+        )
         loop.save(output, overwrite=overwrite, source=source)
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     if as_json:
@@ -189,7 +168,7 @@ def close_loop(
 def _remainder(
     loop: Loop, folder: Path, source: Source, seed: int, progress: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
-    """Learn a force for the residual and save it with the results, or say why there is none."""
+    """Learn a force for the residual and save it with the results, or return why there is none."""
     from pbrl_ppl.errors import FitError
 
     path = folder / "remainder.nc"
@@ -203,7 +182,7 @@ def _remainder(
     return {"learned_remainder": {"words": loop.remainder_words, "posterior": path}}
 
 
-def close_loop_many(
+def _close_many(
     manifest: Path,
     output: Path,
     *,
@@ -212,17 +191,16 @@ def close_loop_many(
     scheduler: str | None,
     as_json: bool,
     quiet: bool,
-    **options: Any,
+    **settings: Any,
 ) -> None:
-    """Close the loop on each log of a manifest, and say which effects are where."""
+    """Close the loop on each log of a manifest, and print which effects are where."""
     kept = f"finished logs are in {output}; the same command goes on"
     with interruptible(kept), stages(quiet) as progress:
         check_can_make(output)
         progress("reading the manifest")
-        os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report
 
-        logs = report.read_manifest(manifest)  # its errors come before a cluster is looked for
+        logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
         with _executor(jobs, scheduler) as executor:
             loops = report.close_loop_many(
                 logs,
@@ -230,7 +208,7 @@ def close_loop_many(
                 executor=executor,
                 progress=progress,
                 source=report.Source(command=command),
-                **options,
+                **settings,
             )
     if as_json:
         print_json({"page": output / "index.html", "logs": loops.rows})
@@ -248,7 +226,7 @@ def close_loop_many(
 
 @contextmanager
 def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
-    """A Dask cluster's, processes of this machine, or none."""
+    """Yield the executor of a Dask cluster, processes of this machine, or None."""
     if scheduler is not None:
         with _cluster(scheduler) as executor:
             yield executor
@@ -264,7 +242,7 @@ def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
 
 @contextmanager
 def _cluster(scheduler: str) -> Iterator[Executor]:
-    """The executor of a running Dask scheduler."""
+    """Yield the executor of a running Dask scheduler."""
     try:
         from distributed import Client
     except ImportError:
@@ -286,10 +264,10 @@ def _cluster(scheduler: str) -> Iterator[Executor]:
 
 
 class OneProcessEach(ThreadPoolExecutor):
-    """Runs each call in a fresh process of its own, so many at a time.
+    """Executor that runs each call in a fresh process.
 
-    One that dies, for want of memory say, takes no other with it, as it would in a pool; it is
-    tried once more. Fresh ones, for PyMC's threads do not survive a fork.
+    A process that dies, out of memory for instance, does not take others with it, as in a pool; its
+    call is tried once more. PyMC's threads do not survive a fork, so processes are spawned.
 
     Parameters
     ----------

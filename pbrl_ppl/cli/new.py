@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pbrl_ppl.cli.options import Columns, Units, columns_of, units_of
+from pbrl_ppl.cli import options
 from pbrl_ppl.cli.scene_text import HINGE, SHAPES, hinge, outline, outlines, scene_text, wall
 from pbrl_ppl.cli.scene_text import bodies as parts
-from pbrl_ppl.cli.terminal import AsJson, Overwrite, Quiet, check_file, interruptible, print_json
+from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
 from pbrl_ppl.errors import HistoryError, OutputError, SceneError
+from pbrl_ppl.files import write_text
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -172,15 +173,15 @@ def new(
             metavar="HISTORY", help="A recording: has the bodies' names and the time step."
         ),
     ] = None,
-    columns: Columns = None,
-    units: Units = None,
+    columns: options.Columns = None,
+    units: options.Units = None,
     model: Annotated[
         str | None,
         typer.Option("--from", metavar="MODEL", help="Copy a model that comes with the package."),
     ] = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Write a commented scene, from options or from a few questions; or copy a model.
 
@@ -193,7 +194,7 @@ def new(
     )  # fmt: skip
     with interruptible():
         check_file(scene, (".toml",), overwrite)
-        names, measures = columns_of(columns or []), units_of(units or [])
+        names, measures = options.columns_of(columns), options.units_of(units)
         if model is not None and (side is not None or any(described)):
             raise SceneError("--from copies a model as it is: leave the other options, or --from")
         if history is None and (names or measures):
@@ -271,11 +272,10 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
 def _write(path: Path, text: str) -> None:
     """Write a scene that can be read, whole or not at all."""
     from pbrl_ppl.effects import attach
-    from pbrl_ppl.history import write_atomically
     from pbrl_ppl.scene import Scene
 
     attach(Scene.from_toml(text))  # whether declared effects exist too
-    write_atomically(path, lambda to: to.write_text(text, encoding="utf-8"))
+    write_text(path, text)
 
 
 @dataclass(frozen=True)

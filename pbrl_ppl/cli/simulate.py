@@ -8,21 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli.options import Columns, Resample, Units, columns_of, units_of
-from pbrl_ppl.cli.terminal import (
-    AsJson,
-    Errors,
-    HistoryFile,
-    Overwrite,
-    Quiet,
-    Seed,
-    Velocities,
-    check_file,
-    interruptible,
-    named_numbers,
-    print_json,
-    stages,
-)
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.terminal import check_file, interruptible, print_json, stages
 from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError
 
 if TYPE_CHECKING:
@@ -41,7 +28,7 @@ def simulate(
         Path,
         typer.Argument(metavar="SOURCE", help="Posterior file (.nc), or scene (.toml) with --set."),
     ],
-    history: HistoryFile,
+    history: options.HistoryFile,
     output: Annotated[
         Path,
         typer.Option("-o", "--output", metavar="FILE", help="The history (.csv, .parquet, .nc)."),
@@ -58,35 +45,30 @@ def simulate(
         int | None,
         typer.Option(min=1, help="Posterior draws, a copy of each trajectory for each; else MAP."),
     ] = None,
-    noise: Errors = None,
-    seed: Seed = 1,
-    estimate_velocities: Velocities = False,
-    columns: Columns = None,
-    units: Units = None,
-    resample: Resample = False,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    noise: options.Noise = None,
+    seed: options.Seed = 1,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    resample: options.Resample = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Simulate a recording: its start states and wrenches, under parameters that are given.
 
     Each trajectory is followed from its first complete state to its end. With --noise, errors of
     measuring are added; without, the states are the engine's.
     """
-    names, measures = columns_of(columns or []), units_of(units or [])
+    reading = options.Reading(columns, units, estimate_velocities, resample=resample)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".csv", ".parquet", ".nc"), overwrite)
-        values = named_numbers(given, "--set", "mass=8")
-        errors = named_numbers(noise, "--noise", "x=0.002")
+        values = options.named_numbers(given, "--set", "mass=8")
+        errors = options.noise_of(noise)
         progress("reading the parameters and the history")
         scene, layout, phi, substeps = _parameters(source, values, draws, seed)
-        scene.replace(noise=errors)  # it is checked there
-        from pbrl_ppl.history import History
-
-        recorded = History.load(
-            history, scene, estimate_velocities=estimate_velocities, columns=names, units=measures,
-            resample=resample,
-        )  # fmt: skip
+        scene.replace(noise=errors)  # raises where the noise is invalid
+        recorded = reading.history(history, scene)
         progress("simulating")
         simulated = _simulated(scene, layout, phi, substeps, recorded)
         result = _history(recorded, simulated, errors, seed, labelled=draws is not None)

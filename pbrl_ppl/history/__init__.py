@@ -13,7 +13,7 @@ from pbrl_ppl.history.derived import (
     unused_velocities,
 )
 from pbrl_ppl.history.ends import End, strange_ends, trimmed
-from pbrl_ppl.history.files import read_table, write_atomically
+from pbrl_ppl.history.files import read_table
 from pbrl_ppl.history.gaps import check_start, longest_gap, unseen
 from pbrl_ppl.history.history import History, Segments
 from pbrl_ppl.history.mujoco import from_mujoco
@@ -50,5 +50,4 @@ __all__ = [
     "unused_velocities",
     "without_bad_frames",
     "without_measurements",
-    "write_atomically",
 ]

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import io
-import secrets
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
@@ -15,6 +13,7 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
+from pbrl_ppl.files import write_atomically
 from pbrl_ppl.state import STATE, WRENCH
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
@@ -177,22 +176,3 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
     else:
         measured = dataset[["observed", "action", "clock", "n_rows"]]
         write_atomically(path, lambda to: measured.to_netcdf(to, engine="h5netcdf"))
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call ``write`` with a temporary path beside ``path``, then rename it to ``path``.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written; nothing is left behind then.
-    """
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
-    try:
-        write(temporary)
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)

@@ -8,7 +8,7 @@ from pbrl_ppl.report.logs import Log, read_manifest
 from pbrl_ppl.report.loop import Loop, check_folder, close_loop
 from pbrl_ppl.report.many import ManyLoops, close_loop_many
 from pbrl_ppl.report.many_page import in_words
-from pbrl_ppl.report.page import Source, write_page
+from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
 from pbrl_ppl.report.posterior_report import render_posterior
 from pbrl_ppl.report.scene_plots import (
@@ -46,5 +46,4 @@ __all__ = [
     "read_manifest",
     "render_posterior",
     "summary",
-    "write_page",
 ]

@@ -14,7 +14,6 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,8 @@ from typing import Any
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ManifestError, PbrlError
-from pbrl_ppl.history import History, write_atomically
+from pbrl_ppl.files import write_text
+from pbrl_ppl.history import History
 from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.scene import Scene, nearest
 
@@ -295,8 +295,7 @@ def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
     text = json.dumps({"name": log.name, "message": message, "traceback": trace}, indent=1)
     try:
         (folder / log.name).mkdir(parents=True, exist_ok=True)
-        write = partial(Path.write_text, data=text + "\n", encoding="utf-8")
-        write_atomically(folder / log.name / FAILED, write)
+        write_text(folder / log.name / FAILED, text + "\n")
     except OSError:
         message += " (its folder cannot be written to either)"
     return {"name": log.name, "kind": log.kind, "status": "failed", "message": message}

@@ -16,7 +16,7 @@ import pandas as pd
 from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
-from pbrl_ppl.history import write_atomically
+from pbrl_ppl.files import write_text
 from pbrl_ppl.posterior import load_posterior
 from pbrl_ppl.report.logs import (
     FAILED,
@@ -295,4 +295,4 @@ def _write_summary(
         texts[f"kind-{kind}.toml"] = each.scene.to_toml()
         texts[f"kind-{kind}.csv"] = each.robots().to_csv(index=False, lineterminator="\n")
     for name, text in texts.items():
-        write_atomically(folder / name, partial(Path.write_text, data=text, encoding="utf-8"))
+        write_text(folder / name, text)

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from pbrl_ppl.errors import OutputError
 from pbrl_ppl.report.style import NARROW, WIDE, png
 from pbrl_ppl.report.words import (
     change,
@@ -113,26 +110,6 @@ def render_page(
     environment.filters["data"] = _data
     picture = {name: _picture(draw) for name, draw in pictures.items()}
     return environment.get_template(template).render(picture=picture, digits_of=digits_of, **told)
-
-
-def write_page(path: str | Path, page: str) -> Path:
-    """Write a page whole or not at all, and return its path.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(page, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
 
 
 def _picture(draw: Callable[[float], Figure]) -> dict[str, str]:

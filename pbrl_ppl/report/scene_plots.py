@@ -15,7 +15,7 @@ from matplotlib.patches import Circle, Patch, Polygon, Wedge
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.history import write_atomically
+from pbrl_ppl.files import write_atomically
 from pbrl_ppl.oomdp import SectorContacts
 from pbrl_ppl.planning import Goal, Plan, Target
 from pbrl_ppl.report.style import AFTER, BEFORE, NARROW, WIDE, blank_figure, legend
