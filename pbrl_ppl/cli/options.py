@@ -219,6 +219,10 @@ class Reading:
     trim: bool | None = None
     resample: bool = False
 
+    def __post_init__(self) -> None:
+        columns_of(self.columns)  # bad usage is reported before any file is read
+        units_of(self.units)
+
     def history(self, path: Path, scene: Scene) -> History:
         """Read one history of a scene."""
         from pbrl_ppl.history import History
@@ -264,8 +268,6 @@ def load(
     """
     from pbrl_ppl.scene import Scene
 
-    columns_of(reading.columns)  # bad usage comes before bad files
-    units_of(reading.units)
     declared = Scene.load(scene)  # its errors come before pandas is loaded
     if time_step is not None:
         declared = declared.replace(time_step=time_step)

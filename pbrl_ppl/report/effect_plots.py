@@ -16,12 +16,12 @@ from scipy.stats import chi2, gaussian_kde
 from pbrl_ppl.criticism import Findings
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import scalars
-from pbrl_ppl.report.evidence import Evidence, Law, binned
+from pbrl_ppl.report.evidence import Evidence, Law, bin_means
 from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, legend
 from pbrl_ppl.report.words import plain
 
-#: Candidates are called significant below this corrected p-value.
-LEVEL = 0.01
+#: Candidates are significant below this corrected p-value.
+_LEVEL = 0.01
 #: Below this identifiable share a candidate is marked as hardly identifiable.
 HARDLY = 0.01
 #: Bars and parameters in one picture, at most; the report's tables show all.
@@ -29,7 +29,7 @@ MOST_CANDIDATES, MOST_ADDED = 20, 12
 
 
 def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
-    """Score statistic of the candidates, best on top, with the threshold of each."""
+    """Plot the score statistic of the candidates, best on top, with the threshold of each."""
     added = {(addition.effect, addition.body) for addition in findings.added}
     shown = [
         candidate
@@ -40,7 +40,7 @@ def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
     several = len({candidate.body for candidate in shown}) > 1
     total = max(len(findings.candidates), 1)
     thresholds = [
-        float(chi2.isf(LEVEL / (total * max(candidate.looks, 1)), candidate.dof))
+        float(chi2.isf(_LEVEL / (total * max(candidate.looks, 1)), candidate.dof))
         for candidate in shown
     ]
     for place, (candidate, threshold) in enumerate(zip(shown, thresholds, strict=True)):
@@ -74,7 +74,7 @@ def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
     axes.margins(x=0.1)
     axes.set_xlim(left=0.0)
     axes.invert_yaxis()
-    axes.set_xlabel("score statistic: how strongly the residual asks for the effect")
+    axes.set_xlabel("score statistic of the effect")
     handles: list[Any] = [
         Patch(color=AFTER, label="added"),
         Patch(color=PLAIN, label="not added"),
@@ -86,7 +86,7 @@ def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
 
 
 def plot_added(findings: Findings, width: float = WIDE) -> Figure:
-    """Posterior of every parameter of the added effects, with the value that means no effect."""
+    """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
     shown = [
         (added, name, estimate)
         for added in findings.added
@@ -95,7 +95,7 @@ def plot_added(findings: Findings, width: float = WIDE) -> Figure:
     columns = min(max(len(shown), 1), 2)
     rows = max(-(-len(shown) // columns), 1)
     width = width if columns > 1 else min(width, 5.0)
-    figure, panels = blank_figure(width, 2.6 * rows, rows, columns, grid="x")
+    figure, panels = blank_figure(width, 2.6 * rows, rows, columns, "x", count=len(shown))
     draws = scalars(findings.posterior_after)
     nulls = {(effect.name, p.name): p.null for effect in catalogue for p in effect.parameters}
     for axes, (added, name, estimate) in zip(panels, shown, strict=False):
@@ -120,8 +120,6 @@ def plot_added(findings: Findings, width: float = WIDE) -> Figure:
         axes.set_yticks([])
         axes.set_title(f"{plain(added.effect)} on {added.body}", fontsize=10)
         axes.set_xlabel(f"{plain(name)} ({estimate.unit})")
-    for axes in panels[len(shown) :]:
-        axes.set_visible(False)
     return figure
 
 
@@ -151,7 +149,7 @@ _MOST_BARS = 12
 
 
 def plot_evidence(evidence: Evidence, width: float = WIDE) -> Figure:
-    """Gain of log-likelihood by what was measured, speed, place, time and contact."""
+    """Plot the gain of log-likelihood by measured number, speed, place, time and contact."""
     figure, panels = blank_figure(width, 8.0, 3, 2)
     _by_cell(panels[0], evidence)
     gains = evidence.by_transition
@@ -176,14 +174,10 @@ def _by_cell(axes: Axes, evidence: Evidence) -> None:
 
 
 def _along(axes: Axes, x: Array, gains: Array, label: str) -> None:
-    """Mean gain of a transition in bins of a quantity, with two standard errors."""
-    which, bins = binned(x)
-    own = [np.flatnonzero(which == i) for i in range(bins)]
-    centre = [float(np.median(x[each])) for each in own]
-    mean = [float(gains[each].mean()) for each in own]
-    error = [2 * float(gains[each].std(ddof=1)) / len(each) ** 0.5 if len(each) > 1 else 0.0
-             for each in own]  # fmt: skip
-    axes.errorbar(centre, mean, error, fmt="o-", color=AFTER, markersize=4, linewidth=1.2)
+    """Draw the mean gain of transitions in bins of a quantity, with two standard errors."""
+    bins = bin_means(x, gains)
+    error = 2 * np.nan_to_num(bins.error)
+    axes.errorbar(bins.centre, bins.mean, error, fmt="o-", color=AFTER, markersize=4, linewidth=1.2)
     axes.axhline(0.0, color="black", linewidth=0.8)
     axes.set_title(f"by {label.partition(' (')[0]}", fontsize=10)
     axes.set_xlabel(label)
@@ -241,18 +235,19 @@ def plot_laws(laws: Sequence[Law], width: float = WIDE) -> Figure:
     for axes, law in zip(panels, laws, strict=False):
         order = np.argsort(law.x)
         axes.axhline(0.0, color="black", linewidth=0.8)
-        axes.plot(law.x, law.y, ".", color=PLAIN, markersize=3, alpha=0.6)
+        axes.plot(law.x, law.residual.values, ".", color=PLAIN, markersize=3, alpha=0.6)
         axes.errorbar(
-            law.centre, law.mean, 2 * np.nan_to_num(law.error), fmt="o", color=AFTER, markersize=4,
-            label="mean ± 2 se",
+            law.bins.centre, law.bins.mean, 2 * np.nan_to_num(law.bins.error), fmt="o",
+            color=AFTER, markersize=4, label="mean ± 2 se",
         )  # fmt: skip
-        axes.plot(law.x[order], law.curve, color=BEFORE, linewidth=1.8, label="simple curve")
-        reach = 1.25 * float(np.quantile(np.abs(law.y), 0.98))
+        axes.plot(law.x[order], law.curve.values, color=BEFORE, linewidth=1.8, label="simple curve")
+        reach = 1.25 * float(np.quantile(np.abs(law.residual.values), 0.98))
         if reach > 0:  # a few far off would hide the rest
             axes.set_ylim(-reach, reach)
-        axes.set_title(f"R² {max(law.curve_share, 0):.2f}", fontsize=10)
-        axes.set_xlabel(f"{law.quantity} ({law.x_unit})".replace(" (1)", ""))
+        axes.set_title(f"R² {max(law.curve.share, 0):.2f}", fontsize=10)
+        axes.set_xlabel(f"{law.quantity} ({law.unit})".replace(" (1)", ""))
     if laws:
-        panels[0].set_ylabel(f"{laws[0].y_name}, {laws[0].dimension} ({laws[0].y_unit})")
+        residual = laws[0].residual
+        panels[0].set_ylabel(f"{residual.name}, {residual.dimension} ({residual.unit})")
         panels[0].legend(frameon=False, fontsize="small")
     return figure

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
-    """Held-out residuals of each state dimension before and after, in units of noise."""
+    """Plot held-out residuals of each state dimension in units of noise, before and after."""
     names = list(findings.residuals_before)
     figure, (axes,) = blank_figure(width, 3.6, 1, 1)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
@@ -60,7 +60,7 @@ def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
 
 
 def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
-    """Held-out errors before and after, one step ahead and at the end of a rollout."""
+    """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
     kinds = [
         ("one_step_rmse", "one step ahead"),
         ("rollout_rmse", f"{findings.rollout_horizon} steps ahead"),
@@ -107,12 +107,12 @@ def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
 
 
 def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
-    """One held-out trajectory: measured, and predicted before and after."""
+    """Plot one held-out trajectory: measured, and predicted before and after."""
     rollout = findings.rollout
     count = len(rollout.names)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
-    figure, panels = blank_figure(width, 0.8 + 1.9 * rows, rows, columns)
+    figure, panels = blank_figure(width, 0.8 + 1.9 * rows, rows, columns, count=count)
     lines: list[tuple[Array, str, Literal["-", "--"], str]] = [
         (rollout.before, BEFORE, "--", "before"),
         (rollout.after, AFTER, "-", "after"),
@@ -133,8 +133,6 @@ def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
         axes.set_ylabel(f"{name} ({unit})")
         if place >= count - columns:
             axes.set_xlabel("time (s)")
-    for axes in panels[count:]:
-        axes.set_visible(False)
     handles = [Line2D([], [], color="black", marker="o", linestyle="", markersize=3)]
     handles += [Line2D([], [], color=c, linestyle=s) for _, c, s, _ in lines]
     names = ["measured", *(name for *_, name in lines)]
@@ -143,7 +141,7 @@ def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
 
 
 def unwrap(angle: Array) -> Array:
-    """Angles (rad) without jumps of a turn, shape (time,); NaN stays NaN."""
+    """Return angles (rad) without jumps of a turn, shape (time,); NaN stays NaN."""
     result = np.array(angle, dtype=float)
     seen = np.isfinite(result)
     result[seen] = np.unwrap(result[seen])
@@ -159,43 +157,40 @@ def _beside(line: Array, measured: Array) -> Array:
     return np.asarray(line + 2 * np.pi * turns)
 
 
-Array = NDArray[np.float64]
-
-#: Chance that a correlation of noise is outside its band, over all that a panel shows.
-CHANCE = 0.01
-#: Curves that are named in a legend.
+#: Probability that noise alone puts any correlation of a panel outside the band.
+_CHANCE = 0.01
+#: Curves that a legend names, at most.
 _NAMED = 4
 
 
 def plot_correlations(findings: Findings, width: float = WIDE) -> Figure:
-    """Correlations of errors with those before and with commands, and the band of noise alone."""
-    told = findings.correlations
-    panels = 2 if told.commands else 1
-    figure, axes = blank_figure(width, 3.2, 1, panels)
-    lags = np.arange(1, len(told.own) + 1)
-    _panel(axes[0], lags, told.own, told.pairs, list(told.cells))
+    """Plot correlations of errors with earlier errors and with commands."""
+    found = findings.correlations
+    figure, axes = blank_figure(width, 3.2, 1, 2 if found.commands else 1)
+    lags = np.arange(1, len(found.own) + 1)
+    _plot_correlations(axes[0], lags, found.own, found.pairs, list(found.cells))
     axes[0].set_xlabel("intervals before")
     axes[0].set_title("with itself", fontsize="medium")
-    if told.commands:
-        lags = np.arange(len(told.driven))
+    if found.commands:
+        lags = np.arange(len(found.driven))
         names = [
             f"{cell}, {command.replace('_', ' ')}"
-            for command in told.commands
-            for cell in told.cells
+            for command in found.commands
+            for cell in found.cells
         ]
-        pairs = np.full((len(lags), len(names)), max(float(told.pairs.max(initial=1)), 1.0))
-        _panel(axes[1], lags, told.driven.reshape(len(lags), -1), pairs, names)
+        pairs = np.full((len(lags), len(names)), max(float(found.pairs.max(initial=1)), 1.0))
+        _plot_correlations(axes[1], lags, found.driven.reshape(len(lags), -1), pairs, names)
         axes[1].set_xlabel("intervals before")
         axes[1].set_title("with commands", fontsize="medium")
     axes[0].set_ylabel("correlation of errors")
     return figure
 
 
-def _panel(
+def _plot_correlations(
     axes: Axes, lags: NDArray[np.intp], values: Array, pairs: Array, names: list[str]
 ) -> None:
-    """Curves of correlations over lags; those that leave the band of noise have a name."""
-    edge = norm.isf(CHANCE / 2 / max(values.size, 1)) / np.sqrt(np.maximum(pairs, 1)).min()
+    """Draw correlations over lags; name those that leave the band of noise alone."""
+    edge = norm.isf(_CHANCE / 2 / max(values.size, 1)) / np.sqrt(np.maximum(pairs, 1)).min()
     axes.axhspan(-edge, edge, color=BAND, zorder=0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
     largest = np.abs(values).max(axis=0)
@@ -212,7 +207,7 @@ def _panel(
 
 
 def plot_growth(findings: Findings, width: float = WIDE) -> Figure:
-    """Errors of forecasts over their length, in units of what noise alone makes at each length."""
+    """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
     growth = findings.growth
     names = [name for name in growth.floor[-1] if growth.floor[-1][name] > 0]
     figure, (axes,) = blank_figure(width, 3.2, 1, 1)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from typing import Any, Literal
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import arviz as az
 import numpy as np
@@ -17,7 +17,6 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.stats import gaussian_kde, rankdata
 
-from pbrl_ppl.criticism import Findings
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import (
     DATATREE,
@@ -62,68 +61,65 @@ def summary(posterior: Any) -> pd.DataFrame:
     return result
 
 
-def most_interesting(of: Any, table: pd.DataFrame | None = None) -> list[str]:
-    """Parameters to look at first: those of added effects, then the worst by R-hat.
+def most_interesting(table: pd.DataFrame, added: Iterable[str] = ()) -> list[str]:
+    """Return the parameters to look at first: those of added effects, then the worst by R-hat.
 
     Parameters
     ----------
-    of : Findings, InferenceData or DataTree
-        Findings, of which the posterior after revision is looked at, or a posterior.
-    table : pandas.DataFrame, optional
-        Its :func:`summary`, where that is at hand.
+    table : pandas.DataFrame
+        The posterior's :func:`summary`.
+    added : iterable of str
+        Labels of the added effects' parameters.
     """
-    revised = isinstance(of, Findings)
-    table = summary(of.posterior_after if revised else of) if table is None else table
-    own = [
-        f"{added.effect}_{name}[{added.body}]"
-        for added in (of.added if revised else ())
-        for name in added.parameters
-    ]
     worst = table["r_hat"].fillna(np.inf).sort_values(ascending=False, kind="stable").index
-    return list(dict.fromkeys([*(n for n in own if n in table.index), *worst]))[:MOST_PARAMETERS]
+    first = [name for name in added if name in table.index]
+    return list(dict.fromkeys([*first, *worst]))[:MOST_PARAMETERS]
 
 
-def plot_trace(of: Any, parameters: Sequence[str] | None = None, width: float = WIDE) -> Figure:
-    """ArviZ's trace of some parameters, laid out alike on every ArviZ.
+def plot_trace(
+    posterior: Any, parameters: Sequence[str] | None = None, width: float = WIDE
+) -> Figure:
+    """Plot ArviZ's trace of some parameters, laid out alike on every ArviZ.
 
     Parameters
     ----------
-    of : Findings, InferenceData or DataTree
-        Findings, of which the posterior after revision is shown, or a posterior.
+    posterior : InferenceData or DataTree
+        With a group ``posterior``.
     parameters : sequence of str, optional
-        Labels such as ``mass[cart]``; by default those of most interest: of added effects, and with
-        the worst R-hat.
+        Labels such as ``mass[cart]``; by default those with the worst R-hat.
     width : float
-        Of the figure (inches).
+        Width of the figure (inches).
     """
-    draws = _chosen(of, parameters)
+    draws = _chosen(posterior, parameters)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # ArviZ uses what newer Matplotlib deprecates, and a constant parameter makes it complain
         warnings.simplefilter("ignore")
         return _trace(draws, width)
 
 
-def plot_rank(of: Any, parameters: Sequence[str] | None = None, width: float = WIDE) -> Figure:
-    """How evenly the ranks of each chain's draws are spread; arguments as of :func:`plot_trace`.
+def plot_rank(
+    posterior: Any, parameters: Sequence[str] | None = None, width: float = WIDE
+) -> Figure:
+    """Plot how evenly the ranks of each chain's draws are spread; arguments as :func:`plot_trace`.
 
     A curve is the share of a chain's draws below each rank, less what an even spread gives. The
-    band is as wide as the chains' own effective sample sizes make it, which that of independent
-    draws is not: chains that agree stay inside it 99 times of 100.
+    band follows from the effective sample sizes of the chains: chains that agree stay inside it 99
+    times of 100.
     """
-    draws = _chosen(of, parameters)
-    # of each chain by itself: chains that differ have next to no effective draws together
-    alone = [
+    draws = _chosen(posterior, parameters)
+    # by chain: chains that differ have few effective draws together
+    sizes = [
         convergence(from_groups({"posterior": draws.isel(chain=[i])}, {}))[1]
         for i in range(draws.sizes["chain"])
     ]
     count = len(draws.data_vars)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
-    figure, panels = blank_figure(width, 0.6 + 1.7 * rows, rows, columns)
+    figure, panels = blank_figure(width, 0.6 + 1.7 * rows, rows, columns, count=count)
     for axes, (name, values) in zip(panels, draws.items(), strict=False):
         chains = values.to_numpy()
         ranks = rankdata(chains).reshape(chains.shape) / chains.size
-        fewest = min(ess[str(name)] for ess in alone)
+        fewest = min(ess[str(name)] for ess in sizes)
         edge = _WORST_SHIFT / np.sqrt(max(fewest, 1.0)) if np.isfinite(fewest) else 1.0
         axes.axhspan(-edge, edge, color=BAND, zorder=0)
         grid = np.linspace(0.0, 1.0, 201)
@@ -135,19 +131,18 @@ def plot_rank(of: Any, parameters: Sequence[str] | None = None, width: float = W
         largest = max(1.4 * edge, 1.1 * float(np.abs(off).max()))
         axes.set_ylim(-largest, largest)
         axes.set_xlabel("rank among all draws", fontsize=8)
-    for axes in panels[count:]:
-        axes.set_visible(False)
     return figure
 
 
-def _chosen(of: Any, parameters: Sequence[str] | None) -> xr.Dataset:
-    """Draws of the parameters to show."""
-    names = most_interesting(of) if parameters is None else list(parameters)
-    return scalars(of.posterior_after if isinstance(of, Findings) else of)[names]
+def _chosen(posterior: Any, parameters: Sequence[str] | None) -> xr.Dataset:
+    """Return the draws of the parameters to show."""
+    if parameters is None:
+        parameters = most_interesting(summary(posterior))
+    return scalars(posterior)[list(parameters)]
 
 
 def _trace(draws: xr.Dataset, width: float) -> Figure:
-    """Draw with ArviZ: the one place that knows how 0.x and 1.x differ in that."""
+    """Draw with ArviZ; the one place where traces of 0.x and 1.x differ."""
     count = len(draws.data_vars)
     if not DATATREE:
         figure, panels = blank_figure(width, 0.6 + 1.5 * count, count, 2, grid=None)
@@ -174,7 +169,7 @@ def _trace(draws: xr.Dataset, width: float) -> Figure:
         },
     )
     result: Figure = collection.viz["figure"].item()
-    plt.close(result)  # ArviZ 1.x registers it with pyplot, which would keep it for ever
+    plt.close(result)  # ArviZ 1.x registers it with pyplot, which would never release it
     return result
 
 
@@ -182,13 +177,11 @@ Array = NDArray[np.float64]
 
 #: Parameters in a picture of pairs, and beside their priors, at most.
 MOST_PAIRS, MOST_PRIORS = 4, 12
-#: Kolmogorov's distance at 1 %, as of ranks.
-_WORST_SHIFT = 1.63
 _POINTS = 800
 
 
 def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -> Figure:
-    """Posterior densities over those of the prior.
+    """Plot posterior densities over those of the prior.
 
     Parameters
     ----------
@@ -197,12 +190,14 @@ def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -
     parameters : sequence of str
         Labels such as ``mass[cart]``.
     width : float
-        Of the figure (inches).
+        Width of the figure (inches).
     """
-    after, before = scalars(posterior), _prior(posterior)
+    after, before = scalars(posterior), prior_draws(posterior)
     columns = min(3, len(parameters)) if width > NARROW else 2
     rows = -(-len(parameters) // columns)
-    figure, panels = _grid(width, 0.6 + 1.5 * rows, rows, columns)
+    figure, panels = blank_figure(
+        width, 0.6 + 1.5 * rows, rows, columns, None, count=len(parameters), stack=False
+    )
     for axes, name in zip(panels, parameters, strict=False):
         drawn = [(after[name].to_numpy().ravel(), AFTER, 0.35)]
         if name in before:
@@ -222,8 +217,6 @@ def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -
         axes.set_ylim(bottom=0)
         axes.tick_params(labelsize=8)
         axes.set_title(name, fontsize=9)
-    for axes in panels[len(parameters) :]:
-        axes.set_visible(False)
     legend(
         figure,
         [Patch(color=PLAIN, alpha=0.6, label="prior"), Patch(color=AFTER, label="posterior")],
@@ -232,7 +225,7 @@ def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -
 
 
 def most_dependent(posterior: Any, most: int = MOST_PAIRS) -> list[str]:
-    """The parameters whose draws depend most on each other, by rank correlation."""
+    """Return the parameters whose draws depend most on each other, by rank correlation."""
     draws = scalars(posterior)
     names = [str(name) for name, v in draws.items() if float(v.max() - v.min()) > 0]
     if len(names) < 2:
@@ -247,11 +240,12 @@ def most_dependent(posterior: Any, most: int = MOST_PAIRS) -> list[str]:
 
 
 def plot_pairs(posterior: Any, parameters: Sequence[str], width: float = WIDE) -> Figure:
-    """Draws of each pair of parameters, with their rank correlation."""
+    """Plot draws of each pair of parameters, with their rank correlation."""
     draws = scalars(posterior)
     n = len(parameters) - 1
     correlation = _correlations(draws, parameters)
-    figure, panels = _grid(width, 0.4 + min(width, 6.4) * n / max(n, 2) * 0.9, n, n)
+    height = 0.4 + min(width, 6.4) * n / max(n, 2) * 0.9
+    figure, panels = blank_figure(width, height, n, n, None, stack=False)
     for row in range(n):
         for column in range(n):
             axes = panels[row * n + column]
@@ -273,10 +267,10 @@ def plot_pairs(posterior: Any, parameters: Sequence[str], width: float = WIDE) -
 
 
 def plot_predictions(posterior: Any, width: float = WIDE) -> Figure:
-    """Where measurements lie in leave-one-out predictions, less what calibrated ones would give.
+    """Plot the calibration of leave-one-out predictions, one curve a state dimension.
 
-    One curve a state dimension; the band is where those of independent measurements stay 99 times
-    of 100.
+    A curve is the share of measurements below each quantile, less what calibrated predictions give;
+    those of independent measurements stay in the band 99 times of 100.
     """
     pit = loo_pit(posterior)
     figure, (axes,) = blank_figure(width, 3.4, 1, 1)
@@ -303,11 +297,16 @@ def plot_predictions(posterior: Any, width: float = WIDE) -> Figure:
     return figure
 
 
-def coverage(posterior: Any) -> dict[str, tuple[float, float, int]]:
-    """Shares of measurements inside the central 50 % and 94 % of their predictions, and how many.
+class Coverage(NamedTuple):
+    """Shares of measurements in the central 50 % and 94 % of predictions, and their number."""
 
-    Leave-one-out, by state dimension.
-    """
+    half: float
+    wide: float
+    measurements: int
+
+
+def coverage(posterior: Any) -> dict[str, Coverage]:
+    """Return the coverage of leave-one-out predictions, by state dimension."""
     pit = loo_pit(posterior)
     result = {}
     for name in (str(state) for state in pit["state"].values):
@@ -315,29 +314,30 @@ def coverage(posterior: Any) -> dict[str, tuple[float, float, int]]:
         values = values[np.isfinite(values)]
         if values.size:
             off = np.abs(values - 0.5)
-            result[name] = (float((off < 0.25).mean()), float((off < 0.47).mean()), values.size)
+            half, wide = (float((off < edge).mean()) for edge in (0.25, 0.47))
+            result[name] = Coverage(half, wide, values.size)
     return result
 
 
 def pareto_k(posterior: Any) -> tuple[Array, float, str]:
-    """Pareto k, the threshold above which it is bad, and what is left out at a time.
+    """Return Pareto k, the threshold above which it is bad, and what is left out at a time.
 
     Raises
     ------
     PosteriorError
-        If ArviZ cannot say.
+        If ArviZ cannot compute it.
     """
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        warnings.simplefilter("ignore")  # of high k, which the result says
+        warnings.simplefilter("ignore")  # ArviZ warns of a high k, which the result shows
         try:
             loo = az.loo(separate(posterior), pointwise=True)
-        except Exception as error:  # whatever it is, a report can do without
+        except Exception as error:  # a report can do without, whatever the cause
             raise PosteriorError(f"leave-one-out cross-validation: {error}") from error
     return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
 
 
 def plot_pareto(k: Array, good: float, unit: str, width: float = WIDE) -> Figure:
-    """Pareto k of every unit left out, and the threshold above which LOO is not to be relied on."""
+    """Plot Pareto k of every unit left out, and the threshold above which LOO is unreliable."""
     figure, (axes,) = blank_figure(width, 2.8, 1, 1)
     high = ~(k <= good)
     axes.axhline(good, color=BEFORE, linewidth=1.2, linestyle="--")
@@ -348,23 +348,14 @@ def plot_pareto(k: Array, good: float, unit: str, width: float = WIDE) -> Figure
     return figure
 
 
-def _prior(posterior: Any) -> xr.Dataset:
-    """One variable per scalar parameter of the prior, if the file holds draws of it."""
+def prior_draws(posterior: Any) -> xr.Dataset:
+    """Return one variable per scalar parameter of the prior; none if there are no prior draws."""
     if "prior" not in groups(posterior):
         return xr.Dataset()
     return scalars(from_groups({"posterior": group(posterior, "prior")}, {}))
 
 
-def _grid(width: float, height: float, rows: int, columns: int) -> tuple[Figure, list[Any]]:
-    """Small panels that stay side by side on a narrow figure."""
-    figure = Figure(figsize=(width, height), layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for axes in panels:
-        axes.spines[["top", "right"]].set_visible(False)
-    return figure, panels
-
-
 def _correlations(draws: xr.Dataset, names: Sequence[str]) -> Array:
-    """Rank correlations, shape (parameter, parameter)."""
+    """Return rank correlations, shape (parameter, parameter)."""
     table = pd.DataFrame({name: draws[name].to_numpy().ravel() for name in names})
     return np.asarray(table.corr("spearman"))

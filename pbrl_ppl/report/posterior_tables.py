@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
 
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
-from pbrl_ppl.posterior import Identifiability, from_groups, group, groups, interval, scalars
+from pbrl_ppl.posterior import Identifiability, interval, scalars
 from pbrl_ppl.report.page import Table
-from pbrl_ppl.report.style import UNITS
-from pbrl_ppl.report.words import digits_of, number
+from pbrl_ppl.report.posterior_plots import prior_draws
+from pbrl_ppl.report.style import UNITS, acceleration_unit
+from pbrl_ppl.report.words import digits_of, number, plain
 
 #: Of parameters, by the variable's name.
 PARAMETERS = {
@@ -60,26 +61,23 @@ STATISTICS = {
 
 
 def meaning(label: str, effects: Iterable[Effect]) -> str:
-    """What a parameter such as ``mass[cart]`` is, in a few words; empty if that is not known."""
+    """Return what a parameter such as ``mass[cart]`` is, in a few words; empty if unknown."""
     name = label.partition("[")[0]
     if name in PARAMETERS:
         return PARAMETERS[name]
     for effect in effects:
         for parameter in effect.parameters:
             if effect.variable(parameter) == name:
-                return (
-                    f"{parameter.name.replace('_', ' ')} of the effect"
-                    f" {effect.name.replace('_', ' ')}"
-                )
+                return f"{plain(parameter.name)} of the effect {plain(effect.name)}"
     return ""
 
 
-#: A chain mix is good below this R-hat and above this effective sample size ...
+#: Chains are good up to this R-hat and from this effective sample size on ...
 GOOD_R_HAT, GOOD_ESS = 1.01, 400.0
 #: ... and up to these good enough for a verdict, and for the first digits of an interval.
 ROUGH_R_HAT, ROUGH_ESS = 1.05, 100.0
 
-_TOLD = {
+_DATA = {
     "informed": "inform it",
     "weak": "inform it weakly",
     "prior only": "say nothing beyond the prior",
@@ -93,7 +91,7 @@ def posterior_rows(
     *,
     method: str = "",
 ) -> list[dict[str, Any]]:
-    """One row per parameter: its summary, unit, meaning, and what is wrong with its chains.
+    """Return a row per parameter: its summary, unit, meaning, and what is wrong with its chains.
 
     Draws of Laplace's approximation are independent, and there are no chains to compare.
     """
@@ -115,7 +113,7 @@ def posterior_rows(
         if name == "sigma":
             unit = UNITS.get(place, "")
         elif name in ("unexplained_acceleration", "contact_acceleration"):
-            unit = "rad/s²" if place == "omega" else "m/s²"
+            unit = acceleration_unit(place)
         rows.append(
             {
                 "label": str(label),
@@ -131,7 +129,7 @@ def posterior_rows(
 
 
 def parameter_table(rows: list[dict[str, Any]], caption: str) -> Table:
-    """Posterior of all parameters, in their units."""
+    """Tabulate the posterior of all parameters, in their units."""
     return Table(
         caption,
         ("Parameter", "Mean", "sd", "94 % interval", "Unit", "R-hat", "ESS bulk", "ESS tail"),
@@ -140,7 +138,7 @@ def parameter_table(rows: list[dict[str, Any]], caption: str) -> Table:
                 (row["label"], row["meaning"]),
                 number(row["mean"]),
                 number(row["sd"]),
-                f"{number(row['lower'], _digits(row))} to {number(row['upper'], _digits(row))}",
+                _span(row["lower"], row["upper"]),
                 row["unit"],
                 number(row["r_hat"], 4),
                 number(row["ess_bulk"]),
@@ -153,14 +151,25 @@ def parameter_table(rows: list[dict[str, Any]], caption: str) -> Table:
     )
 
 
-def _digits(row: Mapping[str, Any]) -> int:
-    return min(digits_of(row["lower"], row["upper"]), 6)
+def _span(low: float, high: float) -> str:
+    """Return an interval as text, with the digits that tell its ends apart."""
+    digits = min(digits_of(low, high), 6)
+    return f"{number(low, digits)} to {number(high, digits)}"
 
 
-def sampler_in_words(rows: list[dict[str, Any]]) -> tuple[str, str]:
-    """Say whether the sampler worked, by the worst of its diagnostics: in a word, and in full."""
+class SamplerResult(NamedTuple):
+    """Whether the sampler worked: in a word, and in full."""
+
+    word: str
+    sentence: str
+
+
+def sampler_in_words(rows: list[dict[str, Any]]) -> SamplerResult:
+    """Return whether the sampler worked, by the worst of its diagnostics."""
     if not all(row["chains"] for row in rows):
-        return "No chains.", "Independent draws of Laplace's approximation: as good as that is."
+        return SamplerResult(
+            "No chains.", "Independent draws of Laplace's approximation: as good as that is."
+        )
     hats = [row["r_hat"] if np.isfinite(row["r_hat"]) else np.inf for row in rows]
     sizes = [min(row["ess_bulk"], row["ess_tail"]) for row in rows]
     failed, rough = (sum(bool(row[name]) for row in rows) for name in ("failed", "wrong"))
@@ -170,34 +179,31 @@ def sampler_in_words(rows: list[dict[str, Any]]) -> tuple[str, str]:
         f" {number(float(np.nanmin(sizes)))} (at least {GOOD_ESS:.0f})."
     )
     if failed:
-        return "Not converged.", f"{failed} of {len(rows)} parameters did not converge. {found}"
+        return SamplerResult(
+            "Not converged.", f"{failed} of {len(rows)} parameters did not converge. {found}"
+        )
     if rough:
-        return (
+        return SamplerResult(
             "Well enough.",
             f"The chains agree, but {rough} of {len(rows)} parameters have fewer effective draws"
             f" or a larger R-hat than is wanted: the last digits of their intervals are rough."
             f" {found} With R-hat up to {ROUGH_R_HAT} and from {ROUGH_ESS:.0f} effective draws on"
             " conclusions stand; for more digits take more draws.",
         )
-    return "Yes.", f"The chains agree and are long enough. {found}"
+    return SamplerResult("Yes.", f"The chains agree and are long enough. {found}")
 
 
-def width_table(posterior: Any, said: Identifiability, units: Mapping[str, str]) -> Table:
-    """Intervals of each parameter before and after the data, both in its unit."""
-    after = scalars(posterior)
-    before: Any = {}
-    if "prior" in groups(posterior):
-        before = scalars(from_groups({"posterior": group(posterior, "prior")}, {}))
+def width_table(posterior: Any, known: Identifiability, units: Mapping[str, str]) -> Table:
+    """Tabulate the intervals of each parameter before and after the data."""
+    before, after = prior_draws(posterior), scalars(posterior)
 
     def spans(draws: Any, name: str) -> str:
         if name not in draws:
             return "–"
-        low, high = interval(draws[name].to_numpy())
-        digits = min(digits_of(low, high), 6)
-        return f"{number(low, digits)} to {number(high, digits)}"
+        return _span(*interval(draws[name].to_numpy()))
 
     rows, marks = [], []
-    for width in said.parameters:
+    for width in known.parameters:
         name = width.parameter
         rows.append(
             (
@@ -206,7 +212,7 @@ def width_table(posterior: Any, said: Identifiability, units: Mapping[str, str])
                 spans(after, name),
                 units.get(name, ""),
                 f"{100 * width.ratio:.3g} %",
-                _TOLD[width.verdict],
+                _DATA[width.verdict],
             )
         )
         marks.append("bad" if width.verdict == "prior only" else "")

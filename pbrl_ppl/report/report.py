@@ -37,6 +37,7 @@ from pbrl_ppl.report.loop_tables import (
     carrier_table,
     error_tables,
     loo_table,
+    models_of,
     residual_test_table,
 )
 from pbrl_ppl.report.motion import animation, held_out_motions
@@ -89,7 +90,10 @@ def render(
     """
     effects = tuple(effects)
     table = summary(findings.posterior_after)
-    parameters = most_interesting(findings, table)
+    parameters = most_interesting(
+        table,
+        (f"{e.effect}_{name}[{e.body}]" for e in findings.added for name in e.parameters),
+    )
     units = {
         f"{added.effect}_{name}": e.unit
         for added in findings.added
@@ -102,25 +106,25 @@ def render(
     laws = find_laws(findings, effects)
     poses = recorded_poses(findings.posterior_before)
     pictures: dict[str, Callable[[float], Figure]] = {
-        "rollout": partial(_drawn, plot_rollout, findings),
-        "errors": partial(_drawn, plot_errors, findings),
-        "residuals": partial(_drawn, plot_residuals, findings),
-        "correlations": partial(_drawn, plot_correlations, findings),
-        "growth": partial(_drawn, plot_growth, findings),
-        "trace": partial(plot_trace, findings, parameters),
-        "rank": partial(plot_rank, findings, parameters),
+        "rollout": partial(plot_rollout, findings),
+        "errors": partial(plot_errors, findings),
+        "residuals": partial(plot_residuals, findings),
+        "correlations": partial(plot_correlations, findings),
+        "growth": partial(plot_growth, findings),
+        "trace": partial(plot_trace, findings.posterior_after, parameters),
+        "rank": partial(plot_rank, findings.posterior_after, parameters),
     }
     if poses is not None:
         later = None if held_out is None else held_out.dataset["start"].to_numpy()[..., :3]
         pictures["scene"] = partial(plot_recording, findings.scene, poses, later)
     if evidence is not None:
-        pictures["evidence"] = partial(_drawn, plot_evidence, evidence)
+        pictures["evidence"] = partial(plot_evidence, evidence)
     if laws:
-        pictures["laws"] = partial(_drawn, plot_laws, laws)
+        pictures["laws"] = partial(plot_laws, laws)
     if findings.candidates:
-        pictures["candidates"] = partial(_drawn, plot_candidates, findings)
+        pictures["candidates"] = partial(plot_candidates, findings)
     if accepted(findings):
-        pictures["added"] = partial(_drawn, plot_added, findings)
+        pictures["added"] = partial(plot_added, findings)
     said = findings.identifiability
     return render_page(
         "report.html.jinja",
@@ -140,7 +144,7 @@ def render(
         carriers=None if evidence is None else carrier_table(evidence),
         laws=laws,
         errors=error_tables(findings),
-        loo=loo_table(findings),
+        loo=findings.loo and loo_table(findings.loo, models_of(findings)),
         acceleration=acceleration_table(findings),
         tests=residual_test_table(findings),
         candidates=candidate_table(findings, effects),
@@ -169,7 +173,3 @@ def recorded_poses(posterior: Any) -> Array | None:
         return np.asarray(given["recorded_start"].to_numpy()[..., :3])
     # of single transitions: where each starts, one after the other
     return np.asarray(given["start"].to_numpy()[None, ..., :3])
-
-
-def _drawn(plot: Callable[..., Figure], of: Any, width: float) -> Figure:
-    return plot(of, width=width)

@@ -220,9 +220,6 @@ def _place(target: Target) -> Array:
     return np.array([[target.x, target.y]])
 
 
-Array = NDArray[np.float64]
-
-
 def draw_contacts(
     axes: Axes, scene: Scene, states: Array, body: str, contacts: SectorContacts | None = None
 ) -> None:

@@ -18,6 +18,7 @@ from pbrl_ppl.criticism import (
 )
 from pbrl_ppl.model import ACCELERATION
 from pbrl_ppl.posterior import draws, group
+from pbrl_ppl.report.style import acceleration_unit
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -33,10 +34,9 @@ def remainder_in_words(before: Any, after: Any) -> str:
     names = group(after, "posterior")[ACCELERATION]
     worst = int(np.argmax(sizes[0] - sizes[1]))
     name = str(names[names.dims[-1]].values[worst])
-    unit = "rad/s²" if name == "omega" else "m/s²"
     return (
         f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
-        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {unit}"
+        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {acceleration_unit(name)}"
     )
 
 

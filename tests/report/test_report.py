@@ -300,7 +300,8 @@ def test_rollout_angles_have_no_jumps() -> None:
 
 
 def test_parameters_of_most_interest() -> None:
-    shown = most_interesting(made_up(stuck=True))
+    table = summary(made_up(stuck=True).posterior_after)
+    shown = most_interesting(table, ["linear_drag_coefficient[cart]", "not_there[cart]"])
     assert shown[:2] == ["linear_drag_coefficient[cart]", "w_x[cart]"]
     assert len(shown) == MOST_PARAMETERS
 
