@@ -13,7 +13,6 @@ from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
 from pbrl_ppl.report.posterior_report import render_posterior
 from pbrl_ppl.report.scene_plots import (
     animate_plan,
-    draw_contacts,
     draw_goal,
     draw_motion,
     draw_scene,
@@ -29,7 +28,6 @@ __all__ = [
     "check_folder",
     "close_loop",
     "close_loop_many",
-    "draw_contacts",
     "draw_goal",
     "draw_motion",
     "draw_scene",
