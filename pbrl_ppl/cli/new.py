@@ -22,13 +22,13 @@ from pbrl_ppl.files import write_text
 if TYPE_CHECKING:
     import pandas as pd
 
-#: Time steps may differ by so much of themselves (as in a history) before they are uneven.
+#: Largest relative difference of time steps that count as even, as in a history.
 _EVEN = 0.01
 
 
 @dataclass(frozen=True)
 class Recorded:
-    """Names of the bodies in a recording, and its clock.
+    """Names of the bodies in a recording, and its time steps.
 
     Parameters
     ----------
@@ -54,7 +54,7 @@ def recorded(
     units: Mapping[str, str],
     given: Sequence[str] = (),
 ) -> Recorded:
-    """Read the names of bodies and the time step off a recording.
+    """Read the names of bodies and the time step from a recording.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def recorded(
             f"history {path}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
             " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
         )
-    # read with the names, as later commands read it with the scene; the outline does not matter
+    # later commands read it with the scene; any outline will do here
     stand_in = Scene(time_step=1.0, bodies=tuple(Body(n, Shape.circle(1.0)) for n in names))
     table = as_history(frame, stand_in, f"history {path}", columns=columns, units=units)
     for name in ("trajectory", "body", "time"):
@@ -109,7 +109,7 @@ def recorded(
 
 
 def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]:
-    """Names of bodies: of columns side by side, of a column of names, or one for all rows."""
+    """Return names of bodies: from columns side by side, a column of names, or one name."""
     beside = dict.fromkeys(key.rpartition(".")[0] for key in columns if "." in key)
     column = columns.get("body", "body")
     if beside:
@@ -237,7 +237,7 @@ def new(
 def _reading(
     found: Recorded | None, columns: list[str] | None, units: list[str] | None
 ) -> list[str]:
-    """Options with which later commands read the recording."""
+    """Return the options with which later commands read the recording."""
     if found is None:
         return []
     options = [word for each in columns or [] for word in ("--columns", each)]
@@ -270,7 +270,7 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a scene that can be read, whole or not at all."""
+    """Write a scene whole or not at all, if it is valid."""
     from pbrl_ppl.effects import attach
     from pbrl_ppl.scene import Scene
 
@@ -280,7 +280,7 @@ def _write(path: Path, text: str) -> None:
 
 @dataclass(frozen=True)
 class _Answers:
-    """What a scene needs, whoever said it."""
+    """Scene settings from options, recording and answers."""
 
     names: Sequence[str]
     shapes: Mapping[str, str]
@@ -298,7 +298,7 @@ def _asked(
     history: Path | None,
     found: Recorded | None,
 ) -> _Answers:
-    """What options, a recording and answers say."""
+    """Return scene settings from options, a recording and answers to questions."""
     shapes = dict(given)
     names = list(shapes)
     if found is not None:

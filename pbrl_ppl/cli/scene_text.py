@@ -128,7 +128,7 @@ def scene_text(
     hinges: Iterable[HingeText] = (),
     walls: Iterable[tuple[Sequence[float], Sequence[float]]] = (),
 ) -> str:
-    """A commented scene as TOML.
+    """Return a commented scene as TOML.
 
     Parameters
     ----------
@@ -162,7 +162,7 @@ def scene_text(
 
 
 def numbers(values: Sequence[float]) -> str:
-    """Numbers as TOML."""
+    """Return numbers as TOML."""
     return f"[{', '.join(map(repr, values))}]"
 
 
@@ -205,7 +205,7 @@ HINGE = "arm@0,0.15 (to the world) or upper@0,-0.1=lower@0,0.15"
 
 
 def outline(text: str) -> tuple[str, str]:
-    """Name and shape, as TOML, of ``NAME=box:LENGTHxWIDTH`` and the like.
+    """Return the name and the shape, as TOML, from ``NAME=box:LENGTHxWIDTH`` and the like.
 
     Examples
     --------
@@ -227,7 +227,7 @@ def outline(text: str) -> tuple[str, str]:
 
 
 def outlines(given: Iterable[str]) -> dict[str, str]:
-    """Shapes by name, as TOML, of all ``--body``."""
+    """Return shapes by name, as TOML, from all ``--body``."""
     shapes: dict[str, str] = {}
     for name, shape in map(outline, given):
         if name in shapes:
@@ -237,7 +237,7 @@ def outlines(given: Iterable[str]) -> dict[str, str]:
 
 
 def hinge(text: str, names: Sequence[str]) -> HingeText:
-    """A hinge of ``BODY@X,Y`` to the world's origin, or of ``BODY@X,Y=OTHER@X,Y``.
+    """Return a hinge from ``BODY@X,Y`` (to the world's origin) or ``BODY@X,Y=OTHER@X,Y``.
 
     Examples
     --------
@@ -263,7 +263,7 @@ def hinge(text: str, names: Sequence[str]) -> HingeText:
 
 
 def wall(text: str) -> tuple[list[float], list[float]]:
-    """Two points of the world (m) from ``X,Y/X,Y``."""
+    """Return two points of the world (m) from ``X,Y/X,Y``."""
     ends = [_floats(end.split(",")) for end in text.split("/")]
     if [len(end) for end in ends] != [2, 2]:
         raise SceneError(f"--wall: {text!r} is not X,Y/X,Y, two points such as -2,-1/2,-1, in m")
@@ -279,7 +279,7 @@ def bodies(
     known: Iterable[str],
     effects: Iterable[str],
 ) -> list[BodyText]:
-    """The bodies in order, with what the options say of each.
+    """Return the bodies in order, with the options of each.
 
     Parameters
     ----------
@@ -292,8 +292,8 @@ def bodies(
     known, effects : iterable of str
         ``NAME.PARAMETER=VALUE`` and ``NAME=EFFECT,...``.
     """
-    rolling, led = list(wheels), list(kinematic)
-    for option, listed in (("--wheel", rolling), ("--kinematic", led)):
+    wheeled, led = list(wheels), list(kinematic)
+    for option, listed in (("--wheel", wheeled), ("--kinematic", led)):
         for name in listed:
             check_named(option, name, names)
     values: dict[str, dict[str, float]] = {name: {} for name in names}
@@ -314,7 +314,7 @@ def bodies(
         declared[name] += listing.split(",")
     return [
         BodyText(
-            name, shapes[name], name in rolling, name in led, values[name], tuple(declared[name])
+            name, shapes[name], name in wheeled, name in led, values[name], tuple(declared[name])
         )
         for name in names
     ]
@@ -329,7 +329,7 @@ def check_named(option: str, name: str, known: Sequence[str]) -> None:
 
 
 def _floats(texts: Iterable[str]) -> list[float]:
-    """Numbers, or none if one of them is no number."""
+    """Return numbers; none if one of the texts is no number."""
     try:
         return [float(text) for text in texts]
     except ValueError:

@@ -57,8 +57,8 @@ def simulate(
 ) -> None:
     """Simulate a recording: its start states and wrenches, under parameters that are given.
 
-    Each trajectory is followed from its first complete state to its end. With --noise, errors of
-    measuring are added; without, the states are the engine's.
+    Each trajectory is followed from its first complete state to its end. With --noise, measurement
+    noise is added; without, the states are the engine's.
     """
     reading = options.Reading(columns, units, estimate_velocities, resample=resample)
     with interruptible(), stages(quiet) as progress:
@@ -89,7 +89,7 @@ def simulate(
 def _parameters(
     source: Path, values: Mapping[str, float], draws: int | None, seed: int
 ) -> tuple[Scene, Layout, Array, int]:
-    """The scene, and parameter vectors, shape (draw, p), from a posterior or from the options."""
+    """Return the scene, and parameter vectors, shape (draw, p), from a posterior or options."""
     import numpy as np
 
     if source.suffix == ".nc":
@@ -142,13 +142,13 @@ def _bare(label: str) -> str:
 def _simulated(
     scene: Scene, layout: Layout, phi: Array, substeps: int, recorded: History
 ) -> list[Any]:
-    """Recorded states replaced by simulated ones, (trajectory, time, body, 6), for each draw."""
+    """Return simulated states, shape (trajectory, time, body, 6), for each draw."""
     import numpy as np
 
     from pbrl_ppl.effects import attach
     from pbrl_ppl.physics import Simulator, check_history
 
-    # one piece a trajectory, which its end cuts short
+    # one segment a trajectory, up to its end
     segments = recorded.segments(int(recorded.dataset["n_rows"].max()) - 1)
     lost = set(range(recorded.n_trajectories)) - set(segments.trajectory.tolist())
     if lost:
@@ -185,7 +185,7 @@ def _simulated(
 def _history(
     recorded: History, states: list[Any], errors: Mapping[str, float], seed: int, labelled: bool
 ) -> History:
-    """A history of simulated states with errors of measuring; labels say which draw, if asked."""
+    """Return a history of simulated states with measurement noise; labels may name the draw."""
     import numpy as np
     import xarray as xr
 

@@ -14,6 +14,7 @@ import traceback
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -27,7 +28,7 @@ from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.scene import Scene, nearest
 
 _NEEDED, _OPTIONAL = ("name", "scene", "train"), ("test", "kind")
-#: A name is a folder's too, on every system, and none of the files beside it.
+#: A log's name is the name of its folder, on every system, and of no file beside it.
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 
@@ -115,7 +116,7 @@ def read_manifest(path: str | Path) -> tuple[Log, ...]:
 
 
 def _log(head: list[str], cells: list[str], where: str, folder: Path) -> Log:
-    """Check one row; its paths are relative to the folder."""
+    """Return the log of one row; its paths are relative to the folder."""
     if len(cells) != len(head):
         raise ManifestError(f"{where}: {len(cells)} cells, expected {len(head)} as in the header")
     row = dict(zip(head, cells, strict=True))
@@ -132,16 +133,16 @@ def _log(head: list[str], cells: list[str], where: str, folder: Path) -> Log:
     return Log(row["name"], folder / row["scene"], folder / row["train"], test, row.get("kind", ""))
 
 
-#: What a finished log is known by, and written last; what a failed one leaves in its place.
+#: The file that marks a finished log, written last; the file that a failed log leaves.
 DONE, FAILED = "report.json", "error.json"
-#: Warnings and figures are a process's, not a thread's: one log at a time in each.
+#: Warnings and figures belong to a process, not a thread: a process works on one log at a time.
 _ONE = threading.Lock()
 _MAKING = ".making-"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is the same for all logs; as of :func:`pbrl_ppl.close_loop` and `History.load`.
+    """Settings of all logs; as of :func:`pbrl_ppl.close_loop` and `History.load`.
 
     Parameters
     ----------
@@ -167,41 +168,30 @@ class Settings:
     time_step: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """All that results depend on, as JSON has it."""
+        """Return the settings as JSON values."""
         effects = None
         if self.catalogue is not None:
             effects = [[effect.name, repr(effect.parameters)] for effect in self.catalogue]
         return vars(self) | {"catalogue": effects}
 
 
-#: Closes the loop on one log; what it gives has a ``save(folder)`` that writes a loop's files.
+#: Closes the loop on one log; its result has a ``save(folder)`` that writes a loop's files.
 Run = Callable[[Log, Settings], Any]
 
 
 def close_log(log: Log, settings: Settings) -> Loop:
     """Read a log's files and close the loop."""
     scene = Scene.load(log.scene)
-    if settings.noise:
-        scene = scene.replace(noise=dict(scene.noise) | dict(settings.noise))
-    if settings.time_step is not None:
-        scene = scene.replace(time_step=settings.time_step)
-    if settings.substeps is not None:
-        scene = scene.replace(substeps=settings.substeps)
-    train, test = (
-        None
-        if path is None
-        else History.load(
-            path,
-            scene,
-            estimate_velocities=settings.estimate_velocities,
-            columns=settings.columns,
-            units=settings.units,
-            resample=settings.time_step is not None,
-        )
-        for path in (log.train, log.test)
+    scene = scene.replace(
+        noise=dict(scene.noise) | dict(settings.noise),
+        time_step=scene.time_step if settings.time_step is None else settings.time_step,
+        substeps=scene.substeps if settings.substeps is None else settings.substeps,
     )
-    if train is None:  # the manifest does not allow it
-        raise ValueError(f"log {log.name} has no train")
+    read = partial(
+        History.load, scene=scene, estimate_velocities=settings.estimate_velocities,
+        columns=settings.columns, units=settings.units, resample=settings.time_step is not None,
+    )  # fmt: skip
+    train, test = read(log.train), None if log.test is None else read(log.test)
     catalogue = full_catalogue if settings.catalogue is None else settings.catalogue
     return close_loop(
         scene, train, test, catalogue=catalogue, seed=settings.seed, draws=settings.draws,
@@ -210,7 +200,7 @@ def close_log(log: Log, settings: Settings) -> Loop:
 
 
 def inputs_sha256(log: Log, settings: Settings) -> str:
-    """Hash of all that a log's result depends on: its files, the settings, the version."""
+    """Return the hash of a log's inputs: its files, the settings, the package's version."""
     digest = hashlib.sha256()
     for path in (log.scene, log.train, log.test):
         content = b""
@@ -226,10 +216,10 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
 
 
 def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) -> dict[str, Any]:
-    """Close the loop on one log, unless that was done; whatever goes wrong, say so in a file.
+    """Close the loop on one log, unless that was done; errors go into a file.
 
-    Files are made aside and renamed into the log's folder, the one that says it is done last, so
-    that a worker may die at any moment.
+    Files are written elsewhere and renamed into the log's folder, ``report.json`` last, so that a
+    worker may die at any moment.
 
     Parameters
     ----------
@@ -275,7 +265,7 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
 
 
 def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:
-    """Write a loop's files into a log's folder, what says that it is done last."""
+    """Write a loop's files into a log's folder, ``report.json`` last."""
     with tempfile.TemporaryDirectory(prefix=_MAKING, dir=place) as aside:
         made = Path(aside) / "result"
         loop.save(made)
@@ -287,7 +277,7 @@ def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:
 
 
 def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
-    """The row of a log that failed; the message is kept in its folder, where that can be."""
+    """Return the row of a log that failed, and write the message into its folder if possible."""
     message = " ".join(str(error).split()) or type(error).__name__
     if not isinstance(error, PbrlError):
         message = f"{type(error).__name__}: {message}"
@@ -302,7 +292,7 @@ def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
 
 
 def row_of(log: Log, folder: Path, inputs: str) -> dict[str, Any] | None:
-    """What a finished log's ``report.json`` says in short; None if there is none of these inputs.
+    """Return a summary of a finished log's ``report.json``; None if these inputs have none.
 
     Parameters
     ----------

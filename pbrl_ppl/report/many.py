@@ -1,4 +1,4 @@
-"""Many robots, many logs: the loop closed on each over any executor, and one page of it all."""
+"""Close the loop on many logs, over any executor, and write a page of all."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from pbrl_ppl.report.many_page import effect_table, in_words, page, summary_tabl
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.sampling import Pooled, pool
 
-#: The files of all logs together; the first says what the folder is.
+#: Files of all logs together; the first marks the folder.
 _SUMMARY, _TABLE, _EFFECTS, _PAGE = "summary.json", "summary.csv", "effects.csv", "index.html"
 _KIND = "pbrl_ppl logs 1"
 
 
 @dataclass(frozen=True, eq=False)
 class ManyLoops:
-    """What was found in many logs.
+    """Results of closing the loop on many logs.
 
     Parameters
     ----------
@@ -55,7 +55,7 @@ class ManyLoops:
     pooled : mapping of str to Pooled
         By kind, hyper-parameters that its robots share, and each robot's parameters given these.
     not_pooled : mapping of str to str
-        Why a kind's robots were not.
+        Why a kind's robots were not pooled.
     """
 
     folder: Path
@@ -69,11 +69,11 @@ class ManyLoops:
         return tuple(row["name"] for row in self.rows if row["status"] == "failed")
 
     def table(self) -> pd.DataFrame:
-        """One row a log: status, verdict, effects, errors before and after, message, folder."""
+        """Return one row a log: status, verdict, effects, errors, message, folder."""
         return summary_table(self.rows)
 
     def effects(self) -> pd.DataFrame:
-        """Which effects were found where: one row an effect and log, with its estimate."""
+        """Return one row an effect and log that it was found in, with its estimate."""
         return effect_table(self.rows)
 
     def __repr__(self) -> str:
@@ -203,7 +203,7 @@ def _row_in_words(row: Mapping[str, Any]) -> str:
 
 
 def _results(tasks: Mapping[Log, Callable[[], Any]], executor: Executor | None) -> Any:
-    """Each task's log, and a call that gives its row or raises its error."""
+    """Yield each task's log, and a call that returns its row or raises its error."""
     if executor is None:
         yield from tasks.items()
         return
@@ -217,7 +217,7 @@ def _results(tasks: Mapping[Log, Callable[[], Any]], executor: Executor | None) 
 
 
 def _ordered(logs: Iterable[Log], rows: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
-    """Rows in the manifest's order; logs without one are waiting."""
+    """Return the rows in the manifest's order; logs without one are waiting."""
     waiting = {"status": "waiting"}
     return tuple(rows.get(log.name, {"name": log.name, "kind": log.kind} | waiting) for log in logs)
 
@@ -251,7 +251,7 @@ def _opened(folder: Path) -> Path:
 def _pooled(
     logs: Iterable[Log], rows: Mapping[str, Mapping[str, Any]], folder: Path
 ) -> tuple[dict[str, Pooled], dict[str, str]]:
-    """Hyper-parameters of each kind with two adequate models or more."""
+    """Return the hyper-parameters of each kind with at least two adequate models."""
     kinds: dict[str, list[str]] = {}
     for log in logs:
         own = kinds.setdefault(log.kind, [])
@@ -278,7 +278,7 @@ def _write_summary(
     pooled: Mapping[str, Pooled],
     not_pooled: Mapping[str, str],
 ) -> None:
-    """Write what concerns all logs, each file whole or not at all."""
+    """Write the files of all logs together, each whole or not at all."""
     contents = {
         "contents": _KIND,
         "logs": rows,

@@ -39,7 +39,7 @@ _WORST_SHIFT = 1.63
 
 
 def summary(posterior: Any) -> pd.DataFrame:
-    """ArviZ's summary of every scalar parameter, with the same columns on every ArviZ.
+    """Return ArviZ's summary of every scalar parameter, with the same columns on every ArviZ.
 
     Parameters
     ----------

@@ -165,11 +165,11 @@ def render(
 
 
 def recorded_poses(posterior: Any) -> Array | None:
-    """Poses of the recording that a posterior holds, shape (trajectory, time, body, 3)."""
+    """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
     if "scene" not in posterior.attrs:
         return None
     given = group(posterior, "constant_data")
     if "recorded_start" in given:
         return np.asarray(given["recorded_start"].to_numpy()[..., :3])
-    # of single transitions: where each starts, one after the other
+    # single transitions: the start of each, in order
     return np.asarray(given["start"].to_numpy()[None, ..., :3])
