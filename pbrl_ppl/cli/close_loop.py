@@ -216,8 +216,8 @@ def _close_many(
             raise typer.Exit(FAILED)
         return
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
-    for (effect, body), own in effects.groupby(["effect", "body"], sort=False):
-        typer.echo(f"{effect}[{body}]: {', '.join(own['name'])}")
+    for (effect, body), found in effects.groupby(["effect", "body"], sort=False):
+        typer.echo(f"{effect}[{body}]: {', '.join(found['name'])}")
     typer.echo(report.in_words(loops.rows))
     typer.echo(f"page: {output / 'index.html'}")
     if loops.failed:

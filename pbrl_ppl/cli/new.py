@@ -153,7 +153,7 @@ def new(
         typer.Option(
             "--hinge",
             metavar="NAME@X,Y[=NAME@X,Y]",
-            help=f"What hangs on what, at which points of their own frames (m): {HINGE}.",
+            help=f"Bodies that a hinge joins, at points in their frames (m): {HINGE}.",
         ),
     ] = None,
     walls: Annotated[

@@ -163,14 +163,14 @@ def _simulated(
     follows = recorded.dataset["kinematic"].to_numpy()
     n_rows = recorded.dataset["n_rows"].to_numpy()
     result = []
-    for own in predicted:
+    for drawn in predicted:
         states = np.full(recorded.dataset["observed"].shape, np.nan)
         states[:, :, follows] = recorded.dataset["start"].to_numpy()[:, :, follows]
         for i, (trajectory, step) in enumerate(
             zip(segments.trajectory, segments.step, strict=True)
         ):
             rows = np.arange(step + 1, n_rows[trajectory])
-            after = own[i, : len(rows)][:, ~follows]
+            after = drawn[i, : len(rows)][:, ~follows]
             if not np.isfinite(after).all():
                 raise SimulationError(
                     "simulate: the engine diverged under these parameters; check them and their"
@@ -196,8 +196,8 @@ def _history(
     spread = np.array([errors.get(name, 0.0) for name in STATE])
     free = ~recorded.dataset["kinematic"].to_numpy()[:, None]
     copies = []
-    for draw, own in enumerate(states):
-        measured = own + free * spread * rng.standard_normal(own.shape)
+    for draw, simulated in enumerate(states):
+        measured = simulated + free * spread * rng.standard_normal(simulated.shape)
         copy = recorded.dataset.copy()
         copy["observed"] = copy["observed"].copy(data=measured)
         if labelled:

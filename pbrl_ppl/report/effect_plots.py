@@ -203,10 +203,10 @@ def _in_place(figure: Figure, axes: Axes, evidence: Evidence) -> None:
 def _by_contact(axes: Axes, evidence: Evidence) -> None:
     gains = evidence.by_transition
     groups = [("free", gains[~evidence.touching]), ("touching", gains[evidence.touching])]
-    for place, (_, own) in enumerate(groups):
-        if len(own):
-            axes.bar(place, own.mean(), width=0.6, color=AFTER if own.mean() >= 0 else BEFORE)
-    names = [f"{name}\n{len(own)} transitions" for name, own in groups]
+    for place, (_, gained) in enumerate(groups):
+        if len(gained):
+            axes.bar(place, gained.mean(), width=0.6, color=AFTER if gained.mean() >= 0 else BEFORE)
+    names = [f"{name}\n{len(gained)} transitions" for name, gained in groups]
     axes.set_xticks([0, 1], names)
     axes.set_xlim(-0.6, 1.6)
     axes.axhline(0.0, color="black", linewidth=0.8)

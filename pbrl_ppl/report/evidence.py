@@ -120,8 +120,8 @@ def find_evidence(findings: Findings, effects: Iterable[Effect]) -> Evidence | N
     noise, segments = after.trajectory_noise, after.segments
     moving = [body.name for body in after.scene.moving]
     body = findings.added[0].body
-    own = moving.index(body)
-    states = segments.start[:, own]
+    index = moving.index(body)
+    states = segments.start[:, index]
     labels = after.data.history.dataset["trajectory"].to_numpy().astype(str)
     return Evidence(
         nats=nats,
@@ -133,7 +133,7 @@ def find_evidence(findings: Findings, effects: Iterable[Effect]) -> Evidence | N
         time=np.asarray(segments.step * after.scene.time_step),
         touching=noise.touching,
         trajectory=labels[segments.trajectory],
-        wrench=segments.actions[:, 0, own],
+        wrench=segments.actions[:, 0, index],
     )
 
 
@@ -183,12 +183,12 @@ def bin_means(x: Array, y: Array) -> Bins:
     # equal values share a bin, so that some may be empty
     _, which = np.unique(np.searchsorted(edges, x, side="left"), return_inverse=True)
     members = [which == i for i in range(int(which.max()) + 1)]
-    spreads = [y[own].std(ddof=1) if own.sum() > 1 else np.nan for own in members]
+    spreads = [y[inside].std(ddof=1) if inside.sum() > 1 else np.nan for inside in members]
     return Bins(
         which,
-        centre=np.array([np.median(x[own]) for own in members]),
-        mean=np.array([y[own].mean() for own in members]),
-        error=np.array([s / np.sqrt(own.sum()) for s, own in zip(spreads, members, strict=True)]),
+        centre=np.array([np.median(x[inside]) for inside in members]),
+        mean=np.array([y[inside].mean() for inside in members]),
+        error=np.array(spreads) / np.sqrt([inside.sum() for inside in members]),
     )
 
 

@@ -208,10 +208,11 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
             content = path.read_bytes()
         digest.update(hashlib.sha256(content).digest() if path else b"none")
     try:
-        own = version("pbrl_ppl")
+        installed = version("pbrl_ppl")
     except PackageNotFoundError:
-        own = "not installed"
-    digest.update(json.dumps([settings.to_dict(), own], sort_keys=True, default=dict).encode())
+        installed = "not installed"
+    contents = [settings.to_dict(), installed]
+    digest.update(json.dumps(contents, sort_keys=True, default=dict).encode())
     return digest.hexdigest()
 
 
@@ -253,10 +254,10 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
                 loop = run(log, settings)
-            said = list(dict.fromkeys(str(w.message) for w in caught
-                                      if issubclass(w.category, UserWarning)))  # fmt: skip
+            shown = (str(w.message) for w in caught if issubclass(w.category, UserWarning))
             about = {"name": log.name, "kind": log.kind, "inputs_sha256": inputs,
-                     "seconds": round(time.monotonic() - begin, 1), "warnings": said}  # fmt: skip
+                     "seconds": round(time.monotonic() - begin, 1),
+                     "warnings": list(dict.fromkeys(shown))}  # fmt: skip
             _keep(loop, place, about)
         except Exception as error:
             return failed(log, folder, error)

@@ -102,7 +102,7 @@ def close_loop_many(
 ) -> ManyLoops:
     """Close the loop on each log of a manifest, and write a page of which effects are where.
 
-    Each log gets a folder of its own with what :meth:`Loop.save` writes. A log whose folder has a
+    Each log gets a folder with what :meth:`Loop.save` writes. A log whose folder has a
     report of the same files and settings is not run again, so the same call goes on after an
     interrupt; one that fails leaves ``error.json`` there, does not stop the rest, and is tried
     again by the next call.
@@ -254,10 +254,10 @@ def _pooled(
     """Return the hyper-parameters of each kind with at least two adequate models."""
     kinds: dict[str, list[str]] = {}
     for log in logs:
-        own = kinds.setdefault(log.kind, [])
+        usable = kinds.setdefault(log.kind, [])
         row = rows[log.name]
         if row["status"] == "done" and row["verdict"] not in (UNEXPLAINED, NOT_CONVERGED):
-            own.append(log.name)
+            usable.append(log.name)
     kinds.pop("", None)
     found, reasons = {}, {}
     for kind, names in kinds.items():

@@ -30,12 +30,12 @@ def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
     for row in rows:
         done = row["status"] == "done"
         named = [f"{each['effect']}[{each['body']}]" for each in row.get("effects", ())]
-        own = {
+        more = {
             "effects": "; ".join(named),
             "warnings": len(row.get("warnings", ())),
             "report": f"{row['name']}/report.html" if done else "",
         }
-        table.append({name: (dict(row) | own).get(name, "") for name in _COLUMNS})
+        table.append({name: (dict(row) | more).get(name, "") for name in _COLUMNS})
     return pd.DataFrame(table, columns=list(_COLUMNS))
 
 
@@ -97,15 +97,14 @@ def _logs(rows: Iterable[Row]) -> Table:
     marks = []
     for row in rows:
         status = row["status"]
-        said = ""
+        words, numbers = row.get("message", ""), ["", "", "", ""]
         if status == "done":
-            said = joined(f"{plain(e['effect'])} on the {plain(e['body'])}" for e in row["effects"])
-        numbers = ["", "", "", ""]
-        if status == "done":
+            effects = (f"{plain(e['effect'])} on the {plain(e['body'])}" for e in row["effects"])
+            words = joined(effects) or words
             numbers = [number(row["error_before"]), number(row["error_after"]),
                        str(len(row["warnings"]) or ""), number(row["seconds"])]  # fmt: skip
         verdict = _verdict(row.get("verdict", status))
-        cells.append([(_link(row), row["kind"]), verdict, said or row.get("message", ""), *numbers])
+        cells.append([(_link(row), row["kind"]), verdict, words, *numbers])
         bad = status == "failed" or row.get("verdict") == NOT_CONVERGED
         marks.append("bad" if bad else "")
     heads = ("Log", "Verdict", "Effects, or what went wrong", "Error before", "Error after",
@@ -167,11 +166,11 @@ def _cell(row: Row, effect: str, body: str) -> str:
     """Return the size of an effect in a log, its detection limit, or a dash."""
     for added in row.get("effects", ()):
         if (added["effect"], added["body"]) == (effect, body):
-            said = [
+            texts = [
                 f"{number(each['mean'])} ± {quantity(each['sd'], each['unit'])}"
                 for each in added["parameters"].values()
             ]
-            return Markup("<strong>{}</strong>").format("; ".join(said))
+            return Markup("<strong>{}</strong>").format("; ".join(texts))
     sizes = row.get("detectable", {}).get(f"{effect}[{body}]") or {}
-    said = [f"below {number(size)}" for size in sizes.values() if size is not None]
-    return "; ".join(said) or "–"
+    texts = [f"below {number(size)}" for size in sizes.values() if size is not None]
+    return "; ".join(texts) or "–"

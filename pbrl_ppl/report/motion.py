@@ -127,9 +127,9 @@ def _of_rollout(findings: Findings) -> list[Motion]:
     rollout = findings.rollout
     if not {"x", "y", "theta"} <= set(rollout.names):
         return []
-    own = [rollout.names.index(name) for name in ("x", "y", "theta")]
+    pose = [rollout.names.index(name) for name in ("x", "y", "theta")]
     measured, before, after = (
-        values[:, None, own] for values in (rollout.measured, rollout.before, rollout.after)
+        values[:, None, pose] for values in (rollout.measured, rollout.before, rollout.after)
     )
     return [Motion("held out", rollout.time, measured, before, after)]
 

@@ -123,9 +123,10 @@ def plot_rank(
         edge = _WORST_SHIFT / np.sqrt(max(fewest, 1.0)) if np.isfinite(fewest) else 1.0
         axes.axhspan(-edge, edge, color=BAND, zorder=0)
         grid = np.linspace(0.0, 1.0, 201)
-        off = np.array([np.searchsorted(np.sort(own), grid) / len(own) - grid for own in ranks])
-        for own in off:
-            axes.plot(grid, own, linewidth=1.1)
+        shares = [np.searchsorted(np.sort(chain), grid) / len(chain) for chain in ranks]
+        off = np.array(shares) - grid
+        for curve in off:
+            axes.plot(grid, curve, linewidth=1.1)
         outside = bool(np.abs(off).max() > edge)
         axes.set_title(f"{name}{': chains differ' if outside else ''}", fontsize=9)
         largest = max(1.4 * edge, 1.1 * float(np.abs(off).max()))

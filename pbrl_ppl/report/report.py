@@ -125,7 +125,7 @@ def render(
         pictures["candidates"] = partial(plot_candidates, findings)
     if accepted(findings):
         pictures["added"] = partial(plot_added, findings)
-    said = findings.identifiability
+    known = findings.identifiability
     return render_page(
         "report.html.jinja",
         pictures,
@@ -152,9 +152,9 @@ def render(
         count=len(rows),
         bad=[row for row in rows if row["failed"]],
         sampled=sampler_in_words(rows),
-        widths=said
+        widths=known
         and width_table(
-            findings.posterior_after, said, {row["label"]: row["unit"] for row in rows}
+            findings.posterior_after, known, {row["label"]: row["unit"] for row in rows}
         ),
         shown=parameters,
         hardly=HARDLY,

@@ -21,7 +21,7 @@ def acceleration_unit(velocity: str) -> str:
     return "rad/s²" if velocity == "omega" else "m/s²"
 
 
-# Okabe and Ito's colours: told apart by colour-blind readers and in grey print
+# Okabe and Ito's colours: distinct for colour-blind readers and in grey print
 BEFORE, AFTER, PLAIN, BAND = "#D55E00", "#0072B2", "#999999", "#e9e9e9"
 #: Widths of pictures (inches): of a page, and of a telephone, where panels are in one column.
 WIDE, NARROW = 8.0, 4.2
