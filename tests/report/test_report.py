@@ -191,7 +191,7 @@ def test_page_compares_by_leave_one_out() -> None:
     findings = replace(made_up(), loo=Comparison(one, two, 210.0, 19.0, 360))
     text = Page(render(findings)).text
     assert "Leave-one-out cross-validation on the 360 transitions of the fit" in text
-    assert "elpd_loo (more is better) 4,000 4,210" in text
+    assert "elpd_loo (nats; more is better) 4,000 4,210" in text
     assert "How many have a Pareto k above 0.70 2 0" in text
     assert "the revised model gains 210 ± 19.0" in text
     assert "makes elpd_loo unreliable" in text
