@@ -16,7 +16,7 @@ from scipy import stats
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import EpisodeError
-from pbrl_ppl.history import write_atomically
+from pbrl_ppl.files import write_atomically
 
 
 def interval(values: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,7 +12,8 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import EpisodeError
-from pbrl_ppl.history import History, from_segments, write_atomically
+from pbrl_ppl.files import write_atomically
+from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -10,18 +11,15 @@ from typing import Annotated
 import typer
 
 from pbrl_ppl.cli.calibrate import calibrate
-from pbrl_ppl.cli.check import check
+from pbrl_ppl.cli.check import check, criticise
 from pbrl_ppl.cli.close_loop import close_loop
-from pbrl_ppl.cli.criticise import criticise
 from pbrl_ppl.cli.doctor import doctor
-from pbrl_ppl.cli.fit import fit
+from pbrl_ppl.cli.fit import fit, update
 from pbrl_ppl.cli.new import new
-from pbrl_ppl.cli.plan import plan
+from pbrl_ppl.cli.plan import plan, suggest
 from pbrl_ppl.cli.report import report
 from pbrl_ppl.cli.simulate import simulate
-from pbrl_ppl.cli.suggest import suggest
 from pbrl_ppl.cli.terminal import BAD_INPUT, in_options, interrupted, warnings_in_a_line
-from pbrl_ppl.cli.update import update
 from pbrl_ppl.errors import PbrlError
 
 #: The commands, in the order of use, and an example of each for its help.
@@ -69,6 +67,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         actions are expected to tell apart, or at least one log that failed; 2 for bad usage or bad
         input, with one message on stderr; 3 where chains have not converged; 130 if interrupted.
     """
+    os.environ.setdefault("MPLBACKEND", "Agg")  # commands show no windows
     argv = sys.argv[1:] if argv is None else list(argv)
     options = _options_of(argv)
     try:
@@ -86,7 +85,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _options_of(argv: Sequence[str]) -> set[str]:
-    """Options of the command that is asked for, such as ``--draws``."""
+    """Return the options of the command that runs, such as ``--draws``."""
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     asked = next((word for word in argv if word in commands), None)
     return {name for option in commands[asked].params for name in option.opts} if asked else set()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,20 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.outputs import check_can_make
-from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
-from pbrl_ppl.cli.terminal import (
-    FAILED,
-    AsJson,
-    Errors,
-    Quiet,
-    SceneFile,
-    Seed,
-    Velocities,
-    interruptible,
-    stated_noise,
-)
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_json
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -32,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def calibrate(
-    scene: SceneFile,
+    scene: options.SceneFile,
     history: Annotated[
         Path, typer.Argument(metavar="HISTORY", help="History whose design is kept (.csv, ...).")
     ],
@@ -48,29 +35,27 @@ def calibrate(
             " times as long), or of single transitions from exact states (the paper's Eq. 11).",
         ),
     ] = False,
-    noise: Errors = None,
+    noise: options.Noise = None,
     replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
-    seed: Seed = 1,
+    seed: options.Seed = 1,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = 1,
     draws: Annotated[int, typer.Option(min=100, help="Posterior draws of each chain.")] = 1500,
-    estimate_velocities: Velocities = False,
-    columns: Columns = None,
-    units: Units = None,
-    time_step: TimeStep = None,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    time_step: options.TimeStep = None,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
+    reading = options.Reading(columns, units, estimate_velocities, resample=time_step is not None)
     with interruptible(f"finished replications are in {output}; the same command goes on"):
         check_can_make(output)
-        declared, (design,) = load_own(
-            scene, history, estimate_velocities=estimate_velocities, columns=columns,
-            units=units, time_step=time_step,
-        )  # fmt: skip
-        declared = stated_noise(declared, noise)
-        os.environ.setdefault("MPLBACKEND", "Agg")
+        declared, (design,) = options.load(
+            scene, [history], reading, time_step=time_step, noise=noise
+        )
         from pbrl_ppl import report
-        from pbrl_ppl.history import write_atomically
+        from pbrl_ppl.files import write_atomically
         from pbrl_ppl.sampling import calibration
 
         with _pool(jobs) as executor:
@@ -94,7 +79,7 @@ def calibrate(
 
 @contextmanager
 def _pool(jobs: int) -> Iterator[Executor | None]:
-    """Fresh processes: PyMC's threads do not survive a fork."""
+    """Yield a pool of fresh processes: PyMC's threads do not survive a fork."""
     if jobs == 1:
         yield None
         return
@@ -106,7 +91,7 @@ def _pool(jobs: int) -> Iterator[Executor | None]:
 
 
 def _calibrated(calibration: Calibration) -> str:
-    """The table's columns that matter, and what they should be."""
+    """Return the columns of the table that matter, and what they should be."""
     rows, data = calibration.table(), calibration.dataset
     head = rows.iloc[0]
     columns = ["p_holm", "coverage_50", "coverage_90", "ess", "r_hat", "passed"]

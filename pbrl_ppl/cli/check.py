@@ -1,68 +1,58 @@
-"""``pbrl-ppl check``."""
+"""``pbrl-ppl check`` and ``pbrl-ppl criticise``."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
-from pbrl_ppl.cli.terminal import (
-    AsJson,
-    HistoryFile,
-    Quiet,
-    SceneFile,
-    Seed,
-    Trim,
-    Velocities,
-    interruptible,
-    stages,
-)
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.terminal import interruptible, print_json, print_table, stages
 from pbrl_ppl.state import STATE
 
 if TYPE_CHECKING:
+    from pbrl_ppl.criticism import Candidate
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
 
 
 def check(
-    scene: SceneFile,
-    history: HistoryFile,
-    estimate_velocities: Velocities = False,
-    columns: Columns = None,
-    units: Units = None,
-    time_step: TimeStep = None,
-    trim: Trim = False,
+    scene: options.SceneFile,
+    history: options.HistoryFile,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    time_step: options.TimeStep = None,
+    trim: options.Trim = False,
     prior: Annotated[
         bool, typer.Option(help="Whether to compare the data with draws from the prior.")
     ] = True,
     draws: Annotated[int, typer.Option(min=50, help="Draws from the prior.")] = 100,
-    seed: Seed = 0,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    seed: options.Seed = 0,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Read a scene and a history: what is in them, what is missing, whether the prior fits.
 
     Warns where a velocity and the changes of its position differ by the factor of a unit.
     """
+    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
-        declared, (loaded,) = load_own(
-            scene, history, estimate_velocities=estimate_velocities, columns=columns,
-            units=units, time_step=time_step, trim=trim,
-        )  # fmt: skip
+        declared, (loaded,) = options.load(scene, [history], reading, time_step=time_step)
         from pbrl_ppl.history import unit_mismatches, unused_velocities
         from pbrl_ppl.physics import check_history
 
         check_history(declared, loaded, loaded.segments(1))
-        contents = _contents(declared, loaded)
-        missing = _missing(loaded)
+        contents, missing = _contents(declared, loaded), _missing(loaded)
         unused = unused_velocities(loaded)
         console = Console(highlight=False, quiet=as_json)
-        console.print(_listed(contents))
-        console.print(_cells(loaded, missing))
+        listed = Table(show_header=False, box=None)
+        for name, value in contents.items():
+            listed.add_row(name, value)
+        console.print(listed)
+        console.print(_missing_table(missing, int(loaded.dataset["n_rows"].sum())))
         for velocity in unused:
             console.print(velocity.sentence, soft_wrap=True)
         checked = None
@@ -80,13 +70,21 @@ def check(
                 console.print(f"prior: {sentence}", soft_wrap=True)
     if as_json:
         found = checked and {"passed": not checked.sentences, "sentences": checked.summary}
-        numbers = {"trajectories": loaded.n_trajectories, "transitions": loaded.n_transitions}
-        cells = {"missing": missing, "velocities_not_used": [vars(each) for each in unused]}
-        units_differ = {"unit_mismatches": unit_mismatches(loaded)}
-        print_json(contents | numbers | cells | units_differ | {"prior": found})
+        print_json(
+            {
+                **contents,
+                "trajectories": loaded.n_trajectories,
+                "transitions": loaded.n_transitions,
+                "missing": missing,
+                "velocities_not_used": [vars(each) for each in unused],
+                "unit_mismatches": unit_mismatches(loaded),
+                "prior": found,
+            }
+        )
 
 
-def _contents(scene: Scene, history: History) -> dict[str, Any]:
+def _contents(scene: Scene, history: History) -> dict[str, str]:
+    """Return what a scene and a history hold, for people."""
     rows = history.dataset["n_rows"].to_numpy()
     intervals = (
         f"{rows.min() - 1}" if rows.min() == rows.max() else f"{rows.min() - 1} to {rows.max() - 1}"
@@ -100,38 +98,88 @@ def _contents(scene: Scene, history: History) -> dict[str, Any]:
     }
 
 
-def _listed(contents: dict[str, Any]) -> Table:
-    table = Table(show_header=False, box=None)
-    for name, value in contents.items():
-        table.add_row(name, value)
-    return table
-
-
 def _missing(history: History) -> dict[str, dict[str, int]]:
-    """Missing cells, by body and state dimension."""
+    """Return the number of missing measurements, by body and state dimension."""
     dataset = history.dataset
     # rows after a trajectory's end are padding, not missing measurements
     real = dataset["time"] < dataset["n_rows"]
     missing = (dataset["observed"].isnull() & real).sum(("trajectory", "time"))
     return {
-        body: {
-            str(name): int(missing.sel(body=body, state=name)) for name in missing["state"].values
-        }
+        body: {str(n): int(missing.sel(body=body, state=n)) for n in missing["state"].values}
         for body in history.bodies
     }
 
 
-def _cells(history: History, missing: dict[str, dict[str, int]]) -> Table:
-    """Table of missing cells."""
-    total = int(history.dataset["n_rows"].sum())
+def _missing_table(missing: dict[str, dict[str, int]], rows: int) -> Table:
+    """Return a table of missing measurements; a body has `rows` of each state dimension."""
     table = Table(title="missing measurements", title_justify="left")
     table.add_column("body")
     for name in STATE:
         table.add_column(name, justify="right")
+    words = {0: "none", rows: "all"}
     for body, counts in missing.items():
-        cells = (
-            "none" if n == 0 else "all" if n == total else f"{n} of {total}"
-            for n in counts.values()
-        )
-        table.add_row(body, *cells)
+        table.add_row(body, *(words.get(n, f"{n} of {rows}") for n in counts.values()))
     return table
+
+
+def criticise(
+    scene: options.SceneFile,
+    history: options.HistoryFile,
+    noise: options.Noise = None,
+    substeps: options.Substeps = None,
+    seed: options.Seed = 1,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    time_step: options.TimeStep = None,
+    trim: options.Trim = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Rank the effects that the declared model might lack by the score test: no refit, no verdict.
+
+    The score test says which effect's signature the residual looks like; close-loop finds out
+    whether that effect helps on data that it has not seen.
+    """
+    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
+    with interruptible(), stages(quiet) as progress:
+        progress("reading the scene and the history")
+        declared, (loaded,) = options.load(
+            scene, [history], reading, time_step=time_step, noise=noise, substeps=substeps
+        )
+        progress("loading the model")
+        from pbrl_ppl import criticism
+        from pbrl_ppl.physics import check_history
+
+        check_history(declared, loaded, loaded.segments(1))
+        found = criticism.criticise(declared, loaded, seed=seed, progress=progress)
+    if as_json:
+        print_json(
+            {
+                "candidates": [vars(candidate) for candidate in found.candidates],
+                "mode": found.mode,
+                "unexplained_acceleration": found.unexplained_acceleration,
+                "substeps": found.substeps,
+            }
+        )
+        return
+    print_table(
+        "what the declared model might lack, by the score test",
+        ["effect", "<body", "S", "dof", "p (corrected)", "<first estimate"],
+        map(_candidate_row, found.candidates),
+    )
+    typer.echo(
+        "small p: the residual looks like that effect's signature; close-loop says whether it is"
+        " missing"
+    )
+
+
+def _candidate_row(candidate: Candidate) -> list[str]:
+    sizes = (
+        f"{name} {value:.3g} {candidate.units[name].removesuffix('1')}".rstrip()
+        for name, value in candidate.estimate.items()
+    )
+    # where the declared parameters absorb the effect, its size is not identifiable
+    seen = ", ".join(sizes) if candidate.statistic > 0 else ""
+    numbers = [f"{candidate.statistic:.1f}", str(candidate.dof), f"{candidate.p_value:.2g}"]
+    return [candidate.effect, candidate.body, *numbers, seen]

@@ -1,35 +1,29 @@
-"""``pbrl-ppl close-loop``."""
+"""``pbrl-ppl close-loop``, on one log or on many."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import replace
 from enum import StrEnum
+from multiprocessing import get_context
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.command_line import command_line
-from pbrl_ppl.cli.many import close_loop_many
-from pbrl_ppl.cli.outputs import check_can_make
-from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, columns_of, load_own, units_of
+from pbrl_ppl.cli import options
 from pbrl_ppl.cli.terminal import (
+    FAILED,
     UNDECIDED,
-    AsJson,
-    Errors,
-    Quiet,
-    Seed,
-    Substeps,
-    Trim,
-    Velocities,
+    check_can_make,
     interruptible,
-    named_numbers,
+    print_json,
     stages,
-    stated_noise,
 )
+from pbrl_ppl.errors import OutputError
 
 if TYPE_CHECKING:
     from pbrl_ppl.report import Loop, Source
@@ -61,7 +55,7 @@ def close_loop(
             help="Held-out history; without it, a quarter of TRAIN's trajectories.",
         ),
     ] = None,
-    seed: Seed = 1,
+    seed: options.Seed = 1,
     overwrite: Annotated[
         bool,
         typer.Option(
@@ -69,7 +63,7 @@ def close_loop(
             help="Write to a folder that has content; with --many, run finished logs again.",
         ),
     ] = False,
-    substeps: Substeps = None,
+    substeps: options.Substeps = None,
     draws: Annotated[
         int | None, typer.Option(min=100, help="Posterior draws of each chain.")
     ] = None,
@@ -80,12 +74,12 @@ def close_loop(
             " the verdict then stands."
         ),
     ] = Method.METROPOLIS,
-    noise: Errors = None,
-    estimate_velocities: Velocities = False,
-    columns: Columns = None,
-    units: Units = None,
-    time_step: TimeStep = None,
-    trim: Trim = False,
+    noise: options.Noise = None,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    time_step: options.TimeStep = None,
+    trim: options.Trim = False,
     many: Annotated[
         Path | None,
         typer.Option(
@@ -107,8 +101,8 @@ def close_loop(
             " gets no name.",
         ),
     ] = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Find what the declared model lacks, add it, refit, and report before and after.
 
@@ -122,32 +116,27 @@ def close_loop(
             raise typer.BadParameter("--trim is for one log; leave it, or --many")
         if learn_remainder:
             raise typer.BadParameter("--learn-remainder is for one log; leave it, or --many")
-        close_loop_many(
+        _close_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
-            method=method.value, noise=named_numbers(noise, "--noise", "x=0.002"),
-            columns=columns_of(columns or []), units=units_of(units or []), time_step=time_step,
-            estimate_velocities=estimate_velocities, command=command_line(context),
+            method=method.value, noise=options.noise_of(noise),
+            columns=options.columns_of(columns), units=options.units_of(units), time_step=time_step,
+            estimate_velocities=estimate_velocities, command=options.command_line(context),
         )  # fmt: skip
         return
     if scene is None or train is None:
         raise typer.BadParameter("expected SCENE and TRAIN, or --many MANIFEST")
     if jobs > 1 or scheduler is not None:
         raise typer.BadParameter("--jobs and --scheduler are for --many")
+    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         check_can_make(output)  # before the long work, which would be lost
         progress("reading the scene and the histories")
-        declared, histories = load_own(
-            scene, train, *([] if test is None else [test]),
-            estimate_velocities=estimate_velocities, columns=columns, units=units,
-            time_step=time_step, trim=trim,
-        )  # fmt: skip
-        declared = stated_noise(declared, noise)
-        if substeps is not None:
-            declared = declared.replace(substeps=substeps)
+        paths = [train] if test is None else [train, test]
+        declared, histories = options.load(
+            scene, paths, reading, time_step=time_step, noise=noise, substeps=substeps
+        )
         progress("loading the sampler")
-        # nobody is there to see a window
-        os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl import report
         from pbrl_ppl.criticism import NOT_CONVERGED
 
@@ -161,7 +150,9 @@ def close_loop(
             progress=progress,
         )
         progress("writing the report")
-        source = report.Source(str(scene), str(train), str(test or ""), command_line(context))
+        source = report.Source(
+            str(scene), str(train), str(test or ""), options.command_line(context)
+        )
         loop.save(output, overwrite=overwrite, source=source)
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     if as_json:
@@ -177,7 +168,7 @@ def close_loop(
 def _remainder(
     loop: Loop, folder: Path, source: Source, seed: int, progress: Callable[[str], None]
 ) -> dict[str, dict[str, Any]]:
-    """Learn a force for the residual and save it with the results, or say why there is none."""
+    """Learn a force for the residual and save it with the results, or return why there is none."""
     from pbrl_ppl.errors import FitError
 
     path = folder / "remainder.nc"
@@ -189,3 +180,115 @@ def _remainder(
     progress("writing the report with it")
     loop.save(folder, overwrite=True, source=source)
     return {"learned_remainder": {"words": loop.remainder_words, "posterior": path}}
+
+
+def _close_many(
+    manifest: Path,
+    output: Path,
+    *,
+    command: str,
+    jobs: int,
+    scheduler: str | None,
+    as_json: bool,
+    quiet: bool,
+    **settings: Any,
+) -> None:
+    """Close the loop on each log of a manifest, and print which effects are where."""
+    kept = f"finished logs are in {output}; the same command goes on"
+    with interruptible(kept), stages(quiet) as progress:
+        check_can_make(output)
+        progress("reading the manifest")
+        from pbrl_ppl import report
+
+        logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
+        with _executor(jobs, scheduler) as executor:
+            loops = report.close_loop_many(
+                logs,
+                output,
+                executor=executor,
+                progress=progress,
+                source=report.Source(command=command),
+                **settings,
+            )
+    if as_json:
+        print_json({"page": output / "index.html", "logs": loops.rows})
+        if loops.failed:
+            raise typer.Exit(FAILED)
+        return
+    effects = loops.effects().drop_duplicates(["name", "effect", "body"])
+    for (effect, body), found in effects.groupby(["effect", "body"], sort=False):
+        typer.echo(f"{effect}[{body}]: {', '.join(found['name'])}")
+    typer.echo(report.in_words(loops.rows))
+    typer.echo(f"page: {output / 'index.html'}")
+    if loops.failed:
+        raise typer.Exit(FAILED)
+
+
+@contextmanager
+def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
+    """Yield the executor of a Dask cluster, processes of this machine, or None."""
+    if scheduler is not None:
+        with _cluster(scheduler) as executor:
+            yield executor
+    elif jobs == 1:
+        yield None
+    else:
+        pool = OneProcessEach(jobs)
+        try:
+            yield pool
+        finally:
+            pool.shutdown(wait=True, cancel_futures=True)
+
+
+@contextmanager
+def _cluster(scheduler: str) -> Iterator[Executor]:
+    """Yield the executor of a running Dask scheduler."""
+    try:
+        from distributed import Client
+    except ImportError:
+        raise OutputError(
+            "--scheduler needs Dask distributed, which is not installed: pip install"
+            " 'pbrl_ppl[many]', here and where the workers run"
+        ) from None
+    try:
+        client = Client(scheduler, timeout=10)
+    except (OSError, ValueError) as error:
+        raise OutputError(
+            f"--scheduler {scheduler}: no Dask scheduler answers there ({error}); expected an"
+            " address such as tcp://host:8786"
+        ) from None
+    with client:
+        if not client.scheduler_info()["workers"]:
+            typer.echo(f"no worker at {scheduler} yet; waiting for one", err=True)
+        yield client.get_executor(pure=False)
+
+
+class OneProcessEach(ThreadPoolExecutor):
+    """Executor that runs each call in a fresh process.
+
+    A process that dies, out of memory for instance, does not take others with it, as in a pool; its
+    call is tried once more. PyMC's threads do not survive a fork, so processes are spawned.
+
+    Parameters
+    ----------
+    jobs : int
+        Processes at a time.
+    """
+
+    def __init__(self, jobs: int) -> None:
+        super().__init__(jobs)
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Schedule a call that can be pickled."""
+        return super().submit(_in_a_process, fn, *args, **kwargs)
+
+
+def _in_a_process(fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+    for again in (True, False):
+        with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
+            try:
+                return pool.submit(fn, *args, **kwargs).result()
+            except BrokenProcessPool:
+                if not again:
+                    raise
+    return None

@@ -11,15 +11,15 @@ from typing import Any
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.terminal import FAILED, AsJson, Quiet, interruptible, stages
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.terminal import FAILED, interruptible, print_json, stages
 
 #: The compiled and the plain path agree to rounding.
 _AGREE = 1e-9
 
 
-def doctor(as_json: AsJson = False, quiet: Quiet = False) -> None:
-    """Versions, whether the compiled engine loop works here, and how many threads there are.
+def doctor(as_json: options.AsJson = False, quiet: options.Quiet = False) -> None:
+    """Report versions, whether the compiled engine loop works, and the number of threads.
 
     Exits with 1 if the compiled loop is wrong; where there is none, a slow one serves.
     """
@@ -44,27 +44,27 @@ def doctor(as_json: AsJson = False, quiet: Quiet = False) -> None:
     if as_json:
         print_json(found | {"ok": not wrong})
     else:
-        _say(found)
+        _print(found)
     if wrong:
         typer.echo("error: the compiled engine loop is wrong here; please report this", err=True)
         raise typer.Exit(FAILED)
 
 
 def _processors() -> int:
-    """Those that this process may use."""
+    """Return the number of processors that this process may use."""
     if sys.platform == "linux":
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def _engine() -> dict[str, Any]:
-    """Which loop there is, how far it is from the plain one, and its time for a transition."""
+    """Return the engine loop's kind, its difference from the plain loop, and its speed."""
     import numpy as np
 
     from pbrl_ppl.physics import Physics, calls
     from pbrl_ppl.scene import Body, Scene, Shape, Wall
 
-    # a puck that hits a wall, so that contacts are in it
+    # a puck that hits a wall, so that there are contacts
     puck = Body("puck", Shape.circle(0.1), known=(("r", 0.5), ("mu_c", 0.3)))
     scene = Scene(time_step=0.1, bodies=(puck,), walls=(Wall((1.0, -1.0), (1.0, 1.0)),))
     start = np.zeros((100, 1, 6))
@@ -82,7 +82,7 @@ def _engine() -> dict[str, Any]:
     }
 
 
-def _say(found: dict[str, Any]) -> None:
+def _print(found: dict[str, Any]) -> None:
     for name, version in found["versions"].items():
         typer.echo(f"{name:12} {version}")
     typer.echo(f"{'platform':12} {found['platform']}")

@@ -1,38 +1,25 @@
-"""``pbrl-ppl fit``."""
+"""``pbrl-ppl fit`` and ``pbrl-ppl update``."""
 
 from __future__ import annotations
 
 import json
-import os
 import sys
 import warnings
-from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json, print_table
-from pbrl_ppl.cli.outputs import check_file
-from pbrl_ppl.cli.own_tables import Columns, TimeStep, Units, load_own
+from pbrl_ppl.cli import options
 from pbrl_ppl.cli.terminal import (
     INTERRUPTED,
     UNDECIDED,
-    AsJson,
-    Errors,
-    HistoryFile,
-    Overwrite,
-    Quiet,
-    SceneFile,
-    Seed,
-    Substeps,
-    Trim,
-    Velocities,
+    check_file,
     interruptible,
+    print_json,
+    print_table,
     stages,
-    stated_noise,
-    with_substeps,
 )
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 
@@ -41,8 +28,8 @@ if TYPE_CHECKING:
 
 
 def fit(
-    scene: SceneFile,
-    history: HistoryFile,
+    scene: options.SceneFile,
+    history: options.HistoryFile,
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help="The posterior file (.nc).")
     ],
@@ -64,8 +51,8 @@ def fit(
         float | None,
         typer.Option(min=0.1, help="Degrees of freedom of Student-t noise; else Gaussian."),
     ] = None,
-    noise: Errors = None,
-    substeps: Substeps = None,
+    noise: options.Noise = None,
+    substeps: options.Substeps = None,
     method: Annotated[
         str,
         typer.Option(help="metropolis, paper, demetropolisz, smc, nuts, laplace or map."),
@@ -82,46 +69,47 @@ def fit(
         Path | None,
         typer.Option(metavar="FILE", help="Go on where this posterior's chains ended."),
     ] = None,
-    seed: Seed = 1,
-    estimate_velocities: Velocities = False,
-    columns: Columns = None,
-    units: Units = None,
-    time_step: TimeStep = None,
-    trim: Trim = False,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    seed: options.Seed = 1,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    time_step: options.TimeStep = None,
+    trim: options.Trim = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Fit the declared model to a history: a posterior file, and a table of it.
 
     Exits with 3 if the chains have not converged, and with 130 if it was interrupted; the draws
     so far are kept.
     """
+    reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
         if trajectories and (horizon > 1 or scalar):
             raise FitError("--horizon and --scalar-sigma are of single transitions: --transitions")
         progress("reading the scene and the history")
-        declared, (loaded,) = load_own(
-            scene, history, estimate_velocities=estimate_velocities, columns=columns,
-            units=units, time_step=time_step, trim=trim,
-        )  # fmt: skip
-        declared = with_substeps(stated_noise(declared, noise), substeps)
+        declared, (loaded,) = options.load(
+            scene, [history], reading, time_step=time_step, noise=noise, substeps=substeps
+        )
         progress("loading the sampler")
-        os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl import report, sampling
+        from pbrl_ppl import sampling
         from pbrl_ppl.physics import check_history
         from pbrl_ppl.posterior import group, load_posterior, save_posterior
 
         check_history(declared, loaded, loaded.segments(1))
         earlier = None if resume is None else load_posterior(resume)
         progress("looking for the mode, then sampling")
-        model = _declared(
-            sampling.physics_model, declared, loaded, horizon=horizon, nu=nu,
-            sigma="scalar" if scalar else "per_dimension", trajectories=trajectories,
-            around=earlier if trajectories else None, seed=seed,
-        )  # fmt: skip
-    # the sampler has a bar of its own
+        try:
+            model = sampling.physics_model(
+                declared, loaded, horizon=horizon, nu=nu, trajectories=trajectories, seed=seed,
+                sigma="scalar" if scalar else "per_dimension",
+                around=earlier if trajectories else None,
+            )  # fmt: skip
+        except ValueError as error:  # an option that the model refuses
+            raise FitError(f"fit: {error}") from None
+    # the sampler shows its own progress
     with interruptible() as interrupts, warnings.catch_warnings(record=True) as caught:
         with redirect_stdout(sys.stderr):
             idata = sampling.fit(
@@ -134,9 +122,18 @@ def fit(
         if not (cut and "was interrupted" in str(warning.message)):
             warnings.warn(warning.message, stacklevel=1)
     converged = not any(issubclass(warning.category, ConvergenceWarning) for warning in caught)
-    table = _summary(report.summary, idata)
+    table = _summary(idata)
     if as_json:
-        print_json(_contents(output, idata, table, converged))
+        print_json(
+            {
+                "posterior": output,
+                "converged": converged if "max_rhat" in idata.attrs else None,
+                "max_rhat": idata.attrs.get("max_rhat"),
+                "min_ess": idata.attrs.get("min_ess"),
+                "parameters": {str(name): row.to_dict() for name, row in table.iterrows()},
+                "warnings": json.loads(idata.attrs["warnings"]),
+            }
+        )
     else:
         print_table(None, ["parameter", *table.columns], _rows(table))
         typer.echo(f"posterior: {output}")
@@ -152,17 +149,10 @@ def fit(
         raise typer.Exit(UNDECIDED)
 
 
-def _declared(physics_model: Any, *args: Any, **options: Any) -> Any:
-    """The model; its refusal of an option is the user's to cure."""
-    try:
-        return physics_model(*args, **options)
-    except ValueError as error:
-        raise FitError(f"fit: {error}") from None
-
-
-def _summary(summary: Callable[[Any], pd.DataFrame], idata: Any) -> pd.DataFrame:
-    """A row for each parameter; of a mode, its place alone."""
+def _summary(idata: Any) -> pd.DataFrame:
+    """Return a row for each parameter; for a mode, its value alone."""
     from pbrl_ppl.posterior import scalars
+    from pbrl_ppl.report import summary
 
     if "max_rhat" not in idata.attrs:
         import pandas as pd
@@ -175,7 +165,7 @@ def _summary(summary: Callable[[Any], pd.DataFrame], idata: Any) -> pd.DataFrame
 
 
 def _rows(table: pd.DataFrame) -> list[list[str]]:
-    """The summary for reading."""
+    """Return the rows of a summary as text."""
     digits = {"ess": ".0f", "r_hat": ".3f"}
     return [
         [str(name), *(f"{value:{digits.get(str(column), '.4g')}}" for column, value in row.items())]
@@ -183,12 +173,66 @@ def _rows(table: pd.DataFrame) -> list[list[str]]:
     ]
 
 
-def _contents(output: Path, idata: Any, table: pd.DataFrame, converged: bool) -> dict[str, Any]:
-    return {
-        "posterior": output,
-        "converged": converged if "max_rhat" in idata.attrs else None,
-        "max_rhat": idata.attrs.get("max_rhat"),
-        "min_ess": idata.attrs.get("min_ess"),
-        "parameters": {str(name): row.to_dict() for name, row in table.iterrows()},
-        "warnings": json.loads(idata.attrs["warnings"]),
-    }
+def update(
+    posterior: Annotated[
+        Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); it has the scene.")
+    ],
+    history: Annotated[
+        Path, typer.Argument(metavar="HISTORY", help="What was recorded since (.csv, ...).")
+    ],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="FILE", help="The new posterior file.")
+    ],
+    seed: options.Seed = 1,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    resample: options.Resample = False,
+    trim: options.Trim = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
+) -> None:
+    """Bring a posterior up to date with new transitions, without a fit from scratch.
+
+    Exits with 3 if the new posterior has not converged.
+    """
+    reading = options.Reading(columns, units, estimate_velocities, trim, resample)
+    with interruptible(), stages(quiet) as progress:
+        check_file(output, (".nc",), overwrite)
+        progress("reading the posterior and the history")
+        from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
+
+        idata = load_posterior(posterior)
+        scene = scene_of(idata)
+        new = reading.trimmed(reading.history(history, scene), scene, history)
+        progress("updating")
+        from pbrl_ppl.sampling import updating
+
+        caught: list[type[Warning]] = []
+        with warnings.catch_warnings():
+            show = warnings.showwarning
+
+            def shown(
+                message: Warning | str, category: type[Warning], *place: Any, **more: Any
+            ) -> None:
+                caught.append(category)
+                show(message, category, *place, **more)  # at once: a refit takes long
+
+            warnings.showwarning = shown
+            idata = updating.update(idata, new, seed=seed, progress=False)
+        if "interrupted" in idata.attrs:  # half a posterior is no prior for the next update
+            raise KeyboardInterrupt
+        save_posterior(idata, output)
+        (*_, last) = json.loads(idata.attrs["updates"])
+    converged = not any(issubclass(category, ConvergenceWarning) for category in caught)
+    if as_json:
+        print_json(last | {"posterior": output, "converged": converged})
+    else:
+        typer.echo(
+            f"{last['did']}: {last['transitions']} transitions, the weights worth"
+            f" {last['share']:.0%} of the draws"
+        )
+        typer.echo(f"posterior: {output}")
+    if not converged:
+        raise typer.Exit(UNDECIDED)

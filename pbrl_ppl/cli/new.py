@@ -8,19 +8,117 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.outputs import check_file
-from pbrl_ppl.cli.own_tables import Columns, Units, columns_of, units_of
-from pbrl_ppl.cli.recorded import Recorded, recorded
-from pbrl_ppl.cli.scene_options import HINGE, SHAPES, hinge, outline, outlines, wall
-from pbrl_ppl.cli.scene_options import bodies as parts
-from pbrl_ppl.cli.scene_text import scene_text
-from pbrl_ppl.cli.terminal import AsJson, Overwrite, Quiet, interruptible
-from pbrl_ppl.errors import OutputError, SceneError
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.scene_text import HINGE, SHAPES, hinge, outline, outlines, scene_text, wall
+from pbrl_ppl.cli.scene_text import bodies as parts
+from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
+from pbrl_ppl.errors import HistoryError, OutputError, SceneError
+from pbrl_ppl.files import write_text
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+#: Largest relative difference of time steps that count as even, as in a history.
+_EVEN = 0.01
+
+
+@dataclass(frozen=True)
+class Recorded:
+    """Names of the bodies in a recording, and its time steps.
+
+    Parameters
+    ----------
+    names : tuple of str
+        In order of appearance.
+    time_step : float
+        Median time between a body's rows (s), to six digits.
+    even : bool
+        Whether all are that long.
+    velocities : bool
+        Whether it has columns of velocities.
+    """
+
+    names: tuple[str, ...]
+    time_step: float
+    even: bool
+    velocities: bool
+
+
+def recorded(
+    path: Path,
+    columns: Mapping[str, str | float],
+    units: Mapping[str, str],
+    given: Sequence[str] = (),
+) -> Recorded:
+    """Read the names of bodies and the time step from a recording.
+
+    Parameters
+    ----------
+    path : Path
+        The recording.
+    columns, units : mapping of str
+        As of `History.load`.
+    given : sequence of str
+        Names of bodies from options, for a recording that names none.
+
+    Raises
+    ------
+    HistoryError
+        If it cannot be read, names no body, or its times do not rise.
+    """
+    import numpy as np
+    import pandas as pd
+
+    from pbrl_ppl.history import as_history, read_table
+    from pbrl_ppl.scene import Body, Scene, Shape
+
+    frame = read_table(path, columns)
+    names = _names(frame, columns) or list(given)
+    if not names:
+        raise HistoryError(
+            f"history {path}: no column has the bodies' names; give --body NAME=SHAPE for one body,"
+            " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
+        )
+    # later commands read it with the scene; any outline will do here
+    stand_in = Scene(time_step=1.0, bodies=tuple(Body(n, Shape.circle(1.0)) for n in names))
+    table = as_history(frame, stand_in, f"history {path}", columns=columns, units=units)
+    for name in ("trajectory", "body", "time"):
+        if name not in table:
+            raise HistoryError(
+                f"history {path}: it has no column {name}; say which it is"
+                f" (--columns {name}=COLUMN), or give --body and --time-step instead"
+            )
+    table["time"] = pd.to_numeric(table["time"], errors="coerce")
+    steps = table.groupby(["trajectory", "body"])["time"].diff().dropna().to_numpy()
+    step = float(np.median(steps)) if len(steps) else float("nan")
+    if not step > 0:
+        raise HistoryError(
+            f"history {path}: its times do not rise from row to row of a body and trajectory;"
+            " correct them, or give --body and --time-step instead"
+        )
+    return Recorded(
+        tuple(names),
+        float(f"{step:.6g}"),
+        even=bool((np.abs(steps - step) <= _EVEN * step).all()),
+        velocities=bool({"vx", "vy", "omega"} & set(table.columns)),
+    )
+
+
+def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]:
+    """Return names of bodies: from columns side by side, a column of names, or one name."""
+    beside = dict.fromkeys(key.rpartition(".")[0] for key in columns if "." in key)
+    column = columns.get("body", "body")
+    if beside:
+        return list(beside)
+    if column in frame:
+        texts = (str(name).strip() for name in frame[column].dropna().unique())
+        return [text for text in texts if text]
+    return [column] if isinstance(column, str) and "body" in columns else []
+
 
 #: Where models/ is in an installed package, and in a clone.
 _MODELS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
@@ -55,7 +153,7 @@ def new(
         typer.Option(
             "--hinge",
             metavar="NAME@X,Y[=NAME@X,Y]",
-            help=f"What hangs on what, at which points of their own frames (m): {HINGE}.",
+            help=f"Bodies that a hinge joins, at points in their frames (m): {HINGE}.",
         ),
     ] = None,
     walls: Annotated[
@@ -75,15 +173,15 @@ def new(
             metavar="HISTORY", help="A recording: has the bodies' names and the time step."
         ),
     ] = None,
-    columns: Columns = None,
-    units: Units = None,
+    columns: options.Columns = None,
+    units: options.Units = None,
     model: Annotated[
         str | None,
         typer.Option("--from", metavar="MODEL", help="Copy a model that comes with the package."),
     ] = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Write a commented scene, from options or from a few questions; or copy a model.
 
@@ -96,7 +194,7 @@ def new(
     )  # fmt: skip
     with interruptible():
         check_file(scene, (".toml",), overwrite)
-        names, measures = columns_of(columns or []), units_of(units or [])
+        names, measures = options.columns_of(columns), options.units_of(units)
         if model is not None and (side is not None or any(described)):
             raise SceneError("--from copies a model as it is: leave the other options, or --from")
         if history is None and (names or measures):
@@ -139,7 +237,7 @@ def new(
 def _reading(
     found: Recorded | None, columns: list[str] | None, units: list[str] | None
 ) -> list[str]:
-    """Options with which later commands read the recording."""
+    """Return the options with which later commands read the recording."""
     if found is None:
         return []
     options = [word for each in columns or [] for word in ("--columns", each)]
@@ -172,18 +270,17 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
 
 
 def _write(path: Path, text: str) -> None:
-    """Write a scene that can be read, whole or not at all."""
+    """Write a scene whole or not at all, if it is valid."""
     from pbrl_ppl.effects import attach
-    from pbrl_ppl.history import write_atomically
     from pbrl_ppl.scene import Scene
 
     attach(Scene.from_toml(text))  # whether declared effects exist too
-    write_atomically(path, lambda to: to.write_text(text, encoding="utf-8"))
+    write_text(path, text)
 
 
 @dataclass(frozen=True)
 class _Answers:
-    """What a scene needs, whoever said it."""
+    """Scene settings from options, recording and answers."""
 
     names: Sequence[str]
     shapes: Mapping[str, str]
@@ -201,7 +298,7 @@ def _asked(
     history: Path | None,
     found: Recorded | None,
 ) -> _Answers:
-    """What options, a recording and answers say."""
+    """Return scene settings from options, a recording and answers to questions."""
     shapes = dict(given)
     names = list(shapes)
     if found is not None:

@@ -2,51 +2,45 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.command_line import command_line
-from pbrl_ppl.cli.outputs import check_file
-from pbrl_ppl.cli.terminal import AsJson, Overwrite, Quiet, interruptible, stages
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.terminal import check_file, interruptible, print_json, stages
 from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.files import write_text
 
 
 def report(
     context: typer.Context,
-    posterior: Annotated[
-        Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); all that is needed.")
-    ],
+    posterior: options.PosteriorFile,
     output: Annotated[
         Path | None,
         typer.Option(
             "-o", "--output", metavar="FILE", help="The page; POSTERIOR with .html if not given."
         ),
     ] = None,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Diagnose a posterior on one self-contained page: chains, prior, predictions, LOO."""
     with interruptible(), stages(quiet) as progress:
         page = posterior.with_suffix(".html") if output is None else output
         check_file(page, (".html",), overwrite)
         progress("reading the posterior")
-        # nobody is there to see a window
-        os.environ.setdefault("MPLBACKEND", "Agg")
         from pbrl_ppl.posterior import load_posterior
-        from pbrl_ppl.report import Source, render_posterior, write_page
+        from pbrl_ppl.report import Source, render_posterior
 
         idata = load_posterior(posterior)
         progress("computing and drawing")
         try:
-            text = render_posterior(idata, source=Source(command=command_line(context)))
+            text = render_posterior(idata, source=Source(command=options.command_line(context)))
         except PosteriorError as error:
             raise PosteriorError(f"{posterior}: {error}") from error
-        write_page(page, text)
+        write_text(page, text)
     if as_json:
         print_json({"report": page})
     else:

@@ -8,21 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli.answers import print_json
-from pbrl_ppl.cli.outputs import check_file
-from pbrl_ppl.cli.own_tables import Columns, Resample, Units, columns_of, units_of
-from pbrl_ppl.cli.terminal import (
-    AsJson,
-    Errors,
-    HistoryFile,
-    Overwrite,
-    Quiet,
-    Seed,
-    Velocities,
-    interruptible,
-    named_numbers,
-    stages,
-)
+from pbrl_ppl.cli import options
+from pbrl_ppl.cli.terminal import check_file, interruptible, print_json, stages
 from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError
 
 if TYPE_CHECKING:
@@ -41,7 +28,7 @@ def simulate(
         Path,
         typer.Argument(metavar="SOURCE", help="Posterior file (.nc), or scene (.toml) with --set."),
     ],
-    history: HistoryFile,
+    history: options.HistoryFile,
     output: Annotated[
         Path,
         typer.Option("-o", "--output", metavar="FILE", help="The history (.csv, .parquet, .nc)."),
@@ -58,35 +45,30 @@ def simulate(
         int | None,
         typer.Option(min=1, help="Posterior draws, a copy of each trajectory for each; else MAP."),
     ] = None,
-    noise: Errors = None,
-    seed: Seed = 1,
-    estimate_velocities: Velocities = False,
-    columns: Columns = None,
-    units: Units = None,
-    resample: Resample = False,
-    overwrite: Overwrite = False,
-    as_json: AsJson = False,
-    quiet: Quiet = False,
+    noise: options.Noise = None,
+    seed: options.Seed = 1,
+    estimate_velocities: options.Velocities = False,
+    columns: options.Columns = None,
+    units: options.Units = None,
+    resample: options.Resample = False,
+    overwrite: options.Overwrite = False,
+    as_json: options.AsJson = False,
+    quiet: options.Quiet = False,
 ) -> None:
     """Simulate a recording: its start states and wrenches, under parameters that are given.
 
-    Each trajectory is followed from its first complete state to its end. With --noise, errors of
-    measuring are added; without, the states are the engine's.
+    Each trajectory is followed from its first complete state to its end. With --noise, measurement
+    noise is added; without, the states are the engine's.
     """
-    names, measures = columns_of(columns or []), units_of(units or [])
+    reading = options.Reading(columns, units, estimate_velocities, resample=resample)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".csv", ".parquet", ".nc"), overwrite)
-        values = named_numbers(given, "--set", "mass=8")
-        errors = named_numbers(noise, "--noise", "x=0.002")
+        values = options.named_numbers(given, "--set", "mass=8")
+        errors = options.noise_of(noise)
         progress("reading the parameters and the history")
         scene, layout, phi, substeps = _parameters(source, values, draws, seed)
-        scene.replace(noise=errors)  # it is checked there
-        from pbrl_ppl.history import History
-
-        recorded = History.load(
-            history, scene, estimate_velocities=estimate_velocities, columns=names, units=measures,
-            resample=resample,
-        )  # fmt: skip
+        scene.replace(noise=errors)  # raises where the noise is invalid
+        recorded = reading.history(history, scene)
         progress("simulating")
         simulated = _simulated(scene, layout, phi, substeps, recorded)
         result = _history(recorded, simulated, errors, seed, labelled=draws is not None)
@@ -107,7 +89,7 @@ def simulate(
 def _parameters(
     source: Path, values: Mapping[str, float], draws: int | None, seed: int
 ) -> tuple[Scene, Layout, Array, int]:
-    """The scene, and parameter vectors, shape (draw, p), from a posterior or from the options."""
+    """Return the scene, and parameter vectors, shape (draw, p), from a posterior or options."""
     import numpy as np
 
     if source.suffix == ".nc":
@@ -160,13 +142,13 @@ def _bare(label: str) -> str:
 def _simulated(
     scene: Scene, layout: Layout, phi: Array, substeps: int, recorded: History
 ) -> list[Any]:
-    """Recorded states replaced by simulated ones, (trajectory, time, body, 6), for each draw."""
+    """Return simulated states, shape (trajectory, time, body, 6), for each draw."""
     import numpy as np
 
     from pbrl_ppl.effects import attach
     from pbrl_ppl.physics import Physics, check_history
 
-    # one piece a trajectory, which its end cuts short
+    # one segment a trajectory, up to its end
     segments = recorded.segments(int(recorded.dataset["n_rows"].max()) - 1)
     lost = set(range(recorded.n_trajectories)) - set(segments.trajectory.tolist())
     if lost:
@@ -181,14 +163,14 @@ def _simulated(
     follows = recorded.dataset["kinematic"].to_numpy()
     n_rows = recorded.dataset["n_rows"].to_numpy()
     result = []
-    for own in predicted:
+    for drawn in predicted:
         states = np.full(recorded.dataset["observed"].shape, np.nan)
         states[:, :, follows] = recorded.dataset["start"].to_numpy()[:, :, follows]
         for i, (trajectory, step) in enumerate(
             zip(segments.trajectory, segments.step, strict=True)
         ):
             rows = np.arange(step + 1, n_rows[trajectory])
-            after = own[i, : len(rows)][:, ~follows]
+            after = drawn[i, : len(rows)][:, ~follows]
             if not np.isfinite(after).all():
                 raise SimulationError(
                     "simulate: the engine diverged under these parameters; check them and their"
@@ -203,7 +185,7 @@ def _simulated(
 def _history(
     recorded: History, states: list[Any], errors: Mapping[str, float], seed: int, labelled: bool
 ) -> History:
-    """A history of simulated states with errors of measuring; labels say which draw, if asked."""
+    """Return a history of simulated states with measurement noise; labels may name the draw."""
     import numpy as np
     import xarray as xr
 
@@ -214,8 +196,8 @@ def _history(
     spread = np.array([errors.get(name, 0.0) for name in STATE])
     free = ~recorded.dataset["kinematic"].to_numpy()[:, None]
     copies = []
-    for draw, own in enumerate(states):
-        measured = own + free * spread * rng.standard_normal(own.shape)
+    for draw, simulated in enumerate(states):
+        measured = simulated + free * spread * rng.standard_normal(simulated.shape)
         copy = recorded.dataset.copy()
         copy["observed"] = copy["observed"].copy(data=measured)
         if labelled:

@@ -1,103 +1,45 @@
-"""Helpers of the commands: shared options, files, progress, interrupts, messages in a line."""
+"""Terminal and files: progress, interrupts, warnings, output, checks of output paths."""
 
 from __future__ import annotations
 
+import contextlib
+import json
 import re
 import signal
 import sys
+import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Annotated
+from typing import Any
 
 import typer
 from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
-if TYPE_CHECKING:
-    from pbrl_ppl.scene import Scene
+from pbrl_ppl.errors import OutputError
+from pbrl_ppl.files import json_values
 
 #: Exit codes: a failed calibration, a failed log, a goal that was not reached, or effects that stay
-#: inseparable; bad input as for bad usage; no verdict, for the chains have not converged; an
-#: interrupt as the shell has it.
+#: inseparable; bad input or usage; chains that have not converged, so no verdict; an interrupt, as
+#: shells report it.
 FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 
-SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.toml).")]
-HistoryFile = Annotated[
-    Path, typer.Argument(metavar="HISTORY", help="Measured history (.csv, .parquet, .nc).")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Same seed, same answer.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object, and nothing else.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace what exists.")]
-Substeps = Annotated[
-    int | None, typer.Option(min=1, help="Engine steps per interval, for the scene's.")
-]
-Errors = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--noise",
-        metavar="NAME=SD",
-        help="Known error of measuring a state dimension (x=0.002, in m; repeat for others).",
-    ),
-]
-Velocities = Annotated[
-    bool,
-    typer.Option(
-        "--estimate-velocities",
-        help="Start predictions from velocities estimated from positions, if none were measured.",
-    ),
-]
-
-Trim = Annotated[
-    bool,
-    typer.Option(
-        "--trim",
-        help="Leave out rows at a trajectory's ends that belong to no model: a body still held, an"
-        " abrupt stop.",
-    ),
-]
-
-#: What messages for Python advise besides, by the argument that it takes: left out of a command's
-#: messages if it has no such option.
+#: Advice in messages for Python, by the argument that it names: left out of the messages of a
+#: command that has no such option.
 _ADVICE = {"thin": " or thin=", "resume": ", or go on with resume= this posterior"}
 #: An argument named in a message for Python.
 _ARGUMENT = re.compile(r"\b([a-z_]+)=(?:True\b)?(?=[\s,;.)]|$)")
 
 
-def named_numbers(given: list[str] | None, option: str, example: str) -> dict[str, float]:
-    """Numbers by name from options such as ``x=0.002``."""
-    numbers = {}
-    for item in given or []:
-        name, _, value = item.rpartition("=")
-        try:
-            numbers[name.strip()] = float(value)
-        except ValueError:
-            name = ""
-        if not name.strip():
-            raise typer.BadParameter(
-                f"{item!r} is not NAME=VALUE, such as {example}", param_hint=option
-            )
-    return numbers
-
-
-def stated_noise(scene: Scene, given: list[str] | None) -> Scene:
-    """The scene with errors of measuring from options such as ``x=0.002``."""
-    return scene.replace(noise=dict(scene.noise) | named_numbers(given, "--noise", "x=0.002"))
-
-
-def with_substeps(scene: Scene, substeps: int | None) -> Scene:
-    """The scene with engine steps from the option, if it was given."""
-    return scene if substeps is None else scene.replace(substeps=substeps)
-
-
 @contextmanager
 def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
-    """Show stages on stderr with the time elapsed: on a terminal the present one runs on."""
+    """Show stages on stderr with the time elapsed; a terminal also shows the running stage."""
     console = Console(stderr=True, quiet=quiet, highlight=False, markup=False)
     running = Stage()
     with console.status(running):
@@ -126,9 +68,9 @@ class Stage:
 
 @contextmanager
 def interruptible(state: str = "nothing was written") -> Iterator[list[int]]:
-    """Say what is left; results are renamed into place as the last thing.
+    """Turn an interrupt into a message that says which results are kept, and an exit code.
 
-    Yields the interrupts so far: a sampler may end at one as if nothing had happened.
+    Yields the interrupts so far: a sampler may catch one and return as if it had finished.
     """
     seen: list[int] = []
 
@@ -136,35 +78,35 @@ def interruptible(state: str = "nothing was written") -> Iterator[list[int]]:
         seen.append(number)
         signal.default_int_handler(number, frame)
 
-    # in the background interrupts are ignored, and stay so
-    own = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    own = own and threading.current_thread() is threading.main_thread()
-    if own:
+    # a shell's background job ignores interrupts: leave it so
+    handled = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    handled = handled and threading.current_thread() is threading.main_thread()
+    if handled:
         signal.signal(signal.SIGINT, note)
     try:
         yield seen
     except KeyboardInterrupt:
         raise typer.Exit(interrupted(state)) from None
     finally:
-        if own:
+        if handled:
             signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def interrupted(state: str = "nothing was written") -> int:
-    """Say what an interrupt left, and give the exit code."""
+    """Print which results are kept after an interrupt, and return the exit code."""
     print(f"interrupted; {state}", file=sys.stderr)  # noqa: T201
     return INTERRUPTED
 
 
 def in_options(message: str, options: Collection[str]) -> str:
-    """A message for Python in one line and in the words of a command: its options.
+    """Return a message for Python in one line, with a command's options for its arguments.
 
     Parameters
     ----------
     message : str
-        Names arguments as ``draws=`` or ``estimate_velocities=True``.
+        It names arguments as ``draws=`` or ``estimate_velocities=True``.
     options : collection of str
-        The command's, as ``--draws``.
+        Those of the command, such as ``--draws``.
 
     Examples
     --------
@@ -185,17 +127,94 @@ def in_options(message: str, options: Collection[str]) -> str:
 
 @contextmanager
 def warnings_in_a_line(options: Collection[str] = ()) -> Iterator[None]:
-    """Show warnings without the line of code they are from, in a command's words."""
+    """Show each warning in one line, without its line of code, naming a command's options."""
 
     def show(message: Warning | str, *_: object, **__: object) -> None:
         print(f"warning: {in_options(str(message), options)}", file=sys.stderr)  # noqa: T201
 
     with warnings.catch_warnings():
         warnings.simplefilter("always", UserWarning)
-        # for authors of libraries, not for users of a command
+        # these are for authors of libraries, not for users of a command
         for category in (DeprecationWarning, PendingDeprecationWarning, FutureWarning):
             warnings.simplefilter("ignore", category)
         # a fast BLAS would change nothing here: the time goes into the engine
         warnings.filterwarnings("ignore", message="PyTensor could not link to a BLAS")
         warnings.showwarning = show
         yield
+
+
+_WIDE = 160
+
+
+def print_json(contents: Mapping[str, Any]) -> None:
+    """Print one JSON object; numbers that are not finite become null."""
+    typer.echo(json.dumps(json_values(contents), indent=1, allow_nan=False))
+
+
+def print_table(title: str | None, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print a table; its first column, and those whose name begins with <, are text."""
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False)
+    for i, name in enumerate(columns):
+        left = i == 0 or name.startswith("<")
+        table.add_column(
+            name.removeprefix("<"), justify="left" if left else "right", no_wrap=not left
+        )
+    for row in rows:
+        table.add_row(*row)
+    # a file or a pipe has no width
+    width = None if sys.stdout.isatty() else _WIDE
+    Console(highlight=False, markup=False, width=width).print(table)
+
+
+def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
+    """Refuse a file that has the wrong ending, exists already, or cannot be written.
+
+    Raises
+    ------
+    OutputError
+        Says which.
+    """
+    if path.suffix not in endings:
+        raise OutputError(f"{path}: expected a name that ends in {' or '.join(endings)}")
+    if path.is_dir():
+        raise OutputError(f"{path}: it is a folder; choose another name")
+    if path.exists() and not overwrite:
+        raise OutputError(f"{path}: it exists; choose another file, or pass --overwrite")
+    if not path.parent.is_dir():
+        raise OutputError(f"{path}: there is no folder {path.parent}; make it, or choose another")
+    try:
+        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=f".{path.stem}."):
+            pass
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot be written ({error.strerror}); choose another file"
+        ) from None
+
+
+def check_can_make(folder: Path) -> None:
+    """Refuse a folder that cannot be made or written: it is tried, and nothing stays.
+
+    Raises
+    ------
+    OutputError
+        If it cannot.
+    """
+    made: list[Path] = []
+    try:
+        for each in reversed((folder, *folder.parents)):
+            if not each.exists():
+                each.mkdir()
+                made.append(each)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except (NotADirectoryError, FileExistsError):
+        pass  # a file is in the way, and `report.check_folder` says which
+    except OSError as error:
+        raise OutputError(
+            f"output folder {folder}: it cannot be made or written ({error.strerror}); choose"
+            " another path"
+        ) from None
+    finally:
+        with contextlib.suppress(OSError):
+            for each in reversed(made):
+                each.rmdir()

@@ -2,7 +2,7 @@
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.cross_validation import Change, gain
-from pbrl_ppl.criticism.dependence import PRODUCTS
+from pbrl_ppl.criticism.dependence import QUANTITIES, recorded_quantities
 from pbrl_ppl.criticism.findings import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
 from pbrl_ppl.criticism.loop import revise
 from pbrl_ppl.criticism.prior_check import (
@@ -23,13 +23,14 @@ from pbrl_ppl.criticism.results import (
 from pbrl_ppl.criticism.rivals import Rival, fit_rivals, kept_groups, named_effects
 from pbrl_ppl.criticism.score import DECISIVE, Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.criticism.selection import TRIED
+from pbrl_ppl.criticism.stages import Stage
 
 __all__ = [
     "ADEQUATE",
     "DECISIVE",
     "DEFAULT",
     "NOT_CONVERGED",
-    "PRODUCTS",
+    "QUANTITIES",
     "TRIED",
     "UNEXPLAINED",
     "Acceleration",
@@ -44,6 +45,7 @@ __all__ = [
     "ResidualTest",
     "Rival",
     "Signature",
+    "Stage",
     "Unexplained",
     "criticise",
     "fit_rivals",
@@ -54,6 +56,7 @@ __all__ = [
     "named_effects",
     "prior_predictive_check",
     "rank_candidates",
+    "recorded_quantities",
     "revise",
     "telling_horizon",
     "twins",

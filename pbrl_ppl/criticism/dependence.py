@@ -13,6 +13,7 @@ from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.cross_validation import folds
 from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
@@ -31,27 +32,28 @@ _RIDGE = 1.0
 #: More transitions than this say the same more slowly.
 _MOST = 1500
 
-FEATURES = (
-    "position x",
-    "position y",
-    "velocity x",
-    "velocity y",
-    "commanded force x",
-    "commanded force y",
-    "orientation (cosine)",
-    "orientation (sine)",
-    "forward speed",
-    "sideways speed",
-    "angular speed",
-    "speed",
-    "commanded forward force",
-    "commanded sideways force",
-    "commanded torque",
-    "forward force commanded before",
-    "sideways force commanded before",
-    "torque commanded before",
-    "time",
-)
+#: Recorded quantities that a residual may depend on, with their units.
+FEATURES = {
+    "position x": "m",
+    "position y": "m",
+    "velocity x": "m/s",
+    "velocity y": "m/s",
+    "commanded force x": "N",
+    "commanded force y": "N",
+    "orientation (cosine)": "1",
+    "orientation (sine)": "1",
+    "forward speed": "m/s",
+    "sideways speed": "m/s",
+    "angular speed": "rad/s",
+    "speed": "m/s",
+    "commanded forward force": "N",
+    "commanded sideways force": "N",
+    "commanded torque": "N m",
+    "forward force commanded before": "N",
+    "sideways force commanded before": "N",
+    "torque commanded before": "N m",
+    "time": "s",
+}
 #: What depends on two quantities together has no smooth term in either: a spinning body's lift,
 #: a force that fades with speed, an actuator that remembers, a floor that is rough in places.
 PRODUCTS = {
@@ -69,6 +71,8 @@ PRODUCTS = {
         ("position y", "velocity y"),
     )
 }
+#: All of these with their units, in the order of the columns of :func:`recorded_quantities`.
+QUANTITIES = FEATURES | {name: f"{FEATURES[a]} {FEATURES[b]}" for name, (a, b) in PRODUCTS.items()}
 
 
 @dataclass(frozen=True)
@@ -124,7 +128,7 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
     for i, body in enumerate(problem.scene.moving):
         if body.kinematic:
             continue
-        features = _features(mode, i)[chosen]
+        features = recorded_quantities(problem, i)[chosen]
         own = np.flatnonzero(places // len(STATE) == i)
         y, names, of = _in_both_frames(innovations[:, own], places[own] % len(STATE), features)
         y = y - y.mean(axis=0)
@@ -152,20 +156,21 @@ def _in_both_frames(
     velocities = [names.index(name) for name in ("vx", "vy") if name in names]
     if len(velocities) < 2:
         return y, names, of
-    c, s = (features[:, FEATURES.index(f"orientation ({part})")] for part in ("cosine", "sine"))
+    columns = list(FEATURES)
+    c, s = (features[:, columns.index(f"orientation ({part})")] for part in ("cosine", "sine"))
     x, y_ = y[:, velocities].T
     turned = np.stack([c * x + s * y_, c * y_ - s * x], axis=1)
     return np.hstack([y, turned]), [*names, "forward speed", "sideways speed"], [*of, *velocities]
 
 
-def _features(mode: Mode, body: int) -> Array:
-    """State, action and products at each start, in the body's frame, shape (transition, name)."""
-    segments = mode.problem.segments
+def recorded_quantities(problem: Problem, body: int) -> Array:
+    """Return ``QUANTITIES`` at the start of each transition, shape (transition, quantity)."""
+    segments = problem.segments
     x, y, theta, vx, vy, omega = segments.start[:, body].T
     fx, fy, torque = segments.actions[:, :, body].mean(axis=1).T
     gx, gy, torque_before = segments.inputs[:, 0, body, 3:6].T
     c, s = np.cos(theta), np.sin(theta)
-    time = segments.step.astype(float)
+    time = segments.step * problem.scene.time_step
     single = np.stack(
         [
             x, y, vx, vy, fx, fy, c, s, c * vx + s * vy, c * vy - s * vx, omega, np.hypot(vx, vy),
@@ -174,7 +179,8 @@ def _features(mode: Mode, body: int) -> Array:
         ],
         axis=1,
     )  # fmt: skip
-    pairs = np.array([[FEATURES.index(name) for name in pair] for pair in PRODUCTS.values()])
+    columns = list(FEATURES)
+    pairs = np.array([[columns.index(name) for name in pair] for pair in PRODUCTS.values()])
     return np.hstack([single, single[:, pairs].prod(axis=2)])
 
 
@@ -217,7 +223,7 @@ def _describe(
 ) -> Unexplained:
     weights = np.linalg.solve(_summed(features) + _RIDGE * np.eye(len(y)), y)
     parts = [np.var(kernel @ weights) for kernel in _kernels(features)]
-    name = (*FEATURES, *PRODUCTS)[int(np.argmax(parts))]
+    name = list(QUANTITIES)[int(np.argmax(parts))]
     return Unexplained(
         body=body,
         dimension=dimension,

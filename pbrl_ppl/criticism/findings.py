@@ -21,6 +21,7 @@ from pbrl_ppl.criticism.results import (
     Rollout,
     Unexplained,
 )
+from pbrl_ppl.files import json_values
 from pbrl_ppl.history import UnusedVelocity
 from pbrl_ppl.posterior import Comparison, Identifiability
 from pbrl_ppl.scene import Scene
@@ -110,7 +111,7 @@ class Findings:
 
     def to_dict(self) -> dict[str, Any]:
         """The contents of ``report.json``; numbers that are not finite become null."""
-        contents: dict[str, Any] = _clean(
+        contents: dict[str, Any] = json_values(
             {
                 "verdict": self.verdict,
                 "numerical": vars(self.numerical),
@@ -160,18 +161,3 @@ class Findings:
             }
         )
         return contents
-
-
-def _clean(value: Any) -> Any:
-    """Plain JSON values."""
-    if isinstance(value, Mapping):
-        return {str(key): _clean(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_clean(item) for item in value]
-    if isinstance(value, (float, np.floating)):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, np.integer):
-        return int(value)
-    return value

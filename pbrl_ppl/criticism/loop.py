@@ -23,6 +23,7 @@ from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.results import ResidualTest
 from pbrl_ppl.criticism.score import Signature, rank_candidates
 from pbrl_ppl.criticism.selection import Selection, Step
+from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import (
     Left,
     unexplained_acceleration,
@@ -137,12 +138,12 @@ def _revised(
             try_effect(effect, scene, train)
     selection = Selection(scene, catalogue, criteria, say)
     effects = attach(scene, (), catalogue)
-    say("looking whether the prior could have made the data")
+    say(Stage.CHECK_PRIOR)
     prior = _prior_test(scene, train, effects, seed)
     if not prior.passed:  # of wrong units nobody wants the fit
         hint = "the declared prior does not explain this recording, unless a missing effect is why"
         warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
-    say("fitting the declared model")
+    say(Stage.FIT)
     declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
     first, current, added = _with_effects(declared, selection, criteria, say, mendable=True)
     # under the right noise effects may show that were hidden before
@@ -157,7 +158,7 @@ def _revised(
             tracked = with_correlated_errors(current, criteria)
             if tracked is None:
                 break
-            say("errors of measuring are correlated: looking again")
+            say(Stage.REPEAT)
             declared = same_noise(declared, tracked)
         first, current, added = _with_effects(
             declared, selection, criteria, say, mendable=again > 0
@@ -166,7 +167,7 @@ def _revised(
     test, frames = without_measurements(test, outliers(as_tested))
     if frames:
         held_out, bad = HeldOut(test, seed), (*bad, *(f"held out: {frame}" for frame in frames))
-    say("testing what is left")
+    say(Stage.TEST)
     before, left = (unexplained_acceleration(mode, criteria) for mode in (declared, current))
     horizon = rollout_horizon(train, scene.time_step)
     with_added = prior
@@ -184,19 +185,19 @@ def _revised(
         followed = misfit.predictable < criteria.most_predictable * without.predictable
         if remains > criteria.large_if_small or not followed:
             # part of a misfit goes to whatever is there: no name is to be had from that
-            say("no effect of the catalogue explains what is missing")
+            say(Stage.WITHDRAW)
             selection.withdraw(added)
             added, current, left = [], declared, before
             misfit = without.with_test(prior)
     if added:
         misfit = beside_names(misfit, current, left)
-    say("sampling the posterior of the declared model")
+    say(Stage.SAMPLE_DECLARED)
     posterior = _posterior(declared, method, seed, draws, criteria, say)
     revised = posterior
     if added:
-        say("sampling the posterior of the revised model")
+        say(Stage.SAMPLE_REVISED)
         revised = _posterior(current, method, seed, draws, criteria, say)
-    say("comparing errors on held-out data")
+    say(Stage.COMPARE)
     models = Models(declared, current, posterior, revised, before, left)
     told = selection.explained(first), tuple(selection.small)
     findings = put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
@@ -215,7 +216,7 @@ def _with_effects(
 
     If the noise is ``mendable`` it ends where outliers show, the last effect unconfirmed.
     """
-    say("scoring what the model might lack")
+    say(Stage.SCORE)
     first = rank_candidates(declared, selection.missing(declared))
     current, ranked = declared, first
     added: list[Step] = []
@@ -234,7 +235,7 @@ def _with_effects(
         current = step.after
         ranked = rank_candidates(current, selection.missing(current))
     if len(added) > 1:
-        say("checking that each added effect is still needed")
+        say(Stage.PRUNE)
         current, added = selection.prune(current, added)
     return first, current, added
 

@@ -12,6 +12,7 @@ from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.resolution import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import rank_candidates
+from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -97,9 +98,9 @@ def criticise(
         for sentence in (*(velocity.sentence for velocity in unused), *bad):
             say(sentence)
         effects = attach(scene, (), catalogue)
-        say("fitting the declared model")
+        say(Stage.FIT)
         mode = declared_mode(scene, history, effects, seed, substeps, say, criteria)
-        say("scoring what the model might lack")
+        say(Stage.SCORE)
         ranked = rank_candidates(mode, candidates(scene, effects, catalogue))
         left = unexplained_acceleration(mode)
     return Ranking(

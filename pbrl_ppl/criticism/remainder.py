@@ -15,6 +15,7 @@ from threadpoolctl import threadpool_limits
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.cross_validation import gain
 from pbrl_ppl.criticism.rivals import likeliest_mode
+from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learned_remainder
 from pbrl_ppl.effects import catalogue as full_catalogue
@@ -97,9 +98,9 @@ def learn_remainder(
         present = [attached.effect.name for attached in mode.problem.physics.effects]
         if LEARNED_REMAINDER in present:
             raise FitError("posterior: it has a learned remainder already; take one without")
-        say("learning what is left")
+        say(Stage.LEARN)
         effect = _learned(mode, body, seed)
-        say("fitting the model with the learned remainder")
+        say(Stage.REFIT)
         refitted = _refitted(mode, effect, body)
         gained = gain(mode, refitted)
         if gained.total < DEFAULT.min_elpd or not gained.certain(DEFAULT.min_elpd_se):

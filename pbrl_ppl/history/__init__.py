@@ -14,7 +14,7 @@ from pbrl_ppl.history.derived import (
     unused_velocities,
 )
 from pbrl_ppl.history.ends import End, strange_ends, trimmed
-from pbrl_ppl.history.files import read_table, write_atomically
+from pbrl_ppl.history.files import read_table
 from pbrl_ppl.history.history import History, Segments, from_segments, segment_rows
 from pbrl_ppl.history.kinematics import estimate_rates, fill_hinges, hung_bodies, lever
 from pbrl_ppl.history.mujoco import from_mujoco
@@ -45,5 +45,4 @@ __all__ = [
     "unused_velocities",
     "without_bad_frames",
     "without_measurements",
-    "write_atomically",
 ]

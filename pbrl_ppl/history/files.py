@@ -1,9 +1,7 @@
 """Files of histories: CSV, Parquet and NetCDF to a table, and back, written atomically."""
 
-import contextlib
 import io
-import secrets
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,7 @@ import pandas as pd
 import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
+from pbrl_ppl.files import write_atomically
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
@@ -193,22 +192,3 @@ def write_dataset(dataset: xr.Dataset, path: Path) -> None:
         write_atomically(path, lambda to: table.to_csv(to, index=False, lineterminator="\n"))
     else:
         write_atomically(path, lambda to: table.to_parquet(to, index=False))
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> None:
-    """Call ``write`` with a temporary path beside ``path``, then rename it to ``path``.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written; nothing is left behind then.
-    """
-    temporary = path.with_name(f".{path.stem}.{secrets.token_hex(4)}{path.suffix}")
-    try:
-        write(temporary)
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error}") from None
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)

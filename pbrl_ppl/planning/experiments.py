@@ -16,7 +16,8 @@ from threadpoolctl import threadpool_limits
 from pbrl_ppl.criticism import DECISIVE, fit_rivals, kept_groups, named_effects
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import EffectError, GoalError
-from pbrl_ppl.history import segment_rows, write_atomically
+from pbrl_ppl.files import write_atomically
+from pbrl_ppl.history import segment_rows
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.allowed import Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.planner import start_state

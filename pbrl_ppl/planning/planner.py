@@ -14,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.history import segment_rows, write_atomically
+from pbrl_ppl.files import write_atomically
+from pbrl_ppl.history import segment_rows
 from pbrl_ppl.physics import check_placement, overlap
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar

@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
-import tempfile
 import warnings
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,7 +20,8 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.errors import OutputError, PosteriorError
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.files import write_atomically
 from pbrl_ppl.scene import Scene
 
 with warnings.catch_warnings():
@@ -104,31 +103,10 @@ def save_posterior(idata: Any, path: str | Path) -> None:
     OutputError
         If the folder does not exist or cannot be written.
     """
-    path = Path(path)
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
-        os.close(handle)
-    except OSError as error:
-        raise OutputError(
-            f"{path}: cannot write there ({error.strerror}); choose an existing, writable folder"
-        ) from error
-    try:
-        _write(idata, name)
-        Path(name).chmod(0o666 & ~_umask())
-        Path(name).replace(path)
-    except BaseException:
-        Path(name).unlink(missing_ok=True)
-        raise
+    write_atomically(Path(path), lambda temporary: _write(idata, temporary))
 
 
-def _umask() -> int:
-    """The process's file mode mask; it can only be read by setting it."""
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def _write(idata: Any, name: str) -> None:
+def _write(idata: Any, name: Path) -> None:
     """NetCDF 4 with one group a dataset: the same file from both stacks."""
     xr.Dataset(attrs=dict(idata.attrs)).to_netcdf(name, mode="w", engine="h5netcdf")
     for group_name, data in groups(idata).items():

@@ -2,17 +2,21 @@
 
 from pbrl_ppl.report.brief import in_brief
 from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
-from pbrl_ppl.report.contact_plots import draw_contacts
 from pbrl_ppl.report.effect_plots import plot_candidates
 from pbrl_ppl.report.error_plots import plot_errors, plot_rollout
+from pbrl_ppl.report.logs import Log, read_manifest
 from pbrl_ppl.report.loop import Loop, check_folder, close_loop
-from pbrl_ppl.report.manifest import Log, read_manifest
 from pbrl_ppl.report.many import ManyLoops, close_loop_many
 from pbrl_ppl.report.many_page import in_words
-from pbrl_ppl.report.page import Source, write_page
+from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
 from pbrl_ppl.report.posterior_report import render_posterior
-from pbrl_ppl.report.scene_plots import animate_plan, draw_goal, draw_motion, draw_scene
+from pbrl_ppl.report.scene_plots import (
+    animate_plan,
+    draw_goal,
+    draw_motion,
+    draw_scene,
+)
 from pbrl_ppl.report.style import png
 
 __all__ = [
@@ -24,7 +28,6 @@ __all__ = [
     "check_folder",
     "close_loop",
     "close_loop_many",
-    "draw_contacts",
     "draw_goal",
     "draw_motion",
     "draw_scene",
@@ -41,5 +44,4 @@ __all__ = [
     "read_manifest",
     "render_posterior",
     "summary",
-    "write_page",
 ]

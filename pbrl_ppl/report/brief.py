@@ -88,7 +88,7 @@ def _errors(findings: Findings) -> list[str]:
 
 
 def _next(findings: Findings, folder: Path, tried: bool) -> str:
-    """Say what to do next."""
+    """Return what to do next."""
     left = findings.unexplained
     if findings.verdict == NOT_CONVERGED:
         return "close the loop again with more --draws, or with tighter priors in the scene."

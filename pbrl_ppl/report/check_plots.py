@@ -11,11 +11,11 @@ from pbrl_ppl.sampling import Calibration, bins
 
 
 def plot_prior_check(check: PriorCheck) -> Figure:
-    """Measured changes of state over a segment beside those that the prior predicts."""
+    """Plot the measured changes of state over a segment beside those that the prior predicts."""
     bodies, states = check.dataset["body"].values, check.dataset["state"].values
     rows = len(bodies) * -(-len(states) // 2)
-    figure, panels = blank_figure(8.0, 0.8 + 1.3 * rows, rows, 2, grid="x")
     pairs = [(body, state) for body in bodies for state in states]
+    figure, panels = blank_figure(8.0, 0.8 + 1.3 * rows, rows, 2, "x", count=len(pairs))
     for axes, (body, state) in zip(panels, pairs, strict=False):
         changes = check.dataset.sel(body=body, state=state)
         for place, (name, colour) in enumerate((("predicted", PLAIN), ("measured", AFTER))):
@@ -28,13 +28,11 @@ def plot_prior_check(check: PriorCheck) -> Figure:
         share = float(changes["share_inside"])
         axes.set_title(f"{state} of {body}: {100 * share:.0f} % as expected", fontsize=9)
         axes.set_xlabel(f"change in {check.seconds:g} s ({UNITS[str(state)]})", fontsize=8)
-    for axes in panels[len(pairs) :]:
-        axes.set_visible(False)
     return figure
 
 
 def plot_calibration(calibration: Calibration) -> Figure:
-    """Rank histograms of a simulation-based calibration, one panel a parameter.
+    """Plot rank histograms of a simulation-based calibration, one panel a parameter.
 
     Parameters
     ----------
@@ -49,7 +47,8 @@ def plot_calibration(calibration: Calibration) -> Figure:
     table, positions = calibration.table(), calibration.dataset["position"]
     n, columns = positions.sizes["replication"], min(4, len(table))
     rows = -(-len(table) // columns)
-    figure, panels = blank_figure(2.6 * columns, 1.7 * rows + 0.6, rows, columns)
+    size = (2.6 * columns, 1.7 * rows + 0.6)
+    figure, panels = blank_figure(*size, rows, columns, count=len(table))
     count = bins(n)
     low, high = binom.interval(0.99, n, 1 / count)
     for axes, (label, row) in zip(panels, table.iterrows(), strict=False):
@@ -62,8 +61,6 @@ def plot_calibration(calibration: Calibration) -> Figure:
         verdict = "" if row["passed"] else ", failed"
         axes.set_title(f"{label}: p = {row['p_holm']:.2g}{verdict}", fontsize=9, color=color)
         axes.set_ylim(bottom=0)
-    for axes in panels[len(table) :]:
-        axes.set_axis_off()
     figure.supxlabel("rank of the true value among posterior draws, as a share", fontsize=9)
     figure.supylabel("replications", fontsize=9)
     return figure

@@ -1,7 +1,8 @@
-"""Pictures of effects: the candidates' scores, and what was added."""
+"""Plots of effects: candidates' scores, added effects, their evidence, residual forces."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,16 +10,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from numpy.typing import NDArray
 from scipy.stats import chi2, gaussian_kde
 
 from pbrl_ppl.criticism import Findings
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import scalars
+from pbrl_ppl.report.evidence import Evidence, Law, bin_means
 from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, legend
 from pbrl_ppl.report.words import plain
 
-#: Candidates are called significant below this corrected p-value.
-LEVEL = 0.01
+#: Candidates are significant below this corrected p-value.
+_LEVEL = 0.01
 #: Below this identifiable share a candidate is marked as hardly identifiable.
 HARDLY = 0.01
 #: Bars and parameters in one picture, at most; the report's tables show all.
@@ -26,7 +29,7 @@ MOST_CANDIDATES, MOST_ADDED = 20, 12
 
 
 def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
-    """Score statistic of the candidates, best on top, with the threshold of each."""
+    """Plot the score statistic of the candidates, best on top, with the threshold of each."""
     added = {(addition.effect, addition.body) for addition in findings.added}
     shown = [
         candidate
@@ -37,7 +40,7 @@ def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
     several = len({candidate.body for candidate in shown}) > 1
     total = max(len(findings.candidates), 1)
     thresholds = [
-        float(chi2.isf(LEVEL / (total * max(candidate.looks, 1)), candidate.dof))
+        float(chi2.isf(_LEVEL / (total * max(candidate.looks, 1)), candidate.dof))
         for candidate in shown
     ]
     for place, (candidate, threshold) in enumerate(zip(shown, thresholds, strict=True)):
@@ -71,7 +74,7 @@ def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
     axes.margins(x=0.1)
     axes.set_xlim(left=0.0)
     axes.invert_yaxis()
-    axes.set_xlabel("score statistic: how strongly the residual asks for the effect")
+    axes.set_xlabel("score statistic of the effect")
     handles: list[Any] = [
         Patch(color=AFTER, label="added"),
         Patch(color=PLAIN, label="not added"),
@@ -83,7 +86,7 @@ def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
 
 
 def plot_added(findings: Findings, width: float = WIDE) -> Figure:
-    """Posterior of every parameter of the added effects, with the value that means no effect."""
+    """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
     shown = [
         (added, name, estimate)
         for added in findings.added
@@ -92,7 +95,7 @@ def plot_added(findings: Findings, width: float = WIDE) -> Figure:
     columns = min(max(len(shown), 1), 2)
     rows = max(-(-len(shown) // columns), 1)
     width = width if columns > 1 else min(width, 5.0)
-    figure, panels = blank_figure(width, 2.6 * rows, rows, columns, grid="x")
+    figure, panels = blank_figure(width, 2.6 * rows, rows, columns, "x", count=len(shown))
     draws = scalars(findings.posterior_after)
     nulls = {(effect.name, p.name): p.null for effect in catalogue for p in effect.parameters}
     for axes, (added, name, estimate) in zip(panels, shown, strict=False):
@@ -117,8 +120,6 @@ def plot_added(findings: Findings, width: float = WIDE) -> Figure:
         axes.set_yticks([])
         axes.set_title(f"{plain(added.effect)} on {added.body}", fontsize=10)
         axes.set_xlabel(f"{plain(name)} ({estimate.unit})")
-    for axes in panels[len(shown) :]:
-        axes.set_visible(False)
     return figure
 
 
@@ -139,3 +140,114 @@ def _mark_null(axes: Axes, null: float, mean: float, sd: float, top: float) -> N
         ha="left" if side < 0 else "right",
         fontsize=8,
     )
+
+
+Array = NDArray[np.float64]
+
+#: Bars of measured numbers in one panel, at most.
+_MOST_BARS = 12
+
+
+def plot_evidence(evidence: Evidence, width: float = WIDE) -> Figure:
+    """Plot the gain of log-likelihood by measured number, speed, place, time and contact."""
+    figure, panels = blank_figure(width, 8.0, 3, 2)
+    _by_cell(panels[0], evidence)
+    gains = evidence.by_transition
+    _along(panels[1], evidence.speed, gains, f"speed of {evidence.body} (m/s)")
+    _along(panels[2], evidence.time, gains, "time in the trajectory (s)")
+    _in_place(figure, panels[3], evidence)
+    _by_contact(panels[4], evidence)
+    _shares(panels[5], evidence)
+    return figure
+
+
+def _by_cell(axes: Axes, evidence: Evidence) -> None:
+    sums = list(evidence.by_cell.items())[:_MOST_BARS]
+    names, values = [name for name, _ in sums], [value for _, value in sums]
+    colours = [AFTER if value >= 0 else BEFORE for value in values]
+    axes.barh(range(len(sums)), values, color=colours)
+    axes.set_yticks(range(len(sums)), names)
+    axes.invert_yaxis()
+    axes.grid(visible=False, axis="y")
+    axes.set_title("by what was measured", fontsize=10)
+    axes.set_xlabel("gain in all (nats)")
+
+
+def _along(axes: Axes, x: Array, gains: Array, label: str) -> None:
+    """Draw the mean gain of transitions in bins of a quantity, with two standard errors."""
+    bins = bin_means(x, gains)
+    error = 2 * np.nan_to_num(bins.error)
+    axes.errorbar(bins.centre, bins.mean, error, fmt="o-", color=AFTER, markersize=4, linewidth=1.2)
+    axes.axhline(0.0, color="black", linewidth=0.8)
+    axes.set_title(f"by {label.partition(' (')[0]}", fontsize=10)
+    axes.set_xlabel(label)
+    axes.set_ylabel("gain a transition (nats)")
+
+
+def _in_place(figure: Figure, axes: Axes, evidence: Evidence) -> None:
+    gains = evidence.by_transition
+    edge = max(float(np.quantile(np.abs(gains), 0.98)), 1e-9)  # a few would hide the rest
+    order = np.argsort(np.abs(gains))
+    x, y = evidence.position[order].T
+    points = axes.scatter(
+        x, y, c=gains[order], s=12, cmap="coolwarm_r", vmin=-edge, vmax=edge, edgecolors="#555555",
+        linewidths=0.3,
+    )  # fmt: skip
+    bar = figure.colorbar(points, ax=axes, shrink=0.85)
+    bar.set_label("gain (nats)")
+    axes.axis("equal")
+    axes.set_title(f"by place of {evidence.body}", fontsize=10)
+    axes.set(xlabel="x (m)", ylabel="y (m)")
+
+
+def _by_contact(axes: Axes, evidence: Evidence) -> None:
+    gains = evidence.by_transition
+    groups = [("free", gains[~evidence.touching]), ("touching", gains[evidence.touching])]
+    for place, (_, gained) in enumerate(groups):
+        if len(gained):
+            axes.bar(place, gained.mean(), width=0.6, color=AFTER if gained.mean() >= 0 else BEFORE)
+    names = [f"{name}\n{len(gained)} transitions" for name, gained in groups]
+    axes.set_xticks([0, 1], names)
+    axes.set_xlim(-0.6, 1.6)
+    axes.axhline(0.0, color="black", linewidth=0.8)
+    axes.set_title("by contact", fontsize=10)
+    axes.set_ylabel("gain a transition (nats)")
+
+
+def _shares(axes: Axes, evidence: Evidence) -> None:
+    gains = np.sort(np.maximum(evidence.by_transition, 0.0))[::-1]
+    held = np.cumsum(gains) / max(float(gains.sum()), 1e-300)
+    axes.plot(100 * np.arange(len(held) + 1) / len(held), 100 * np.r_[0, held], color=AFTER)
+    axes.plot([0, 100], [0, 100], color=PLAIN, linestyle=":", linewidth=1)
+    count = len(evidence.carriers())
+    axes.plot([100 * count / len(held)], [80], "o", color=BEFORE)
+    axes.annotate(
+        f"{count} transitions\nhold 80 %", (100 * count / len(held), 80), xytext=(8, -24),
+        textcoords="offset points", fontsize=8,
+    )  # fmt: skip
+    axes.set_title("by transition", fontsize=10)
+    axes.set(xlabel="transitions, most telling first (%)", ylabel="share of the gains (%)")
+
+
+def plot_laws(laws: Sequence[Law], width: float = WIDE) -> Figure:
+    """Plot residual forces against the quantities that they depend on, with means and a curve."""
+    figure, panels = blank_figure(width, 3.6, 1, max(len(laws), 1))
+    for axes, law in zip(panels, laws, strict=False):
+        order = np.argsort(law.x)
+        axes.axhline(0.0, color="black", linewidth=0.8)
+        axes.plot(law.x, law.residual.values, ".", color=PLAIN, markersize=3, alpha=0.6)
+        axes.errorbar(
+            law.bins.centre, law.bins.mean, 2 * np.nan_to_num(law.bins.error), fmt="o",
+            color=AFTER, markersize=4, label="mean ± 2 se",
+        )  # fmt: skip
+        axes.plot(law.x[order], law.curve.values, color=BEFORE, linewidth=1.8, label="simple curve")
+        reach = 1.25 * float(np.quantile(np.abs(law.residual.values), 0.98))
+        if reach > 0:  # a few far off would hide the rest
+            axes.set_ylim(-reach, reach)
+        axes.set_title(f"R² {max(law.curve.share, 0):.2f}", fontsize=10)
+        axes.set_xlabel(f"{law.quantity} ({law.unit})".replace(" (1)", ""))
+    if laws:
+        residual = laws[0].residual
+        panels[0].set_ylabel(f"{residual.name}, {residual.dimension} ({residual.unit})")
+        panels[0].legend(frameon=False, fontsize="small")
+    return figure

@@ -1,10 +1,11 @@
-"""Pictures of held-out errors: residuals, error bars, and one trajectory."""
+"""Plots of errors: held-out residuals, errors, rollouts, correlations and growth."""
 
 from __future__ import annotations
 
 from typing import Any, Literal
 
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -13,13 +14,13 @@ from scipy.stats import norm
 
 from pbrl_ppl.criticism import Findings
 from pbrl_ppl.posterior import HDI_PROB
-from pbrl_ppl.report.style import AFTER, BAND, BEFORE, UNITS, WIDE, blank_figure, legend
+from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, UNITS, WIDE, blank_figure, legend
 
 Array = NDArray[np.float64]
 
 
 def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
-    """Held-out residuals of each state dimension before and after, in units of noise."""
+    """Plot held-out residuals of each state dimension in units of noise, before and after."""
     names = list(findings.residuals_before)
     figure, (axes,) = blank_figure(width, 3.6, 1, 1)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
@@ -59,7 +60,7 @@ def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
 
 
 def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
-    """Held-out errors before and after, one step ahead and at the end of a rollout."""
+    """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
     kinds = [
         ("one_step_rmse", "one step ahead"),
         ("rollout_rmse", f"{findings.rollout_horizon} steps ahead"),
@@ -106,12 +107,12 @@ def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
 
 
 def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
-    """One held-out trajectory: measured, and predicted before and after."""
+    """Plot one held-out trajectory: measured, and predicted before and after."""
     rollout = findings.rollout
     count = len(rollout.names)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
-    figure, panels = blank_figure(width, 0.8 + 1.9 * rows, rows, columns)
+    figure, panels = blank_figure(width, 0.8 + 1.9 * rows, rows, columns, count=count)
     lines: list[tuple[Array, str, Literal["-", "--"], str]] = [
         (rollout.before, BEFORE, "--", "before"),
         (rollout.after, AFTER, "-", "after"),
@@ -132,8 +133,6 @@ def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
         axes.set_ylabel(f"{name} ({unit})")
         if place >= count - columns:
             axes.set_xlabel("time (s)")
-    for axes in panels[count:]:
-        axes.set_visible(False)
     handles = [Line2D([], [], color="black", marker="o", linestyle="", markersize=3)]
     handles += [Line2D([], [], color=c, linestyle=s) for _, c, s, _ in lines]
     names = ["measured", *(name for *_, name in lines)]
@@ -142,7 +141,7 @@ def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
 
 
 def unwrap(angle: Array) -> Array:
-    """Angles (rad) without jumps of a turn, shape (time,); NaN stays NaN."""
+    """Return angles (rad) without jumps of a turn, shape (time,); NaN stays NaN."""
     result = np.array(angle, dtype=float)
     seen = np.isfinite(result)
     result[seen] = np.unwrap(result[seen])
@@ -156,3 +155,76 @@ def _beside(line: Array, measured: Array) -> Array:
         return line
     turns = np.round((measured[both[0]] - line[both[0]]) / (2 * np.pi))
     return np.asarray(line + 2 * np.pi * turns)
+
+
+#: Probability that noise alone puts any correlation of a panel outside the band.
+_CHANCE = 0.01
+#: Curves that a legend names, at most.
+_NAMED = 4
+
+
+def plot_correlations(findings: Findings, width: float = WIDE) -> Figure:
+    """Plot correlations of errors with earlier errors and with commands."""
+    found = findings.correlations
+    figure, axes = blank_figure(width, 3.2, 1, 2 if found.commands else 1)
+    lags = np.arange(1, len(found.own) + 1)
+    _plot_correlations(axes[0], lags, found.own, found.pairs, list(found.cells))
+    axes[0].set_xlabel("intervals before")
+    axes[0].set_title("with itself", fontsize="medium")
+    if found.commands:
+        lags = np.arange(len(found.driven))
+        names = [
+            f"{cell}, {command.replace('_', ' ')}"
+            for command in found.commands
+            for cell in found.cells
+        ]
+        pairs = np.full((len(lags), len(names)), max(float(found.pairs.max(initial=1)), 1.0))
+        _plot_correlations(axes[1], lags, found.driven.reshape(len(lags), -1), pairs, names)
+        axes[1].set_xlabel("intervals before")
+        axes[1].set_title("with commands", fontsize="medium")
+    axes[0].set_ylabel("correlation of errors")
+    return figure
+
+
+def _plot_correlations(
+    axes: Axes, lags: NDArray[np.intp], values: Array, pairs: Array, names: list[str]
+) -> None:
+    """Draw correlations over lags; name those that leave the band of noise alone."""
+    edge = norm.isf(_CHANCE / 2 / max(values.size, 1)) / np.sqrt(np.maximum(pairs, 1)).min()
+    axes.axhspan(-edge, edge, color=BAND, zorder=0)
+    axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
+    largest = np.abs(values).max(axis=0)
+    outside = [i for i in np.argsort(-largest) if largest[i] > edge]
+    for i in range(values.shape[1]):
+        if i not in outside[:_NAMED]:
+            axes.plot(lags, values[:, i], ".-", color=PLAIN, linewidth=0.7, markersize=4)
+    for i in outside[:_NAMED]:
+        axes.plot(lags, values[:, i], ".-", linewidth=1.6, markersize=7, label=names[i])
+    if outside:
+        axes.legend(frameon=False, fontsize="small")
+    axes.set_ylim(-max(1.3 * edge, 1.1 * largest.max()), max(1.3 * edge, 1.1 * largest.max()))
+    axes.set_xticks(lags)
+
+
+def plot_growth(findings: Findings, width: float = WIDE) -> Figure:
+    """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
+    growth = findings.growth
+    names = [name for name in growth.floor[-1] if growth.floor[-1][name] > 0]
+    figure, (axes,) = blank_figure(width, 3.2, 1, 1)
+    axes.axhline(1.0, color="black", linewidth=0.8)
+    for i, name in enumerate(names):
+        ratio = [
+            error.get(name, np.nan) / floor[name] if floor.get(name) else np.nan
+            for error, floor in zip(growth.error, growth.floor, strict=True)
+        ]
+        colour = AFTER if i % 2 else BEFORE
+        axes.plot(growth.seconds, ratio, ["o-", "s--", "^:"][i // 2 % 3], color=colour, label=name)
+    axes.set_xlabel("length of the forecast (s)")
+    axes.set_ylabel("error / noise alone")
+    top = axes.get_ylim()[1]
+    if top > 10:
+        axes.set_yscale("log")
+    else:
+        axes.set_ylim(0.0, max(2.0, top))
+    axes.legend(frameon=False, ncols=3, fontsize="small")
+    return figure

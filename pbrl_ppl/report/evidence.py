@@ -1,4 +1,4 @@
-"""Evidence for the added effects by state dimension and transition of the fitted recording."""
+"""Evidence for added effects, and residual forces against recorded quantities."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import QUANTITIES, Findings, recorded_quantities
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import group, problem_of
 from pbrl_ppl.report.motion import likeliest
+from pbrl_ppl.report.style import acceleration_unit
+from pbrl_ppl.report.words import depends_on_records
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
@@ -21,11 +23,13 @@ Ints = NDArray[np.intp]
 
 #: Bins of a quantity, each with as many transitions, and the fewest transitions that a bin has.
 _BINS, _LEAST = 10, 8
+#: Further quantities whose bins explain less than this share of the residual are left out.
+_SMALLEST_SHARE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Evidence for what was added, cell by cell of the recording that was fitted.
+    """Evidence for the added effects, by measured number of the fitted recording.
 
     Parameters
     ----------
@@ -33,15 +37,15 @@ class Evidence:
         Log-likelihood that each measured number gains given those before it, shape (transition,
         cell), each model with its own noise, at its likeliest draw.
     bodies, dimensions : tuple of str
-        Of each cell.
+        Body and state dimension of each observed coordinate (cell).
     body : str
-        On which the first effect was added: that of ``speed`` and ``position``.
+        Body of the first added effect, which ``speed`` and ``position`` are of.
     speed : ndarray
-        Of the body at the transition's start (m/s), shape (transition,).
+        Speed of the body at the transition's start (m/s), shape (transition,).
     position : ndarray
-        Of the body (m), shape (transition, 2).
+        Position of the body (m), shape (transition, 2).
     time : ndarray
-        Since the trajectory's first row (s), shape (transition,).
+        Time since the trajectory's first row (s), shape (transition,).
     touching : ndarray of bool
         Whether bodies touch, shape (transition,).
     trajectory : ndarray of str
@@ -63,36 +67,36 @@ class Evidence:
 
     @property
     def by_transition(self) -> Array:
-        """Sum over the cells, shape (transition,)."""
+        """Gain of each transition (nats), shape (transition,)."""
         return np.asarray(self.nats.sum(axis=1))
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the cells: dimension and, of several bodies, body."""
+        """Names of the observed coordinates: dimension and, of several bodies, body."""
         if len(set(self.bodies)) == 1:
             return self.dimensions
         return tuple(f"{d} of {body}" for d, body in zip(self.dimensions, self.bodies, strict=True))
 
     @property
     def by_cell(self) -> dict[str, float]:
-        """Sum over the transitions, by cell, largest first."""
+        """Gain by observed coordinate (nats), largest first."""
         sums = zip(self.names, self.nats.sum(axis=0).tolist(), strict=True)
         return dict(sorted(sums, key=lambda item: -item[1]))
 
     def in_words(self) -> str:
-        """Say where the gain is largest, for a reader."""
+        """Return a sentence on where the gain is largest."""
         total, sums = float(self.nats.sum()), self.by_cell
         first = next(iter(sums))
         carriers = len(self.carriers())
-        said = (
+        sentence = (
             f"The revised model makes the recording that was fitted {total:,.0f} nats likelier."
             f" The largest share is in {first} ({100 * sums[first] / total:.0f} %), and {carriers}"
             f" of {len(self.nats)} transitions hold 80 % of the gains."
         )
-        return said if total > 0 else "The recording that was fitted is no likelier."
+        return sentence if total > 0 else "The recording that was fitted is no likelier."
 
     def carriers(self, share: float = 0.8) -> Ints:
-        """The fewest transitions that hold this share of the gains, largest first."""
+        """Return the fewest transitions that hold this share of the gains, largest first."""
         gains = self.by_transition
         order = np.argsort(-gains, kind="stable")
         total = np.cumsum(np.maximum(gains[order], 0.0))
@@ -102,7 +106,7 @@ class Evidence:
 
 
 def find_evidence(findings: Findings, effects: Iterable[Effect]) -> Evidence | None:
-    """Trace the gain of the revised model to the measured numbers that it comes from.
+    """Return the gain of the revised model by measured number.
 
     None where nothing was added, or a posterior does not hold its recording.
     """
@@ -116,8 +120,8 @@ def find_evidence(findings: Findings, effects: Iterable[Effect]) -> Evidence | N
     noise, segments = after.trajectory_noise, after.segments
     moving = [body.name for body in after.scene.moving]
     body = findings.added[0].body
-    own = moving.index(body)
-    states = segments.start[:, own]
+    index = moving.index(body)
+    states = segments.start[:, index]
     labels = after.data.history.dataset["trajectory"].to_numpy().astype(str)
     return Evidence(
         nats=nats,
@@ -129,12 +133,12 @@ def find_evidence(findings: Findings, effects: Iterable[Effect]) -> Evidence | N
         time=np.asarray(segments.step * after.scene.time_step),
         touching=noise.touching,
         trajectory=labels[segments.trajectory],
-        wrench=segments.actions[:, 0, own],
+        wrench=segments.actions[:, 0, index],
     )
 
 
 def recorded(*posteriors: object) -> bool:
-    """Whether posteriors hold what was recorded, of whole trajectories."""
+    """Return whether posteriors hold their recording, of whole trajectories."""
     for posterior in posteriors:
         attrs = getattr(posterior, "attrs", {})
         if "scene" not in attrs or "smoothed" not in group(posterior, "constant_data"):
@@ -143,21 +147,209 @@ def recorded(*posteriors: object) -> bool:
 
 
 def _log_density(problem: Problem, posterior: Any) -> Array:
-    """Log-likelihood of each measured number given those before it, shape (transition, cell)."""
+    """Return the log-likelihood of each measured number given those before it."""
     phi, sigma = likeliest(problem, posterior)
     noise = problem.trajectory_noise
     cells = -0.5 * problem.robust(phi, sigma) ** 2 - np.log(noise.scale(sigma))
     whole = problem.log_density(problem.residual(phi), sigma, phi)
-    # the norm of the density, which is the same for all
+    # the density's constant, shared evenly
     rest = (whole - np.where(noise.seen, cells, 0.0).sum(axis=1))[:, None]
     rest = rest / np.maximum(noise.seen.sum(axis=1, keepdims=True), 1)
     return np.where(noise.seen, cells + rest, 0.0)
 
 
-def binned(x: Array) -> tuple[Ints, int]:
-    """Bin of each value, of about as many values each, and how many bins there are."""
+@dataclass(frozen=True, eq=False)
+class Bins:
+    """Means of y in bins of x that hold about as many values each.
+
+    Parameters
+    ----------
+    which : ndarray of int
+        Bin of each value, shape (n,).
+    centre, mean, error : ndarray
+        Median of x, mean of y, and its standard error (NaN for a single value), shape (bin,).
+    """
+
+    which: Ints
+    centre: Array
+    mean: Array
+    error: Array
+
+
+def bin_means(x: Array, y: Array) -> Bins:
+    """Return the means of y in bins of x; equal values of x share a bin."""
     wanted = int(np.clip(len(x) // _LEAST, 1, _BINS))
     edges = np.unique(np.quantile(x, np.linspace(0, 1, wanted + 1)[1:-1]))
     # equal values share a bin, so that some may be empty
     _, which = np.unique(np.searchsorted(edges, x, side="left"), return_inverse=True)
-    return which, int(which.max()) + 1
+    members = [which == i for i in range(int(which.max()) + 1)]
+    spreads = [y[inside].std(ddof=1) if inside.sum() > 1 else np.nan for inside in members]
+    return Bins(
+        which,
+        centre=np.array([np.median(x[inside]) for inside in members]),
+        mean=np.array([y[inside].mean() for inside in members]),
+        error=np.array(spreads) / np.sqrt([inside.sum() for inside in members]),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class ResidualForce:
+    """Force, torque or acceleration of a body that the model lacks.
+
+    Parameters
+    ----------
+    dimension : str
+        The velocity that it changes.
+    values : ndarray
+        Of each transition, in ``unit``, shape (transition,).
+    name, unit : str
+        What the values are.
+    """
+
+    dimension: str
+    values: Array
+    name: str
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """A simple curve: its formula, its values at the sorted x, the share of variance explained."""
+
+    form: str
+    values: Array
+    share: float
+
+
+@dataclass(frozen=True, eq=False)
+class Law:
+    """Residual force of a body against a quantity that it depends on.
+
+    Parameters
+    ----------
+    residual : ResidualForce
+        What is explained.
+    quantity, unit : str
+        What it depends on.
+    x : ndarray
+        That quantity at each transition, shape (transition,).
+    bins : Bins
+        Means of the residual in bins of x.
+    share : float
+        Share of the residual's variance that the means explain, corrected for their number.
+    curve : Curve
+        The simplest curve that follows the residual.
+    """
+
+    residual: ResidualForce
+    quantity: str
+    unit: str
+    x: Array
+    bins: Bins
+    share: float
+    curve: Curve
+
+
+def find_laws(findings: Findings, effects: Iterable[Effect], most: int = 3) -> list[Law]:
+    """Return residual forces against the quantity that they depend on, and others like it.
+
+    The residual force is what each step adds to the smoothed states beyond the model, over the time
+    step, times the body's posterior mean mass or moment.
+
+    Empty where the test of dependence passed, no body is named, or the posterior does not hold
+    its recording.
+    """
+    remains = findings.unexplained
+    if remains is None or not remains.body or not depends_on_records(findings):
+        return []
+    if not recorded(findings.posterior_after):
+        return []
+    problem = problem_of(findings.posterior_after, tuple(effects))
+    phi, _ = likeliest(problem, findings.posterior_after)
+    body = [moving.name for moving in problem.scene.moving].index(remains.body)
+    residual = _residual_force(problem, phi, body, remains.dimension)
+    if residual is None:
+        return []
+    laws = [
+        _law(residual, quantity, unit, x)
+        for (quantity, unit), x in zip(
+            QUANTITIES.items(), recorded_quantities(problem, body).T, strict=True
+        )
+        if np.ptp(x) > 1e-9
+    ]
+    laws.sort(key=lambda law: (law.quantity != remains.depends_on, -law.curve.share))
+    if not laws or laws[0].quantity != remains.depends_on:
+        return []
+    return [laws[0], *(law for law in laws[1:most] if law.share > _SMALLEST_SHARE)]
+
+
+def _residual_force(
+    problem: Problem, phi: Array, body: int, dimension: str
+) -> ResidualForce | None:
+    """Return what steps add to a velocity of a body over the time step, times its inertia."""
+    cells = problem.trajectory_noise.cells
+    added = cells.of_residual(problem.residual(phi)) / problem.scene.time_step
+    column = {int(place): i for i, place in enumerate(cells.places)}
+
+    def acceleration(name: str) -> Array | None:
+        place = body * len(STATE) + STATE.index(name)
+        return added[:, column[place]] if place in column else None
+
+    if dimension in ("forward speed", "sideways speed"):
+        x, y, theta = acceleration("vx"), acceleration("vy"), problem.segments.start[:, body, 2]
+        if x is None or y is None:
+            return None
+        c, s = np.cos(theta), np.sin(theta)
+        values = c * x + s * y if dimension == "forward speed" else c * y - s * x
+    else:
+        dimension = {"x": "vx", "y": "vy", "theta": "omega"}.get(dimension, dimension)
+        found = acceleration(dimension) if dimension in STATE else None
+        if found is None:
+            return None
+        values = found
+    moving = problem.scene.moving[body]
+    sizes = dict(zip(problem.layout.labels, phi.tolist(), strict=True))
+    mass = dict(moving.known).get("mass", sizes.get(f"mass[{moving.owner}]"))
+    if mass is None:
+        unit = acceleration_unit(dimension)
+        return ResidualForce(dimension, values, "residual acceleration", unit)
+    if dimension == "omega":
+        moment = float(mass) * moving.shape.unit_moment
+        return ResidualForce(dimension, moment * values, "residual torque", "N m")
+    return ResidualForce(dimension, float(mass) * values, "residual force", "N")
+
+
+def _law(residual: ResidualForce, quantity: str, unit: str, x: Array) -> Law:
+    """Return the means in bins of a quantity, and the simplest curve that follows them."""
+    y, bins = residual.values, bin_means(x, residual.values)
+    total = float(((y - y.mean()) ** 2).sum())
+    inside = float(((y - bins.mean[bins.which]) ** 2).sum())
+    spare = max(len(y) - len(bins.mean), 1)
+    share = 1.0 - (inside / spare) / (total / max(len(y) - 1, 1)) if total > 0 else 0.0
+    return Law(residual, quantity, unit, x, bins, share, _simplest(x, y))
+
+
+def _simplest(x: Array, y: Array) -> Curve:
+    """Return the curve of a few that has the best information criterion (BIC)."""
+    one, order = np.ones_like(x), np.argsort(x)
+    forms = {
+        "{0:.3g}": (one,),
+        "{0:.3g} {1:+.3g} q": (one, x),
+        "{0:.3g} {1:+.3g} sign(q)": (one, np.sign(x)),
+        "{0:.3g} {1:+.3g} q |q|": (one, x * np.abs(x)),
+        "{0:.3g} {1:+.3g} q²": (one, x**2),
+        "{0:.3g} {1:+.3g} q {2:+.3g} q |q|": (one, x, x * np.abs(x)),
+    }
+    total = max(float(((y - y.mean()) ** 2).sum()), 1e-300)
+    best, result = np.inf, Curve("", np.zeros_like(x), 0.0)
+    for form, terms in forms.items():
+        columns = np.stack(terms, axis=1)
+        sizes, _, rank, _ = np.linalg.lstsq(columns, y, rcond=None)
+        if rank < len(terms):
+            continue
+        rest = max(float(((y - columns @ sizes) ** 2).sum()), 1e-300)
+        bic = len(y) * np.log(rest) + len(terms) * np.log(len(y))
+        if bic < best:
+            text = form.format(*sizes).replace("-", "−").replace(" +", " + ").replace(" −", " − ")
+            best, result = bic, Curve(text, (columns @ sizes)[order], 1.0 - rest / total)
+    return result

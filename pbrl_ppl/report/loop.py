@@ -25,9 +25,10 @@ from pbrl_ppl.criticism import (
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError, OutputError
+from pbrl_ppl.files import write_text
 from pbrl_ppl.history import History
 from pbrl_ppl.posterior import save_posterior
-from pbrl_ppl.report.page import Source, write_page
+from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.report import render
 from pbrl_ppl.report.words import remainder_in_words, verdict_in_words
 from pbrl_ppl.scene import Scene
@@ -179,7 +180,8 @@ class Loop:
         OutputError
             If the file cannot be written.
         """
-        return write_page(path, self.page(source))
+        write_text(Path(path), self.page(source))
+        return Path(path)
 
     def save(
         self, folder: str | Path, overwrite: bool = False, *, source: Source | None = None

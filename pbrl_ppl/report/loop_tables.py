@@ -1,26 +1,102 @@
-"""Tables of a closed loop: errors, residual tests, candidates, and evidence."""
+"""Tables of a closed loop: errors, residual tests, candidates, detection limits, evidence."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import Candidate, Findings
-from pbrl_ppl.effects import Effect
+from pbrl_ppl.effects import Effect, Sensor
+from pbrl_ppl.parameters import Prior
+from pbrl_ppl.posterior import Comparison
 from pbrl_ppl.report.evidence import Evidence
-from pbrl_ppl.report.limits import limits_in_words, measured_parameters
 from pbrl_ppl.report.page import Table
-from pbrl_ppl.report.style import UNITS
+from pbrl_ppl.report.style import UNITS, acceleration_unit
 from pbrl_ppl.report.words import chance, number, percent, plain, quantity
+from pbrl_ppl.state import STATE
+
+#: A size is plausible if the effect's prior has more than this probability beyond it.
+_IMPLAUSIBLE = 1e-3
+_DRAWS = 20_000
+
+
+def measured_parameters(
+    candidate: Candidate, findings: Findings, effects: Iterable[Effect]
+) -> tuple[str, ...]:
+    """Return a candidate's parameters without those of state dimensions that were not measured.
+
+    Parameters
+    ----------
+    candidate : Candidate
+        Of the findings.
+    findings : Findings
+        Their residuals name the state dimensions that were measured.
+    effects : iterable of Effect
+        Where the candidate's name is looked up.
+    """
+    effect = next((each for each in effects if each.name == candidate.effect), None)
+    names = tuple(candidate.units)
+    if effect is None or not isinstance(effect.stage, Sensor):
+        return names
+    return tuple(name for name in names if name not in STATE or name in findings.residuals_after)
+
+
+def limits_in_words(candidate: Candidate, findings: Findings, effects: Iterable[Effect]) -> str:
+    """Return the detection limit of each parameter as text; empty where there is none.
+
+    A limit beyond what the effect's prior allows is left out: no plausible size would be found.
+
+    Parameters
+    ----------
+    candidate, findings, effects
+        As of :func:`measured_parameters`.
+    """
+    effects = tuple(effects)
+    effect = next((each for each in effects if each.name == candidate.effect), None)
+    priors = {} if effect is None else {each.name: each for each in effect.parameters}
+    limits = {}
+    for name in measured_parameters(candidate, findings, effects):
+        if name not in candidate.detectable:
+            continue
+        size, unit = candidate.detectable[name], candidate.units[name]
+        null = priors[name].null if name in priors else 0.0
+        if not np.isfinite(size) or (
+            name in priors and not _plausible(priors[name].prior, null, size, candidate.caps)
+        ):
+            limits[name] = ""
+        elif candidate.caps:
+            limits[name] = f"{plain(name)} up to {quantity(size, unit)}"
+        elif null:
+            limits[name] = f"{plain(name)} {number(null)} ± {quantity(size, unit)}"
+        else:
+            limits[name] = f"{plain(name)} {quantity(size, unit)}"
+    if not any(limits.values()):
+        return "no plausible size" if limits else ""
+    return ", ".join(text or f"{plain(name)} no plausible size" for name, text in limits.items())
+
+
+def _plausible(prior: Prior, null: float, size: float, caps: bool) -> bool:
+    """Return whether the prior reaches a size: a distance from the null value, or a cap."""
+    draws = _draws(prior)
+    reached = draws <= size if caps else np.abs(draws - null) >= size
+    return bool(reached.mean() > _IMPLAUSIBLE)
+
+
+@cache
+def _draws(prior: Prior) -> NDArray[np.float64]:
+    return prior.sample(np.random.default_rng(0), _DRAWS)
+
 
 #: Transitions in the table of those that carry most.
 _CARRIERS = 8
 
 
 def error_tables(findings: Findings) -> list[Table]:
-    """Held-out errors by state dimension, one interval and a rollout ahead, and in all."""
+    """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
     tables = []
     seconds = findings.rollout_horizon * findings.scene.time_step
     kinds = [
@@ -60,22 +136,31 @@ def _row(
     return (name, *(number(value, digits) for value in (*both, floor)), *unit)
 
 
+def models_of(findings: Findings) -> tuple[str, ...]:
+    """Return the heads of the columns of one model, or of two."""
+    return ("Before", "After") if findings.added else ("Declared model",)
+
+
 def _before_after(
     findings: Findings, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
 ) -> Table:
-    both = ("Before", "After") if findings.added else ("Declared model",)
-    columns = (name, *both, "Noise floor", *last)
+    columns = (name, *models_of(findings), "Noise floor", *last)
     return Table(caption, columns, rows, words=(len(columns) - 1,) if last else ())
 
 
-def loo_table(findings: Findings) -> Table | None:
-    """Leave-one-out cross-validation of both models."""
-    loo = findings.loo
-    if loo is None:
-        return None
-    models = [loo.before, loo.after] if findings.added else [loo.before]
+def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
+    """Tabulate the leave-one-out cross-validation of one model, or of two.
+
+    Parameters
+    ----------
+    loo : Comparison
+        The model before and after.
+    columns : sequence of str
+        Heads of the columns: one for the model before alone, or two.
+    """
+    models = (loo.before, loo.after)[: len(columns)]
     rows = [
-        ("elpd_loo (more is better)", *(number(model.elpd_loo, 4) for model in models)),
+        ("elpd_loo (nats; more is better)", *(number(model.elpd_loo, 4) for model in models)),
         ("Standard error", *(number(model.se) for model in models)),
         ("p_loo, the effective number of parameters", *(number(m.p_loo) for m in models)),
         (
@@ -83,20 +168,16 @@ def loo_table(findings: Findings) -> Table | None:
             *(str(model.high_pareto_k) for model in models),
         ),
     ]
-    return Table(
-        f"{loo.method} (az.loo, az.compare)",
-        ("Measure", *(("Before", "After") if findings.added else ("Declared model",))),
-        rows,
-    )
+    return Table(f"{loo.method} (az.loo)", ("Measure", *columns), rows)
 
 
 def acceleration_table(findings: Findings) -> Table:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
-    told = findings.acceleration
+    left = findings.acceleration
     rows = []
-    for name, before in told.before.items():
-        shares = [told.relative_before[name], told.relative_after[name]]
-        values = [before, told.after[name]]
+    for name, before in left.before.items():
+        shares = [left.relative_before[name], left.relative_after[name]]
+        values = [before, left.after[name]]
         if not findings.added:
             shares, values = shares[1:], values[:1]
         rows.append(
@@ -104,11 +185,11 @@ def acceleration_table(findings: Findings) -> Table:
                 name,
                 *(number(value) for value in values),
                 *(percent(share) for share in shares),
-                "rad/s²" if name == "omega" else "m/s²",
-                "yes" if told.certain_after.get(name) else "no",
+                acceleration_unit(name),
+                "yes" if left.certain_after.get(name) else "no",
             )
         )
-    both = ("Before", "After") if findings.added else ("Declared model",)
+    both = models_of(findings)
     shared = ("Before, share", "After, share") if findings.added else ("Share",)
     return Table(
         "Unexplained acceleration (standard deviation in an interval)",
@@ -175,11 +256,11 @@ def _estimates(candidate: Candidate, names: Iterable[str]) -> str:
 
 
 def carrier_table(evidence: Evidence) -> Table:
-    """The transitions that carry most of the evidence."""
+    """Tabulate the transitions that carry most of the evidence."""
     gains = evidence.by_transition
     shown = np.argsort(-gains, kind="stable")[:_CARRIERS]
     return Table(
-        f"The {len(shown)} transitions that tell most",
+        f"The {len(shown)} transitions with most evidence",
         ("Trajectory", "Time (s)", "Gain (nats)", "Mostly in", "Speed (m/s)",
          "Force x (N)", "Force y (N)", "Torque (N m)", "Touching"),
         [

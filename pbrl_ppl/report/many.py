@@ -1,4 +1,4 @@
-"""Many robots, many logs: the loop closed on each over any executor, and one page of it all."""
+"""Close the loop on many logs, over any executor, and write a page of all."""
 
 from __future__ import annotations
 
@@ -16,32 +16,33 @@ import pandas as pd
 from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
-from pbrl_ppl.history import write_atomically
+from pbrl_ppl.files import write_text
 from pbrl_ppl.posterior import load_posterior
-from pbrl_ppl.report.loop import check_folder
-from pbrl_ppl.report.manifest import Log, read_manifest
-from pbrl_ppl.report.many_page import effect_table, in_words, page, summary_table
-from pbrl_ppl.report.one_log import (
+from pbrl_ppl.report.logs import (
     FAILED,
+    Log,
     Run,
     Settings,
     close_log,
     failed,
     inputs_sha256,
+    read_manifest,
     row_of,
     settle,
 )
+from pbrl_ppl.report.loop import check_folder
+from pbrl_ppl.report.many_page import effect_table, in_words, page, summary_table
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.sampling import Pooled, pool
 
-#: The files of all logs together; the first says what the folder is.
+#: Files of all logs together; the first marks the folder.
 _SUMMARY, _TABLE, _EFFECTS, _PAGE = "summary.json", "summary.csv", "effects.csv", "index.html"
 _KIND = "pbrl_ppl logs 1"
 
 
 @dataclass(frozen=True, eq=False)
 class ManyLoops:
-    """What was found in many logs.
+    """Results of closing the loop on many logs.
 
     Parameters
     ----------
@@ -54,7 +55,7 @@ class ManyLoops:
     pooled : mapping of str to Pooled
         By kind, hyper-parameters that its robots share, and each robot's parameters given these.
     not_pooled : mapping of str to str
-        Why a kind's robots were not.
+        Why a kind's robots were not pooled.
     """
 
     folder: Path
@@ -68,11 +69,11 @@ class ManyLoops:
         return tuple(row["name"] for row in self.rows if row["status"] == "failed")
 
     def table(self) -> pd.DataFrame:
-        """One row a log: status, verdict, effects, errors before and after, message, folder."""
+        """Return one row a log: status, verdict, effects, errors, message, folder."""
         return summary_table(self.rows)
 
     def effects(self) -> pd.DataFrame:
-        """Which effects were found where: one row an effect and log, with its estimate."""
+        """Return one row an effect and log that it was found in, with its estimate."""
         return effect_table(self.rows)
 
     def __repr__(self) -> str:
@@ -101,7 +102,7 @@ def close_loop_many(
 ) -> ManyLoops:
     """Close the loop on each log of a manifest, and write a page of which effects are where.
 
-    Each log gets a folder of its own with what :meth:`Loop.save` writes. A log whose folder has a
+    Each log gets a folder with what :meth:`Loop.save` writes. A log whose folder has a
     report of the same files and settings is not run again, so the same call goes on after an
     interrupt; one that fails leaves ``error.json`` there, does not stop the rest, and is tried
     again by the next call.
@@ -202,7 +203,7 @@ def _row_in_words(row: Mapping[str, Any]) -> str:
 
 
 def _results(tasks: Mapping[Log, Callable[[], Any]], executor: Executor | None) -> Any:
-    """Each task's log, and a call that gives its row or raises its error."""
+    """Yield each task's log, and a call that returns its row or raises its error."""
     if executor is None:
         yield from tasks.items()
         return
@@ -216,7 +217,7 @@ def _results(tasks: Mapping[Log, Callable[[], Any]], executor: Executor | None) 
 
 
 def _ordered(logs: Iterable[Log], rows: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
-    """Rows in the manifest's order; logs without one are waiting."""
+    """Return the rows in the manifest's order; logs without one are waiting."""
     waiting = {"status": "waiting"}
     return tuple(rows.get(log.name, {"name": log.name, "kind": log.kind} | waiting) for log in logs)
 
@@ -250,13 +251,13 @@ def _opened(folder: Path) -> Path:
 def _pooled(
     logs: Iterable[Log], rows: Mapping[str, Mapping[str, Any]], folder: Path
 ) -> tuple[dict[str, Pooled], dict[str, str]]:
-    """Hyper-parameters of each kind with two adequate models or more."""
+    """Return the hyper-parameters of each kind with at least two adequate models."""
     kinds: dict[str, list[str]] = {}
     for log in logs:
-        own = kinds.setdefault(log.kind, [])
+        usable = kinds.setdefault(log.kind, [])
         row = rows[log.name]
         if row["status"] == "done" and row["verdict"] not in (UNEXPLAINED, NOT_CONVERGED):
-            own.append(log.name)
+            usable.append(log.name)
     kinds.pop("", None)
     found, reasons = {}, {}
     for kind, names in kinds.items():
@@ -277,7 +278,7 @@ def _write_summary(
     pooled: Mapping[str, Pooled],
     not_pooled: Mapping[str, str],
 ) -> None:
-    """Write what concerns all logs, each file whole or not at all."""
+    """Write the files of all logs together, each whole or not at all."""
     contents = {
         "contents": _KIND,
         "logs": rows,
@@ -294,4 +295,4 @@ def _write_summary(
         texts[f"kind-{kind}.toml"] = each.scene.to_toml()
         texts[f"kind-{kind}.csv"] = each.robots().to_csv(index=False, lineterminator="\n")
     for name, text in texts.items():
-        write_atomically(folder / name, partial(Path.write_text, data=text, encoding="utf-8"))
+        write_text(folder / name, text)

@@ -1,4 +1,4 @@
-"""Many logs in tables and on a page: which effects were found where."""
+"""Tables and page of many logs: which effects were found in which."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ _SIDE_BY_SIDE = 4
 
 
 def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
-    """One row a log; errors are in units of the noise, paths relative to the folder."""
+    """Return one row a log; errors are in units of the noise, paths relative to the folder."""
     table = []
     for row in rows:
         done = row["status"] == "done"
         named = [f"{each['effect']}[{each['body']}]" for each in row.get("effects", ())]
-        own = {
+        more = {
             "effects": "; ".join(named),
             "warnings": len(row.get("warnings", ())),
             "report": f"{row['name']}/report.html" if done else "",
         }
-        table.append({name: (dict(row) | own).get(name, "") for name in _COLUMNS})
+        table.append({name: (dict(row) | more).get(name, "") for name in _COLUMNS})
     return pd.DataFrame(table, columns=list(_COLUMNS))
 
 
 def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
-    """One row a log, effect and parameter, with its estimate and 94 % interval."""
+    """Return one row a log, effect and parameter, with its estimate and 94 % interval."""
     table = [
         {"name": row["name"], "kind": row["kind"], "effect": added["effect"],
          "body": added["body"], "parameter": name, "mean": each["mean"], "sd": each["sd"],
@@ -54,7 +54,7 @@ def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
 
 
 def in_words(rows: Iterable[Row]) -> str:
-    """One line: how many logs had which end."""
+    """Return how many logs had which verdict or status."""
     ends = Counter(str(row.get("verdict", row["status"])) for row in rows)
     return ", ".join(f"{count} {end}" for end, count in sorted(ends.items()))
 
@@ -65,7 +65,7 @@ def page(
     not_pooled: Mapping[str, str],
     source: Source,
 ) -> str:
-    """One page of HTML with links to each log's report."""
+    """Render one page of HTML with links to each log's report."""
     found: dict[tuple[str, str], list[str]] = {}
     for row in rows:
         for each in row.get("effects", ()):
@@ -92,20 +92,19 @@ def page(
 
 
 def _logs(rows: Iterable[Row]) -> Table:
-    """One row a log."""
+    """Tabulate the logs, one row each."""
     cells: list[list[Cell]] = []
     marks = []
     for row in rows:
         status = row["status"]
-        said = ""
+        words, numbers = row.get("message", ""), ["", "", "", ""]
         if status == "done":
-            said = joined(f"{plain(e['effect'])} on the {plain(e['body'])}" for e in row["effects"])
-        numbers = ["", "", "", ""]
-        if status == "done":
+            effects = (f"{plain(e['effect'])} on the {plain(e['body'])}" for e in row["effects"])
+            words = joined(effects) or words
             numbers = [number(row["error_before"]), number(row["error_after"]),
                        str(len(row["warnings"]) or ""), number(row["seconds"])]  # fmt: skip
         verdict = _verdict(row.get("verdict", status))
-        cells.append([(_link(row), row["kind"]), verdict, said or row.get("message", ""), *numbers])
+        cells.append([(_link(row), row["kind"]), verdict, words, *numbers])
         bad = status == "failed" or row.get("verdict") == NOT_CONVERGED
         marks.append("bad" if bad else "")
     heads = ("Log", "Verdict", "Effects, or what went wrong", "Error before", "Error after",
@@ -114,7 +113,7 @@ def _logs(rows: Iterable[Row]) -> Table:
 
 
 def _effects(rows: Iterable[Row], pairs: list[tuple[str, str]]) -> Table:
-    """One row a finished log, one column an effect."""
+    """Tabulate the effects, one row a finished log, one column an effect."""
     cells: list[list[Cell]] = [
         [_link(row), *(_cell(row, *pair) for pair in pairs)]
         for row in rows
@@ -125,16 +124,23 @@ def _effects(rows: Iterable[Row], pairs: list[tuple[str, str]]) -> Table:
 
 
 def _pooled(pooled: Pooled, kind: str) -> Table:
-    """One row a parameter that a kind's robots share."""
+    """Tabulate the hyper-parameters of a kind, one row a parameter."""
 
-    def told(row: Mapping[Any, Any], middle: str, of: str) -> Cell:
-        return number(row[middle]), f"{number(row[f'{of}_low'])} to {number(row[f'{of}_high'])}"
+    def interval(row: Mapping[Any, Any], middle: str, name: str) -> Cell:
+        low, high = number(row[f"{name}_low"]), number(row[f"{name}_high"])
+        return number(row[middle]), f"{low} to {high}"
 
     cells: list[list[Cell]] = [
-        [(row["parameter"], row["scale"]), told(row, "mean", "mean"), told(row, "spread", "spread"),
-         told(row, "next_median", "next"), str(row["informed"]), chance(row["p_same"])]
+        [
+            (row["parameter"], row["scale"]),
+            interval(row, "mean", "mean"),
+            interval(row, "spread", "spread"),
+            interval(row, "next_median", "next"),
+            str(row["informed"]),
+            chance(row["p_same"]),
+        ]
         for row in pooled.table().to_dict("records")
-    ]  # fmt: skip
+    ]
     heads = ("Parameter", "Mean of the kind", "Spread of robots", "Next robot",
              "Robots that inform", "Same in all, p")  # fmt: skip
     return Table(f"Robots of the kind {kind}", heads, cells)
@@ -149,7 +155,7 @@ def _title(effect: str, body: str) -> str:
 
 
 def _link(row: Row) -> str:
-    """A log's name, which leads to its report or to what went wrong."""
+    """Return a log's name, with a link to its report or its error."""
     files = {"done": "report.html", "failed": "error.json"}
     if row["status"] not in files:
         return str(row["name"])
@@ -157,14 +163,14 @@ def _link(row: Row) -> str:
 
 
 def _cell(row: Row, effect: str, body: str) -> str:
-    """What a log says of an effect: its size, how small it would have to be, or nothing."""
+    """Return the size of an effect in a log, its detection limit, or a dash."""
     for added in row.get("effects", ()):
         if (added["effect"], added["body"]) == (effect, body):
-            said = [
+            texts = [
                 f"{number(each['mean'])} ± {quantity(each['sd'], each['unit'])}"
                 for each in added["parameters"].values()
             ]
-            return Markup("<strong>{}</strong>").format("; ".join(said))
+            return Markup("<strong>{}</strong>").format("; ".join(texts))
     sizes = row.get("detectable", {}).get(f"{effect}[{body}]") or {}
-    said = [f"below {number(size)}" for size in sizes.values() if size is not None]
-    return "; ".join(said) or "–"
+    texts = [f"below {number(size)}" for size in sizes.values() if size is not None]
+    return "; ".join(texts) or "–"

@@ -1,4 +1,4 @@
-"""Held-out motions, measured and predicted, as the moving picture of a report has them."""
+"""Held-out motions, measured and predicted, for a report's animation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pbrl_ppl.state import wrapped
 
 Array = NDArray[np.float64]
 
-#: Motions in one page, and their rows in all, at most: those that the declared model has worst.
+#: Motions in one page, and their rows in all, at most; the declared model's worst come first.
 MOST, _MOST_ROWS = 6, 3000
 
 
@@ -46,7 +46,7 @@ class Motion:
 
 
 def likeliest(problem: Problem, posterior: Any) -> tuple[Array, Array]:
-    """The draw of highest likelihood: phi, shape (p,), and the noise parameters."""
+    """Return the draw of highest likelihood: phi, shape (p,), and the noise parameters."""
     best = likeliest_draw(posterior)
     phi, sigma = parameter_draws(problem, posterior)
     return phi[best], sigma[best]
@@ -98,7 +98,7 @@ def held_out_motions(
 
 
 def distance(scene: Scene, motion: Motion, predicted: Array) -> float:
-    """Root mean square distance (m) of outlines from where they were measured."""
+    """Return the root mean square distance (m) of outlines from the measured ones."""
     reach = np.array([body.shape.bounding_radius for body in scene.moving])
     if len(reach) != motion.measured.shape[1]:  # one body of several
         reach = np.array([reach.max()])
@@ -110,7 +110,7 @@ def distance(scene: Scene, motion: Motion, predicted: Array) -> float:
 def _played(
     posterior: Any, history: History, effects: Sequence[Effect]
 ) -> dict[tuple[int, int], Array]:
-    """Poses that a posterior predicts, by trajectory and the step that they start from."""
+    """Return the poses that a posterior predicts, by trajectory and starting step."""
     problem = problem_of(posterior, effects)
     phi, _ = likeliest(problem, posterior)
     longest = int(history.dataset["n_rows"].max()) - 1
@@ -123,19 +123,19 @@ def _played(
 
 
 def _of_rollout(findings: Findings) -> list[Motion]:
-    """The findings' own trajectory of one body."""
+    """Return the one trajectory that the findings hold."""
     rollout = findings.rollout
     if not {"x", "y", "theta"} <= set(rollout.names):
         return []
-    own = [rollout.names.index(name) for name in ("x", "y", "theta")]
+    pose = [rollout.names.index(name) for name in ("x", "y", "theta")]
     measured, before, after = (
-        values[:, None, own] for values in (rollout.measured, rollout.before, rollout.after)
+        values[:, None, pose] for values in (rollout.measured, rollout.before, rollout.after)
     )
     return [Motion("held out", rollout.time, measured, before, after)]
 
 
 def animation(findings: Findings, motions: Sequence[Motion]) -> dict[str, Any] | None:
-    """What the page's script draws, as plain values; None where there is no motion to show.
+    """Return what the page's script draws, as JSON values; None where there is no motion.
 
     Lengths are in m with five digits, angles in rad.
     """
@@ -177,7 +177,7 @@ def animation(findings: Findings, motions: Sequence[Motion]) -> dict[str, Any] |
 
 
 def _box(motion: Motion, margin: float) -> list[list[float]]:
-    """Corners of what is shown: the measured places, and as much around them for predictions."""
+    """Return the corners of the view: the measured positions, and a margin for predictions."""
     places = motion.measured[..., :2].reshape(-1, 2)
     low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
     spare = 0.7 * float((high - low).max()) + margin
@@ -193,6 +193,6 @@ def _outline(shape: Any) -> list[list[float]] | None:
 
 
 def _rounded(values: Array) -> Any:
-    """Nested lists of five decimals, with None for what is not a number."""
+    """Return nested lists of five decimals, with None for NaN."""
     plain = np.round(values, 5).astype(object)
     return np.where(np.isfinite(values), plain, np.array(None)).tolist()

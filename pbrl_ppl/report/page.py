@@ -1,20 +1,17 @@
-"""Pages of HTML that need nothing else: their template, tables and pictures."""
+"""Self-contained pages of HTML: their template, tables and pictures."""
 
 from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from pbrl_ppl.errors import OutputError
 from pbrl_ppl.report.style import NARROW, WIDE, png
 from pbrl_ppl.report.words import (
     change,
@@ -33,7 +30,7 @@ Cell = str | tuple[str, str]
 
 @dataclass(frozen=True)
 class Source:
-    """Where findings come from, for a reader who wants to make them again.
+    """Where findings come from, for a reader who wants to reproduce them.
 
     Parameters
     ----------
@@ -56,7 +53,7 @@ class Table:
     Parameters
     ----------
     caption : str
-        What it is about.
+        Title of the table.
     columns : sequence of str
         Their heads.
     rows : sequence of sequence
@@ -75,20 +72,17 @@ class Table:
 
     @property
     def marked(self) -> list[tuple[str, list[tuple[int, str, str, str]]]]:
-        """Rows with their mark: place, head, text and note of each cell."""
-        marks = self.marks or [""] * len(self.rows)
+        """Rows with their mark; of each cell: column number, head, text and note."""
         result = []
-        for mark, row in zip(marks, self.rows, strict=True):
-            cells = []
-            for place, (head, cell) in enumerate(zip(self.columns, row, strict=True)):
-                text, note = cell if isinstance(cell, tuple) else (cell, "")
-                cells.append((place, head, text, note))
-            result.append((mark, cells))
+        for mark, row in zip(self.marks or [""] * len(self.rows), self.rows, strict=True):
+            cells = [cell if isinstance(cell, tuple) else (cell, "") for cell in row]
+            heads = enumerate(zip(self.columns, cells, strict=True))
+            result.append((mark, [(place, head, *cell) for place, (head, cell) in heads]))
         return result
 
 
 def render_page(
-    template: str, pictures: Mapping[str, Callable[[float], Figure]], **told: Any
+    template: str, pictures: Mapping[str, Callable[[float], Figure]], **values: Any
 ) -> str:
     """Fill a template; pictures are drawn twice, for a page and for a telephone.
 
@@ -98,7 +92,7 @@ def render_page(
         Its name in this folder.
     pictures : dict of str to callable
         Draws a picture at a width (inches).
-    **told : object
+    **values : object
         What the template shows.
     """
     environment = jinja2.Environment(
@@ -108,45 +102,25 @@ def render_page(
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    for written in (number, percent, p_equals, plain, joined, change, quantity):
-        environment.filters[written.__name__] = written
+    for words in (number, percent, p_equals, plain, joined, change, quantity):
+        environment.filters[words.__name__] = words
     environment.filters["data"] = _data
     picture = {name: _picture(draw) for name, draw in pictures.items()}
-    return environment.get_template(template).render(picture=picture, digits_of=digits_of, **told)
-
-
-def write_page(path: str | Path, page: str) -> Path:
-    """Write a page whole or not at all, and return its path.
-
-    Raises
-    ------
-    OutputError
-        If the file cannot be written.
-    """
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.write_text(page, encoding="utf-8")
-        temporary.replace(path)
-    except OSError as error:
-        raise OutputError(f"{path}: cannot be written: {error.strerror}") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-    return path
+    return environment.get_template(template).render(picture=picture, digits_of=digits_of, **values)
 
 
 def _picture(draw: Callable[[float], Figure]) -> dict[str, str]:
-    """A picture in both widths."""
+    """Return a picture in both widths."""
     return {"wide": _address(draw(WIDE)), "narrow": _address(draw(NARROW))}
 
 
 def _address(figure: Figure) -> str:
-    """A picture as an address that holds it."""
+    """Return a picture as a data URL."""
     return "data:image/png;base64," + base64.b64encode(png(figure)).decode("ascii")
 
 
 def _data(value: Any) -> Markup:
-    """JSON for a script element, which no text in it can end."""
+    """Return JSON for a script element, escaped so that no text can end it."""
     text = json.dumps(value, separators=(",", ":"), allow_nan=False)
     for sign in "<>&":
         text = text.replace(sign, f"\\u{ord(sign):04x}")

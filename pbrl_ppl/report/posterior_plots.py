@@ -1,10 +1,10 @@
-"""Pictures of chains, and ArviZ's summary of posteriors."""
+"""Plots of posteriors: chains, priors, pairs, predictions; and ArviZ's summary."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal, NamedTuple
 
 import arviz as az
 import numpy as np
@@ -12,11 +12,25 @@ import pandas as pd
 import xarray as xr
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
-from scipy.stats import rankdata
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+from scipy.stats import gaussian_kde, rankdata
 
-from pbrl_ppl.criticism import Findings
-from pbrl_ppl.posterior import DATATREE, HDI_PROB, convergence, from_groups, scalars
-from pbrl_ppl.report.style import BAND, NARROW, WIDE, blank_figure
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.posterior import (
+    DATATREE,
+    HDI_PROB,
+    convergence,
+    from_groups,
+    group,
+    groups,
+    left_out,
+    loo_pit,
+    scalars,
+    separate,
+)
+from pbrl_ppl.report.style import AFTER, BAND, BEFORE, NARROW, PLAIN, WIDE, blank_figure, legend
 
 #: Parameters in one picture, at most; the report's tables show all.
 MOST_PARAMETERS = 6
@@ -25,7 +39,7 @@ _WORST_SHIFT = 1.63
 
 
 def summary(posterior: Any) -> pd.DataFrame:
-    """ArviZ's summary of every scalar parameter, with the same columns on every ArviZ.
+    """Return ArviZ's summary of every scalar parameter, with the same columns on every ArviZ.
 
     Parameters
     ----------
@@ -47,92 +61,89 @@ def summary(posterior: Any) -> pd.DataFrame:
     return result
 
 
-def most_interesting(of: Any, table: pd.DataFrame | None = None) -> list[str]:
-    """Parameters to look at first: those of added effects, then the worst by R-hat.
+def most_interesting(table: pd.DataFrame, added: Iterable[str] = ()) -> list[str]:
+    """Return the parameters to look at first: those of added effects, then the worst by R-hat.
 
     Parameters
     ----------
-    of : Findings, InferenceData or DataTree
-        Findings, of which the posterior after revision is looked at, or a posterior.
-    table : pandas.DataFrame, optional
-        Its :func:`summary`, where that is at hand.
+    table : pandas.DataFrame
+        The posterior's :func:`summary`.
+    added : iterable of str
+        Labels of the added effects' parameters.
     """
-    revised = isinstance(of, Findings)
-    table = summary(of.posterior_after if revised else of) if table is None else table
-    own = [
-        f"{added.effect}_{name}[{added.body}]"
-        for added in (of.added if revised else ())
-        for name in added.parameters
-    ]
     worst = table["r_hat"].fillna(np.inf).sort_values(ascending=False, kind="stable").index
-    return list(dict.fromkeys([*(n for n in own if n in table.index), *worst]))[:MOST_PARAMETERS]
+    first = [name for name in added if name in table.index]
+    return list(dict.fromkeys([*first, *worst]))[:MOST_PARAMETERS]
 
 
-def plot_trace(of: Any, parameters: Sequence[str] | None = None, width: float = WIDE) -> Figure:
-    """ArviZ's trace of some parameters, laid out alike on every ArviZ.
+def plot_trace(
+    posterior: Any, parameters: Sequence[str] | None = None, width: float = WIDE
+) -> Figure:
+    """Plot ArviZ's trace of some parameters, laid out alike on every ArviZ.
 
     Parameters
     ----------
-    of : Findings, InferenceData or DataTree
-        Findings, of which the posterior after revision is shown, or a posterior.
+    posterior : InferenceData or DataTree
+        With a group ``posterior``.
     parameters : sequence of str, optional
-        Labels such as ``mass[cart]``; by default those of most interest: of added effects, and with
-        the worst R-hat.
+        Labels such as ``mass[cart]``; by default those with the worst R-hat.
     width : float
-        Of the figure (inches).
+        Width of the figure (inches).
     """
-    draws = _chosen(of, parameters)
+    draws = _chosen(posterior, parameters)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         # ArviZ uses what newer Matplotlib deprecates, and a constant parameter makes it complain
         warnings.simplefilter("ignore")
         return _trace(draws, width)
 
 
-def plot_rank(of: Any, parameters: Sequence[str] | None = None, width: float = WIDE) -> Figure:
-    """How evenly the ranks of each chain's draws are spread; arguments as of :func:`plot_trace`.
+def plot_rank(
+    posterior: Any, parameters: Sequence[str] | None = None, width: float = WIDE
+) -> Figure:
+    """Plot how evenly the ranks of each chain's draws are spread; arguments as :func:`plot_trace`.
 
     A curve is the share of a chain's draws below each rank, less what an even spread gives. The
-    band is as wide as the chains' own effective sample sizes make it, which that of independent
-    draws is not: chains that agree stay inside it 99 times of 100.
+    band follows from the effective sample sizes of the chains: chains that agree stay inside it 99
+    times of 100.
     """
-    draws = _chosen(of, parameters)
-    # of each chain by itself: chains that differ have next to no effective draws together
-    alone = [
+    draws = _chosen(posterior, parameters)
+    # by chain: chains that differ have few effective draws together
+    sizes = [
         convergence(from_groups({"posterior": draws.isel(chain=[i])}, {}))[1]
         for i in range(draws.sizes["chain"])
     ]
     count = len(draws.data_vars)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
-    figure, panels = blank_figure(width, 0.6 + 1.7 * rows, rows, columns)
+    figure, panels = blank_figure(width, 0.6 + 1.7 * rows, rows, columns, count=count)
     for axes, (name, values) in zip(panels, draws.items(), strict=False):
         chains = values.to_numpy()
         ranks = rankdata(chains).reshape(chains.shape) / chains.size
-        fewest = min(ess[str(name)] for ess in alone)
+        fewest = min(ess[str(name)] for ess in sizes)
         edge = _WORST_SHIFT / np.sqrt(max(fewest, 1.0)) if np.isfinite(fewest) else 1.0
         axes.axhspan(-edge, edge, color=BAND, zorder=0)
         grid = np.linspace(0.0, 1.0, 201)
-        off = np.array([np.searchsorted(np.sort(own), grid) / len(own) - grid for own in ranks])
-        for own in off:
-            axes.plot(grid, own, linewidth=1.1)
+        shares = [np.searchsorted(np.sort(chain), grid) / len(chain) for chain in ranks]
+        off = np.array(shares) - grid
+        for curve in off:
+            axes.plot(grid, curve, linewidth=1.1)
         outside = bool(np.abs(off).max() > edge)
         axes.set_title(f"{name}{': chains differ' if outside else ''}", fontsize=9)
         largest = max(1.4 * edge, 1.1 * float(np.abs(off).max()))
         axes.set_ylim(-largest, largest)
         axes.set_xlabel("rank among all draws", fontsize=8)
-    for axes in panels[count:]:
-        axes.set_visible(False)
     return figure
 
 
-def _chosen(of: Any, parameters: Sequence[str] | None) -> xr.Dataset:
-    """Draws of the parameters to show."""
-    names = most_interesting(of) if parameters is None else list(parameters)
-    return scalars(of.posterior_after if isinstance(of, Findings) else of)[names]
+def _chosen(posterior: Any, parameters: Sequence[str] | None) -> xr.Dataset:
+    """Return the draws of the parameters to show."""
+    if parameters is None:
+        parameters = most_interesting(summary(posterior))
+    return scalars(posterior)[list(parameters)]
 
 
 def _trace(draws: xr.Dataset, width: float) -> Figure:
-    """Draw with ArviZ: the one place that knows how 0.x and 1.x differ in that."""
+    """Draw with ArviZ; the one place where traces of 0.x and 1.x differ."""
     count = len(draws.data_vars)
     if not DATATREE:
         figure, panels = blank_figure(width, 0.6 + 1.5 * count, count, 2, grid=None)
@@ -159,5 +170,193 @@ def _trace(draws: xr.Dataset, width: float) -> Figure:
         },
     )
     result: Figure = collection.viz["figure"].item()
-    plt.close(result)  # ArviZ 1.x registers it with pyplot, which would keep it for ever
+    plt.close(result)  # ArviZ 1.x registers it with pyplot, which would never release it
     return result
+
+
+Array = NDArray[np.float64]
+
+#: Parameters in a picture of pairs, and beside their priors, at most.
+MOST_PAIRS, MOST_PRIORS = 4, 12
+_POINTS = 800
+
+
+def plot_prior(posterior: Any, parameters: Sequence[str], width: float = WIDE) -> Figure:
+    """Plot posterior densities over those of the prior.
+
+    Parameters
+    ----------
+    posterior : InferenceData or DataTree
+        With a group ``prior``.
+    parameters : sequence of str
+        Labels such as ``mass[cart]``.
+    width : float
+        Width of the figure (inches).
+    """
+    after, before = scalars(posterior), prior_draws(posterior)
+    columns = min(3, len(parameters)) if width > NARROW else 2
+    rows = -(-len(parameters) // columns)
+    figure, panels = blank_figure(
+        width, 0.6 + 1.5 * rows, rows, columns, None, count=len(parameters), stack=False
+    )
+    for axes, name in zip(panels, parameters, strict=False):
+        drawn = [(after[name].to_numpy().ravel(), AFTER, 0.35)]
+        if name in before:
+            drawn.insert(0, (before[name].to_numpy().ravel(), PLAIN, 0.35))
+        low, high = np.quantile(drawn[0][0], [0.01, 0.99])
+        low, high = min(low, drawn[-1][0].min()), max(high, drawn[-1][0].max())
+        for values, colour, alpha in drawn:
+            if np.ptp(values) > 0:
+                grid = np.unique(
+                    np.r_[np.linspace(low, high, 200), np.quantile(values, np.linspace(0, 1, 100))]
+                )
+                grid = grid[(grid >= low) & (grid <= high)]
+                density = gaussian_kde(values)(grid)
+                axes.fill_between(grid, density / density.max(), color=colour, alpha=alpha)
+                axes.plot(grid, density / density.max(), color=colour, linewidth=1)
+        axes.set_yticks([])
+        axes.set_ylim(bottom=0)
+        axes.tick_params(labelsize=8)
+        axes.set_title(name, fontsize=9)
+    legend(
+        figure,
+        [Patch(color=PLAIN, alpha=0.6, label="prior"), Patch(color=AFTER, label="posterior")],
+    )
+    return figure
+
+
+def most_dependent(posterior: Any, most: int = MOST_PAIRS) -> list[str]:
+    """Return the parameters whose draws depend most on each other, by rank correlation."""
+    draws = scalars(posterior)
+    names = [str(name) for name, v in draws.items() if float(v.max() - v.min()) > 0]
+    if len(names) < 2:
+        return []
+    strength = np.abs(np.nan_to_num(_correlations(draws, names)))
+    np.fill_diagonal(strength, 0.0)
+    chosen = list(divmod(int(strength.argmax()), len(names)))
+    while len(chosen) < min(most, len(names)):
+        rest = [i for i in range(len(names)) if i not in chosen]
+        chosen.append(max(rest, key=lambda i: float(strength[i, chosen].max())))
+    return [names[i] for i in chosen]
+
+
+def plot_pairs(posterior: Any, parameters: Sequence[str], width: float = WIDE) -> Figure:
+    """Plot draws of each pair of parameters, with their rank correlation."""
+    draws = scalars(posterior)
+    n = len(parameters) - 1
+    correlation = _correlations(draws, parameters)
+    height = 0.4 + min(width, 6.4) * n / max(n, 2) * 0.9
+    figure, panels = blank_figure(width, height, n, n, None, stack=False)
+    for row in range(n):
+        for column in range(n):
+            axes = panels[row * n + column]
+            if column > row:
+                axes.set_visible(False)
+                continue
+            first, second = parameters[column], parameters[row + 1]
+            x, y = (draws[name].to_numpy().ravel() for name in (first, second))
+            some = slice(None, None, max(1, len(x) // _POINTS))
+            axes.plot(x[some], y[some], ".", color=AFTER, markersize=2, alpha=0.4)
+            axes.set_title(f"{correlation[row + 1, column]:+.2f}".replace("-", "−"), fontsize=9)
+            axes.locator_params(nbins=3)
+            axes.tick_params(labelsize=7)
+            if row == n - 1:
+                axes.set_xlabel(first.replace("[", "\n["), fontsize=8)
+            if column == 0:
+                axes.set_ylabel(second.replace("[", "\n["), fontsize=8)
+    return figure
+
+
+def plot_predictions(posterior: Any, width: float = WIDE) -> Figure:
+    """Plot the calibration of leave-one-out predictions, one curve a state dimension.
+
+    A curve is the share of measurements below each quantile, less what calibrated predictions give;
+    those of independent measurements stay in the band 99 times of 100.
+    """
+    pit = loo_pit(posterior)
+    figure, (axes,) = blank_figure(width, 3.4, 1, 1)
+    grid = np.linspace(0.0, 1.0, 201)
+    fewest = np.inf
+    handles = []
+    marks: tuple[Literal["-", "--", ":"], ...] = ("-", "--", ":")
+    for i, name in enumerate(str(state) for state in pit["state"].values):
+        values = np.sort(pit.sel(state=name).to_numpy().ravel())
+        values = values[np.isfinite(values)]
+        if not values.size:
+            continue
+        fewest = min(fewest, values.size)
+        off = np.searchsorted(values, grid, side="right") / values.size - grid
+        colour, mark = (BEFORE, AFTER)[i % 2], marks[i // 2 % 3]
+        axes.plot(grid, off, mark, color=colour, linewidth=1.5)
+        handles.append(Line2D([], [], color=colour, linestyle=mark, label=name))
+    edge = _WORST_SHIFT / np.sqrt(max(fewest, 1.0)) if np.isfinite(fewest) else 0.0
+    axes.axhspan(-edge, edge, color=BAND, zorder=0)
+    axes.set_xlabel("position in the prediction: 0 below all draws, 1 above")
+    axes.set_ylabel("share below, less expected")
+    if handles:
+        legend(figure, handles)
+    return figure
+
+
+class Coverage(NamedTuple):
+    """Shares of measurements in the central 50 % and 94 % of predictions, and their number."""
+
+    half: float
+    wide: float
+    measurements: int
+
+
+def coverage(posterior: Any) -> dict[str, Coverage]:
+    """Return the coverage of leave-one-out predictions, by state dimension."""
+    pit = loo_pit(posterior)
+    result = {}
+    for name in (str(state) for state in pit["state"].values):
+        values = pit.sel(state=name).to_numpy()
+        values = values[np.isfinite(values)]
+        if values.size:
+            off = np.abs(values - 0.5)
+            half, wide = (float((off < edge).mean()) for edge in (0.25, 0.47))
+            result[name] = Coverage(half, wide, values.size)
+    return result
+
+
+def pareto_k(posterior: Any) -> tuple[Array, float, str]:
+    """Return Pareto k, the threshold above which it is bad, and what is left out at a time.
+
+    Raises
+    ------
+    PosteriorError
+        If ArviZ cannot compute it.
+    """
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")  # ArviZ warns of a high k, which the result shows
+        try:
+            loo = az.loo(separate(posterior), pointwise=True)
+        except Exception as error:  # a report can do without, whatever the cause
+            raise PosteriorError(f"leave-one-out cross-validation: {error}") from error
+    return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
+
+
+def plot_pareto(k: Array, good: float, unit: str, width: float = WIDE) -> Figure:
+    """Plot Pareto k of every unit left out, and the threshold above which LOO is unreliable."""
+    figure, (axes,) = blank_figure(width, 2.8, 1, 1)
+    high = ~(k <= good)
+    axes.axhline(good, color=BEFORE, linewidth=1.2, linestyle="--")
+    axes.plot(np.flatnonzero(~high), k[~high], ".", color=AFTER, markersize=4)
+    axes.plot(np.flatnonzero(high), np.nan_to_num(k[high], posinf=2.0), "x", color=BEFORE)
+    axes.set_xlabel(unit)
+    axes.set_ylabel("Pareto k")
+    return figure
+
+
+def prior_draws(posterior: Any) -> xr.Dataset:
+    """Return one variable per scalar parameter of the prior; none if there are no prior draws."""
+    if "prior" not in groups(posterior):
+        return xr.Dataset()
+    return scalars(from_groups({"posterior": group(posterior, "prior")}, {}))
+
+
+def _correlations(draws: xr.Dataset, names: Sequence[str]) -> Array:
+    """Return rank correlations, shape (parameter, parameter)."""
+    table = pd.DataFrame({name: draws[name].to_numpy().ravel() for name in names})
+    return np.asarray(table.corr("spearman"))

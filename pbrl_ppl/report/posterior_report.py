@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -14,6 +14,7 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError, PosteriorError
 from pbrl_ppl.posterior import (
+    Identifiability,
     compare,
     group,
     groups,
@@ -22,20 +23,25 @@ from pbrl_ppl.posterior import (
     scalars,
     scene_of,
 )
-from pbrl_ppl.report.comparison_plots import (
+from pbrl_ppl.report.loop_tables import loo_table
+from pbrl_ppl.report.page import Source, Table, render_page
+from pbrl_ppl.report.posterior_plots import (
     MOST_PRIORS,
+    Coverage,
     coverage,
     most_dependent,
+    most_interesting,
     pareto_k,
     plot_pairs,
     plot_pareto,
     plot_predictions,
     plot_prior,
+    plot_rank,
+    plot_trace,
+    summary,
 )
-from pbrl_ppl.report.glossary import STATISTICS
-from pbrl_ppl.report.page import Source, Table, render_page
-from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
-from pbrl_ppl.report.posterior_rows import (
+from pbrl_ppl.report.posterior_tables import (
+    STATISTICS,
     parameter_table,
     posterior_rows,
     sampler_in_words,
@@ -43,9 +49,9 @@ from pbrl_ppl.report.posterior_rows import (
 )
 from pbrl_ppl.report.report import recorded_poses
 from pbrl_ppl.report.scene_plots import plot_recording
-from pbrl_ppl.report.words import number
+from pbrl_ppl.report.words import plain
 
-#: With fewer there is nothing to say of chains, densities or cross-validation.
+#: Fewest draws for diagnostics of chains, densities and cross-validation.
 LEAST_DRAWS = 100
 
 
@@ -90,13 +96,14 @@ def render_posterior(
         )
     table = summary(posterior)
     rows = posterior_rows(table, effects, method=str(posterior.attrs.get("method", "")))
-    shown, pairs = most_interesting(posterior, table), most_dependent(posterior)
+    shown, pairs = most_interesting(table), most_dependent(posterior)
     moving = [row["label"] for row in rows if row["sd"] > 0]
     priors = (moving or [row["label"] for row in rows])[:MOST_PRIORS]
     missing: dict[str, str] = {}
-    said = _or_why(lambda: identify(posterior, effects=effects), "identifiability", missing)
+    known = _or_why(lambda: identify(posterior, effects=effects), "identifiability", missing)
     covered = _or_why(lambda: coverage(posterior), "predictions", missing)
     k = _or_why(lambda: pareto_k(posterior), "loo", missing)
+    compared = None if k is None else compare(posterior, posterior)
     pictures: dict[str, Callable[[float], Figure]] = {
         "prior": partial(plot_prior, posterior, priors),
         "trace": partial(plot_trace, posterior, shown),
@@ -116,22 +123,22 @@ def render_posterior(
         "posterior.html.jinja",
         pictures,
         bodies=[body.name for body in scene.moving],
-        headline=_headline(posterior, said),
+        headline=_headline(posterior, known),
         sampled=sampler_in_words(rows),
         bad=[row for row in rows if row["failed"]],
-        sentences=() if said is None else said.sentences,
+        sentences=() if known is None else known.sentences,
         predicts=_predicts(covered, missing),
-        warnings=_warned(posterior, said is not None),
+        warnings=_warned(posterior, known is not None),
         about=_about(posterior),
         posterior=parameter_table(rows, "Posterior of all parameters"),
         count=len(rows),
         has_prior="prior" in groups(posterior),
         shown_priors=priors,
         pairs=pairs,
-        widths=said and width_table(posterior, said, units),
+        widths=known and width_table(posterior, known, units),
         shown=shown,
-        covered=covered and _covered(covered),
-        loo=_loo(posterior) if k is not None else None,
+        covered=covered and _coverage_table(covered),
+        loo=compared and loo_table(compared, ["Value"]),
         missing=missing,
         meanings={row["label"]: row["meaning"] for row in rows if row["meaning"]},
         statistics=STATISTICS,
@@ -143,22 +150,23 @@ def render_posterior(
 
 
 def _or_why(compute: Callable[[], Any], name: str, missing: dict[str, str]) -> Any:
-    """What is computed, or None, with the reason kept for the page."""
+    """Return what is computed, or None, and keep the reason for the page."""
     try:
         return compute()
     except PbrlError as error:
-        missing[name] = f"Not to be had: {error}"
+        missing[name] = f"Not available: {error}"
         return None
 
 
-def _headline(posterior: Any, said: Any) -> str:
+def _headline(posterior: Any, informed_by: Identifiability | None) -> str:
     scene, attrs = scene_of(posterior), posterior.attrs
     bodies = ", ".join(body.name for body in scene.dynamic)
-    effects = [f"{name.replace('_', ' ')} of {body}" for name, body in _effects(attrs)]
+    effects = json.loads(str(attrs.get("effects", "[]")))
+    effects = [f"{plain(name)} of {body}" for name, body in effects]
     text = f"Posterior of {bodies}{' with ' + ', '.join(effects) if effects else ''}"
-    if said is None:
+    if informed_by is None:
         return f"{text}: {len(scalars(posterior).data_vars)} parameters"
-    verdicts = [width.verdict for width in said.parameters]
+    verdicts = [width.verdict for width in informed_by.parameters]
     informed, weak, kept = map(verdicts.count, ("informed", "weak", "prior only"))
     text += f". The data inform {informed} of {len(verdicts)} parameters"
     if weak:
@@ -168,10 +176,10 @@ def _headline(posterior: Any, said: Any) -> str:
     return f"{text}."
 
 
-def _predicts(covered: Any, missing: dict[str, str]) -> str:
+def _predicts(covered: Mapping[str, Coverage] | None, missing: dict[str, str]) -> str:
     if not covered:
         return missing.get("predictions", "It holds no predictions.")
-    inside = [wide for _, wide, _ in covered.values()]
+    inside = [each.wide for each in covered.values()]
     low, high = min(inside), max(inside)
     return (
         f"Intervals that should hold 94 % of measurements hold {100 * low:.0f} to"
@@ -180,11 +188,11 @@ def _predicts(covered: Any, missing: dict[str, str]) -> str:
     )
 
 
-def _warned(posterior: Any, told: bool) -> list[str]:
-    """Warnings of the fit, without those that the page says in its own words."""
+def _warned(posterior: Any, identified: bool) -> list[str]:
+    """Return the warnings of the fit, without those that other parts of the page cover."""
     every = json.loads(str(posterior.attrs.get("warnings", "[]")))
-    own = ("have not converged", *(("say nothing about",) if told else ()))
-    return [each for each in every if not any(words in each for words in own)]
+    covered = ("have not converged", *(("say nothing about",) if identified else ()))
+    return [each for each in every if not any(words in each for words in covered)]
 
 
 def _about(posterior: Any) -> str:
@@ -201,40 +209,19 @@ def _about(posterior: Any) -> str:
     )
 
 
-def _covered(covered: dict[str, tuple[float, float, int]]) -> Table:
+def _coverage_table(covered: Mapping[str, Coverage]) -> Table:
     return Table(
         "Measurements inside leave-one-out predictions",
         ("State dimension", "In the central 50 %", "In the central 94 %", "Measurements"),
         [
-            (name, f"{100 * half:.1f} %", f"{100 * wide:.1f} %", str(count))
-            for name, (half, wide, count) in covered.items()
+            (name, f"{100 * each.half:.1f} %", f"{100 * each.wide:.1f} %", str(each.measurements))
+            for name, each in covered.items()
         ],
     )
-
-
-def _loo(posterior: Any) -> Table | None:
-    found = compare(posterior, posterior)
-    if found is None:
-        return None
-    one = found.before
-    return Table(
-        f"{found.method} (az.loo)",
-        ("Measure", "Value"),
-        [
-            ("elpd_loo (nats; more is better)", number(one.elpd_loo, 4)),
-            ("Standard error", number(one.se)),
-            ("p_loo, the effective number of parameters", number(one.p_loo)),
-            (f"How many have a Pareto k above {number(one.good_k, 2)}", str(one.high_pareto_k)),
-        ],
-    )
-
-
-def _effects(attrs: Any) -> list[tuple[str, str]]:
-    return [(str(name), str(body)) for name, body in json.loads(str(attrs.get("effects", "[]")))]
 
 
 def _refit(posterior: Any) -> str:
-    """Lines of Python that make the posterior again from its recording."""
+    """Return the lines of Python that make the posterior again from its recording."""
     attrs, draws = posterior.attrs, group(posterior, "posterior")
     options = []
     if "smoothed" in group(posterior, "constant_data"):
@@ -262,11 +249,9 @@ def _refit(posterior: Any) -> str:
 
 
 def _origin(posterior: Any) -> dict[str, str]:
-    """Attributes that say where a posterior is from."""
+    """Return the attributes that say where a posterior comes from."""
     attrs = posterior.attrs
-    told = {"seed": str(attrs["seed"]), "data_sha256": str(attrs.get("data_sha256", ""))}
-    for name in ("method", "substeps", "horizon", "updates"):
-        if name in attrs:
-            told[name] = str(attrs[name])
+    names = ("seed", "data_sha256", "method", "substeps", "horizon", "updates")
+    origin = {name: str(attrs[name]) for name in names if name in attrs}
     versions = json.loads(str(attrs.get("versions", "{}")))
-    return told | {"versions": ", ".join(f"{name} {number}" for name, number in versions.items())}
+    return origin | {"versions": ", ".join(f"{name} {number}" for name, number in versions.items())}

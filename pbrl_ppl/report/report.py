@@ -15,30 +15,41 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.posterior import group
-from pbrl_ppl.report.effect_plots import HARDLY, MOST_CANDIDATES, plot_added, plot_candidates
-from pbrl_ppl.report.error_plots import plot_errors, plot_residuals, plot_rollout
-from pbrl_ppl.report.evidence import find_evidence
-from pbrl_ppl.report.evidence_plots import plot_evidence, plot_laws
-from pbrl_ppl.report.glossary import STATISTICS
-from pbrl_ppl.report.laws import find_laws
+from pbrl_ppl.report.effect_plots import (
+    HARDLY,
+    MOST_CANDIDATES,
+    plot_added,
+    plot_candidates,
+    plot_evidence,
+    plot_laws,
+)
+from pbrl_ppl.report.error_plots import (
+    plot_correlations,
+    plot_errors,
+    plot_growth,
+    plot_residuals,
+    plot_rollout,
+)
+from pbrl_ppl.report.evidence import find_evidence, find_laws
 from pbrl_ppl.report.loop_tables import (
     acceleration_table,
     candidate_table,
     carrier_table,
     error_tables,
     loo_table,
+    models_of,
     residual_test_table,
 )
 from pbrl_ppl.report.motion import animation, held_out_motions
 from pbrl_ppl.report.page import Source, render_page
 from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
-from pbrl_ppl.report.posterior_rows import (
+from pbrl_ppl.report.posterior_tables import (
+    STATISTICS,
     parameter_table,
     posterior_rows,
     sampler_in_words,
     width_table,
 )
-from pbrl_ppl.report.residual_plots import plot_correlations, plot_growth
 from pbrl_ppl.report.scene_plots import plot_recording
 from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import (
@@ -79,7 +90,10 @@ def render(
     """
     effects = tuple(effects)
     table = summary(findings.posterior_after)
-    parameters = most_interesting(findings, table)
+    parameters = most_interesting(
+        table,
+        (f"{e.effect}_{name}[{e.body}]" for e in findings.added for name in e.parameters),
+    )
     units = {
         f"{added.effect}_{name}": e.unit
         for added in findings.added
@@ -92,26 +106,26 @@ def render(
     laws = find_laws(findings, effects)
     poses = recorded_poses(findings.posterior_before)
     pictures: dict[str, Callable[[float], Figure]] = {
-        "rollout": partial(_drawn, plot_rollout, findings),
-        "errors": partial(_drawn, plot_errors, findings),
-        "residuals": partial(_drawn, plot_residuals, findings),
-        "correlations": partial(_drawn, plot_correlations, findings),
-        "growth": partial(_drawn, plot_growth, findings),
-        "trace": partial(plot_trace, findings, parameters),
-        "rank": partial(plot_rank, findings, parameters),
+        "rollout": partial(plot_rollout, findings),
+        "errors": partial(plot_errors, findings),
+        "residuals": partial(plot_residuals, findings),
+        "correlations": partial(plot_correlations, findings),
+        "growth": partial(plot_growth, findings),
+        "trace": partial(plot_trace, findings.posterior_after, parameters),
+        "rank": partial(plot_rank, findings.posterior_after, parameters),
     }
     if poses is not None:
         later = None if held_out is None else held_out.dataset["start"].to_numpy()[..., :3]
         pictures["scene"] = partial(plot_recording, findings.scene, poses, later)
     if evidence is not None:
-        pictures["evidence"] = partial(_drawn, plot_evidence, evidence)
+        pictures["evidence"] = partial(plot_evidence, evidence)
     if laws:
-        pictures["laws"] = partial(_drawn, plot_laws, laws)
+        pictures["laws"] = partial(plot_laws, laws)
     if findings.candidates:
-        pictures["candidates"] = partial(_drawn, plot_candidates, findings)
+        pictures["candidates"] = partial(plot_candidates, findings)
     if accepted(findings):
-        pictures["added"] = partial(_drawn, plot_added, findings)
-    said = findings.identifiability
+        pictures["added"] = partial(plot_added, findings)
+    known = findings.identifiability
     return render_page(
         "report.html.jinja",
         pictures,
@@ -130,7 +144,7 @@ def render(
         carriers=None if evidence is None else carrier_table(evidence),
         laws=laws,
         errors=error_tables(findings),
-        loo=loo_table(findings),
+        loo=findings.loo and loo_table(findings.loo, models_of(findings)),
         acceleration=acceleration_table(findings),
         tests=residual_test_table(findings),
         candidates=candidate_table(findings, effects),
@@ -138,9 +152,9 @@ def render(
         count=len(rows),
         bad=[row for row in rows if row["failed"]],
         sampled=sampler_in_words(rows),
-        widths=said
+        widths=known
         and width_table(
-            findings.posterior_after, said, {row["label"]: row["unit"] for row in rows}
+            findings.posterior_after, known, {row["label"]: row["unit"] for row in rows}
         ),
         shown=parameters,
         hardly=HARDLY,
@@ -151,15 +165,11 @@ def render(
 
 
 def recorded_poses(posterior: Any) -> Array | None:
-    """Poses of the recording that a posterior holds, shape (trajectory, time, body, 3)."""
+    """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
     if "scene" not in posterior.attrs:
         return None
     given = group(posterior, "constant_data")
     if "recorded_start" in given:
         return np.asarray(given["recorded_start"].to_numpy()[..., :3])
-    # of single transitions: where each starts, one after the other
+    # single transitions: the start of each, in order
     return np.asarray(given["start"].to_numpy()[None, ..., :3])
-
-
-def _drawn(plot: Callable[..., Figure], of: Any, width: float) -> Figure:
-    return plot(of, width=width)

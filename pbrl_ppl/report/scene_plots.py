@@ -1,4 +1,4 @@
-"""Pictures of scenes from above: where bodies are, how they moved, where they should be."""
+"""Plots of scenes from above: bodies, motions, goals, animated plans."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
 from numpy.typing import NDArray
 
-from pbrl_ppl.history import write_atomically
-from pbrl_ppl.planning import Goal, Plan, Target
+from pbrl_ppl.files import write_atomically
+from pbrl_ppl.planning import Goal, Plan
 from pbrl_ppl.report.style import NARROW, WIDE, blank_figure, legend
 from pbrl_ppl.scene import Body, Scene
 
@@ -158,7 +158,7 @@ def _colour(index: int) -> str:
 
 
 def _outline(body: Body, pose: Array, **how: Any) -> Patch:
-    """A body's outline at a pose (x, y, theta)."""
+    """Return a body's outline at a pose (x, y, theta)."""
     corners = body.shape.outline
     if corners is None:
         return Circle((pose[0], pose[1]), float(body.shape.radius or 0.0), **how)
@@ -190,8 +190,8 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
     figure = Figure(figsize=(6.0, 6.0), layout="constrained")
     axes = figure.add_subplot()
     reach = max(body.shape.bounding_radius for body in plan.scene.moving)
-    places = states[..., :2].reshape(-1, 2)
-    places = np.concatenate([places, *(_place(target) for target in plan.goal.targets)])
+    targets = [(t.x, t.y) for t in plan.goal.targets if t.x is not None and t.y is not None]
+    places = np.concatenate([states[..., :2].reshape(-1, 2), np.reshape(targets, (-1, 2))])
     low, high = places.min(axis=0) - 2 * reach, places.max(axis=0) + 2 * reach
     middle, half = (low + high) / 2, float((high - low).max()) / 2
 
@@ -208,10 +208,3 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
     moving = FuncAnimation(figure, draw, frames=times, init_func=lambda: None)
     rate: Any = 1.0 / (every * plan.scene.time_step)  # pictures a second; fractions are right
     write_atomically(Path(path), lambda to: moving.save(to, PillowWriter(fps=rate), dpi=80))
-
-
-def _place(target: Target) -> Array:
-    """Place of a target, shape (1, 2), or (0, 2) if it has none."""
-    if target.x is None or target.y is None:
-        return np.zeros((0, 2))
-    return np.array([[target.x, target.y]])

@@ -14,7 +14,14 @@ from pbrl_ppl.state import STATE, STATE_UNITS
 
 #: Unit of each state dimension.
 UNITS: Mapping[str, str] = dict(zip(STATE, STATE_UNITS, strict=True))
-# Okabe and Ito's colours: told apart by colour-blind readers and in grey print
+
+
+def acceleration_unit(velocity: str) -> str:
+    """Return the unit of the acceleration of a velocity such as ``vx`` or ``omega``."""
+    return "rad/s²" if velocity == "omega" else "m/s²"
+
+
+# Okabe and Ito's colours: distinct for colour-blind readers and in grey print
 BEFORE, AFTER, PLAIN, BAND = "#D55E00", "#0072B2", "#999999", "#e9e9e9"
 #: Widths of pictures (inches): of a page, and of a telephone, where panels are in one column.
 WIDE, NARROW = 8.0, 4.2
@@ -23,13 +30,30 @@ _COLOURS = 96
 
 
 def blank_figure(
-    width: float, height: float, rows: int, columns: int, grid: Literal["x", "y"] | None = "y"
+    width: float,
+    height: float,
+    rows: int,
+    columns: int,
+    grid: Literal["x", "y"] | None = "y",
+    *,
+    count: int | None = None,
+    stack: bool = True,
 ) -> tuple[Figure, list[Axes]]:
-    """Return a figure that pyplot does not know of, and its panels row by row.
+    """Return a figure outside pyplot, and its panels row by row.
 
-    On a narrow one all panels are in one column, and the height grows with them.
+    Parameters
+    ----------
+    width, height : float
+        Size in inches. On a narrow figure all panels are stacked in one column, and the height
+        grows with them, unless ``stack`` is false.
+    rows, columns : int
+        Panels.
+    grid : str, optional
+        Axis of the grid lines.
+    count : int, optional
+        Panels that are shown, if fewer than there are.
     """
-    if width <= NARROW and columns > 1:
+    if stack and width <= NARROW and columns > 1:
         height, rows, columns = height * columns * 0.95, rows * columns, 1
     figure = Figure(figsize=(width, height), layout="constrained")
     panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
@@ -38,6 +62,8 @@ def blank_figure(
         axes.set_axisbelow(True)
         if grid:
             axes.grid(axis=grid, color="#dddddd", linewidth=0.6)
+    for axes in panels[count:] if count is not None else ():
+        axes.set_visible(False)
     return figure, panels
 
 

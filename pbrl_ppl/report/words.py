@@ -18,6 +18,7 @@ from pbrl_ppl.criticism import (
 )
 from pbrl_ppl.likelihood import ACCELERATION
 from pbrl_ppl.posterior import draws, group
+from pbrl_ppl.report.style import acceleration_unit
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -28,20 +29,19 @@ _TOO_LARGE = 1.5
 
 
 def remainder_in_words(before: Any, after: Any) -> str:
-    """What a learned remainder does, from the posteriors without and with it."""
+    """Return what a learned remainder does, from the posteriors without and with it."""
     sizes = [draws(each)[ACCELERATION].mean(axis=0) for each in (before, after)]
     names = group(after, "posterior")[ACCELERATION]
     worst = int(np.argmax(sizes[0] - sizes[1]))
     name = str(names[names.dims[-1]].values[worst])
-    unit = "rad/s²" if name == "omega" else "m/s²"
     return (
         f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
-        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {unit}"
+        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {acceleration_unit(name)}"
     )
 
 
 def verdict_in_words(findings: Findings) -> str:
-    """Say the verdict in a sentence or two, for a reader who knows no statistics."""
+    """Return the verdict in a sentence or two, for a reader who knows no statistics."""
     found = joined(
         f"{added.sentence.rstrip('.')} ({plain(added.effect)}) on the {plain(added.body)}"
         for added in findings.added
@@ -70,7 +70,7 @@ def verdict_in_words(findings: Findings) -> str:
 
 
 def _adequate(findings: Findings) -> str:
-    """Say how adequate the model is: what passed, and which negligible misfit is significant."""
+    """Return how adequate the model is: what passed, and which negligible misfit is significant."""
     tested = sum(test.tested for test in findings.tests)
     passed = f"the declared model passes all {tested} tests of its residual"
     if untested := [test.name for test in findings.tests if not test.tested]:
@@ -94,8 +94,8 @@ def _adequate(findings: Findings) -> str:
 
 def significant_acceleration(findings: Findings) -> float:
     """Return the largest significant unexplained acceleration over that of the bodies, or 0."""
-    told = findings.acceleration
-    sizes = (told.relative_after[name] for name, sure in told.certain_after.items() if sure)
+    left = findings.acceleration
+    sizes = (left.relative_after[name] for name, sure in left.certain_after.items() if sure)
     return max(sizes, default=0.0)
 
 
@@ -112,7 +112,7 @@ def depends_on_records(findings: Findings) -> bool:
 
 
 def error_in_words(findings: Findings) -> str:
-    """Say what a held-out error means where its figure alone would contradict the verdict."""
+    """Return what a held-out error means, where it alone would contradict the verdict."""
     model, after = "revised" if findings.added else "declared", findings.after.normalised_rmse
     if findings.unexplained is not None or significant_acceleration(findings):
         return (
@@ -128,18 +128,18 @@ def error_in_words(findings: Findings) -> str:
 
 
 def rejected_in_words(findings: Findings) -> str:
-    """Say why the leading significant candidates were not added."""
-    there = {(added.effect, added.body) for added in findings.added}
-    told = [
+    """Return why the leading significant candidates were not added."""
+    present = {(added.effect, added.body) for added in findings.added}
+    reasons = [
         f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
         for one in findings.candidates
-        if one.why and one.p_value < DEFAULT.try_p and (one.effect, one.body) not in there
+        if one.why and one.p_value < DEFAULT.try_p and (one.effect, one.body) not in present
     ]
-    return f"Not added: {'; '.join(told[:TRIED])}." if told else ""
+    return f"Not added: {'; '.join(reasons[:TRIED])}." if reasons else ""
 
 
 def left_out_in_words(findings: Findings) -> str:
-    """Say which single bad frames were left out of the histories, the first few one by one."""
+    """Return which bad frames were left out of the histories, the first few one by one."""
     first, more = findings.bad_frames[:TRIED], len(findings.bad_frames) - TRIED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""
     return f"{'; '.join(first)}{rest}." if first else ""
@@ -168,7 +168,7 @@ def number(value: float | None, digits: int = 3) -> str:
 
 
 def digits_of(low: float, high: float) -> int:
-    """Significant digits that tell the ends of an interval apart, at least three.
+    """Return the significant digits that tell the ends of an interval apart, at least three.
 
     Examples
     --------
@@ -213,7 +213,7 @@ def p_equals(p_value: float) -> str:
 
 
 def change(before: float, after: float) -> str:
-    """Say by how much an error fell."""
+    """Return by how much an error fell or rose."""
     share = 1 - after / before if before > 0 else float("nan")
     if not np.isfinite(share) or abs(share) < 0.005:
         return "did not change"
@@ -223,7 +223,7 @@ def change(before: float, after: float) -> str:
 def gains_in_words(
     before: Mapping[str, float], after: Mapping[str, float], units: Mapping[str, str]
 ) -> str:
-    """Say how the errors of all state dimensions changed: how many fell, the most, and a rise.
+    """Return how the errors of all state dimensions changed.
 
     Examples
     --------
@@ -235,14 +235,16 @@ def gains_in_words(
         return ""
     best, worst = min(shares, key=shares.__getitem__), max(shares, key=shares.__getitem__)
 
-    def told(name: str) -> str:
+    def change_of(name: str) -> str:
         size = f"from {number(before[name])} to {quantity(after[name], units.get(name, ''))}"
         return f"{name} (by {100 * abs(1 - shares[name]):.0f} %, {size})"
 
     fell = sum(share < 0.995 for share in shares.values())
-    parts = [f"fell in {fell} of {len(shares)} state dimensions, most in {told(best)}"] * (fell > 0)
+    parts = [f"fell in {fell} of {len(shares)} state dimensions, most in {change_of(best)}"] * (
+        fell > 0
+    )
     if shares[worst] > 1.005:
-        parts.append(f"rose{' most' if fell < len(shares) - 1 else ''} in {told(worst)}")
+        parts.append(f"rose{' most' if fell < len(shares) - 1 else ''} in {change_of(worst)}")
     return "; it ".join(parts) or "did not change"
 
 

@@ -22,7 +22,8 @@ from rich.progress import track
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
-from pbrl_ppl.history import History, write_atomically
+from pbrl_ppl.files import write_atomically
+from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, declared_problem
 from pbrl_ppl.posterior import versions
 from pbrl_ppl.sampling.ranks import Calibration

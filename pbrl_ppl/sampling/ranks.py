@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import binom, chisquare
 
-from pbrl_ppl.history import write_atomically
+from pbrl_ppl.files import write_atomically
 
 Array = NDArray[np.float64]
 

@@ -10,9 +10,9 @@ import pytest
 
 from pbrl_ppl import report
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.many import OneProcessEach
+from pbrl_ppl.cli.close_loop import OneProcessEach
 from pbrl_ppl.report import many
-from pbrl_ppl.report.one_log import Settings, close_log, settle
+from pbrl_ppl.report.logs import Settings, close_log, settle
 from tests.helpers.fleet import made_logs, pretend
 from tests.helpers.processes import dies
 

@@ -160,7 +160,7 @@ def test_an_interruption_leaves_nothing_half_written(tmp_path, monkeypatch, olde
 
 
 def test_no_folder_to_write_in(tmp_path) -> None:
-    with pytest.raises(OutputError, match=r"cannot write there .*; choose an existing, writable"):
+    with pytest.raises(OutputError, match="cannot be written"):
         save_posterior(made(), tmp_path / "nowhere" / "cart.nc")
 
 

@@ -9,9 +9,8 @@ from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import compare
-from pbrl_ppl.report.evidence import binned, find_evidence
-from pbrl_ppl.report.evidence_plots import plot_evidence, plot_laws
-from pbrl_ppl.report.laws import find_laws
+from pbrl_ppl.report.effect_plots import plot_evidence, plot_laws
+from pbrl_ppl.report.evidence import bin_means, find_evidence, find_laws
 from pbrl_ppl.report.motion import animation, distance, held_out_motions
 from tests.helpers.made_up import made_up
 from tests.helpers.revised import DRAG, recordings, revised, unexplained
@@ -49,11 +48,15 @@ def test_no_evidence_where_nothing_was_added_or_recorded() -> None:
 def test_the_law_that_is_wanted_is_the_drag() -> None:
     laws = find_laws(unexplained(), catalogue)
     first = laws[0]
-    assert (first.quantity, first.dimension, first.y_unit) == ("velocity x", "vx", "N")
-    assert first.curve_share > 0.8
-    slope = np.polyfit(first.x, first.y, 1)[0]
+    assert (first.quantity, first.residual.dimension, first.residual.unit) == (
+        "velocity x",
+        "vx",
+        "N",
+    )
+    assert first.curve.share > 0.8
+    slope = np.polyfit(first.x, first.residual.values, 1)[0]
     assert slope == pytest.approx(-DRAG, rel=0.25)
-    assert "q" in first.form
+    assert "q" in first.curve.form
     assert len(plot_laws(laws).axes) == len(laws)
     # where the test of dependence passed, or names another quantity, nothing speaks against it
     left = Unexplained("puck", "y", "nothing that was recorded", 0.5, 0.001, "y is off")
@@ -61,7 +64,7 @@ def test_the_law_that_is_wanted_is_the_drag() -> None:
         assert find_laws(replace(unexplained(), unexplained=other), catalogue) == []
     named = replace(left, depends_on="velocity y")
     others = find_laws(replace(unexplained(), unexplained=named), catalogue)
-    assert (others[0].quantity, others[0].dimension) == ("velocity y", "vy")
+    assert (others[0].quantity, others[0].residual.dimension) == ("velocity y", "vy")
 
 
 def test_a_law_may_follow_whatever_an_error_may_depend_on() -> None:
@@ -74,10 +77,11 @@ def test_a_law_may_follow_whatever_an_error_may_depend_on() -> None:
 
 
 def test_bins_hold_about_as_many_and_equal_values_share_one() -> None:
-    which, bins = binned(np.arange(100.0))
-    assert bins == 10 and np.bincount(which).tolist() == [10] * 10
-    which, bins = binned(np.repeat([0.0, 1.0], 50))
-    assert bins == 2 and len(set(which[:50])) == 1
+    even = bin_means(np.arange(100.0), np.arange(100.0))
+    assert np.bincount(even.which).tolist() == [10] * 10
+    assert even.mean[0] == even.centre[0] == 4.5
+    two = bin_means(np.repeat([0.0, 1.0], 50), np.ones(100))
+    assert len(two.mean) == 2 and len(set(two.which[:50])) == 1
 
 
 def test_motions_are_those_of_the_recording_worst_first() -> None:

@@ -10,7 +10,7 @@ from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.report import page as page_module
 from pbrl_ppl.report.brief import in_brief
-from pbrl_ppl.report.limits import limits_in_words
+from pbrl_ppl.report.loop_tables import limits_in_words
 from pbrl_ppl.report.report import render
 from pbrl_ppl.report.words import gains_in_words, verdict_in_words
 from tests.helpers.html import Page

@@ -11,7 +11,7 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import DATATREE, from_groups, groups, load_posterior
 from pbrl_ppl.report import page as page_module
 from pbrl_ppl.report import plot_rank, render_posterior
-from pbrl_ppl.report.comparison_plots import coverage, most_dependent, plot_pairs, plot_prior
+from pbrl_ppl.report.posterior_plots import coverage, most_dependent, plot_pairs, plot_prior
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import made_up_posterior
 from tests.helpers.revised import revised
@@ -59,7 +59,7 @@ def test_what_cannot_be_had_is_said() -> None:
     whole = load_posterior(file("5"))
     parts = {k: v for k, v in groups(whole).items() if k != "posterior_predictive"}
     text = Page(render_posterior(from_groups(parts, whole.attrs))).text
-    assert "Not to be had: posterior: it has no group 'posterior_predictive'" in text
+    assert "it has no group 'posterior_predictive'" in text
     short = {
         k: v.isel(draw=slice(20)) if "draw" in v.sizes else v for k, v in groups(whole).items()
     }

@@ -19,10 +19,10 @@ from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.report import loop as loop_module
 from pbrl_ppl.report import page as page_module
 from pbrl_ppl.report.error_plots import plot_rollout, unwrap
-from pbrl_ppl.report.glossary import PARAMETERS
 from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
+from pbrl_ppl.report.posterior_tables import PARAMETERS
 from pbrl_ppl.report.report import render
 from pbrl_ppl.report.words import number, rejected_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
@@ -191,7 +191,7 @@ def test_page_compares_by_leave_one_out() -> None:
     findings = replace(made_up(), loo=Comparison(one, two, 210.0, 19.0, 360))
     text = Page(render(findings)).text
     assert "Leave-one-out cross-validation on the 360 transitions of the fit" in text
-    assert "elpd_loo (more is better) 4,000 4,210" in text
+    assert "elpd_loo (nats; more is better) 4,000 4,210" in text
     assert "How many have a Pareto k above 0.70 2 0" in text
     assert "the revised model gains 210 ± 19.0" in text
     assert "makes elpd_loo unreliable" in text
@@ -300,7 +300,8 @@ def test_rollout_angles_have_no_jumps() -> None:
 
 
 def test_parameters_of_most_interest() -> None:
-    shown = most_interesting(made_up(stuck=True))
+    table = summary(made_up(stuck=True).posterior_after)
+    shown = most_interesting(table, ["linear_drag_coefficient[cart]", "not_there[cart]"])
     assert shown[:2] == ["linear_drag_coefficient[cart]", "w_x[cart]"]
     assert len(shown) == MOST_PARAMETERS
 

@@ -1,9 +1,11 @@
-"""One of many logs, where a worker has it: its loop closed, kept, and found again later."""
+"""One log of many: the manifest that lists it, and its closed loop in a worker."""
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
+import re
 import shutil
 import tempfile
 import threading
@@ -19,22 +21,128 @@ from typing import Any
 
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import PbrlError
-from pbrl_ppl.history import History, write_atomically
+from pbrl_ppl.errors import ManifestError, PbrlError
+from pbrl_ppl.files import write_text
+from pbrl_ppl.history import History
 from pbrl_ppl.report.loop import FILES, Loop, close_loop
-from pbrl_ppl.report.manifest import Log
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, nearest
 
-#: What a finished log is known by, and written last; what a failed one leaves in its place.
+_NEEDED, _OPTIONAL = ("name", "scene", "train"), ("test", "kind")
+#: A log's name is the name of its folder, on every system, and of no file beside it.
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
+
+
+@dataclass(frozen=True)
+class Log:
+    """One recording of one robot.
+
+    Parameters
+    ----------
+    name : str
+        Of its folder.
+    scene, train : Path
+        The declared scene, and what is fitted.
+    test : Path, optional
+        What errors are measured on; a quarter of the trajectories of ``train`` without it.
+    kind : str
+        Robots of one kind share hyper-parameters; empty for none.
+    """
+
+    name: str
+    scene: Path
+    train: Path
+    test: Path | None = None
+    kind: str = ""
+
+
+def read_manifest(path: str | Path) -> tuple[Log, ...]:
+    """Read the rows of a manifest: a CSV file with the columns name, scene, train, test, kind.
+
+    Parameters
+    ----------
+    path : str or Path
+        ``test`` and ``kind`` may be empty or left out. Paths are relative to the manifest's folder.
+
+    Returns
+    -------
+    tuple of Log
+        In the file's order, with absolute paths. Whether these files are there is not looked at.
+
+    Raises
+    ------
+    ManifestError
+        If the file cannot be read, a column is unknown or missing, a cell is empty, or a name is
+        there twice or no folder's name.
+    """
+    path = Path(path)
+    where = f"manifest {path}"
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except FileNotFoundError:
+        raise ManifestError(f"{where}: there is no such file; check the path") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ManifestError(f"{where}: cannot be read: {error}") from None
+    try:
+        table = [[cell.strip() for cell in row] for row in csv.reader(text.splitlines())]
+    except csv.Error as error:
+        raise ManifestError(f"{where}: no CSV table: {error}") from None
+    if not any(map(any, table)):
+        raise ManifestError(f"{where}: it is empty; expected {', '.join(_NEEDED)} and rows")
+    head, known = table[0], (*_NEEDED, *_OPTIONAL)
+    for name in head:
+        if name not in known:
+            raise ManifestError(
+                f'{where}: unknown column "{name}"{nearest(name, known)} Expected'
+                f" {', '.join(known)} (the last two are optional)"
+            )
+    if lacking := [name for name in _NEEDED if name not in head]:
+        raise ManifestError(f"{where}: missing column(s) {', '.join(lacking)}")
+    if len(set(head)) < len(head):
+        raise ManifestError(f"{where}: a column is there twice; drop one")
+    logs = [
+        _log(head, row, f"{where}, row {number}", path.parent.absolute())
+        for number, row in enumerate(table[1:], start=2)
+        if any(row)
+    ]
+    if not logs:
+        raise ManifestError(f"{where}: it has no rows; expected one a log")
+    seen: set[str] = set()
+    for log in logs:
+        # some file systems do not tell capitals
+        if log.name.lower() in seen:
+            raise ManifestError(f'{where}: the name "{log.name}" is there twice; expected one each')
+        seen.add(log.name.lower())
+    return tuple(logs)
+
+
+def _log(head: list[str], cells: list[str], where: str, folder: Path) -> Log:
+    """Return the log of one row; its paths are relative to the folder."""
+    if len(cells) != len(head):
+        raise ManifestError(f"{where}: {len(cells)} cells, expected {len(head)} as in the header")
+    row = dict(zip(head, cells, strict=True))
+    for name in _NEEDED:
+        if not row[name]:
+            raise ManifestError(f"{where}: {name} is empty; fill it in")
+    for name in ("name", "kind"):
+        if row.get(name) and not _NAME.fullmatch(row[name]):
+            raise ManifestError(
+                f'{where}: {name} is "{row[name]}"; expected letters, digits, "_" and "-", for it'
+                " names a file"
+            )
+    test = folder / row["test"] if row.get("test") else None
+    return Log(row["name"], folder / row["scene"], folder / row["train"], test, row.get("kind", ""))
+
+
+#: The file that marks a finished log, written last; the file that a failed log leaves.
 DONE, FAILED = "report.json", "error.json"
-#: Warnings and figures are a process's, not a thread's: one log at a time in each.
+#: Warnings and figures belong to a process, not a thread: a process works on one log at a time.
 _ONE = threading.Lock()
 _MAKING = ".making-"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is the same for all logs; as of :func:`pbrl_ppl.close_loop` and `History.load`.
+    """Settings of all logs; as of :func:`pbrl_ppl.close_loop` and `History.load`.
 
     Parameters
     ----------
@@ -60,41 +168,30 @@ class Settings:
     time_step: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """All that results depend on, as JSON has it."""
+        """Return the settings as JSON values."""
         effects = None
         if self.catalogue is not None:
             effects = [[effect.name, repr(effect.parameters)] for effect in self.catalogue]
         return vars(self) | {"catalogue": effects}
 
 
-#: Closes the loop on one log; what it gives has a ``save(folder)`` that writes a loop's files.
+#: Closes the loop on one log; its result has a ``save(folder)`` that writes a loop's files.
 Run = Callable[[Log, Settings], Any]
 
 
 def close_log(log: Log, settings: Settings) -> Loop:
     """Read a log's files and close the loop."""
     scene = Scene.load(log.scene)
-    if settings.noise:
-        scene = scene.replace(noise=dict(scene.noise) | dict(settings.noise))
-    if settings.time_step is not None:
-        scene = scene.replace(time_step=settings.time_step)
-    if settings.substeps is not None:
-        scene = scene.replace(substeps=settings.substeps)
-    train, test = (
-        None
-        if path is None
-        else History.load(
-            path,
-            scene,
-            estimate_velocities=settings.estimate_velocities,
-            columns=settings.columns,
-            units=settings.units,
-            resample=settings.time_step is not None,
-        )
-        for path in (log.train, log.test)
+    scene = scene.replace(
+        noise=dict(scene.noise) | dict(settings.noise),
+        time_step=scene.time_step if settings.time_step is None else settings.time_step,
+        substeps=scene.substeps if settings.substeps is None else settings.substeps,
     )
-    if train is None:  # the manifest does not allow it
-        raise ValueError(f"log {log.name} has no train")
+    read = partial(
+        History.load, scene=scene, estimate_velocities=settings.estimate_velocities,
+        columns=settings.columns, units=settings.units, resample=settings.time_step is not None,
+    )  # fmt: skip
+    train, test = read(log.train), None if log.test is None else read(log.test)
     catalogue = full_catalogue if settings.catalogue is None else settings.catalogue
     return close_loop(
         scene, train, test, catalogue=catalogue, seed=settings.seed, draws=settings.draws,
@@ -103,7 +200,7 @@ def close_log(log: Log, settings: Settings) -> Loop:
 
 
 def inputs_sha256(log: Log, settings: Settings) -> str:
-    """Hash of all that a log's result depends on: its files, the settings, the version."""
+    """Return the hash of a log's inputs: its files, the settings, the package's version."""
     digest = hashlib.sha256()
     for path in (log.scene, log.train, log.test):
         content = b""
@@ -111,18 +208,19 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
             content = path.read_bytes()
         digest.update(hashlib.sha256(content).digest() if path else b"none")
     try:
-        own = version("pbrl_ppl")
+        installed = version("pbrl_ppl")
     except PackageNotFoundError:
-        own = "not installed"
-    digest.update(json.dumps([settings.to_dict(), own], sort_keys=True, default=dict).encode())
+        installed = "not installed"
+    contents = [settings.to_dict(), installed]
+    digest.update(json.dumps(contents, sort_keys=True, default=dict).encode())
     return digest.hexdigest()
 
 
 def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) -> dict[str, Any]:
-    """Close the loop on one log, unless that was done; whatever goes wrong, say so in a file.
+    """Close the loop on one log, unless that was done; errors go into a file.
 
-    Files are made aside and renamed into the log's folder, the one that says it is done last, so
-    that a worker may die at any moment.
+    Files are written elsewhere and renamed into the log's folder, ``report.json`` last, so that a
+    worker may die at any moment.
 
     Parameters
     ----------
@@ -156,10 +254,10 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
                 loop = run(log, settings)
-            said = list(dict.fromkeys(str(w.message) for w in caught
-                                      if issubclass(w.category, UserWarning)))  # fmt: skip
+            shown = (str(w.message) for w in caught if issubclass(w.category, UserWarning))
             about = {"name": log.name, "kind": log.kind, "inputs_sha256": inputs,
-                     "seconds": round(time.monotonic() - begin, 1), "warnings": said}  # fmt: skip
+                     "seconds": round(time.monotonic() - begin, 1),
+                     "warnings": list(dict.fromkeys(shown))}  # fmt: skip
             _keep(loop, place, about)
         except Exception as error:
             return failed(log, folder, error)
@@ -168,7 +266,7 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
 
 
 def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:
-    """Write a loop's files into a log's folder, what says that it is done last."""
+    """Write a loop's files into a log's folder, ``report.json`` last."""
     with tempfile.TemporaryDirectory(prefix=_MAKING, dir=place) as aside:
         made = Path(aside) / "result"
         loop.save(made)
@@ -180,7 +278,7 @@ def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:
 
 
 def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
-    """The row of a log that failed; the message is kept in its folder, where that can be."""
+    """Return the row of a log that failed, and write the message into its folder if possible."""
     message = " ".join(str(error).split()) or type(error).__name__
     if not isinstance(error, PbrlError):
         message = f"{type(error).__name__}: {message}"
@@ -188,15 +286,14 @@ def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
     text = json.dumps({"name": log.name, "message": message, "traceback": trace}, indent=1)
     try:
         (folder / log.name).mkdir(parents=True, exist_ok=True)
-        write = partial(Path.write_text, data=text + "\n", encoding="utf-8")
-        write_atomically(folder / log.name / FAILED, write)
+        write_text(folder / log.name / FAILED, text + "\n")
     except OSError:
         message += " (its folder cannot be written to either)"
     return {"name": log.name, "kind": log.kind, "status": "failed", "message": message}
 
 
 def row_of(log: Log, folder: Path, inputs: str) -> dict[str, Any] | None:
-    """What a finished log's ``report.json`` says in short; None if there is none of these inputs.
+    """Return a summary of a finished log's ``report.json``; None if these inputs have none.
 
     Parameters
     ----------
