@@ -35,6 +35,7 @@ from pbrl_ppl.model.smoothing import (
     with_sensitivity,
 )
 from pbrl_ppl.model.table1 import build_layout, index_priors
+from pbrl_ppl.model.tails import degrees_of_freedom, tail_places
 from pbrl_ppl.model.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.model.transition import Transition
 
@@ -60,6 +61,7 @@ __all__ = [
     "cells_of",
     "check_moves",
     "declared_problem",
+    "degrees_of_freedom",
     "estimate_sigma",
     "exponential",
     "index_priors",
@@ -79,6 +81,7 @@ __all__ = [
     "simulated_trajectories",
     "single_transitions",
     "smoothed",
+    "tail_places",
     "whiten",
     "with_measurements",
     "with_sensitivity",

@@ -12,11 +12,9 @@ import pymc as pm
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.sampling.emulation import emulate
-from pbrl_ppl.sampling.equal_wheels import evened_logp
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
-from pbrl_ppl.sampling.starts import blank_point, gaussian_blocks
-from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
+from pbrl_ppl.sampling.surrogate import Surrogate, Unpack, emulate
 from pbrl_ppl.sampling.traces import as_trace, thinned
 
 #: Engine steps that cost no more than what samplers do beside them.

@@ -1,7 +1,8 @@
-"""Starting points of samplers: the Laplace approximation in their space, and dispersed points."""
+"""Space of the samplers: transforms, log-density, Laplace approximation and starting points."""
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.special import expit
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.parameters import Prior, gathered, inside
+from pbrl_ppl.parameters import Prior, Wheel, gathered, inside, wheels
 from pbrl_ppl.posterior import group, parameter_draws
 from pbrl_ppl.sampling.metropolis import Gaussian
 
@@ -231,3 +232,45 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
 def _range(prior: Prior) -> Array:
     """The 2 % and 98 % quantiles of a prior, by simulation: they only limit where chains begin."""
     return np.quantile(prior.sample(np.random.default_rng(0), 2000), [0.02, 0.98])
+
+
+def evened_logp(model: pm.Model, problem: Problem) -> Any:
+    """Return a correction of the model's log-density: `parameters.evened` as an expression.
+
+    With it the prior of each wheel is the same for all its equal descriptions, so that one mode
+    stands for all. The description of each draw is chosen afterwards (`parameters.redescribed`).
+
+    Parameters
+    ----------
+    model : pymc.Model
+        The model of ``problem``.
+    problem : Problem
+        Says which wheels are unknown.
+
+    Returns
+    -------
+    tensor or float
+        In terms of the model's value variables; zero where every prior is even.
+    """
+    uneven = [wheel for wheel in wheels(problem.layout) if wheel.period > 1]
+    if not uneven:
+        return 0.0
+    change = sum(_of_wheel(model, problem, wheel) for wheel in uneven)
+    return model.replace_rvs_by_values([change])[0]
+
+
+def _of_wheel(model: pm.Model, problem: Problem, wheel: Wheel) -> Any:
+    places = {
+        f"{block.name}[{owner}]": (block.name, i)
+        for block in problem.layout.blocks
+        for i, owner in enumerate(block.owners)
+    }
+    angle, *mus = (model[name][i] for name, i in (places[label] for label in wheel.labels))
+    direction, *frictions = wheel.priors
+    terms = []
+    for turns in range(4):
+        term = direction.kappa * pm.math.cos(angle + turns * np.pi / 2 - direction.mu)
+        for mu, prior in zip(mus[:: -1 if turns % 2 else 1], frictions, strict=True):
+            term = term - 0.5 * ((mu - prior.mu) / prior.sigma) ** 2
+        terms.append(term)
+    return reduce(pm.math.logaddexp, terms) - np.log(4.0) - terms[0]

@@ -1,11 +1,12 @@
 """AdaptiveMetropolis on targets with closed forms, in an ordinary pm.Model."""
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
 
-from pbrl_ppl.posterior.store import az, group
+from pbrl_ppl.posterior.store import group
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Gaussian, Jumps
 
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
