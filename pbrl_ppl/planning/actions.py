@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.goals import read_tables, read_toml
-from pbrl_ppl.posterior import group, scene_of
 from pbrl_ppl.scene import Scene, nearest
 
 Array = NDArray[np.float64]
@@ -155,6 +154,8 @@ class ActionSet:
         GoalError
             If nothing was pushed.
         """
+        from pbrl_ppl.posterior import group, scene_of  # not for given actions
+
         scene = scene_of(idata)
         given = group(idata, "constant_data")["actions"].to_numpy()[..., :3]
         actions: list[Action] = []

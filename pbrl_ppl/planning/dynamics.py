@@ -21,7 +21,6 @@ from pbrl_ppl.model import (
     tail_places,
 )
 from pbrl_ppl.physics import Simulator, after_recording
-from pbrl_ppl.posterior import PosteriorRecord, vectors
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH
 
@@ -243,6 +242,8 @@ class Dynamics:
         PosteriorError
             If it has another schema version, holds fewer draws, or lacks its mode.
         """
+        from pbrl_ppl.posterior import PosteriorRecord, vectors  # not for known dynamics
+
         record = PosteriorRecord.of(idata)
         attached = record.attached(effects)
         layout = build_layout(record.scene, attached)

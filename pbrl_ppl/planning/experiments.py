@@ -20,7 +20,6 @@ from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.allowed import Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.planner import start_state
 from pbrl_ppl.planning.separation import Separation
-from pbrl_ppl.posterior import scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS
 
@@ -198,6 +197,7 @@ def suggest_actions(
     """
     # with the samplers, which a plan does not need
     from pbrl_ppl.criticism import fit_rivals, kept_groups, named_effects
+    from pbrl_ppl.posterior import scene_of
 
     say = progress or (lambda stage: None)
     posterior = getattr(known, "posterior_after", known)

@@ -19,11 +19,10 @@ from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import chi2, norm
 
-from pbrl_ppl.effects import Effect, attach, catalogue
+from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.model import build_layout
 from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws, prior_draws, wheels
-from pbrl_ppl.posterior import HDI_PROB, moment_matched, scalars, scene_of
+from pbrl_ppl.posterior import HDI_PROB, layout_of, moment_matched, scalars, scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import wrapped
 
@@ -76,26 +75,26 @@ class Population:
     informed: NDArray[np.bool_]
 
     def mean(self, q: float) -> float:
-        """Quantile of the kind's mean."""
+        """Return a quantile of the kind's mean."""
         return _quantile(self.weights, self.centre, self.centre_sd, q)
 
     def deviation(self, q: float) -> float:
-        """Quantile of the spread between robots."""
+        """Return a quantile of the spread between robots."""
         return float(np.interp(q, np.cumsum(self.weights), self.spread))
 
     def robot(self, number: int, q: float) -> float:
-        """Quantile of a robot's parameter, given all robots' data."""
+        """Return a quantile of a robot's parameter, given all robots' data."""
         return _quantile(self.weights, self.value[number], self.value_sd[number], q)
 
     def next(self, q: float) -> float:
-        """Quantile of the parameter of a robot that was not seen."""
+        """Return a quantile of the parameter of a robot without data."""
         return _quantile(self.weights, self.centre, np.hypot(self.centre_sd, self.spread), q)
 
 
 def population(
     estimate: Array, sd: Array, *, centre: float, width: float, spread: float
 ) -> Population:
-    """Partial pooling of normal likelihoods, integrated over mean and spread.
+    """Pool normal likelihoods partially, integrated over mean and spread.
 
     Parameters
     ----------
@@ -140,7 +139,7 @@ def population(
 
 
 def _quantile(weights: Array, mean: Array, sd: Array, q: float) -> float:
-    """Quantile of a mixture of normals."""
+    """Return a quantile of a mixture of normals."""
     some = weights > _NOTHING
     weights, mean, sd = weights[some] / weights[some].sum(), mean[some], sd[some]
     low, high = float((mean - 9 * sd).min()), float((mean + 9 * sd).max())
@@ -177,7 +176,7 @@ class Pooled:
     _single: Mapping[str, Array]
 
     def table(self) -> pd.DataFrame:
-        """One row a parameter, in its own unit; the spread is on ``scale`` (of logarithms: shares).
+        """Return one row a parameter, in its unit; the spread is on ``scale`` (logarithms: shares).
 
         ``mean`` is the median of the kind's mean, ``next`` that of a further robot; with 94 %
         intervals. ``p_same`` as of :class:`Population`, ``informed`` how many robots inform.
@@ -198,7 +197,7 @@ class Pooled:
         return pd.DataFrame(rows)
 
     def robots(self) -> pd.DataFrame:
-        """One row a robot and parameter: its single posterior, and that given all robots."""
+        """Return one row a robot and parameter: its single posterior, and that given all robots."""
         rows = [
             {
                 "robot": robot,
@@ -217,7 +216,7 @@ class Pooled:
         return pd.DataFrame(rows)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; not a number is None."""
+        """Return plain values for JSON; not a number is None."""
         table = self.table().astype(object)
         return {
             "robots": list(self.names),
@@ -226,7 +225,7 @@ class Pooled:
         }
 
     def _natural(self, name: str, value: float) -> float:
-        """A value on the scale of the prior, in the parameter's unit and support."""
+        """Return a value on the scale of the prior, in the parameter's unit and support."""
         scale, reference = self._families[name]
         if scale == "logarithm":
             return float(np.exp(value))
@@ -281,7 +280,7 @@ def pool(
     effects = tuple(effects)
     names = tuple(posteriors)
     scenes = [scene_of(idata) for idata in posteriors.values()]
-    layouts = [build_layout(scene, attach(scene, (), effects)) for scene in scenes]
+    layouts = [layout_of(idata, effects) for idata in posteriors.values()]
     for name, layout in zip(names, layouts, strict=True):
         if _table1(layout) != _table1(layouts[0]):
             raise PosteriorError(
@@ -310,14 +309,14 @@ def pool(
 
 
 def _table1(layout: Layout) -> list[str]:
-    """Labels of the parameters that are no effect's."""
+    """Return the labels of the parameters that are no effect's."""
     return [f"{b.name}[{owner}]" for b in layout.blocks if b.effect is None for owner in b.owners]
 
 
 def _drawn(
     names: tuple[str, ...], posteriors: list[Any], layouts: list[Layout]
 ) -> list[dict[str, Array]]:
-    """Each robot's draws of its bodies' parameters; equal wheels are described alike in all."""
+    """Return each robot's draws of its bodies' parameters; equal wheels are described alike."""
     result: list[dict[str, Array]] = []
     first: Array | None = None
     for name, idata, layout in zip(names, posteriors, layouts, strict=True):
@@ -338,7 +337,7 @@ def _drawn(
 
 
 def _priors(layout: Layout) -> dict[str, Prior]:
-    """Priors by label; those of a wheel are of the description that was chosen among equal ones."""
+    """Return priors by label; those of a wheel are of the chosen one of its equal descriptions."""
     priors = dict(zip(layout.labels, layout.priors, strict=True))
     for wheel in wheels(layout):
         if wheel.period < 4:
@@ -353,7 +352,7 @@ def _scale(prior: Prior) -> str:
 
 
 def _moments(prior: Prior, draws: Array) -> tuple[float, float]:
-    """Mean and standard deviation of draws, of an angle about its mean direction."""
+    """Return mean and standard deviation of draws, of an angle about its mean direction."""
     if prior.family != "von_mises":
         return float(draws.mean()), float(draws.std())
     mean = float(np.angle(np.exp(1j * draws).mean()))
@@ -363,7 +362,7 @@ def _moments(prior: Prior, draws: Array) -> tuple[float, float]:
 def _pooled(
     priors: list[Prior], draws: list[Array], spread: float, free: bool
 ) -> tuple[Population, float]:
-    """The population of a parameter, and the angle that its scale is about."""
+    """Return the population of a parameter, and the angle that its scale is about."""
     matched = [moment_matched(prior, x) for prior, x in zip(priors, draws, strict=True)]
     if priors[0].family == "von_mises":
         return _pooled_angles(priors, matched, spread, free)
@@ -386,7 +385,7 @@ def _pooled(
 def _pooled_angles(
     priors: list[Prior], matched: list[Prior], spread: float, free: bool
 ) -> tuple[Population, float]:
-    """As normal about their mean direction, which they are where the data inform.
+    """Pool angles as normal about their mean direction, as they are where the data inform.
 
     A ``free`` angle is uniform a priori: what its prior has of concentration is from the choice
     among a wheel's equal descriptions, and about the angle itself.
@@ -409,7 +408,7 @@ def _pooled_angles(
 
 
 def _next_prior(prior: Prior, found: Population, reference: float) -> dict[str, float]:
-    """Hyper-parameters with the median and the 94 % interval of a robot that was not seen."""
+    """Return hyper-parameters with the median and 94 % interval of a robot without data."""
     middle, low, high = (found.next(q) for q in (_MIDDLE, *_ENDS))
     sigma = (high - low) / float(np.diff(norm.ppf(_ENDS))[0])
     if prior.family == "von_mises":
@@ -421,7 +420,7 @@ def _next_prior(prior: Prior, found: Population, reference: float) -> dict[str, 
 def _scene(
     scenes: list[Scene], priors: Mapping[str, dict[str, float]], left_out: tuple[str, ...]
 ) -> Scene:
-    """The first scene with the effects that all have, and these priors."""
+    """Return the first scene with the effects that all have, and these priors."""
     dropped = {tuple(label.rstrip("]").split("[")) for label in left_out}
     bodies = []
     for body in scenes[0].bodies:
