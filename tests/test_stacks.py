@@ -10,7 +10,7 @@ import arviz as az
 import numpy as np
 import pytest
 
-from pbrl_ppl.posterior.store import draws, group, load_posterior, save_posterior, scene_of
+from pbrl_ppl.posterior import draws, group, load_posterior, save_posterior, scene_of
 from pbrl_ppl.sampling import update
 from tests.helpers.stacks import GENERATIONS, SCENE, file, fitted, history
 

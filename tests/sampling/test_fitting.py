@@ -20,11 +20,9 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import data
-from pbrl_ppl.posterior import save_posterior as save
-from pbrl_ppl.posterior.completion import MAX_RHAT, MIN_ESS, complete
-from pbrl_ppl.posterior.store import (
+from pbrl_ppl.posterior import (
     convergence,
+    data,
     draws,
     from_groups,
     group,
@@ -32,6 +30,8 @@ from pbrl_ppl.posterior.store import (
     load_posterior,
     scene_of,
 )
+from pbrl_ppl.posterior import save_posterior as save
+from pbrl_ppl.posterior.completion import MAX_RHAT, MIN_ESS, complete
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.sampling.starts import unconstrain

@@ -21,14 +21,15 @@ from pbrl_ppl.errors import (
 from pbrl_ppl.history import History
 from pbrl_ppl.model import along_trajectories, build_model
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import loo_pit, problem_of
-from pbrl_ppl.posterior.store import (
+from pbrl_ppl.posterior import (
     convergence,
     draws,
     from_groups,
     group,
     groups,
     load_posterior,
+    loo_pit,
+    problem_of,
     save_posterior,
     scalars,
     scene_of,
