@@ -6,10 +6,11 @@
 from pathlib import Path
 from typing import Any
 
+import arviz as az
 import numpy as np
 import pytest
 
-from pbrl_ppl.posterior.store import az, draws, group, load_posterior, save_posterior, scene_of
+from pbrl_ppl.posterior import draws, group, load_posterior, save_posterior, scene_of
 from pbrl_ppl.sampling import update
 from tests.helpers.stacks import GENERATIONS, SCENE, file, fitted, history
 

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 
+import arviz as az
 import numpy as np
 import pandas as pd
 import pymc as pm
@@ -35,7 +36,7 @@ from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import WHEEL_PARAMETERS
 from pbrl_ppl.physics import PartedSimulator, Physics, build_layout
-from pbrl_ppl.posterior.store import az, convergence, group
+from pbrl_ppl.posterior.store import convergence, group
 from pbrl_ppl.sampling.fitting import METHODS
 
 sys.path.insert(0, str(Path(__file__).parent))

@@ -33,7 +33,7 @@ from pbrl_ppl.likelihood.smoothing import (
     smoothed,
     with_sensitivity,
 )
-from pbrl_ppl.likelihood.tails import sum_tails
+from pbrl_ppl.likelihood.tails import degrees_of_freedom, sum_tails, tail_places
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 
 __all__ = [
@@ -55,6 +55,7 @@ __all__ = [
     "cells_of",
     "check_moves",
     "declared_problem",
+    "degrees_of_freedom",
     "estimate_sigma",
     "exponential",
     "linearised",
@@ -73,6 +74,7 @@ __all__ = [
     "single_transitions",
     "smoothed",
     "sum_tails",
+    "tail_places",
     "with_measurements",
     "with_sensitivity",
 ]

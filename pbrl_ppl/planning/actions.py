@@ -1,4 +1,4 @@
-"""Actions of a planner: wrenches on bodies, and their durations."""
+"""Actions of a planner: wrenches on bodies and their durations."""
 
 from __future__ import annotations
 
@@ -14,12 +14,11 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.goals import read_tables, read_toml
-from pbrl_ppl.posterior import group, scene_of
 from pbrl_ppl.scene import Scene, nearest
 
 Array = NDArray[np.float64]
 
-#: Of the recorded pushes, the size that a plan pushes with, and intervals for which it does.
+#: Quantile of the recorded pushes that a plan pushes with, and for how many intervals.
 _QUANTILE, _INTERVALS = 0.9, (2, 5)
 
 
@@ -30,19 +29,18 @@ class Action:
     Attributes
     ----------
     body : str
-        Which is pushed.
+        Name of the body that is pushed.
     force : tuple of float
         N.
     torque : float
         N m.
     frame : str
-        ``body``: the force turns with the body from interval to interval, as someone who pushes it
-        would; ``world``: it does not.
+        ``body``: the force turns with the body from interval to interval; ``world``: it does not.
 
     Raises
     ------
     GoalError
-        If a number is not finite, or the frame neither.
+        If a number is not finite, or the frame is neither.
     """
 
     body: str
@@ -71,7 +69,7 @@ class Action:
 
 @dataclass(frozen=True)
 class ActionSet:
-    """Wrenches, one of which acts at a time, and the times for which it does.
+    """Wrenches, one of which acts at a time, and their durations.
 
     Attributes
     ----------
@@ -119,7 +117,7 @@ class ActionSet:
         frame: str = "body",
         durations: Sequence[float] | None = None,
     ) -> ActionSet:
-        """All combinations of forces along x, along y, and torques on one body (N, N, N m)."""
+        """Return all combinations of forces along x and y, and torques on a body (N, N, N m)."""
         wrenches = product(forces, lateral, torques)
         return cls(
             tuple(Action(body, (fx, fy), torque, frame) for fx, fy, torque in wrenches),
@@ -141,10 +139,10 @@ class ActionSet:
 
     @classmethod
     def recorded(cls, idata: Any) -> ActionSet:
-        """Actions like those in the posterior's data, so that the model knows what they do.
+        """Return actions like those in the posterior's data, whose effects the model knows.
 
-        For each body that was pushed: a force along its x or y, either way, and a torque, either
-        way, alone and together, of the size that a tenth of the recorded ones exceed.
+        For each body that was pushed: forces along x and y and torques, in both directions, alone
+        and together, of a size that a tenth of the recorded ones exceed.
 
         Parameters
         ----------
@@ -156,6 +154,8 @@ class ActionSet:
         GoalError
             If nothing was pushed.
         """
+        from pbrl_ppl.posterior import group, scene_of  # not for given actions
+
         scene = scene_of(idata)
         given = group(idata, "constant_data")["actions"].to_numpy()[..., :3]
         actions: list[Action] = []
@@ -179,12 +179,12 @@ class ActionSet:
         return cls(tuple(actions), tuple(scene.time_step * n for n in _INTERVALS))
 
     def check(self, scene: Scene) -> None:
-        """Refuse a body that the scene lacks, and durations between its sampling intervals.
+        """Check that the scene has the bodies, and that durations are whole sampling intervals.
 
         Raises
         ------
         GoalError
-            It names the body or the duration.
+            If not; it names the body or the duration.
         """
         moving = [body.name for body in scene.dynamic]
         for action in self.actions:
@@ -197,7 +197,7 @@ class ActionSet:
         self.intervals(scene)
 
     def intervals(self, scene: Scene) -> tuple[int, ...]:
-        """The durations as numbers of sampling intervals, in increasing order."""
+        """Return the durations as numbers of sampling intervals, in increasing order."""
         found = set()
         for duration in self.durations or (scene.time_step,):
             count = duration / scene.time_step
@@ -210,7 +210,7 @@ class ActionSet:
         return tuple(sorted(found))
 
     def wrenches(self, scene: Scene, which: NDArray[np.intp], heading: Array) -> Array:
-        """World-frame wrenches of chosen actions, shape (n, body, 3).
+        """Return world-frame wrenches of chosen actions, shape (n, body, 3).
 
         Parameters
         ----------
@@ -222,20 +222,20 @@ class ActionSet:
             The bodies' angles, shape (n, body), rad.
         """
         names = [body.name for body in scene.moving]
-        own = np.array([names.index(action.body) for action in self.actions])[which]
+        body = np.array([names.index(action.body) for action in self.actions])[which]
         given = np.array([(*action.force, action.torque) for action in self.actions])[which]
         turns = np.array([action.frame == "body" for action in self.actions])[which]
         rows = np.arange(len(which))
-        angle = np.where(turns, heading[rows, own], 0.0)
+        angle = np.where(turns, heading[rows, body], 0.0)
         c, s = np.cos(angle), np.sin(angle)
         out = np.zeros((len(which), len(names), 3))
-        out[rows, own, 0] = c * given[:, 0] - s * given[:, 1]
-        out[rows, own, 1] = s * given[:, 0] + c * given[:, 1]
-        out[rows, own, 2] = given[:, 2]
+        out[rows, body, 0] = c * given[:, 0] - s * given[:, 1]
+        out[rows, body, 1] = s * given[:, 0] + c * given[:, 1]
+        out[rows, body, 2] = given[:, 2]
         return out
 
     def strongest(self, body: str) -> tuple[float, float]:
-        """The largest force (N) and torque (N m) on a body."""
-        own = [action for action in self.actions if action.body == body]
-        force = max((math.hypot(*action.force) for action in own), default=0.0)
-        return force, max((abs(action.torque) for action in own), default=0.0)
+        """Return the largest force (N) and torque (N m) on a body."""
+        chosen = [action for action in self.actions if action.body == body]
+        force = max((math.hypot(*action.force) for action in chosen), default=0.0)
+        return force, max((abs(action.torque) for action in chosen), default=0.0)

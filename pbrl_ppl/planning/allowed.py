@@ -1,4 +1,4 @@
-"""Sequences of wrenches that an experiment may use: within bounds, or from an action set."""
+"""Sequences of wrenches allowed in an experiment: within bounds, or from an action set."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ Array = NDArray[np.float64]
 #: Lowest and highest value of components of the wrench, by body.
 Bounds = Mapping[str, Mapping[str, Sequence[float]]]
 #: Wrenches (n, time, body, 3) to states (n, time + 1, body, 6).
-Foreseen = Callable[[Array], Array]
+Predict = Callable[[Array], Array]
 
-#: Pieces of a sequence within bounds, if nothing says how long each is held.
+#: Pieces of a sequence within bounds by default.
 _PIECES = 8
 
 
@@ -33,24 +33,24 @@ class Allowed(Protocol):
         """Pieces of a sequence."""
 
     def random(self, rng: np.random.Generator, n: int) -> Array:
-        """Sequences drawn from the set, shape (n, piece, ...)."""
+        """Draw sequences from the set, shape (n, piece, ...)."""
 
     def extreme(self, rng: np.random.Generator, n: int) -> Array:
-        """The same, with more of what is at the set's edge."""
+        """Draw sequences with more values at the bounds of the set."""
 
-    def wrenches(self, genes: Array, foreseen: Foreseen) -> Array:
-        """World-frame wrenches of sequences, shape (n, time, body, 3)."""
+    def wrenches(self, genes: Array, predict: Predict) -> Array:
+        """Return world-frame wrenches of sequences, shape (n, time, body, 3)."""
 
 
 def allowed_wrenches(
     scene: Scene, actions: ActionSet | Bounds, steps: int, hold: int | None
 ) -> Allowed:
-    """The sequences that an action set, or bounds, allow.
+    """Return the sequences that an action set or bounds allow.
 
     Raises
     ------
     GoalError
-        If a body or a component is unknown, or a bound is none.
+        If a body or a component is unknown, or a bound is not two numbers.
     """
     if isinstance(actions, ActionSet):
         actions.check(scene)
@@ -110,7 +110,7 @@ class _Within:
             [kind == 0, kind == 1], [inner, np.broadcast_to(nothing, inner.shape)], ends
         )
 
-    def wrenches(self, genes: Array, foreseen: Foreseen) -> Array:
+    def wrenches(self, genes: Array, predict: Predict) -> Array:
         return np.repeat(genes, self.hold, axis=1)[:, : self.steps]
 
 
@@ -133,7 +133,7 @@ class _OfActions:
     def extreme(self, rng: np.random.Generator, n: int) -> Array:
         return self.random(rng, n)
 
-    def wrenches(self, genes: Array, foreseen: Foreseen) -> Array:
+    def wrenches(self, genes: Array, predict: Predict) -> Array:
         number, length = genes.astype(np.intp).transpose(2, 0, 1)
         ends = np.cumsum(np.array(self.actions.intervals(self.scene))[length], axis=1)
         time = np.arange(self.steps)
@@ -144,7 +144,7 @@ class _OfActions:
         turned = any(action.frame == "body" for action in self.actions.actions)
         heading = np.zeros((n, bodies))
         for t in range(self.steps):
-            if turned:  # a force that turns with its body is known once the way so far is
-                heading = np.nan_to_num(foreseen(out[:, :t])[:, -1, :, THETA])
+            if turned:  # a force in the body frame depends on the path so far
+                heading = np.nan_to_num(predict(out[:, :t])[:, -1, :, THETA])
             out[:, t] = self.actions.wrenches(self.scene, which[:, t], heading)
         return out

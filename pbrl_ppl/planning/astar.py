@@ -4,32 +4,28 @@ from __future__ import annotations
 
 import heapq
 import time
-from collections.abc import Callable
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.bound import TimeToGo
-from pbrl_ppl.planning.contact import contact_cost
-from pbrl_ppl.planning.goals import Goal
-from pbrl_ppl.planning.risk import tail_mean
-from pbrl_ppl.planning.search import NODES, Found
-from pbrl_ppl.planning.transition_model import TransitionModel
+from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 #: Nodes expanded in one engine call; fewer under many draws, whose calls are large anyway.
 _BATCH = 32
-#: Share of the limits for a search under one draw that guides that under all.
+#: Share of the limits for the search under one draw that guides the search under all.
 _GUIDE = 0.5
 #: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
 #: second; further away and nearer they grow and shrink in proportion, between these limits.
 _CELLS = np.array([4.0, 4.0, 5.0, 8.0, 8.0, 10.0])
 _TEN, _NEAR, _FAR = 10.0, 0.25, 2.0
-#: The largest tolerance that cells are in proportion to (m, rad): a lax goal needs care on the way.
+#: The largest tolerance that cells are in proportion to (m, rad).
 _WIDEST = 0.1
 #: Times that the cells are halved where the search runs out of nodes.
 _REFINED = 8
@@ -37,82 +33,51 @@ _REFINED = 8
 _REPORT = 0.5
 
 
-def astar(
-    dynamics: TransitionModel,
-    start: Array,
-    goal: Goal,
-    actions: ActionSet,
-    *,
-    tail: float = 1.0,
-    weight: float = 3.0,
-    nodes: int = NODES,
-    seconds: float | None = None,
-    improve: bool = False,
-    noise: bool = False,
-    rng: np.random.Generator | None = None,
-    progress: Callable[[str], None] | None = None,
-) -> Found:
+def astar(task: Task, *, weight: float = 3.0, improve: bool = False) -> Found:
     """Search for the quickest actions that bring bodies to the goal.
 
     The cost of a plan is its time and the penalties for contact. A node holds the states under all
     draws, to machine precision; of nodes in one cell of the closed set (the mean state, finer near
-    the goal, in proportion to its tolerance) the cheapest is kept. Where nothing is left to try,
-    the cells are halved and the search begins anew. Under many draws, a plan for one of them is
-    found first, and the search begins with the nodes along it: that costs little, and leads around
+    the goal, in proportion to its tolerance) the cheapest is kept. When the queue is empty, the
+    cells are halved and the search starts again. Under many draws, a plan for one of them is found
+    first, and the search starts with the nodes along it: that costs little, and leads around
     obstacles.
 
     Parameters
     ----------
-    dynamics : TransitionModel
-        One draw or many.
-    start : ndarray
-        Shape (body, 6).
-    goal, actions
-        As of :func:`pbrl_ppl.plan`.
-    tail : float
-        The goal is reached where the mean shortfall of the worst share of draws is within the
-        tolerances: 1 for the expectation, less for conditional value at risk.
+    task : Task
+        Model, start, goal, actions and limits.
     weight : float
         Of the heuristic: 1 is A*, which goes on until no node of the queue can lead to a cheaper
-        plan; more is quicker, ends at the first plan, and as far as the heuristic is admissible and
-        cells hold one state, that costs at most so many times the least. See
+        plan. A larger weight is quicker, ends at the first plan and, as far as the heuristic is
+        admissible and cells hold one state, costs at most so many times the least. See
         :class:`pbrl_ppl.planning.bound.TimeToGo` for where it is.
-    nodes : int
-        States to generate at most, each draw's own, the guiding search's among them.
-    seconds : float, optional
-        Where to stop, too; then the plan depends on how busy the machine is.
     improve : bool
         Whether to go on for a cheaper plan until a limit, or until there is none.
-    noise : bool
-        Whether Eq. 13's noise is added to every transition.
-    rng : Generator, optional
-        Of the noise.
-    progress : callable, optional
-        Told how far the search is.
 
     Returns
     -------
     Found
-        If the goal is not reached, the plan that ends nearest to it in L2 distance. A plan of
-        nothing is one where bodies are at rest: others do not stay where they are.
+        If the goal is not reached, the plan that ends nearest to it in L2 distance. An empty plan
+        counts only where bodies are at rest: others do not stay where they are.
 
     Raises
     ------
     GoalError
         If the weight is below 1, or ``nodes`` below 1.
     """
+    nodes = task.nodes
     if weight < 1 or nodes < 1:
         raise GoalError(f"A*: weight is {weight} and nodes {nodes}, expected at least 1 of each")
-    search = _Search(dynamics, start, goal, actions, tail, weight)
-    search.rng = (rng or np.random.default_rng(0)) if noise else None
-    begin = told = time.monotonic()
-    limit = np.inf if seconds is None else seconds
+    rng = (task.rng or np.random.default_rng(0)) if task.noise else None
+    search = _Search(task, weight, rng)
+    begin = reported = time.monotonic()
     stopped = "exhausted"
     try:
-        if dynamics.draws > 1:
-            guide = _Search(dynamics.single(), start, goal, actions, tail, weight)
+        if task.dynamics.draws > 1:
+            guide = _Search(replace(task, dynamics=task.dynamics.single()), weight)
             while not guide.best and guide.generated < _GUIDE * nodes and guide.open():
-                if time.monotonic() - begin > _GUIDE * limit:
+                if time.monotonic() - begin > _GUIDE * task.seconds:
                     break
                 guide.expand()
             search.follow(guide.path(guide.best or guide.nearest))
@@ -121,81 +86,74 @@ def astar(
             now = time.monotonic()
             if search.best and not improve and (weight > 1 or search.settled()):
                 break
-            if search.generated >= nodes or now - begin > limit:
+            if search.generated >= nodes or now - begin > task.seconds:
                 stopped = "nodes" if search.generated >= nodes else "time"
                 break
             search.expand()
-            if progress is not None and now - told > _REPORT:
-                told = now
-                progress(
-                    f"{search.generated} states, nearest to the goal {search.least_distance:.2f} m"
-                )
+            if now - reported > _REPORT:
+                reported = now
+                far = search.least_distance
+                task.progress(f"{search.generated} states, nearest to the goal {far:.2f} m")
     except KeyboardInterrupt:
         stopped = "interrupted"
     reached = search.best is not None
     if reached and stopped == "exhausted":
         stopped = "goal"
-    steps = search.path(search.best or search.nearest)
-    wrenches = played(dynamics, start, actions, steps)
+    wrenches = played(task, search.path(search.best or search.nearest))
     return Found(wrenches, reached, stopped, search.generated, time.monotonic() - begin)
 
 
-#: An edge of the tree: the node it starts from, the action, and for how many intervals.
-Edge = tuple[int, int, int]
+class Edge(NamedTuple):
+    """Edge of the tree: the node it starts from, the action, and for how many intervals."""
+
+    node: int
+    action: int
+    intervals: int
 
 
 class _Search:
     """State of the search: the tree, the open queue and the closed set."""
 
-    def __init__(
-        self,
-        dynamics: TransitionModel,
-        start: Array,
-        goal: Goal,
-        actions: ActionSet,
-        tail: float,
-        weight: float,
-    ) -> None:
-        self.dynamics, self.goal, self.actions = dynamics, goal, actions
-        self.tail, self.weight, self.scene = tail, weight, dynamics.scene
-        self.rng: np.random.Generator | None = None
-        self.counts = actions.intervals(self.scene)
-        self.to_go = TimeToGo(dynamics, goal, actions, start)
-        self.root = np.repeat(start[None], dynamics.draws, axis=0)[None]
+    def __init__(self, task: Task, weight: float, rng: np.random.Generator | None = None) -> None:
+        self.dynamics, self.goal, self.actions = task.dynamics, task.goal, task.actions
+        self.tail, self.weight, self.rng = task.tail, weight, rng
+        self.scene = task.dynamics.scene
+        self.counts = task.actions.intervals(self.scene)
+        self.to_go = TimeToGo(task.dynamics, task.goal, task.actions, task.start)
+        self.root = np.repeat(task.start[None], task.dynamics.draws, axis=0)[None]
         self.generated = 1
-        self.near = min(_WIDEST, *(target.tolerance for target in goal.targets))
-        turn = min(_WIDEST, *(target.angle_tolerance for target in goal.targets))
+        self.near = min(_WIDEST, *(target.tolerance for target in self.goal.targets))
+        turn = min(_WIDEST, *(target.angle_tolerance for target in self.goal.targets))
         self.cells = _CELLS * np.array([self.near, self.near, turn] * 2)
         self.refined = 0
         self.begin()
 
     def open(self) -> bool:
-        """Whether the queue holds anything; where it does not, begin anew with finer cells."""
+        """Return whether the queue holds a node; start again with finer cells where it does not."""
         if not self.queue and self.best is None and self.refined < _REFINED:
             self.refined += 1
             self.begin()
         return bool(self.queue)
 
     def settled(self) -> bool:
-        """Whether nothing in the queue has a lower priority than the best plan's cost."""
+        """Return whether no node in the queue can lead to a cheaper plan."""
         return self.queue[0][0] >= self.least_cost
 
     def begin(self) -> None:
         """Reset tree, queue and closed set to the root."""
-        # the tree; it has room for more nodes than there are
+        # the tree: arrays with room for more nodes
         self.states, self.cost = self.root.copy(), np.zeros(1)
-        self.last = self.dynamics.before[None].copy()  # what acted on the way to each node
+        self.last = self.dynamics.before[None].copy()  # the last wrenches before each node
         self.edges = np.array([[-1, -1, 0]])
         self.size = 1
         self.queue: list[tuple[float, int]] = [(0.0, 0)]
         self.closed: dict[bytes, float] = {}
-        # what was found
         self.best: Edge | None = None
         self.least_cost = np.inf
-        self.nearest: Edge = (0, -1, 0)
+        self.nearest = Edge(0, -1, 0)
         self.least_distance = np.inf
         root = np.moveaxis(self.states, 0, 1)
-        self._look(root, np.zeros(1), np.zeros(1, int), np.zeros(1, int), 0)
+        self._note(root, np.zeros(1), np.zeros(1, int), np.zeros(1, int), 0)
         if self.root[..., 3:].any():
             self.least_distance = np.inf
 
@@ -226,12 +184,12 @@ class _Search:
                 states = self.dynamics.noisy(states, self.rng)
             self.generated += len(parents) * self.dynamics.draws
             cost = cost + self.scene.time_step * (1.0 + contact_cost(self.goal, self.scene, states))
-            far = self._look(states, cost, parents, which, interval)
+            far = self._note(states, cost, parents, which, interval)
             if interval == only or (only is None and interval in self.counts):
                 self._add(states, wrenches, cost, far, parents, which, interval)
 
-    def _look(self, states: Array, cost: Array, parents: Ints, which: Ints, interval: int) -> Array:
-        """Note what reaches the goal, or comes nearer than anything before; L2 distances."""
+    def _note(self, states: Array, cost: Array, parents: Ints, which: Ints, interval: int) -> Array:
+        """Keep the cheapest edge to the goal and the nearest one; return L2 distances."""
         possible = np.isfinite(states).all(axis=(0, 2, 3)) & np.isfinite(cost)
         there = tail_mean(self.goal.shortfall(self.scene, states), self.tail) <= 1.0
         there &= possible & (cost < self.least_cost)
@@ -239,7 +197,7 @@ class _Search:
         far = np.where(possible, far, np.inf)
 
         def edge(row: int) -> Edge:
-            return int(parents.flat[row]), int(which.flat[row]), interval
+            return Edge(int(parents.flat[row]), int(which.flat[row]), interval)
 
         if there.any():
             row = int(np.argmin(np.where(there, cost, np.inf)))
@@ -259,7 +217,7 @@ class _Search:
         which: Ints,
         interval: int,
     ) -> None:
-        """Add nodes that are in a new cell, or got there more cheaply."""
+        """Add nodes that are in a new cell, or are cheaper than the one in it."""
         ahead = tail_mean(self.to_go(states), self.tail)
         chosen = []
         keys = self._cells(states, far)
@@ -287,7 +245,7 @@ class _Search:
             heapq.heappush(self.queue, (value, node))
 
     def _cells(self, states: Array, far: Array) -> NDArray[np.int32]:
-        """Cell of the closed set of each node, shape (n, number)."""
+        """Return the cell of the closed set of each node, shape (n, number)."""
         mean = np.nan_to_num(states.mean(axis=0))
         mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))
         level = np.floor(np.log2(np.clip(far / (_TEN * self.near), _NEAR, _FAR)))
@@ -296,23 +254,22 @@ class _Search:
         return np.concatenate([level[:, None], cell], axis=1).astype(np.int32)
 
     def path(self, last: Edge) -> list[tuple[int, int]]:
-        """Actions and intervals from the root, to the end of an edge."""
-        steps, (node, action, intervals) = [], last
-        while intervals:
-            steps.append((action, intervals))
-            node, action, intervals = (int(entry) for entry in self.edges[node])
+        """Return actions and intervals from the root to the end of an edge."""
+        steps, edge = [], last
+        while edge.intervals:
+            steps.append((edge.action, edge.intervals))
+            edge = Edge(*self.edges[edge.node].tolist())
         return steps[::-1]
 
 
 def mean_angle(angle: Array) -> Array:
-    """Mean direction over the first axis (rad)."""
+    """Return the mean direction over the first axis (rad)."""
     return np.asarray(np.arctan2(np.sin(angle).mean(axis=0), np.cos(angle).mean(axis=0)))
 
 
-def played(
-    dynamics: TransitionModel, start: Array, actions: ActionSet, steps: list[tuple[int, int]]
-) -> Array:
-    """World-frame wrenches of actions from a start, one an interval, shape (time, body, 3)."""
+def played(task: Task, steps: list[tuple[int, int]]) -> Array:
+    """Return world-frame wrenches of actions, one an interval, shape (time, body, 3)."""
+    dynamics, start, actions = task.dynamics, task.start, task.actions
     scene, states = dynamics.scene, np.repeat(start[None, None], dynamics.draws, axis=0)
     wrenches = np.zeros((sum(intervals for _, intervals in steps), len(start), 3))
     sequence = [action for action, intervals in steps for _ in range(intervals)]

@@ -10,36 +10,36 @@ from scipy.sparse.csgraph import dijkstra
 
 from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning.actions import ActionSet
+from pbrl_ppl.planning.dynamics import TransitionModel
 from pbrl_ppl.planning.goals import Goal, Target
-from pbrl_ppl.planning.transition_model import TransitionModel
 from pbrl_ppl.scene import Body, Scene, Shape
 
 Array = NDArray[np.float64]
 
-#: Cells of the grid on which distances around walls are found, along its longer side; and room
-#: beyond what is known of the scene, for one can go around the end of a wall (m).
+#: Cells along the longer side of the grid on which distances around walls are found, and the margin
+#: of the grid (m): a body can go around the end of a wall.
 _CELLS, _ROOM = 160, 2.0
 #: Moves on the grid: to neighbours, and as a knight does, which cuts the error of eight directions.
 _MOVES = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
 
 
 class TimeToGo:
-    """Least time to the goal, for pushes as strong as the action set has them.
+    """Lower bound on the time to the goal, for pushes up to the strongest of the action set.
 
-    A body that is pushed covers a distance no faster than its own speed and the strongest push,
-    without friction, allow. Distances go around walls and static bodies on a grid. That is
-    admissible for pushed bodies that move towards the goal, as far as the grid is fine enough. It
-    is not for a body that moves away, which friction or a wall may turn back sooner; for one that
-    is moved by others, which may hit harder than they are pushed; or where an effect drives bodies.
+    A pushed body is bounded by its speed and the strongest push without friction. Distances go
+    around walls and static bodies on a grid. The bound is admissible for pushed bodies that move
+    towards the goal, as far as the grid is fine enough. It is not for a body that moves away, which
+    friction or a wall may turn back sooner; for a body that is hit by others; or where an effect
+    drives bodies.
 
     Parameters
     ----------
     dynamics : TransitionModel
-        Says what a push can do.
+        Bounds what a push can do.
     goal : Goal
         Targets.
     actions : ActionSet
-        Strongest pushes.
+        Says the strongest pushes.
     start : ndarray
         Shape (body, 6); the grid covers it.
     """
@@ -50,9 +50,9 @@ class TimeToGo:
         scene = dynamics.scene
         self.goal, self.scene = goal, scene
         anyone = max(actions.strongest(body.name)[0] for body in scene.dynamic)
-        self._own = goal.places(scene)
+        self._bodies = goal.places(scene)
         self._fields, self._push, self._turn = [], [], []
-        for target, i in zip(goal.targets, self._own, strict=True):
+        for target, i in zip(goal.targets, self._bodies, strict=True):
             force, torque = actions.strongest(target.body)
             push, turn = dynamics.acceleration(target.body, force or anyone, torque)
             self._push.append(push)
@@ -60,10 +60,10 @@ class TimeToGo:
             self._fields.append(_distances(scene, scene.body(target.body), target, start[i]))
 
     def __call__(self, states: Array) -> Array:
-        """Seconds, shape (draw, n), from states of shape (draw, n, body, 6)."""
+        """Return seconds, shape (draw, n), from states of shape (draw, n, body, 6)."""
         offset = self.goal.errors(self.scene, states)
         least = np.zeros(states.shape[:2])
-        for j, (target, i) in enumerate(zip(self.goal.targets, self._own, strict=True)):
+        for j, (target, i) in enumerate(zip(self.goal.targets, self._bodies, strict=True)):
             body = states[:, :, i]
             push, turn = self._push[j][:, None], self._turn[j][:, None]
             far = np.hypot(offset[..., j, 0], offset[..., j, 1])
@@ -85,7 +85,7 @@ class TimeToGo:
 
 
 def _time(way: Array, speed: Array, push: Array) -> Array:
-    """Least time for a way at a speed and a largest acceleration; 0 for none."""
+    """Return the least time for a distance at a speed and a largest acceleration."""
     way = np.maximum(way, 0.0)
     # without a push, at constant speed
     push = np.maximum(push, 1e-6)
@@ -106,7 +106,7 @@ class _Field:
 
 
 def _distances(scene: Scene, body: Body, target: Target, start: Array) -> _Field | None:
-    """Distances of a body's origin from its target around walls and static bodies; None without."""
+    """Return distances of a body's origin from its target around obstacles; None without any."""
     static = tuple(obstacle for obstacle in scene.bodies if obstacle.static)
     if (not scene.walls and not static) or target.x is None or target.y is None:
         return None
@@ -138,7 +138,7 @@ def _distances(scene: Scene, body: Body, target: Target, start: Array) -> _Field
 
 
 def _graph(free: NDArray[np.bool_]) -> coo_array:
-    """Moves between free cells; a knight's passes two others."""
+    """Return the moves between free cells; a knight's passes two others."""
     number = np.arange(free.size).reshape(free.shape)
     rows, columns, lengths = [], [], []
     for dx, dy in _MOVES:
@@ -161,7 +161,7 @@ def _shift(span: slice, by: int) -> slice:
 
 
 def _inner(shape: Shape) -> float:
-    """Radius of a circle about the origin that fits into the shape; 0 if the origin is outside."""
+    """Return the radius of the largest circle about the origin inside the shape, or 0."""
     if shape.kind == "circle":
         return float(shape.radius or 0.0)
     corners = np.array(shape.outline)

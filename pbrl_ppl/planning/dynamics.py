@@ -1,26 +1,159 @@
-"""The transition model of a plan: Eq. 7 or 13 at posterior draws, each with its own states."""
+"""Transition models of a plan: Eq. 7 or 13 at posterior draws, each with its own states."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from copy import copy
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.likelihood import log_posterior
+from pbrl_ppl.likelihood import Cells, degrees_of_freedom, next_state_random, tail_places
 from pbrl_ppl.physics import Physics, after_recording
-from pbrl_ppl.planning.noise import StepNoise, step_noise
-from pbrl_ppl.planning.transition_model import rollout
-from pbrl_ppl.posterior import draws as all_draws
-from pbrl_ppl.posterior import group, known_effects, parameter_draws, problem_of, stored_mode
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import WRENCH
+from pbrl_ppl.state import STATE, WRENCH
 
 Array = NDArray[np.float64]
+
+
+@runtime_checkable
+class TransitionModel(Protocol):
+    """Transition model that :func:`pbrl_ppl.plan` can plan with.
+
+    :class:`pbrl_ppl.Dynamics` is one, and so are :class:`pbrl_ppl.LWR` and :class:`pbrl_ppl.OOLWR`.
+    """
+
+    @property
+    def scene(self) -> Scene:
+        """Known geometry, with the order of the bodies."""
+
+    @property
+    def before(self) -> Array:
+        """Wrenches that acted before the start, shape (body, 3), N and N m."""
+
+    @property
+    def draws(self) -> int:
+        """Number of models in it, each with its own states: posterior draws, or 1."""
+
+    def single(self) -> Self:
+        """Return one of the models, in the middle of all."""
+
+    def after(self, before: Array) -> Self:
+        """Return the model after these previous wrenches, shape (body, 3), N and N m."""
+
+    def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
+        """Return a bound on what a push can do: m/s^2 and rad/s^2, shape (draw,) each."""
+
+    def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
+        """Return the states after one sampling interval; NaN where the model has no answer.
+
+        Parameters
+        ----------
+        states : ndarray
+            Shape (draw, n, body, 6), SI units.
+        wrenches, previous : ndarray
+            Now and in the interval before, shape (n, body, 3), world frame, N and N m.
+        """
+
+    def noisy(self, states: Array, rng: np.random.Generator) -> Array:
+        """Return states (draw, n, body, 6) with the noise of a step."""
+
+
+def rollout(
+    model: TransitionModel,
+    start: Array,
+    wrenches: Array,
+    rng: np.random.Generator | None = None,
+) -> Array:
+    """Play wrenches (time, body, 3) from a state (body, 6): shape (draw, time + 1, body, 6).
+
+    With a generator, the noise of a step is added after each interval.
+    """
+    states = np.broadcast_to(start, (model.draws, 1, *start.shape))
+    path = [states]
+    last = model.before
+    for wrench in wrenches:
+        states, last = model.step(states, wrench[None], last[None]), wrench
+        if rng is not None:
+            states = model.noisy(states, rng)
+        path.append(states)
+    return np.concatenate(path, axis=1)
+
+
+class StepNoise(Protocol):
+    """Noise that a step adds to states, one distribution a posterior draw."""
+
+    def add(self, states: Array, rng: np.random.Generator) -> Array:
+        """Return states (draw, n, body, 6) with noise."""
+
+    def single(self, draw: int) -> StepNoise:
+        """Return the noise of one draw."""
+
+
+@dataclass(frozen=True, eq=False)
+class StateNoise:
+    """Noise of each state dimension, as in Eq. 11.
+
+    Parameters
+    ----------
+    sigma : ndarray
+        Shape (draw, state).
+    columns : tuple of int
+        The state dimensions.
+    nu : float, ndarray or None
+        Degrees of freedom, shape (draw, 1, 1, body, 1) where they are inferred.
+    """
+
+    sigma: Array
+    columns: tuple[int, ...]
+    nu: float | Array | None
+
+    def add(self, states: Array, rng: np.random.Generator) -> Array:
+        """Return states (draw, n, body, 6) with noise."""
+        out, columns = states.copy(), self.columns
+        for i, scale in enumerate(self.sigma):
+            nu = self.nu[i][0] if isinstance(self.nu, np.ndarray) else self.nu
+            out[i][..., columns] = next_state_random(states[i][..., columns], scale, rng, nu=nu)
+        return out
+
+    def single(self, draw: int) -> StateNoise:
+        """Return the noise of one draw."""
+        one = slice(draw, draw + 1)
+        nu = self.nu[one] if isinstance(self.nu, np.ndarray) else self.nu
+        return StateNoise(self.sigma[one], self.columns, nu)
+
+
+@dataclass(frozen=True, eq=False)
+class AccelerationNoise:
+    """Unexplained acceleration, held over an interval; measurement errors disturb no body.
+
+    Parameters
+    ----------
+    sigma : ndarray
+        Noise parameters, shape (draw, parameter), m/s^2 and rad/s^2 where they are accelerations.
+    cells : Cells
+        Coordinates that they move.
+    """
+
+    sigma: Array
+    cells: Cells
+
+    def add(self, states: Array, rng: np.random.Generator) -> Array:
+        """Return states (draw, n, body, 6) with noise."""
+        out = np.ascontiguousarray(states).copy()
+        # without what a contact adds, which is not predicted
+        apart = np.zeros(states.shape[:2], dtype=bool)
+        flat = out.reshape(*apart.shape, -1)
+        flat[..., self.cells.places] += self.cells.pushes(self.sigma[:, None], apart, rng)
+        return out
+
+    def single(self, draw: int) -> AccelerationNoise:
+        """Return the noise of one draw."""
+        return AccelerationNoise(self.sigma[draw : draw + 1], self.cells)
 
 
 class Dynamics:
@@ -38,9 +171,9 @@ class Dynamics:
     effects : iterable of Effect or Attached
         Effects beside those that the scene declares.
     noise : StepNoise, optional
-        What a step adds under each draw: then :meth:`noisy` works.
+        Noise of a step under each draw: then :meth:`noisy` works.
     substeps, threads : int
-        Of the engine.
+        Settings of the engine.
     declared : iterable of Effect
         Where the names of the effects that the scene declares are looked up.
     """
@@ -69,7 +202,7 @@ class Dynamics:
     def known(
         cls, scene: Scene, parameters: Mapping[str, object], effects: Any = (), **options: Any
     ) -> Dynamics:
-        """Dynamics of named parameters, as of :class:`pbrl_ppl.Transition`: the true model, say."""
+        """Return dynamics of named parameters, as :class:`pbrl_ppl.Transition` takes them."""
         layout = Physics.declare(scene, effects).layout
         return cls(scene, layout.to_vector(parameters), effects, **options)
 
@@ -83,17 +216,16 @@ class Dynamics:
         effects: Iterable[Effect] = catalogue,
         threads: int = 2,
     ) -> Dynamics:
-        """Dynamics of a posterior's draws.
+        """Return dynamics of a posterior's draws.
 
         Parameters
         ----------
         idata : InferenceData or DataTree
             As made by :func:`pbrl_ppl.fit`, or loaded.
         draws : int, optional
-            Chosen at random without replacement; without it, the posterior's mode (MAP) as the
-            posterior holds it, or else the draw of highest :func:`log_posterior`.
+            Chosen at random without replacement; without it, the posterior's mode (MAP).
         seed : int
-            Of the choice.
+            Seed of the choice.
         effects : iterable of Effect
             Where the names of its effects are looked up.
         threads : int
@@ -102,35 +234,39 @@ class Dynamics:
         Raises
         ------
         PosteriorError
-            If it holds fewer draws.
+            If it has another schema version, holds fewer draws, or lacks its mode.
         """
-        effects = known_effects(idata, effects)
-        problem = problem_of(idata, effects)  # all of its effects are declared in its scene
-        phi, sigma = parameter_draws(problem, idata)
-        mode = stored_mode(problem, idata) if draws is None else None
-        if mode is not None:
-            phi, sigma, chosen = mode.phi[None], mode.sigma[None], np.array([0])
-        elif draws is None:
-            likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
-            known = likelihood.transpose("chain", "draw").to_numpy().ravel()
-            choice = None
-            if problem.library is not None:
-                choice = all_draws(idata)["library_index"].astype(np.intp)
-            density = log_posterior(problem, phi, sigma, choice, log_likelihood=known)
-            chosen = np.array([np.argmax(density)])
-        elif not 1 <= draws <= len(phi):
-            raise PosteriorError(
-                f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}"
-            )
+        from pbrl_ppl.posterior import PosteriorRecord, vectors  # not for known dynamics
+
+        record = PosteriorRecord.of(idata)
+        attached = record.attached(effects)
+        physics = Physics(record.scene, attached, record.substeps)
+        layout = physics.layout
+        if draws is None:
+            phi, sigma = (vector[None] for vector in record.mode_vectors(layout))
         else:
+            phi, sigma = vectors(idata, layout, record.noise_variables)
+            if not 1 <= draws <= len(phi):
+                raise PosteriorError(
+                    f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}"
+                )
             chosen = np.random.default_rng(seed).choice(len(phi), draws, replace=False)
+            phi, sigma = phi[chosen], sigma[chosen]
+        noise: StepNoise
+        if record.cells is not None:
+            noise = AccelerationNoise(sigma, record.cells)
+        else:
+            nu: float | Array | None = record.nu
+            if tail_places(physics):
+                nu = degrees_of_freedom(physics, phi, record.nu)
+            noise = StateNoise(sigma, tuple(STATE.index(name) for name in record.measured), nu)
         return cls(
-            problem.scene,
-            phi[chosen],
-            noise=step_noise(problem, phi[chosen], sigma[chosen]),
-            substeps=problem.physics.substeps,
+            record.scene,
+            phi,
+            noise=noise,
+            substeps=record.substeps,
             threads=threads,
-            declared=effects,
+            declared=[each.effect for each in attached],
         )
 
     @property
@@ -139,31 +275,36 @@ class Dynamics:
         return len(self.phi)
 
     def single(self) -> Dynamics:
-        """Dynamics of one draw: the nearest to the mean of all, in units of their spread."""
+        """Return dynamics of the draw nearest to the mean of all, in units of their spread."""
         offset = (self.phi - self.phi.mean(axis=0)) / np.maximum(self.phi.std(axis=0), 1e-12)
         i = int(np.argmin((offset**2).sum(axis=1)))
-        chosen = copy(self)
-        chosen.phi = self.phi[i : i + 1]
+        chosen = self.at(self.phi[i : i + 1])
         if self._noise is not None:
             chosen._noise = self._noise.single(i)
         return chosen
 
+    def at(self, phi: Array) -> Dynamics:
+        """Return the same dynamics at other parameters, shape (draw, p), with the same worlds."""
+        other = copy(self)
+        other.phi = phi
+        return other
+
     def after(self, before: Array) -> Dynamics:
-        """Dynamics after these previous wrenches, shape (body, 3), N and N m."""
+        """Return dynamics after these previous wrenches, shape (body, 3), N and N m."""
         later = copy(self)
         later.before = np.asarray(before, dtype=float).reshape(self.before.shape)
         return later
 
     def mass(self, body: str) -> Array:
-        """A body's mass under each draw, shape (draw,), kg."""
-        own = self.scene.body(body)
-        known = dict(own.known)
+        """Return a body's mass under each draw, shape (draw,), kg."""
+        chosen = self.scene.body(body)
+        known = dict(chosen.known)
         if "mass" in known:
             return np.full(self.draws, float(known["mass"]))
-        return self.phi[:, self.layout.index("mass", own.owner)]
+        return self.phi[:, self.layout.index("mass", chosen.owner)]
 
     def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
-        """The most that a push without friction can do: m/s^2 and rad/s^2, shape (draw,) each."""
+        """Return what a push can do without friction: m/s^2 and rad/s^2, shape (draw,) each."""
         shape, mass = self.scene.body(body).shape, self.mass(body)
         # a wheel or a contact at the rim turns the body as hard as it is pushed
         turning = torque + force * shape.bounding_radius
@@ -171,7 +312,7 @@ class Dynamics:
         return linear, turning / (mass * shape.unit_moment)
 
     def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
-        """States after one sampling interval.
+        """Return the states after one sampling interval.
 
         Parameters
         ----------
@@ -180,7 +321,7 @@ class Dynamics:
         wrenches : ndarray
             Shape (n, body, 3), world frame, N and N m; the same under each draw.
         previous : ndarray, optional
-            Those of the interval before, same shape; :attr:`before` without them.
+            Wrenches of the interval before, same shape; :attr:`before` without them.
 
         Returns
         -------
@@ -191,20 +332,16 @@ class Dynamics:
         if self._whole:  # the time is after the recording
             last = np.broadcast_to(self.before if previous is None else previous, wrenches.shape)
             actions = after_recording(wrenches, last)[:, None]
-        # what had diverged stays so; the engine refuses it
+        # the engine refuses states that had diverged: they stay NaN
         lost = np.asarray(~np.isfinite(states).all(axis=(-2, -1)))
         given = np.where(lost[..., None, None], 0.0, states) if lost.any() else states
-        out = np.stack(
-            [
-                self._physics.predict(p, s, actions)[:, 0]
-                for p, s in zip(self.phi, given, strict=True)
-            ]
-        )
+        pairs = zip(self.phi, given, strict=True)
+        out = np.stack([self._physics.predict(p, s, actions)[:, 0] for p, s in pairs])
         out[lost] = np.nan
         return out
 
     def noisy(self, states: Array, rng: np.random.Generator) -> Array:
-        """Add Eq. 13's noise to states of shape (draw, n, body, 6).
+        """Return states of shape (draw, n, body, 6) with Eq. 13's noise.
 
         Raises
         ------

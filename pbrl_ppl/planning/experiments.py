@@ -1,4 +1,4 @@
-"""Experiments: the actions that tell apart effects which the data so far cannot separate."""
+"""Experiments: actions that separate effects which the data so far cannot."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from threadpoolctl import threadpool_limits
 
-from pbrl_ppl.criticism import DECISIVE, fit_rivals, kept_groups, named_effects
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import EffectError, GoalError
 from pbrl_ppl.files import write_atomically
@@ -22,17 +21,16 @@ from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.allowed import Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.planner import start_state
 from pbrl_ppl.planning.separation import Separation
-from pbrl_ppl.posterior import scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS
 
 Array = NDArray[np.float64]
 
-#: A log Bayes factor from which one effect is named alone; a score statistic is twice as large.
-_TOLD = DECISIVE / 2
-#: Sequences of a generation, those that it is bred from, generations, draws to judge them by.
+#: A log Bayes factor from which one effect is named alone: half the score statistic's `DECISIVE`.
+_NAMED = 5.0
+#: Sequences of a generation, its parents, generations, and draws to rank them by.
 _POPULATION, _PARENTS, _GENERATIONS, _ROUGH_DRAWS = 40, 10, 8, 3
-#: Share of a child's pieces that are new; leaders that are judged by all draws.
+#: Share of a child's pieces that are new; leaders that are ranked by all draws.
 _NEW, _LEADERS = 0.2, 4
 #: More than any separation (nats).
 _MEETING = 1e9
@@ -40,23 +38,23 @@ _MEETING = 1e9
 
 @dataclass(frozen=True, eq=False)
 class Suggestion:
-    """An experiment that is expected to tell rival effects apart.
+    """Experiment that is expected to separate rival effects.
 
     Attributes
     ----------
     scene : Scene
-        As the posterior has it.
+        Scene of the posterior.
     start : ndarray
-        State it starts from, shape (body, 6), SI units.
+        Initial state, shape (body, 6), SI units.
     wrenches : xarray.DataArray
-        What to do: dims (time, body, wrench), world frame, N and N m, each held for an interval.
+        Dims (time, body, wrench), world frame, N and N m, each held for an interval.
     separation : xarray.DataArray
         Expected log Bayes factor of each effect, if it is the true one, over each rival: dims
         (true, rival), nats.
     at_random : float
-        What a random sequence of the same set gives in the mean, of its weakest pair (nats).
+        Mean over random sequences of the same set, for the weakest pair (nats).
     meeting : bool
-        Whether bodies may meet in it, where models are rough.
+        Whether bodies may meet, where models are rough.
     """
 
     scene: Scene
@@ -68,17 +66,17 @@ class Suggestion:
 
     @property
     def expected(self) -> float:
-        """Expected log Bayes factor of the pair that is told apart worst (nats)."""
+        """Expected log Bayes factor of the pair that is separated worst (nats)."""
         return float(_weakest(self.separation.to_numpy()))
 
     @property
     def decisive(self) -> bool:
-        """Whether one effect alone is expected to be named after it."""
-        return self.expected >= _TOLD
+        """Whether one effect alone is expected to be named afterwards."""
+        return self.expected >= _NAMED
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What is to be expected, in words."""
+        """Sentences on the expected result."""
         time = self.scene.time_step * self.wrenches.sizes["time"]
         names = [str(name) for name in self.separation["true"].values]
         said = [
@@ -93,18 +91,18 @@ class Suggestion:
             " that is told apart worst"
         )
         if not self.decisive:
-            times = int(np.ceil(_TOLD / max(self.expected, 1e-3)))
+            times = int(np.ceil(_NAMED / max(self.expected, 1e-3)))
             more = f"repeat it {times} times, or " if times <= 20 else ""
             said.append(
-                f"a factor of {_TOLD:g} names one effect alone, which is not to be expected: {more}"
-                "allow stronger actions, more steps or another start"
+                f"a factor of {_NAMED:g} names one effect alone, which is not to be expected:"
+                f" {more}allow stronger actions, more steps or another start"
             )
         if self.meeting:
             said.append("bodies may meet on the way, where models are rough: keep them apart")
         return tuple(said)
 
     def to_dataframe(self) -> pd.DataFrame:
-        """The experiment as rows of a history without measurements but the start."""
+        """Return the experiment as rows of a history without measurements after the start."""
         wrenches = self.wrenches.to_numpy()[None]
         nothing = np.full((1, wrenches.shape[1], *self.start.shape), np.nan)
         return segment_rows(self.scene, self.start[None], wrenches, nothing)
@@ -135,15 +133,14 @@ def suggest_actions(
     catalogue: Iterable[Effect] = catalogue,
     progress: Callable[[str], None] | None = None,
 ) -> Suggestion:
-    """Find the actions that tell best apart effects which the data so far cannot separate.
+    """Find the actions that best separate effects which the data so far cannot.
 
     Each rival effect is fitted to the recording that the posterior holds, so that it has the size
-    that explains what was seen. Sequences from the allowed set are then judged by the log Bayes
-    factor that they are expected to give, were one rival or the other true: the
-    Kullback-Leibler distance of what both foresee, in the mean over posterior draws, in units of
-    the errors of measuring and of unexplained accelerations, less what the rivals' parameters
-    absorb. Of several pairs, and of both directions, the worst counts. The best sequence is bred
-    from random ones. The noise is as in the posterior: a refit lets it take a part of the misfit,
+    that explains the data. Sequences from the allowed set are then ranked by the expected log Bayes
+    factor: the Kullback-Leibler divergence between the predictions of two rivals, as a mean over
+    posterior draws, in units of measurement and process noise, less what the rivals' parameters
+    absorb. The worst of all pairs and both directions counts. The best sequence is found by a
+    genetic algorithm. The noise is as in the posterior: a refit lets it take a part of the misfit,
     so that large factors come out smaller.
 
     Parameters
@@ -199,6 +196,10 @@ def suggest_actions(
         said.sentences  # what is to be expected
         said.to_csv("next.csv")  # play it, record, and close the loop on both recordings
     """
+    # with the samplers, which a plan does not need
+    from pbrl_ppl.criticism import fit_rivals, kept_groups, named_effects
+    from pbrl_ppl.posterior import scene_of
+
     say = progress or (lambda stage: None)
     posterior = getattr(known, "posterior_after", known)
     catalogue = tuple(getattr(known, "catalogue", catalogue))
@@ -261,7 +262,7 @@ def suggest_actions(
 def _bred(
     judge: Separation, allowed: Allowed, rng: np.random.Generator, say: Callable[[str], None]
 ) -> tuple[Array, float]:
-    """The leading sequences of the last generation, and what those of the first give in the mean.
+    """Return the leading sequences of the last generation, and the mean value of the first.
 
     Children take pieces from two parents, and some from the allowed set.
     """
@@ -292,12 +293,12 @@ def _wide(mask: NDArray[np.bool_], genes: Array) -> NDArray[np.bool_]:
 
 
 def _weakest(separation: Array) -> Array:
-    """Of all pairs and directions the least, (true, rival, ...) -> (...)."""
+    """Return the least of all pairs and directions, (true, rival, ...) -> (...)."""
     off = ~np.eye(len(separation), dtype=bool)
     return np.asarray(separation[off].min(axis=0))
 
 
 def _value(separation: Array, meeting: NDArray[np.bool_]) -> Array:
-    """What sequences are ranked by: those in which bodies meet come after all others."""
+    """Return what sequences are ranked by: those in which bodies meet come last."""
     value = _weakest(separation)
     return np.where(np.isfinite(value), value - np.where(meeting, _MEETING, 0.0), -np.inf)

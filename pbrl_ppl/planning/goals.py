@@ -1,4 +1,4 @@
-"""Goals: where bodies should be, how nearly, and whether they may touch anything on the way."""
+"""Goals of a plan: target poses, tolerances and the contact penalty."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Target:
-    """Where one body should be; a coordinate that is None is free.
+    """Target pose of one body; a coordinate that is None is free.
 
     Attributes
     ----------
@@ -30,11 +30,11 @@ class Target:
     x, y, theta : float, optional
         m, m, rad.
     weight : float
-        In the L2 distance, beside other bodies.
+        Weight of the body in the L2 distance.
     tolerance, angle_tolerance : float
-        How far off is still there (m, rad).
+        Largest error at the goal (m, rad).
     speed : float, optional
-        The most it may move there, its rim included (m/s); any speed by default.
+        Largest speed at the goal, that of the rim included (m/s); any speed by default.
 
     Raises
     ------
@@ -70,15 +70,15 @@ class Target:
 
 @dataclass(frozen=True)
 class Goal:
-    """Targets of a plan, and its penalty for contact.
+    """Targets of a plan and its penalty for contact.
 
     Attributes
     ----------
     targets : tuple of Target
         One or more bodies, each once.
     contact_penalty : float
-        What a second in contact costs, beside the second itself; infinite if nothing may touch.
-        Contacts are looked for at the ends of the sampling intervals.
+        Cost of a second in contact, in addition to the second; infinite if nothing may touch.
+        Contacts are checked at the ends of the sampling intervals.
 
     Raises
     ------
@@ -108,14 +108,14 @@ class Goal:
 
     @classmethod
     def of(cls, targets: Mapping[str, Sequence[float | None]], **options: float) -> Goal:
-        """Goal from poses by body name: ``{"cart": (x, y, theta)}``, None where free.
+        """Return a goal from poses by body name: ``{"cart": (x, y, theta)}``, None where free.
 
         Parameters
         ----------
         targets : mapping
             Pose of each body, m and rad.
         **options
-            ``contact_penalty`` is the goal's, all others are every target's.
+            ``contact_penalty`` of the goal, and options of every target.
 
         Raises
         ------
@@ -149,12 +149,12 @@ class Goal:
         return cls(tuple(read_tables(path, table.pop("target", []), Target)), **table)
 
     def check(self, scene: Scene) -> None:
-        """Refuse a goal for a body that the scene lacks, or that cannot move.
+        """Check that the scene has the bodies, and that they can be pushed.
 
         Raises
         ------
         GoalError
-            It names the body.
+            If one cannot; it names the body.
         """
         moving = [body.name for body in scene.dynamic]
         for target in self.targets:
@@ -165,12 +165,12 @@ class Goal:
                 )
 
     def places(self, scene: Scene) -> list[int]:
-        """Indices of the targets' bodies among the scene's moving ones."""
+        """Return the indices of the targets' bodies among the scene's moving bodies."""
         moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
     def errors(self, scene: Scene, states: Array) -> Array:
-        """Offsets from the targets, 0 where free, shape (..., target, 3): m, m, rad.
+        """Return offsets from the targets, 0 where free, shape (..., target, 3): m, m, rad.
 
         Parameters
         ----------
@@ -188,7 +188,7 @@ class Goal:
         return np.where(np.isnan(wanted), 0.0, offset)
 
     def distance(self, scene: Scene, states: Array) -> Array:
-        """Weighted L2 distance from the targets (m), angles at the bodies' rims, shape (...)."""
+        """Return the weighted L2 distance from the targets (m), angles at the rims, shape (...)."""
         lever = np.array([scene.body(t.body).shape.bounding_radius for t in self.targets])
         weight = np.array([t.weight for t in self.targets])
         offset = self.errors(scene, states)
@@ -196,7 +196,7 @@ class Goal:
         return np.asarray(np.sqrt((weight[:, None] * offset**2).sum(axis=(-2, -1))))
 
     def shortfall(self, scene: Scene, states: Array) -> Array:
-        """Error of the worst target in units of its tolerances; at most 1 is there."""
+        """Return the error of the worst target in units of its tolerances; 1 or less is reached."""
         offset = self.errors(scene, states)
         worst = np.zeros(offset.shape[:-2])
         for i, (t, place) in enumerate(zip(self.targets, self.places(scene), strict=True)):
@@ -210,7 +210,7 @@ class Goal:
 
 
 def read_toml(path: str | Path, what: str, known: Iterable[str]) -> dict[str, Any]:
-    """Read a TOML file with these keys at most.
+    """Read a TOML file that may have these keys.
 
     Raises
     ------
@@ -228,7 +228,7 @@ def read_toml(path: str | Path, what: str, known: Iterable[str]) -> dict[str, An
 
 
 def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> None:
-    """Refuse an unknown key, and name the nearest known one."""
+    """Check the keys of a table; the error for an unknown one names the nearest known one."""
     known = list(known)
     for key in table:
         if key not in known:
@@ -236,7 +236,7 @@ def check_keys(table: Mapping[str, Any], known: Iterable[str], where: str) -> No
 
 
 def read_tables(path: str | Path, tables: Iterable[Mapping[str, Any]], kind: Any) -> Iterator[Any]:
-    """One Target or Action from each table of a file.
+    """Yield a Target or Action for each table of a file.
 
     Raises
     ------

@@ -19,12 +19,10 @@ from pbrl_ppl.history import segment_rows
 from pbrl_ppl.physics import check_placement, overlap
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.astar import astar
-from pbrl_ppl.planning.dynamics import Dynamics
+from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, rollout
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
-from pbrl_ppl.planning.risk import tail_mean
-from pbrl_ppl.planning.search import NODES, Found
-from pbrl_ppl.planning.transition_model import TransitionModel, rollout
+from pbrl_ppl.planning.search import NODES, Found, Task, tail_mean
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import STATE
 
@@ -222,29 +220,16 @@ def plan(
     _check_room(scene, goal)
     search: Callable[..., Found] = astar if method == "astar" else mppi
     rng = np.random.default_rng(seed)
-    found = search(
-        dynamics, first, goal, actions, tail=tail, nodes=nodes, seconds=seconds, noise=noise,
-        rng=rng, progress=progress, **options,
-    )  # fmt: skip
-    return _described(dynamics, first, goal, found, tail, noise, rng)
-
-
-def _described(
-    dynamics: TransitionModel,
-    start: Array,
-    goal: Goal,
-    found: Found,
-    tail: float,
-    noise: bool,
-    rng: np.random.Generator,
-) -> Plan:
-    scene = dynamics.scene
-    states = rollout(dynamics, start, found.wrenches)
+    limit = np.inf if seconds is None else seconds
+    say = progress or (lambda text: None)
+    task = Task(dynamics, first, goal, actions, tail, nodes, limit, noise, rng, say)
+    found = search(task, **options)
+    states = rollout(dynamics, first, found.wrenches)
     distance = float(tail_mean(goal.distance(scene, states[:, -1]), tail))
     if noise:
         times = -(-_NOISY // dynamics.draws)
         states = np.concatenate(
-            [rollout(dynamics, start, found.wrenches, rng) for _ in range(times)]
+            [rollout(dynamics, first, found.wrenches, rng) for _ in range(times)]
         )
     predicted = xr.Dataset(
         {"predicted": (("draw", "time", "body", "state"), states)},
@@ -256,7 +241,7 @@ def _described(
         },
     )
     return Plan(
-        scene, goal, start, found.wrenches, predicted, found.reached, found.stopped, distance,
+        scene, goal, first, found.wrenches, predicted, found.reached, found.stopped, distance,
         found.nodes, found.seconds,
     )  # fmt: skip
 

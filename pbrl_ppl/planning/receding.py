@@ -3,54 +3,42 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
-from pbrl_ppl.planning.actions import ActionSet
-from pbrl_ppl.planning.contact import contact_cost
-from pbrl_ppl.planning.goals import Goal
-from pbrl_ppl.planning.risk import tail_mean
-from pbrl_ppl.planning.search import NODES, Found
-from pbrl_ppl.planning.transition_model import TransitionModel
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
 
 Array = NDArray[np.float64]
 
-#: Share of the noise that goes on from one interval to the next: pushes last longer than one.
+#: Correlation of the noise from one interval to the next.
 _PERSISTENCE = 0.7
-#: Spread of the wrenches that are tried, as a share of the strongest.
+#: Standard deviation of the wrenches that are tried, as a share of the strongest.
 _SPREAD = 0.5
-#: The best of so many samples have about as much weight as all others.
+#: Share of the samples that have about as much weight as all others.
 _ELITE = 0.05
-#: What a speed of 1 m/s costs at the horizon's end (m): who arrives fast does not stay.
+#: Cost of a speed of 1 m/s at the end of the horizon (m): a fast body does not stay there.
 _ARRIVAL = 0.2
 
 
 class Horizon:
     """Receding horizon: wrenches for the next intervals, improved and moved on at every step.
 
+    Wrenches may be anything up to the strongest of the action set, on all of its bodies at once.
+
     Parameters
     ----------
-    dynamics : TransitionModel
-        One draw or many.
-    goal, actions
-        As of :func:`pbrl_ppl.plan`; wrenches may be anything up to the strongest of the set, on
-        all of its bodies at once.
+    task : Task
+        Model, goal, actions and risk.
     horizon : int
         Intervals looked ahead.
     samples : int
         Sequences tried at a time.
     iterations : int
-        Times they are drawn anew about the best mean.
-    tail : float
-        Share of the worst draws that count.
-    noise : bool
-        Whether Eq. 13's noise is added.
+        Times they are drawn about the best mean.
     rng : Generator
-        Of the samples.
+        Source of the samples.
 
     References
     ----------
@@ -59,24 +47,15 @@ class Horizon:
     """
 
     def __init__(
-        self,
-        dynamics: TransitionModel,
-        goal: Goal,
-        actions: ActionSet,
-        *,
-        horizon: int,
-        samples: int,
-        iterations: int,
-        tail: float,
-        noise: bool,
-        rng: np.random.Generator,
+        self, task: Task, horizon: int, samples: int, iterations: int, rng: np.random.Generator
     ) -> None:
-        self.dynamics, self.goal, self.rng = dynamics, goal, rng
+        self.task, self.rng = task, rng
         self.samples, self.iterations = samples, iterations
-        self.tail, self.noise = tail, noise
-        self.most = _strongest(dynamics.scene, actions)
+        scene = task.dynamics.scene
+        strongest = [task.actions.strongest(body.name) for body in scene.moving]
+        self.most = np.array([(force, force, torque) for force, torque in strongest])
         self.mean = np.zeros((horizon, *self.most.shape))
-        self._own = goal.places(dynamics.scene)
+        self.bodies = task.goal.places(scene)
         self.generated = 0
 
     def improve(self, start: Array, before: Array) -> None:
@@ -107,59 +86,47 @@ class Horizon:
             self.mean = np.tensordot(weight / weight.sum(), tried, axes=1)
 
     def advance(self) -> Array:
-        """The first wrench, shape (body, 3); the others move up."""
+        """Return the first wrench, shape (body, 3); the others move up."""
         first: Array = self.mean[0].copy()
         self.mean = np.concatenate([self.mean[1:], self.mean[-1:]])
         return first
 
     def _cost(self, start: Array, tried: Array, before: Array) -> Array:
-        """L2 distance from the goal, its mean on the way and at the end, speed there, contacts."""
-        scene, horizon = self.dynamics.scene, tried.shape[1]
+        """Return L2 distance from the goal (mean and last), last speed, and contacts."""
+        task, horizon = self.task, tried.shape[1]
+        scene, goal = task.dynamics.scene, task.goal
         states = np.repeat(start[:, None], len(tried), axis=1)
         cost = np.zeros(len(tried))
         for t in range(horizon):
             last = tried[:, t - 1] if t else np.broadcast_to(before, tried[:, 0].shape)
-            states = self.dynamics.step(states, tried[:, t], last)
-            if self.noise:
-                states = self.dynamics.noisy(states, self.rng)
-            self.generated += len(tried) * self.dynamics.draws
-            far = tail_mean(self.goal.distance(scene, states), self.tail)
-            cost += far / horizon + scene.time_step * contact_cost(self.goal, scene, states)
-        speed = np.sqrt((states[..., self._own, 3:5] ** 2).sum(axis=(-2, -1)))
-        return np.asarray(cost + far + _ARRIVAL * tail_mean(speed, self.tail))
+            states = task.dynamics.step(states, tried[:, t], last)
+            if task.noise:
+                states = task.dynamics.noisy(states, self.rng)
+            self.generated += len(tried) * task.dynamics.draws
+            far = tail_mean(goal.distance(scene, states), task.tail)
+            cost += far / horizon + scene.time_step * contact_cost(goal, scene, states)
+        speed = np.sqrt((states[..., self.bodies, 3:5] ** 2).sum(axis=(-2, -1)))
+        return np.asarray(cost + far + _ARRIVAL * tail_mean(speed, task.tail))
 
 
 def mppi(
-    dynamics: TransitionModel,
-    start: Array,
-    goal: Goal,
-    actions: ActionSet,
+    task: Task,
     *,
-    tail: float = 1.0,
     horizon: int = 15,
     samples: int = 256,
     iterations: int = 3,
     intervals: int = 200,
-    nodes: int = NODES,
-    seconds: float | None = None,
-    noise: bool = False,
-    rng: np.random.Generator | None = None,
-    progress: Callable[[str], None] | None = None,
 ) -> Found:
     """Go towards the goal by a receding horizon, in the model, until it is reached.
 
     Parameters
     ----------
-    dynamics, start, goal, actions, tail, noise, rng, progress
-        As of :func:`pbrl_ppl.planning.astar.astar`.
+    task : Task
+        Model, start, goal, actions and limits.
     horizon, samples, iterations : int
-        As of :class:`Horizon`.
+        As for :class:`Horizon`.
     intervals : int
         The longest plan.
-    nodes : int
-        States to generate at most, each draw's own.
-    seconds : float, optional
-        Where to stop, too; then the plan depends on how busy the machine is.
 
     Returns
     -------
@@ -171,35 +138,32 @@ def mppi(
     GoalError
         If a number is below 1.
     """
+    nodes, dynamics, goal, start = task.nodes, task.dynamics, task.goal, task.start
     if min(horizon, samples, iterations, intervals, nodes) < 1:
         raise GoalError(
             "MPPI: horizon, samples, iterations, intervals and nodes must be at least 1"
         )
     scene, begin = dynamics.scene, time.monotonic()
-    limit = np.inf if seconds is None else seconds
-    ahead = Horizon(
-        dynamics, goal, actions, horizon=horizon, samples=samples, iterations=iterations,
-        tail=tail, noise=noise, rng=rng or np.random.default_rng(0),
-    )  # fmt: skip
+    rng = task.rng or np.random.default_rng(0)
+    ahead = Horizon(task, horizon, samples, iterations, rng)
     states = np.repeat(start[None, None], dynamics.draws, axis=0)
     wrenches: list[Array] = []
     nearest, best, stopped = np.inf, 0, "exhausted"
 
     try:
         while True:
-            if float(tail_mean(goal.shortfall(scene, states), tail)[0]) <= 1.0:
+            if float(tail_mean(goal.shortfall(scene, states), task.tail)[0]) <= 1.0:
                 stopped, best = "goal", len(wrenches)
                 break
-            far = float(tail_mean(goal.distance(scene, states), tail)[0])
+            far = float(tail_mean(goal.distance(scene, states), task.tail)[0])
             if far < nearest and (wrenches or not start[:, 3:].any()):
                 nearest, best = far, len(wrenches)
             if len(wrenches) >= intervals:
                 break
-            if ahead.generated >= nodes or time.monotonic() - begin > limit:
+            if ahead.generated >= nodes or time.monotonic() - begin > task.seconds:
                 stopped = "nodes" if ahead.generated >= nodes else "time"
                 break
-            if progress is not None:
-                progress(f"interval {len(wrenches)}, {far:.2f} m from the goal")
+            task.progress(f"interval {len(wrenches)}, {far:.2f} m from the goal")
             last = wrenches[-1] if wrenches else dynamics.before
             ahead.improve(states[:, 0], last)
             wrenches.append(ahead.advance())
@@ -209,12 +173,3 @@ def mppi(
     chosen = np.array(wrenches[:best]).reshape(-1, len(start), 3)
     took = time.monotonic() - begin
     return Found(chosen, stopped == "goal", stopped, ahead.generated, took)
-
-
-def _strongest(scene: Scene, actions: ActionSet) -> Array:
-    """The strongest wrench on each body, shape (body, 3), N, N, N m."""
-    most = np.zeros((len(scene.moving), 3))
-    for i, body in enumerate(scene.moving):
-        force, torque = actions.strongest(body.name)
-        most[i] = force, force, torque
-    return most

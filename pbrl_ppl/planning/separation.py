@@ -1,20 +1,22 @@
-"""Expected separation of rival models by an experiment: log Bayes factors before it is made."""
+"""Expected separation of rival models by an experiment: log Bayes factors."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import copy
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import Rival
 from pbrl_ppl.likelihood import TrajectoryNoise
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.scene import Scene
+
+if TYPE_CHECKING:  # with the samplers, which a plan does not need
+    from pbrl_ppl.criticism import Rival
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
@@ -27,16 +29,16 @@ _STEP = 0.3
 
 @dataclass(frozen=True, eq=False)
 class _Paths:
-    """Transitions along the paths that one model foresees, one path after the other.
+    """Transitions along the paths that one model predicts, one path after the other.
 
     Parameters
     ----------
     begin, end : ndarray
         States, shape (transition, body, 6).
     wrenches, before : ndarray
-        Of the interval and of the one before, shape (transition, body, 3).
+        Wrenches of the interval and of the one before, shape (transition, body, 3).
     intervals : int
-        Of each path.
+        Number of intervals of each path.
     lost : ndarray of bool
         Whether the engine diverged on a path, shape (path,).
     """
@@ -50,20 +52,19 @@ class _Paths:
 
 
 class Separation:
-    """Log Bayes factors that experiments are expected to give between rival models.
+    """Expected log Bayes factors of experiments between rival models.
 
-    The data that one model foresees are predicted by another step by step, and whitened by the
+    The data that one model predicts are predicted by another step by step, and whitened by the
     latter's Kalman filter with both noises of the posterior. Both models are linear in their
-    parameters about their modes, with the posterior as prior: what a rival's parameters can absorb
-    within what is known of them does not separate.
+    parameters about their modes, with the posterior as prior: a difference that a rival's
+    parameters can absorb within their posterior does not separate.
 
     Parameters
     ----------
     rivals : sequence of Rival
         Two or more.
     start : ndarray
-        State in which the experiment begins, shape (body, 6), SI units; known to the error of
-        measuring.
+        Initial state of the experiment, shape (body, 6), SI units; known to measurement noise.
     before : ndarray
         Wrenches before it, shape (body, 3).
     threads : int
@@ -78,25 +79,25 @@ class Separation:
         self._engines = [self._engine(rival, threads) for rival in rivals]
 
     def path(self, wrenches: Array) -> Array:
-        """States (n, time + 1, body, 6) that the first rival's mode foresees, as of `__call__`."""
+        """Return the states (n, time + 1, body, 6) that the first rival's mode predicts."""
         first = self.rivals[0]
         return np.asarray(self._rolled(first, first.mode.phi[None], wrenches)[0])
 
     def __call__(self, wrenches: Array, draws: int) -> tuple[Array, Bools]:
-        """Expected log Bayes factors of experiments.
+        """Return the expected log Bayes factors of experiments.
 
         Parameters
         ----------
         wrenches : ndarray
-            Of each experiment, shape (n, time, body, 3), N and N m.
+            Wrenches of each experiment, shape (n, time, body, 3), N and N m.
         draws : int
-            Posterior draws that the truth is taken from.
+            Number of posterior draws of the true model.
 
         Returns
         -------
         separation : ndarray
-            Of the true model over its rival, nats, shape (true, rival, n); 0 of a model over
-            itself, NaN where the engine diverged.
+            Factor of the true model over its rival, nats, shape (true, rival, n); 0 on the
+            diagonal, NaN where the engine diverged.
         meeting : ndarray of bool
             Whether bodies meet on any of the paths, shape (n,).
         """
@@ -106,12 +107,12 @@ class Separation:
             paths = self._paths(true, true.draws[:draws], wrenches)
             met = touching(self.scene, paths.begin, paths.end)
             meeting |= met.reshape(-1, n, paths.intervals).any(axis=(0, 2))
-            own = self._foreseen(true, paths, met)[1]
+            widening = self._explained(true, paths, met)[1]
             for j, rival in enumerate(self.rivals):
                 if i == j:
                     continue
-                misfit, spread, absorbed = self._foreseen(rival, paths, met)
-                value = 0.5 * (misfit - absorbed + spread - own)
+                misfit, spread, absorbed = self._explained(rival, paths, met)
+                value = 0.5 * (misfit - absorbed + spread - widening)
                 value[paths.lost] = np.nan
                 result[i, j] = value.reshape(-1, n).mean(axis=0)
         return result, meeting
@@ -125,13 +126,11 @@ class Separation:
         return found.after(self.before)
 
     def _dynamics(self, rival: Rival, phi: Array) -> Dynamics:
-        """A rival's dynamics at parameters (draw, p)."""
-        found = copy(self._engines[self.rivals.index(rival)])
-        found.phi = phi
-        return found
+        """Return a rival's dynamics at parameters (draw, p)."""
+        return self._engines[self.rivals.index(rival)].at(phi)
 
     def _rolled(self, rival: Rival, phi: Array, wrenches: Array) -> Array:
-        """States that a model foresees under each draw, shape (draw, n, time + 1, body, 6)."""
+        """Return the states predicted under each draw, shape (draw, n, time + 1, body, 6)."""
         dynamics = self._dynamics(rival, phi)
         n, intervals = wrenches.shape[:2]
         states = np.broadcast_to(self.start, (len(phi), n, *self.start.shape))
@@ -158,11 +157,11 @@ class Separation:
             along(wrenches), along(before), wrenches.shape[1], lost.ravel(),
         )  # fmt: skip
 
-    def _foreseen(self, rival: Rival, paths: _Paths, met: Bools) -> tuple[Array, Array, Array]:
-        """A model's account of other paths, each of shape (path,).
+    def _explained(self, rival: Rival, paths: _Paths, met: Bools) -> tuple[Array, Array, Array]:
+        """Return how a model explains the paths of another, three arrays of shape (path,).
 
-        Squared misfit with what its parameters absorb taken off, logarithm of how much they widen
-        the predictions, and how many numbers of the data go into them.
+        Squared whitened residual less what the parameters absorb, log-determinant of the
+        predictions' widening by the parameters, and number of parameters that the data inform.
         """
         mode = rival.mode
         cells = mode.problem.trajectory_noise.cells
@@ -171,7 +170,7 @@ class Separation:
         lower, upper = mode.problem.layout.bounds
 
         def steps(phi: Array, begin: Array) -> Array:
-            """Cells after an interval, (point, p) and (point, transition, body, 6)."""
+            """Return the cells after an interval, shape (point, transition, cell)."""
             dynamics = self._dynamics(rival, phi)
             ends = dynamics.step(begin, paths.wrenches, paths.before)
             return np.nan_to_num(cells.of(ends))
@@ -219,5 +218,5 @@ class Separation:
 
 
 def bare(scene: Scene) -> Scene:
-    """A scene without the effects that its bodies declare: each rival has its own."""
+    """Return a scene without the effects that its bodies declare: the rivals differ in them."""
     return scene.replace(bodies=tuple(replace(body, effects=()) for body in scene.bodies))

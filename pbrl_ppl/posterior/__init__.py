@@ -1,23 +1,38 @@
 """Posterior files: save, load, draws, what the data inform, the next prior."""
 
-from pbrl_ppl.posterior.comparison import Comparison, compare
-from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
-from pbrl_ppl.posterior.known_effects import known_effects
-from pbrl_ppl.posterior.learned_library import learned_library, library_probabilities
-from pbrl_ppl.posterior.leave_out import by_number, by_trajectory, left_out, separate
-from pbrl_ppl.posterior.loo_pit import loo_pit
-from pbrl_ppl.posterior.origin import linearised_as, problem_of, versions
-from pbrl_ppl.posterior.places import both_places, placed
-from pbrl_ppl.posterior.predictions import predicted_rows
-from pbrl_ppl.posterior.prior_groups import prior_groups
-from pbrl_ppl.posterior.record import (
+from pbrl_ppl.posterior.completion import (
     MIN_ESS,
     checked,
     complete,
     evaluate,
     parameter_draws,
+    prior_groups,
 )
-from pbrl_ppl.posterior.recording import both_recordings, recorded, recording
+from pbrl_ppl.posterior.cross_validation import (
+    Comparison,
+    by_number,
+    by_trajectory,
+    compare,
+    left_out,
+    loo_pit,
+    predicted_rows,
+    separate,
+)
+from pbrl_ppl.posterior.data import (
+    CELLS,
+    both_places,
+    both_recordings,
+    linearised_as,
+    placed,
+    problem_of,
+    recorded,
+    recorded_cells,
+    recording,
+    versions,
+)
+from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
+from pbrl_ppl.posterior.mode import Point, stored_mode, updated_mode
+from pbrl_ppl.posterior.record import PosteriorRecord, layout_of, scene_of, vectors
 from pbrl_ppl.posterior.store import (
     DATATREE,
     HDI_PROB,
@@ -26,32 +41,34 @@ from pbrl_ppl.posterior.store import (
     from_groups,
     group,
     groups,
-    has_one_sigma,
     interval,
     likeliest_draw,
     load_posterior,
     save_posterior,
     scalars,
-    scene_of,
     smoothed,
 )
-from pbrl_ppl.posterior.stored_mode import MODE, Point, climbed_text, stored_mode
-from pbrl_ppl.posterior.updated_prior import moment_matched, updated_scene
+from pbrl_ppl.posterior.updated_prior import (
+    learned_library,
+    library_probabilities,
+    moment_matched,
+    updated_scene,
+)
 
 __all__ = [
+    "CELLS",
     "DATATREE",
     "HDI_PROB",
     "MIN_ESS",
-    "MODE",
     "Comparison",
     "Identifiability",
     "Point",
+    "PosteriorRecord",
     "both_places",
     "both_recordings",
     "by_number",
     "by_trajectory",
     "checked",
-    "climbed_text",
     "compare",
     "complete",
     "convergence",
@@ -60,10 +77,9 @@ __all__ = [
     "from_groups",
     "group",
     "groups",
-    "has_one_sigma",
     "identify",
     "interval",
-    "known_effects",
+    "layout_of",
     "learned_library",
     "left_out",
     "library_probabilities",
@@ -78,6 +94,7 @@ __all__ = [
     "prior_groups",
     "problem_of",
     "recorded",
+    "recorded_cells",
     "recording",
     "save_posterior",
     "scalars",
@@ -86,6 +103,8 @@ __all__ = [
     "smoothed",
     "stored_mode",
     "uninformed",
+    "updated_mode",
     "updated_scene",
+    "vectors",
     "versions",
 ]

@@ -10,32 +10,32 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, attach, catalogue
+from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
-from pbrl_ppl.physics import Physics, build_layout
-from pbrl_ppl.posterior.known_effects import known_effects
-from pbrl_ppl.posterior.store import group, likeliest_draw, scalars, scene_of
+from pbrl_ppl.physics import Physics
+from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
+from pbrl_ppl.posterior.store import group, likeliest_draw, scalars
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 
 INFORMED, WEAK, PRIOR_ONLY = "informed", "weak", "prior only"
-#: What to record so that parameters show, by what their names hold; the first that fits.
+#: What to record so that parameters show, by part of their names; the first match counts.
 _CURES = (
     ((" r[", " mu_c["), "record contacts (collisions with a wall or another body)"),
     (("torque", "inertia", "angular", "w_theta", "pivot"), "record the body turning"),
 )
 _ANY_CURE = "record motion in which that matters"
-#: Posterior over prior sd below which data inform, and from which they hardly do. The latter leaves
-#: room for the error of an sd from a hundred effective draws, 7 %.
+#: Ratio of posterior to prior sd below which data inform, and from which they hardly do. The latter
+#: allows for the error of an sd from a hundred effective draws, 7 %.
 CLEARLY, HARDLY = 0.5, 0.85
 #: A mean that moved by this many prior sds was moved by the data, whatever the width.
 _MOVED = 0.3
 #: Squared column norm in prior sds: below it the data alone would be a tenth of the prior.
 _NO_EFFECT = 0.1
-#: Of a direction, parameters that do less than this share of what the strongest does are left out.
+#: Parameters with less than this share of the strongest effect in a direction are left out of it.
 _MINOR = 0.2
 _PRIOR_DRAWS = 20_000
 
@@ -47,7 +47,7 @@ class Width:
     Parameters
     ----------
     parameter : str
-        Its label, such as ``mass[cart]``.
+        Label, such as ``mass[cart]``.
     prior_sd, posterior_sd : float
         Of the logarithm for a log-normal prior (1); angular deviation for an angle (rad, at most
         the square root of 2); else in the parameter's unit.
@@ -73,7 +73,7 @@ class Direction:
     weights : tuple of (str, float)
         Parameters that move together, in prior sds, as a unit vector; the first is positive.
     effect : float
-        How far one prior sd along it moves the predictions, in units of the noise; below 1.
+        Change of the predictions for one prior sd, in units of the noise; below 1.
     """
 
     weights: tuple[tuple[str, float], ...]
@@ -81,7 +81,7 @@ class Direction:
 
     @property
     def sentence(self) -> str:
-        """The same in words."""
+        """Sentence that names the parameters and the cure."""
         names = [name for name, _ in self.weights]
         moves = [f"{name} {'up' if weight > 0 else 'down'}" for name, weight in self.weights]
         return (
@@ -97,11 +97,11 @@ class Identifiability:
     Parameters
     ----------
     parameters : tuple of Width
-        One a continuous parameter, in the layout's order.
+        One for each continuous parameter, in the layout's order.
     silent : tuple of str
-        Parameters of which the data say nothing: predictions do not depend on them.
+        Parameters that the data say nothing about: predictions do not depend on them.
     directions : tuple of Direction
-        Combinations that the data do not constrain though each parameter has an effect.
+        Combinations that the data do not constrain, though each parameter has an effect.
     """
 
     parameters: tuple[Width, ...]
@@ -110,7 +110,7 @@ class Identifiability:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What the data do not say, in words; none where they inform all."""
+        """Sentences on what the data do not inform; none where they inform all."""
         cures: dict[str, list[str]] = {}
         for name in self.silent:
             found = (cure for words, cure in _CURES if any(word in f" {name}" for word in words))
@@ -122,12 +122,12 @@ class Identifiability:
         return (*silent, *(direction.sentence for direction in self.directions))
 
     def table(self) -> pd.DataFrame:
-        """One row a parameter: prior_sd, posterior_sd, ratio, verdict."""
+        """Return one row a parameter: prior_sd, posterior_sd, ratio, verdict."""
         columns = [field.name for field in fields(Width)]
         return pd.DataFrame(map(asdict, self.parameters), columns=columns).set_index("parameter")
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain values for ``report.json``."""
+        """Return plain values for ``report.json``."""
         return {
             "parameters": [asdict(width) for width in self.parameters],
             "directions": [
@@ -141,7 +141,7 @@ class Identifiability:
 def identify(
     fitted: Any, *, mode: Mode | None = None, effects: Iterable[Effect] = catalogue
 ) -> Identifiability:
-    """Say which parameters the data inform, and which combinations they cannot tell apart.
+    """Return which parameters the data inform, and which combinations they cannot tell apart.
 
     Widths are compared on the prior's natural scale. Directions are the eigenvectors of ``J^T J``
     with eigenvalues below 1, ``J`` being the derivative of the whitened residual by the parameters
@@ -161,8 +161,8 @@ def identify(
     Returns
     -------
     Identifiability
-        A joint whose bodies are unknown takes no part: what it joins is in
-        :func:`pbrl_ppl.joint_probabilities`, and its anchors are of whichever bodies that is.
+        A joint whose bodies are unknown is left out: what it joins is in
+        :func:`pbrl_ppl.joint_probabilities`, and its anchors depend on that.
 
     Raises
     ------
@@ -203,14 +203,14 @@ def identify(
     verdicts = {width.parameter: width.verdict for width in widths}
     silent = tuple(
         label
-        for label, own in zip(labels, np.diag(gram), strict=True)
-        if own < _NO_EFFECT and verdicts[label] != INFORMED
+        for label, information in zip(labels, np.diag(gram), strict=True)
+        if information < _NO_EFFECT and verdicts[label] != INFORMED
     )
     return Identifiability(widths, silent, _directions(gram, labels))
 
 
 def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[str, ...]:
-    """Labels of the parameters of which a posterior knows no more than the prior did.
+    """Return labels of the parameters that a posterior knows no better than the prior.
 
     Parameters
     ----------
@@ -224,19 +224,18 @@ def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[st
     PosteriorError
         If the posterior holds no scene.
     """
-    scene = scene_of(idata)
-    layout = build_layout(scene, attach(scene, (), known_effects(idata, effects)))
+    layout = layout_of(idata, effects)
     widths = _widths(layout, _prior_draws(layout), _flat(idata))
     return tuple(width.parameter for width in widths if width.verdict == PRIOR_ONLY)
 
 
 def _flat(idata: Any) -> dict[str, Array]:
-    """Posterior draws by label, shape (draw,), chains joined."""
+    """Return posterior draws by label, shape (draw,), chains joined."""
     return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
 
 
 def _prior_draws(layout: Layout) -> dict[str, Array]:
-    """Draws of every parameter that takes part by label, wheels folded as the posterior's are."""
+    """Return prior draws by label, wheels folded as the posterior's are."""
     rng = np.random.default_rng(0)
     # an anchor means something else in each body that may hold it
     free = {owner for b in layout.blocks if b.name in JOINT_INDICES for owner in b.owners}
@@ -250,12 +249,12 @@ def _prior_draws(layout: Layout) -> dict[str, Array]:
 
 
 def _natural(prior: Prior, x: Array) -> Array:
-    """Values on the prior's natural scale: the logarithm for ``log_normal``."""
+    """Return values on the prior's natural scale: the logarithm for ``log_normal``."""
     return np.log(x) if prior.family == "log_normal" else x
 
 
 def _spread(prior: Prior, draws: Array) -> float:
-    """Standard deviation on the natural scale; of an angle the angular deviation (rad)."""
+    """Return the standard deviation on the natural scale; angular deviation of an angle (rad)."""
     if prior.family == "von_mises":
         return float(np.sqrt(2.0 * (1.0 - np.abs(np.exp(1j * draws).mean()))))
     return float(_natural(prior, draws).std())
@@ -272,7 +271,7 @@ def _width(label: str, prior_sd: float, posterior_sd: float, moved: float) -> Wi
 def _widths(
     layout: Layout, prior: Mapping[str, Array], posterior: Mapping[str, Array]
 ) -> tuple[Width, ...]:
-    """Widths of every parameter that takes part, from draws."""
+    """Return the widths of all parameters with prior draws."""
     folded = fold_draws(layout, posterior)
     turned = {x for wheel in wheels(layout) if wheel.period == 1 for x in wheel.labels}
     widths = []
@@ -288,7 +287,7 @@ def _widths(
 
 
 def _directions(gram: Array, labels: list[str]) -> tuple[Direction, ...]:
-    """Combinations that move predictions by less than the noise, of parameters that do alone."""
+    """Return combinations that move predictions by less than the noise, unlike their parameters."""
     active = np.flatnonzero(np.diag(gram) >= 1.0)
     part = gram[np.ix_(active, active)]
     alone = np.sqrt(np.diag(part))
@@ -307,7 +306,7 @@ def _directions(gram: Array, labels: list[str]) -> tuple[Direction, ...]:
 
 
 def _sparse(rows: Array) -> Array:
-    """Row-reduce a basis: two separate ambiguities come out as two, not as their mixtures."""
+    """Row-reduce a basis, so that two separate ambiguities are not mixed."""
     rows = rows.copy()
     for k in range(len(rows)):
         i, j = divmod(int(np.abs(rows[k:]).argmax()), rows.shape[1])
@@ -319,20 +318,19 @@ def _sparse(rows: Array) -> Array:
 
 
 def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array, Array]:
-    """Layout, the likeliest draw, and the whitened residual's derivative there."""
-    scene = scene_of(idata)
-    attached = attach(scene, (), known_effects(idata, effects))
-    physics = Physics(scene, attached, substeps=int(idata.attrs["substeps"]), threads=2)
+    """Return the layout, the likeliest draw, and the derivative of the whitened residual there."""
+    record = PosteriorRecord.of(idata)
+    physics = Physics(record.scene, record.attached(effects), record.substeps, threads=2)
     layout = physics.layout
     data, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
-    columns = tuple(STATE.index(str(name)) for name in measured["state"].values)
+    columns = tuple(STATE.index(name) for name in record.measured)
     observations = Observations(measured.to_numpy(), columns)
     best = likeliest_draw(idata)
     draws = _flat(idata)
     phi = inside(layout.priors, np.array([draws[label][best] for label in layout.labels]))
-    told = dict.fromkeys(observations.names, np.inf) | dict(scene.noise)
+    stated = dict.fromkeys(observations.names, np.inf) | dict(record.scene.noise)
     inferred = {n: draws.get("sigma", draws.get(f"sigma[{n}]")) for n in observations.names}
-    sigma = np.array([told[n] if own is None else own[best] for n, own in inferred.items()])
+    sigma = np.array([stated[n] if x is None else x[best] for n, x in inferred.items()])
 
     def residual(points: Array) -> Array:
         states = physics.predict(points, data["start"].to_numpy(), data["actions"].to_numpy())
@@ -344,6 +342,6 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array,
 
 
 def _listed(names: list[str]) -> str:
-    """``a, b and c``."""
+    """Return ``a, b and c``."""
     *most, last = names
     return f"{', '.join(most)} and {last}" if most else last

@@ -9,9 +9,9 @@ and needs no netCDF4. ``arviz.from_netcdf`` of either and ``xarray.open_datatree
 from __future__ import annotations
 
 import contextlib
-import json
 import warnings
 from collections.abc import Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -20,48 +20,46 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
-from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.files import write_atomically
-from pbrl_ppl.scene import Scene
-
-with warnings.catch_warnings():
-    # ArviZ 0.23 announces the refactoring of 1.0 at import; nothing here depends on it
-    warnings.simplefilter("ignore", FutureWarning)
-    import arviz as az
 
 Array = NDArray[np.float64]
 
 #: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in its own InferenceData.
-DATATREE = not az.__version__.startswith("0.")
+DATATREE = not version("arviz").startswith("0.")
 
 #: Level of the intervals in reports, as in ArviZ 0.x.
 HDI_PROB = 0.94
 
-_KIND = "pbrl_ppl posterior 1"
+#: Version of the attributes of a posterior file, see `PosteriorRecord`.
+SCHEMA = 2
+
 _NEEDED = ("posterior", "sample_stats", "log_likelihood", "observed_data", "constant_data")
 
 
+def arviz() -> Any:
+    """Return ArviZ, imported without the warning by which 0.23 announces 1.0."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)
+        import arviz
+    return arviz
+
+
 def groups(idata: Any) -> dict[str, xr.Dataset]:
-    """All groups of an InferenceData or DataTree as plain datasets."""
+    """Return all groups of an InferenceData or DataTree as plain datasets."""
     if DATATREE:
         return {name: node.to_dataset() for name, node in idata.children.items()}
     return {name: idata[name] for name in idata.groups()}
 
 
-def has_one_sigma(idata: Any) -> bool:
-    """Whether one sigma is that of all state dimensions."""
-    posterior = group(idata, "posterior")  # without it where all errors of measuring are stated
-    return "sigma" in posterior and posterior["sigma"].ndim == 2  # chain and draw
-
-
 def likeliest_draw(idata: Any) -> int:
-    """Place of the draw of highest likelihood, chains one after the other as of :func:`draws`."""
+    """Return the index of the draw of highest likelihood, in the order of :func:`draws`."""
     likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
     return int(likelihood.transpose("chain", "draw").to_numpy().argmax())
 
 
 def group(idata: Any, name: str) -> xr.Dataset:
-    """One group as a plain dataset.
+    """Return one group as a plain dataset.
 
     Raises
     ------
@@ -83,7 +81,7 @@ def from_groups(datasets: Mapping[str, xr.Dataset], attrs: Mapping[str, Any]) ->
         tree = xr.DataTree.from_dict({f"/{name}": data for name, data in datasets.items()})
         tree.attrs.update(attrs)
         return tree
-    idata = az.InferenceData(**datasets)
+    idata = arviz().InferenceData(**datasets)
     idata.attrs.update(attrs)
     return idata
 
@@ -103,15 +101,20 @@ def save_posterior(idata: Any, path: str | Path) -> None:
     OutputError
         If the folder does not exist or cannot be written.
     """
-    write_atomically(Path(path), lambda temporary: _write(idata, temporary))
+    path = Path(path)
+    if not path.parent.is_dir():
+        raise OutputError(
+            f"{path}: cannot write there: no such folder; choose an existing, writable folder"
+        )
+    write_atomically(path, lambda temporary: _write(idata, temporary))
 
 
-def _write(idata: Any, name: Path) -> None:
-    """NetCDF 4 with one group a dataset: the same file from both stacks."""
-    xr.Dataset(attrs=dict(idata.attrs)).to_netcdf(name, mode="w", engine="h5netcdf")
-    for group_name, data in groups(idata).items():
+def _write(idata: Any, path: Path) -> None:
+    """Write NetCDF 4 with one group a dataset: the same file from both stacks."""
+    xr.Dataset(attrs=dict(idata.attrs)).to_netcdf(path, mode="w", engine="h5netcdf")
+    for name, data in groups(idata).items():
         encoding = {key: {"zlib": True} for key, v in data.variables.items() if v.dtype.kind == "f"}
-        data.to_netcdf(name, mode="a", group=group_name, engine="h5netcdf", encoding=encoding)
+        data.to_netcdf(path, mode="a", group=name, engine="h5netcdf", encoding=encoding)
 
 
 def load_posterior(path: str | Path) -> Any:
@@ -148,39 +151,35 @@ def load_posterior(path: str | Path) -> Any:
         raise PosteriorError(
             f"{path}: this is not a NetCDF file; pass one that fit saved"
         ) from error
-    if attrs.get("pbrl_ppl") != _KIND:
-        raise PosteriorError(
-            f"{path}: this is no posterior file of pbrl_ppl; save one with save_posterior"
-        )
+    check_schema(attrs, str(path))
     missing = [name for name in _NEEDED if name not in found]
     if missing:
         raise PosteriorError(f"{path}: it lacks {', '.join(missing)}; save the whole fit again")
     return from_groups(found, attrs)
 
 
-def attributes(scene: Scene, **values: Any) -> dict[str, Any]:
-    """Attributes of a posterior file: plain strings and numbers, no pickle."""
-    packed = {
-        key: v if isinstance(v, (int, float, str)) else json.dumps(v) for key, v in values.items()
-    }
-    return {"pbrl_ppl": _KIND, "scene": scene.to_toml(), **packed}
-
-
-def scene_of(idata: Any) -> Scene:
-    """The scene that a posterior was fitted with, added effects included.
+def check_schema(attrs: Mapping[str, Any], where: str) -> None:
+    """Refuse attributes that are not a posterior's, or of another schema version.
 
     Raises
     ------
     PosteriorError
-        If there is none.
+        It says what was got and what was expected.
     """
-    if "scene" not in idata.attrs:
-        raise PosteriorError("posterior: it holds no scene; make it with pbrl_ppl.fit")
-    return Scene.from_toml(str(idata.attrs["scene"]))
+    if "pbrl_ppl" not in attrs:
+        raise PosteriorError(
+            f"{where}: this is no posterior of pbrl_ppl; make it with fit, save it with"
+            " save_posterior"
+        )
+    if attrs.get("schema") != SCHEMA:
+        raise PosteriorError(
+            f"{where}: the posterior has schema version {attrs.get('schema')}, expected {SCHEMA};"
+            " fit it again with this version of pbrl_ppl"
+        )
 
 
 def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Array]:
-    """Posterior draws by name, chains joined.
+    """Return posterior draws by name, chains joined.
 
     Parameters
     ----------
@@ -212,7 +211,7 @@ def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Array]:
 
 
 def scalars(posterior: Any) -> xr.Dataset:
-    """One variable per scalar parameter, called ``name[coordinate]``.
+    """Return one variable per scalar parameter, called ``name[coordinate]``.
 
     Parameters
     ----------
@@ -239,7 +238,7 @@ def scalars(posterior: Any) -> xr.Dataset:
 
 
 def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
-    """Rank-normalised R-hat, and the smaller of bulk and tail ESS, of every scalar parameter.
+    """Return R-hat, and the smaller of bulk and tail effective size, of every scalar parameter.
 
     Parameters
     ----------
@@ -258,6 +257,7 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     flat = variables.drop_vars(fixed)
     if not flat.data_vars:
         return dict.fromkeys(constant, 1.0), constant
+    az = arviz()
     # chains that each stand still at a place of their own have an infinite R-hat
     with np.errstate(divide="ignore", invalid="ignore"):
         # the generations differ in the tail that they look at by default
@@ -276,7 +276,7 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
 
 
 def smoothed(log_weights: Array) -> tuple[Array, float]:
-    """Pareto-smoothed importance weights that add up to one, and the shape k of their tail.
+    """Return Pareto-smoothed importance weights that sum to one, and the shape k of their tail.
 
     Parameters
     ----------
@@ -300,20 +300,20 @@ def smoothed(log_weights: Array) -> tuple[Array, float]:
             # it takes log-likelihoods, whose inverse is the weight in leave-one-out
             result, k = array_stats.psislw(-log_weights, axis=-1)
         else:
-            result, k = az.psislw(log_weights)
+            result, k = arviz().psislw(log_weights)
     weights = np.exp(np.asarray(result) - np.max(result))
     return weights / weights.sum(), float(k)
 
 
 def _dataset(value: Any) -> xr.Dataset:
-    """A diagnostic's result as a dataset in both generations."""
+    """Return the result of a diagnostic as a dataset, in both generations."""
     if "posterior" in getattr(value, "children", {}):
         value = value["posterior"]
     return value if isinstance(value, xr.Dataset) else xr.Dataset(value.to_dataset())
 
 
 def interval(values: Array, prob: float = HDI_PROB) -> tuple[float, float]:
-    """Highest-density interval of draws, 1-d: the shortest that holds ``prob`` of them."""
+    """Return the highest-density interval of draws: the shortest that holds ``prob`` of them."""
     ordered = np.sort(np.asarray(values).ravel())
     count = max(1, int(np.floor(prob * len(ordered))))
     if count >= len(ordered):

@@ -1,42 +1,45 @@
-"""Table 1 updated from a posterior: the same families, with the posterior's moments."""
+"""Priors learned from posteriors: Table 1 with a posterior's moments, and parameter libraries."""
 
 from __future__ import annotations
 
 import json
 from collections import defaultdict
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 from scipy.special import i0e, i1e
 from scipy.stats import truncnorm
 
-from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, attach, catalogue
+from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.modes import ATTRIBUTE, index_law
-from pbrl_ppl.parameters import JOINT_INDICES, Prior, fold_draws
-from pbrl_ppl.physics import build_layout, index_priors
-from pbrl_ppl.posterior.known_effects import known_effects
-from pbrl_ppl.posterior.store import scalars, scene_of
+from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, fold_draws
+from pbrl_ppl.physics import index_priors
+from pbrl_ppl.posterior.record import layout_of, scene_of
+from pbrl_ppl.posterior.store import group, scalars
 from pbrl_ppl.scene import Joint, Scene
 
 Array = NDArray[np.float64]
 
-#: Limits of a truncated normal: mu this many sigmas outside the support is an exponential's slope,
-#: and sigma this many times the width of what it covers is level.
+#: Limits of a truncated normal: it is exponential with mu this many sigmas outside its support, and
+#: uniform with sigma this many times the width of what it covers.
 _OUTSIDE, _LEVEL = 5.0, 5.0
 #: Limits of a von Mises concentration: as good as uniform, and 0.001 rad.
 _KAPPA = (1e-3, 1e6)
+#: Variables of a posterior that are no parameters.
+_OTHERS = ("library_index", "sigma")
 
 
 def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene:
-    """The posterior's scene with a prior that knows what the posterior knows.
+    """Return the posterior's scene with the posterior as its prior.
 
-    The next fit of new data starts from it. It keeps each parameter's own distribution, in Table
-    1's family, and forgets how parameters depend on each other. A joint of unknown bodies gets the
+    A fit of new data can start from it. It keeps each parameter's own distribution, in Table
+    1's family, without the dependence between parameters. A joint of unknown bodies gets the
     posterior probabilities of its indices. Joints' anchors have no prior in a scene and sigma's is
     taken from the data: both start afresh.
 
@@ -65,8 +68,7 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
         scene = pp.updated_scene(pp.load_posterior("monday.nc"))
         model = pp.physics_model(scene, pp.History.load("tuesday.csv", scene))
     """
-    scene = scene_of(idata)
-    layout = build_layout(scene, attach(scene, (), known_effects(idata, effects)))
+    scene, layout = scene_of(idata), layout_of(idata, effects)
     posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
     draws = fold_draws(layout, posterior)
     found: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
@@ -87,8 +89,8 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
             found[owner][block.name] = {k: getattr(matched, k) for k in matched.hyper_names}
     bodies = []
     for body in scene.bodies:
-        own = found[body.owner] | found[body.name]  # those that it shares, and its effects'
-        new = {name: tuple(hyper.items()) for name, hyper in own.items()}
+        both = found[body.owner] | found[body.name]  # those that it shares, and its effects'
+        new = {name: tuple(hyper.items()) for name, hyper in both.items()}
         laws = tuple(name for name in body.effects if name != LEARNED_REMAINDER)
         known = tuple((dict(body.prior) | new).items())
         bodies.append(replace(body, prior=known, effects=laws))
@@ -96,7 +98,7 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
 
 
 def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
-    """The joints, those of unknown bodies with their indices' posterior probabilities."""
+    """Return the joints, those of unknown bodies with their indices' posterior probabilities."""
     rows = json.loads(str(idata.attrs.get(ATTRIBUTE, "[]")))
     joints = []
     for name, joint in zip(scene.joint_names, scene.joints, strict=True):
@@ -121,9 +123,10 @@ def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
 
 
 def moment_matched(prior: Prior, draws: Array) -> Prior:
-    """The member of a prior's family that has the draws' mean and standard deviation.
+    """Return the member of a prior's family with the draws' mean and standard deviation.
 
-    Of the logarithm for ``log_normal``; the mean direction and resultant length for ``von_mises``.
+    These are of the logarithm for ``log_normal``, mean direction and resultant length for
+    ``von_mises``.
     A truncated normal's moments are those of its truncated density; where no member has the draws'
     (piled on both bounds, say), the nearest is taken.
 
@@ -153,7 +156,7 @@ def moment_matched(prior: Prior, draws: Array) -> Prior:
 
 
 def _concentration(resultant: float) -> float:
-    """Kappa whose von Mises distribution has this mean resultant length, 0 to 1."""
+    """Return kappa whose von Mises distribution has this mean resultant length, 0 to 1."""
     low, high = np.log(_KAPPA)
 
     def excess(log_kappa: float) -> float:
@@ -166,7 +169,7 @@ def _concentration(resultant: float) -> float:
 
 
 def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, float]:
-    """Mu and sigma of the normal that has this mean and sd once it is truncated."""
+    """Return mu and sigma of the normal that has this mean and sd once it is truncated."""
     reach = min(upper - lower, mean - lower + sd, upper - mean + sd)
     reach = reach if np.isfinite(upper - lower) else 10 * reach
 
@@ -175,13 +178,75 @@ def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, 
         mu = np.clip(mean + sd * point[0], lower - _OUTSIDE * sigma, upper + _OUTSIDE * sigma)
         return float(mu), sigma
 
-    def miss(point: Array) -> Array:
+    def error(point: Array) -> Array:
         mu, sigma = hyper(point)
         law = truncnorm((lower - mu) / sigma, (upper - mu) / sigma, mu, sigma)
         return np.array([(law.mean() - mean) / sd, np.log(law.std() / sd)])
 
-    # a posterior that no bound touches is its own parent
+    # a posterior that no bound touches keeps its moments
     begin = np.array([0.0, np.log(min(sd, 0.9 * _LEVEL * reach))])
     far = _LEVEL * reach / sd * (_OUTSIDE + 1)
     limits = ([-far, np.log(0.5 * sd)], [far, np.log(_LEVEL * reach)])
-    return hyper(least_squares(miss, begin, bounds=limits, x_scale="jac").x)
+    return hyper(least_squares(error, begin, bounds=limits, x_scale="jac").x)
+
+
+def learned_library(
+    posteriors: Mapping[str, Any], probabilities: Mapping[str, Any] | None = None
+) -> ParameterLibrary:
+    """Return the means of posteriors as parameter sets to choose among.
+
+    Parameters
+    ----------
+    posteriors : mapping of str to InferenceData or DataTree
+        By the name of the set. Where a posterior has several bodies, each is a set, called
+        ``name.body``, or ``name.class`` where bodies share parameters. Known parameters of the
+        scene go into the set.
+    probabilities : mapping, optional
+        As for :class:`pbrl_ppl.ParameterLibrary`.
+
+    Examples
+    --------
+    ::
+
+        learned = {name: pp.load_posterior(f"{name}.nc") for name in ("cart", "table")}
+        model = pp.physics_model(scene, history, library=pp.learned_library(learned))
+    """
+    sets: dict[str, dict[str, float]] = {}
+    for name, idata in posteriors.items():
+        scene, flat = scene_of(idata), scalars(idata)
+        for body in scene.dynamic:
+            found = {key: float(value) for key, value in body.known}
+            for label, values in flat.data_vars.items():
+                key, _, owner = str(label).rstrip("]").partition("[")
+                if owner in (body.name, body.owner) and key not in _OTHERS:
+                    x = values.to_numpy()
+                    angle = key == "w_theta"  # its mean is a direction
+                    found[key] = float(np.angle(np.exp(1j * x).mean()) if angle else x.mean())
+            alone = len({body.owner for body in scene.dynamic}) == 1
+            sets[name if alone else f"{name}.{body.owner}"] = found
+    return ParameterLibrary(sets, probabilities)
+
+
+def library_probabilities(idata: Any) -> pd.DataFrame:
+    """Return the probability of every parameter set: one row a body or class, one column a set.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit` from a model with a ``library``.
+
+    Raises
+    ------
+    PosteriorError
+        If it is of a model without a library.
+    """
+    if "library" not in idata.attrs:
+        raise PosteriorError("posterior: its model has no library; pass library= to physics_model")
+    names = ParameterLibrary.from_json(str(idata.attrs["library"])).names
+    index = group(idata, "posterior")["library_index"].transpose("chain", "draw", ...)
+    (dim,) = index.dims[2:]
+    share = {name: (index == i).mean(("chain", "draw")) for i, name in enumerate(names)}
+    return pd.DataFrame(
+        {name: probability.to_numpy() for name, probability in share.items()},
+        index=index[dim].to_numpy(),
+    )

@@ -18,7 +18,6 @@ from pbrl_ppl.posterior import (
     compare,
     group,
     groups,
-    has_one_sigma,
     identify,
     scalars,
     scene_of,
@@ -228,7 +227,7 @@ def _refit(posterior: Any) -> str:
         options.append("trajectories=True")
     if int(attrs.get("horizon", 1)) > 1:
         options.append(f"horizon={int(attrs['horizon'])}")
-    if has_one_sigma(posterior):
+    if attrs.get("scalar_sigma"):
         options.append('sigma="scalar"')
     if "nu" in attrs:
         options.append(f"nu={float(attrs['nu']):g}")

@@ -57,7 +57,7 @@ def calibrate(
     """Check prior, engine, likelihood and sampler against each other on simulated data.
 
     Start states, actions and which cells are measured are the history's; what was measured counts
-    for nothing but the prior of sigma, which stays that of the history. A start state is exact, as
+    only for the prior of sigma, which stays that of the history. A start state is exact, as
     in Eq. 11, or measured with an error, with ``trajectories``. A wheel's equal descriptions are
     folded into one, of truth and draws alike. The log-likelihood is ranked too: the parameters'
     ranks alone cannot see a fit that ignores its data.
@@ -186,7 +186,7 @@ def _seed(seed: int, number: int) -> int:
 
 
 def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[tuple[int, Any]]:
-    """Each task's number, and a call that gives its result or raises its error."""
+    """Yield each task's number, and a call that gives its result or raises its error."""
     if executor is None:
         yield from tasks.items()
         return
@@ -200,7 +200,7 @@ def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[t
 
 
 def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Provenance of a calibration: all that its numbers depend on, as JSON has it."""
+    """Return the provenance of a calibration: all that its numbers depend on, as JSON values."""
     about = {
         "scene": design.scene.to_toml(),
         "history": design.data.history.data_sha256,
@@ -220,7 +220,7 @@ def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str,
 
 
 def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
-    """Make the folder of a calibration, or check that it holds this one."""
+    """Make the folder of a calibration, or check that it holds this calibration."""
     path = folder / _DESIGN
     try:
         folder.mkdir(parents=True, exist_ok=True)

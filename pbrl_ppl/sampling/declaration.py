@@ -1,4 +1,4 @@
-"""The model that users sample: Eq. 11, or whole trajectories linearised at their mode."""
+"""Declaration of the model: Eq. 11, or whole trajectories linearised at their mode."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pymc as pm
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, declared_problem
+from pbrl_ppl.likelihood import TrajectoryLikelihood, declared_problem
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_trajectory_mode, following, trajectory_mode
 from pbrl_ppl.parameters import ParameterLibrary
@@ -115,7 +115,10 @@ def physics_model(
     if around is not None and not isinstance(around, Mode):
         problem = linearised_as(problem, around)
     elif isinstance(problem.likelihood, TrajectoryLikelihood) and not problem.layout.discrete.any():
-        mode = find_trajectory_mode(problem, seed) if around is None else climbed(problem, around)
+        if around is None:
+            mode = find_trajectory_mode(problem, seed)
+        else:  # the mode that is reached from the given one
+            mode = following(trajectory_mode(problem, around.phi))
         problem = mode.problem
     model = build_model(problem)
     model.mode = mode
@@ -123,8 +126,3 @@ def physics_model(
         for name, value in problem.named(mode.phi, mode.sigma).items():
             model.set_initval(model[name], value)
     return model
-
-
-def climbed(problem: Problem, near: Mode) -> Mode:
-    """The mode of whole trajectories that is reached from a mode of the same parameters."""
-    return following(trajectory_mode(problem, near.phi))

@@ -1,11 +1,11 @@
-"""Emulator of the engine about a mode, by polynomials of the parameters."""
+"""Emulator of the engine about a mode: residuals as polynomials of the parameters."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,12 +17,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Piece:
-    """Residuals that hang on the same parameters, and are polynomials of them.
+    """Residuals that depend on the same parameters, and are polynomials of them.
 
     Parameters
     ----------
     places : ndarray
-        Where phi holds those, shape (parameter,).
+        Places of the parameters in phi, shape (parameter,).
     bodies, rows : ndarray
         Bodies and transitions of the residuals, shapes (body,) and (transition,).
     """
@@ -34,10 +34,10 @@ class Piece:
 
 @dataclass(frozen=True, eq=False)
 class Pieces:
-    """What is emulated of a problem, and what is left to the engine.
+    """Residuals of a problem that are emulated, and those that the engine predicts.
 
-    Bodies that meet are one part of many parameters. Where nothing touches, each moves by its own;
-    the few steps in which bodies meet have kinks that no polynomial follows.
+    Bodies that meet are one part of many parameters. Where nothing touches, they move
+    independently; transitions in which bodies meet have kinks that no polynomial follows.
 
     Parameters
     ----------
@@ -55,29 +55,29 @@ class Pieces:
 
     @classmethod
     def of(cls, problem: Problem) -> Pieces:
-        """A piece for each part of the scene; one for each body that joints leave alone."""
+        """Return a piece for each part of the scene; one for each body of a part without joints."""
         labels = problem.layout.labels
         moving = problem.scene.moving
         met = np.zeros(problem.segments.n, dtype=bool)
-        own: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
+        found: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
         whole = isinstance(problem.likelihood, TrajectoryLikelihood)
         for part in problem.simulator.parts:
             if not whole or len(part.bodies) == 1 or part.physics.scene.joints:
-                own.append((part.places, part.bodies))
+                found.append((part.places, part.bodies))
                 continue
             met = problem.trajectory_noise.touching
             for body in part.bodies:
                 kept = moving[body].name, moving[body].owner
                 chosen = problem.layout.subset(kept).labels
                 places = np.array([labels.index(label) for label in chosen], dtype=int)
-                own.append((places, np.array([body])))
+                found.append((places, np.array([body])))
         apart, rows = np.flatnonzero(~met), np.flatnonzero(met)
-        pieces = [Piece(*of, apart) for of in own] if len(apart) else []
+        pieces = [Piece(places, bodies, apart) for places, bodies in found] if len(apart) else []
         return cls(pieces, rows, _engine(problem, rows))
 
 
 def _engine(problem: Problem, rows: NDArray[np.intp]) -> Callable[[Array], Array]:
-    """Residuals of some transitions by the engine, as a function of phi."""
+    """Return residuals of some transitions by the engine, as a function of phi."""
     start, inputs = problem.segments.start[rows], problem.inputs[rows]
     observed = replace(problem.observations, values=problem.observations.values[rows])
     sensitivity = problem.likelihood.sensitivity
@@ -91,8 +91,17 @@ def _engine(problem: Problem, rows: NDArray[np.intp]) -> Callable[[Array], Array
     return residual
 
 
+class _Fit(NamedTuple):
+    """Polynomials of a piece: their residuals, the scaling of the parameters, and the weights."""
+
+    where: tuple[Any, ...]
+    centre: Array
+    scale: Array
+    weights: Array
+
+
 class Emulator:
-    """Residuals as polynomials of the parameters, by least squares, each piece's of its own.
+    """Residuals as polynomials of the parameters, fitted by least squares for each piece.
 
     Regression over draws as wide as the posterior averages over the kinks of friction, which a
     derivative at one point does not.
@@ -100,42 +109,41 @@ class Emulator:
     Parameters
     ----------
     pieces : Pieces
-        Say which parameters move which residuals.
+        Which parameters change which residuals.
     phi : ndarray
-        Where the engine was run, shape (run, p).
+        Parameters of the engine runs, shape (run, p).
     residual : ndarray
-        What it gave, shape (run, transition, H, body, state).
+        Residuals of the runs, shape (run, transition, H, body, state).
     degree : int
-        Of the polynomials.
+        Degree of the polynomials.
     """
 
     def __init__(self, pieces: Pieces, phi: Array, residual: Array, degree: int) -> None:
         self.shape, self.degree, self.pieces = residual.shape[1:], degree, pieces
-        self._fits: list[tuple[Any, ...]] = []
-        self._asked: dict[int, Array] = {}
-        self._said = np.zeros(self.shape)
+        self._fits: list[_Fit] = []
+        self._last: dict[int, Array] = {}
+        self._residual = np.zeros(self.shape)
         for piece in pieces.emulated:
-            own = phi[:, piece.places]
-            centre, scale = own.mean(axis=0), np.maximum(own.std(axis=0), 1e-300)
-            terms = monomials((own - centre) / scale, degree)
+            x = phi[:, piece.places]
+            centre, scale = x.mean(axis=0), np.maximum(x.std(axis=0), 1e-300)
+            terms = monomials((x - centre) / scale, degree)
             where = np.ix_(piece.rows, np.arange(self.shape[1]), piece.bodies)
             targets = residual[:, piece.rows][:, :, :, piece.bodies].reshape(len(phi), -1)
-            weights = np.linalg.lstsq(terms, targets, rcond=None)[0]
-            self._fits.append((where, centre, scale, weights))
+            weights = np.asarray(np.linalg.lstsq(terms, targets, rcond=None)[0], dtype=float)
+            self._fits.append(_Fit(where, centre, scale, weights))
 
     def __call__(self, phi: Array) -> Array:
-        """Residuals for phi of shape (p,); the array changes with the next call."""
+        """Return residuals for phi of shape (p,); the next call changes the array."""
         for i, piece in enumerate(self.pieces.emulated):
-            own = phi[piece.places]
-            if i in self._asked and np.array_equal(own, self._asked[i]):
+            x, fit = phi[piece.places], self._fits[i]
+            if i in self._last and np.array_equal(x, self._last[i]):
                 continue  # a sampler moves one part at a time
-            self._asked[i] = own
-            where, *_, weights = self._fits[i]
-            said = self._said[where]
-            self._said[where] = (self.terms(phi, i) @ weights).reshape(said.shape)
+            self._last[i] = x
+            shape = self._residual[fit.where].shape
+            self._residual[fit.where] = (self.terms(phi, i) @ fit.weights).reshape(shape)
         if len(self.pieces.rows):
-            self._said[self.pieces.rows] = self.pieces.exact(phi)
-        return self._said
+            self._residual[self.pieces.rows] = self.pieces.exact(phi)
+        return self._residual
 
     @property
     def linear(self) -> bool:
@@ -143,20 +151,19 @@ class Emulator:
         return len(self.pieces.emulated) == 1 and not len(self.pieces.rows)
 
     def terms(self, phi: Array, piece: int) -> Array:
-        """What a piece's residuals are linear in, for phi of shape (p,): the monomials (term,)."""
-        _, centre, scale, _ = self._fits[piece]
-        own = phi[self.pieces.emulated[piece].places]
-        return monomials((own - centre) / scale, self.degree)
+        """Return the monomials of a piece, shape (term,), for phi of shape (p,)."""
+        fit, x = self._fits[piece], phi[self.pieces.emulated[piece].places]
+        return monomials((x - fit.centre) / fit.scale, self.degree)
 
     @property
     def basis(self) -> Array:
-        """A single piece's residuals for each term, shape (term, transition, H, body, state)."""
-        weights = self._fits[0][-1]
+        """Residuals of a single piece for each term, shape (term, transition, H, body, state)."""
+        weights = self._fits[0].weights
         return np.asarray(weights.reshape(len(weights), *self.shape))
 
 
 def monomials(z: Array, degree: int) -> Array:
-    """The monomials of z, shape (..., p), up to a degree, shape (..., term)."""
+    """Return the monomials of z, shape (..., p), up to a degree, shape (..., term)."""
     columns = [np.ones((*z.shape[:-1], 1)), z]
     for d in range(2, degree + 1):
         chosen = np.array(list(combinations_with_replacement(range(z.shape[-1]), d)), dtype=int)

@@ -1,4 +1,4 @@
-"""A model's posterior, by one of several samplers."""
+"""Posterior of a model by one of several samplers, with its checks before and after."""
 
 from __future__ import annotations
 
@@ -9,18 +9,32 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+from numpy.typing import NDArray
 
-from pbrl_ppl.likelihood import TrajectoryLikelihood
+from pbrl_ppl.errors import FitError, MeetingWarning
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_mode, find_trajectory_mode, following, weigh
-from pbrl_ppl.posterior import Point, complete, group, stored_mode
-from pbrl_ppl.sampling.fit_checks import DEFAULT, checked_problem
-from pbrl_ppl.sampling.library_draws import most_frequent, prior_starts, summed
-from pbrl_ppl.sampling.meeting import as_in, joined_model, model_of_draws
+from pbrl_ppl.posterior import (
+    Point,
+    PosteriorRecord,
+    complete,
+    group,
+    linearised_as,
+    parameter_draws,
+    stored_mode,
+)
 from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job
-from pbrl_ppl.sampling.mixture import mix, most_probable
+from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, prior_starts, summed
 from pbrl_ppl.sampling.starts import dispersed, from_posterior
 from pbrl_ppl.sampling.traces import appended
+
+Array = NDArray[np.float64]
+
+#: The sampler where none is asked for.
+DEFAULT = "metropolis"
+#: Draws of a trace at which contacts between parts are looked for, at most.
+_CHECKED_DRAWS = 50
 
 
 def fit(
@@ -39,11 +53,11 @@ def fit(
 ) -> Any:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
-    Multi-start least squares finds the mode, from about which the chains start, if the model holds
-    none. Where the scene does not say which bodies a joint joins, every choice is fitted by itself,
-    and their draws are mixed by their evidences (:func:`pbrl_ppl.joint_probabilities`). A model
-    with a ``library`` needs no chain: all choices are summed over, unless ``method="paper"`` walks
-    among them.
+    The chains start about the mode, which multi-start least squares finds if the model holds none.
+    Where the scene does not say which bodies a joint joins, every choice is fitted by itself, and
+    their draws are mixed by their evidences (:func:`pbrl_ppl.joint_probabilities`). A model with a
+    ``library`` needs no chain: all choices are summed over, unless ``method="paper"`` walks among
+    them.
 
     The mode is kept in ``attrs["mode"]`` as JSON: ``parameters`` and ``noise`` by label, and
     ``log_posterior``. With a library it is the most probable choice of each body (of bodies that
@@ -112,21 +126,21 @@ def fit(
     UninformedWarning
         If the data say nothing about a parameter.
     """
-    problem = checked_problem(model, method, METHODS, start, resume)
+    problem = _checked_problem(model, method, start, resume)
     again = partial(
         fit, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
         cores=cores, progress=progress,
     )  # fmt: skip
     library = problem.library
     chosen = METHODS[method] if library is None else OVER_LIBRARY.get(method, METHODS[method])
-    # among one set there is no walk
+    # with one set there is nothing to walk over
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
     draws = chosen.draws if draws is None else draws
     chains = chosen.chains if chains is None else chains
     point: Point | None
     if library is not None and not walks:
         trace, point = summed(model, draws, chains, seed)
-        if joined := model_of_draws(problem, trace):
+        if joined := _joined_of_draws(problem, trace):
             return again(joined)
         return complete(problem, trace, seed=seed, method="exact sum over the library", mode=point)
     if method == "map":
@@ -158,7 +172,7 @@ def fit(
             warnings.filterwarnings("ignore", message="Numba will use object mode")
             return chosen.run(job)
 
-    model = as_in(model, resume)
+    model = _as_in(model, resume)
     problem = model.problem
     if walks:
         trace = sampled(model, None)
@@ -172,14 +186,19 @@ def fit(
         point = stored_mode(problem, resume)
     else:
         held: Mode | None = getattr(model, "mode", None)  # of physics_model
-        whole = isinstance(problem.likelihood, TrajectoryLikelihood)
-        search = find_trajectory_mode if whole else find_mode
+        search = (
+            find_mode
+            if isinstance(problem.likelihood, TransitionLikelihood)
+            else find_trajectory_mode
+        )
         mode = start or held or search(problem, seed=seed)
-        if whole and mode is not held:  # linearised at it by now
+        if (
+            isinstance(mode.problem.likelihood, TrajectoryLikelihood) and mode is not held
+        ):  # linearised at it by now
             mode = mode if start is None else following(start)
             problem = mode.problem
             model = build_model(problem)
-        if joined := joined_model(problem, mode.phi[None], mode.sigma[None]):
+        if joined := _joined_model(problem, mode.phi[None], mode.sigma[None]):
             return again(joined)
         trace = sampled(model, mode)
         point = Point(mode.phi, mode.sigma)
@@ -187,7 +206,7 @@ def fit(
     sizes = group(trace, "posterior").sizes
     all_chains = chains if resume is None else group(resume, "posterior").sizes["chain"]
     cut = sizes["draw"] < draws or sizes["chain"] < all_chains
-    if not cut and (joined := model_of_draws(problem, trace)):
+    if not cut and (joined := _joined_of_draws(problem, trace)):
         return again(joined)
     if resume is not None:
         if sizes["chain"] < all_chains:
@@ -195,3 +214,82 @@ def fit(
         trace = appended(resume, trace)
     asked = (draws, all_chains) if cut else None
     return complete(problem, trace, seed=seed, method=method, asked=asked, mode=point)
+
+
+def _checked_problem(model: pm.Model, method: str, start: Any, resume: Any) -> Problem:
+    """Return the problem of a model; refuse arguments of `fit` that do not go with it."""
+    problem = getattr(model, "problem", None)
+    if not isinstance(problem, Problem):
+        raise FitError("fit: this pm.Model was not made by physics_model; use pm.sample for others")
+    if method not in METHODS:
+        raise FitError(f"fit: method is {method!r}, expected one of {', '.join(METHODS)}")
+    if start is not None and resume is not None:
+        raise FitError("fit: start= and resume= are given, but chains begin at one: leave one out")
+    if start is not None and not isinstance(start, Mode):
+        raise FitError(
+            f"fit: start is a {type(start).__name__}, expected a Mode; pass a posterior to go on"
+            " with as resume="
+        )
+    given = "start" if start is not None else "resume" if resume is not None else None
+    if problem.library is not None and (method not in (DEFAULT, "paper") or given):
+        raise FitError(
+            "fit: a model with a library is summed over exactly, or walked over by method='paper';"
+            " leave out method= or use that, and leave out start= and resume="
+        )
+    if problem.layout.discrete.any():
+        if method == "smc":
+            raise FitError(
+                "fit: method is 'smc' and which bodies a joint joins is unknown; each choice of"
+                " bodies is sampled by itself, which tempering from the prior is not made for; use"
+                " 'metropolis', or name the bodies in the scene"
+            )
+        if given:
+            raise FitError(
+                f"fit: {given}= was given and which bodies a joint joins is unknown; a fit cannot"
+                f" go on from one choice of bodies to all of them; leave {given} out and raise"
+                " draws="
+            )
+    return problem
+
+
+def _joined_model(problem: Problem, phi: Array, sigma: Array) -> pm.Model | None:
+    """Return a model whose bodies that meet at draws (n, p) and (n, state) are in one part.
+
+    The likelihood simulates bodies apart that were apart in the data. None if they do not meet
+    under these parameters either.
+
+    Warns
+    -----
+    MeetingWarning
+        If bodies meet.
+    """
+    joined = problem.joined(phi, sigma)
+    if joined is problem:
+        return None
+    warnings.warn(
+        f"fit: {', '.join(joined.physics.together)} meet under the parameters that were found, and"
+        " were thought apart by where they are in the data; all is fitted again with them in one"
+        " world",
+        MeetingWarning,
+        stacklevel=3,
+    )
+    return build_model(joined)
+
+
+def _joined_of_draws(problem: Problem, trace: Any) -> pm.Model | None:
+    """Return the model of `_joined_model` at some of a trace's draws."""
+    phi, sigma = parameter_draws(problem, trace)
+    rows = np.linspace(0, len(phi) - 1, min(_CHECKED_DRAWS, len(phi))).astype(int)
+    return _joined_model(problem, phi[rows], sigma[rows])
+
+
+def _as_in(model: pm.Model, idata: Any) -> pm.Model:
+    """Return the model with the parts and the linearisation that a posterior was sampled with."""
+    if idata is None:
+        return model
+    problem = model.problem
+    known = PosteriorRecord.of(idata).together
+    if not set(known) <= set(problem.physics.together):
+        problem = problem.with_physics(together=known)
+    problem = linearised_as(problem, idata)
+    return model if problem is model.problem else build_model(problem)

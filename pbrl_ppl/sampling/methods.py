@@ -1,4 +1,4 @@
-"""The samplers of `fit`, each with the schedule it has where nothing else is asked for."""
+"""Samplers of `fit`, each with its default schedule."""
 
 from __future__ import annotations
 
@@ -12,20 +12,18 @@ import pymc as pm
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.sampling.emulation import emulate
-from pbrl_ppl.sampling.equal_wheels import evened_logp
-from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps
-from pbrl_ppl.sampling.starts import blank_point, gaussian_blocks
-from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps, Schedule
+from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
+from pbrl_ppl.sampling.surrogate import Surrogate, Unpack, emulate
 from pbrl_ppl.sampling.traces import as_trace, thinned
 
-#: Engine steps that cost no more than what samplers do beside them.
+#: Engine steps that cost no more than the rest of a sampler's step.
 _LITTLE = 2000
 
 
 @dataclass(frozen=True)
 class Method:
-    """A sampler, and how long it runs where nothing else is asked for.
+    """A sampler and its default schedule.
 
     Parameters
     ----------
@@ -61,7 +59,7 @@ class Job:
 
     @property
     def mode(self) -> Mode:
-        """The mode that the chains start about.
+        """Mode that the chains start about.
 
         Raises
         ------
@@ -74,7 +72,7 @@ class Job:
         return self.about
 
     def sample(self, step: Any, steps_a_draw: int = 1) -> Any:
-        """``pm.sample`` from the starts; how it converged is judged elsewhere."""
+        """Run ``pm.sample`` from the starts, without its checks of convergence."""
         try:
             trace = pm.sample(
                 draws=self.draws * steps_a_draw,
@@ -97,32 +95,40 @@ class Job:
 
 
 def _metropolis(job: Job) -> Any:
-    """Block-wise adaptive Metropolis with a surrogate; see AdaptiveMetropolis."""
+    """Run block-wise adaptive Metropolis with a surrogate; see `AdaptiveMetropolis`."""
     problem, model = job.mode.problem, job.model
     blocks = gaussian_blocks(model, job.mode)
-    options: dict[str, Any] = {"inner": 10, "initial_point": blank_point(model, problem)}
-    options["extra"] = evened_logp(model, problem)
     if job.mode.others and len(blocks) == 1:
-        hills = [gaussian_blocks(model, peak)[0] for peak in job.mode.others]
-        jumps = Jumps((deepcopy(blocks[0]), *hills))  # the block itself adapts
+        others = [gaussian_blocks(model, mode)[0] for mode in job.mode.others]
+        jumps = Jumps((deepcopy(blocks[0]), *others))  # the block itself adapts
     else:
         jumps = None
     # an exact step of one block, in engine steps; where that is little, looking ahead is no use
     engine = problem.simulator
     cost = engine.steps * problem.segments.n * problem.data.horizon / len(engine.parts)
+    rough, schedule = None, Schedule(thin=job.thin)
     if cost > _LITTLE:
         unpack = Unpack(model, problem)
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
-            options |= {"rough": Surrogate(problem, unpack, emulator), "inner": 45, "plain": 0.3}
+            rough = Surrogate(problem, unpack, emulator)
+            schedule = Schedule(inner=45, plain=0.3, thin=job.thin)
     return job.sample(
-        AdaptiveMetropolis(model.free_RVs, blocks=blocks, thin=job.thin, jumps=jumps, **options)
+        AdaptiveMetropolis(
+            model.free_RVs,
+            blocks=blocks,
+            rough=rough,
+            schedule=schedule,
+            jumps=jumps,
+            extra=evened_logp(model, problem),
+            initial_point=blank_point(model, problem),
+        )
     )
 
 
 def _paper(job: Job) -> Any:
-    """One random-walk Metropolis step a variable, as PyMC 2 did: burn in, then keep each n-th.
+    """Run one random-walk Metropolis step a variable, as PyMC 2 did, and keep each n-th draw.
 
-    Which set of a library each body has is proposed uniformly, body by body.
+    The set of a library that each body has is proposed uniformly, body by body.
     """
     discrete = job.model.discrete_value_vars
     steps = [
@@ -135,17 +141,17 @@ def _paper(job: Job) -> Any:
 
 
 def _demetropolisz(job: Job) -> Any:
-    """Differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
+    """Run differential evolution from each chain's past (ter Braak and Vrugt, 2008)."""
     return job.sample(pm.DEMetropolisZ(job.model.free_RVs), job.thin)
 
 
 def _nuts(job: Job) -> Any:
-    """NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
+    """Run NUTS on the finite-difference gradient: where nothing slides to a stop or collides."""
     return job.sample(pm.NUTS(job.model.free_RVs), job.thin)
 
 
 def _smc(job: Job) -> Any:
-    """Sequential Monte Carlo from the prior: for several modes and few parameters."""
+    """Run sequential Monte Carlo from the prior: for several modes and few parameters."""
     return pm.sample_smc(
         draws=job.draws,
         chains=job.chains,
@@ -157,20 +163,20 @@ def _smc(job: Job) -> Any:
 
 
 def _map(job: Job) -> Any:
-    """The mode alone, as a posterior of one draw."""
+    """Return the mode alone, as a posterior of one draw."""
     values = job.mode.problem.named(job.mode.phi, job.mode.sigma)
     draws = {name: np.asarray(value)[None, None] for name, value in values.items()}
     return as_trace(job.model, draws, {"lp": np.array([[job.mode.log_posterior]])})
 
 
 def _laplace(job: Job) -> Any:
-    """Independent draws from the Gaussian at the mode; of the noise, of its logarithm."""
+    """Draw independently from the Gaussian at the mode; that of the noise is of its logarithm."""
     rng, mode = np.random.default_rng(job.seed), job.mode
     shape = job.chains, job.draws
     phi = mode.draws(rng, job.chains * job.draws)
     centre, covariance = mode.noise_gaussian()
-    louder = rng.standard_normal((len(phi), len(centre))) @ np.linalg.cholesky(covariance).T
-    sigma = np.exp(centre + louder)
+    noise = rng.standard_normal((len(phi), len(centre))) @ np.linalg.cholesky(covariance).T
+    sigma = np.exp(centre + noise)
     values = mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
     return as_trace(job.model, values, {"accept": np.ones(shape)})
 

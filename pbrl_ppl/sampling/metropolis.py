@@ -46,8 +46,8 @@ class Gaussian:
     mean, covariance : ndarray
         First guess, shapes (d,) and (d, d).
     cheap : int
-        Steps a round where they cost nothing to speak of, as those of the noise do: then there is
-        no need to look ahead.
+        Steps a round of a block whose steps cost little, as those of the noise do: it does not
+        look ahead. 0 for other blocks.
     """
 
     places: NDArray[np.intp]
@@ -65,16 +65,16 @@ class Gaussian:
         self.log_scale = float(np.log(2.38 / np.sqrt(max(len(self.places), 1))))
 
     def depth(self, x: Array) -> Any:
-        """Minus the log-density at points (..., d), up to a constant."""
+        """Return minus the log-density at points (..., d), up to a constant."""
         return 0.5 * (self.standardised(x) ** 2).sum(axis=0)
 
     def standardised(self, x: Array) -> Array:
-        """Points (..., d) in units of this Gaussian, shape (d, ...)."""
+        """Return points (..., d) in units of this Gaussian, shape (d, ...)."""
         # called for each step: scipy's `solve_triangular` takes ten times as long to check
         return np.asarray(dtrtrs(self.factor, (x - self.mean).T, lower=True)[0])
 
     def propose(self, x: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, Any]:
-        """A proposal from each point (..., d), and the logarithm of the Hastings ratio."""
+        """Return a proposal from each point (..., d), and the logarithm of the Hastings ratio."""
         noise = rng.standard_normal(x.shape) @ self.factor.T
         if walk:
             return x + np.exp(self.log_scale) * noise, np.zeros(x.shape[:-1])
@@ -91,20 +91,19 @@ class Gaussian:
         tune: bool,
         shift: Any = None,
     ) -> tuple[Array, float, float]:
-        """One Metropolis step of the block in the vector q, whose log-density is ``here``.
+        """Make a Metropolis step of the block in the vector q, whose log-density is ``here``.
 
-        Where there are several hills, ``shift`` is from this block's own to that of the point,
-        shape (d,): what is learned is a hill's shape, and all proposals are walks, the same on
-        each.
+        With several modes, ``shift`` is from this block's mode to that of the point, shape (d,):
+        the shape of a mode is learned, and all proposals are random walks.
 
         Returns
         -------
         q : ndarray
-            Where it ends: the vector itself if the proposal was rejected.
+            The vector after the step; the same one if the proposal was rejected.
         here : float
             The log-density there.
         rate : float
-            With what probability the proposal was accepted.
+            Probability of acceptance.
         """
         alone = bool(self.cheap) and bool(rng.uniform() < 0.5)
         walk = shift is not None or bool(rng.uniform() < 0.5)
@@ -149,29 +148,29 @@ class Gaussian:
 
 @dataclass(frozen=True, eq=False)
 class Jumps:
-    """Mode jumping: moves between hills of the posterior that a walk would not cross.
+    """Mode jumping: moves between modes of the posterior that a random walk would not cross.
 
-    Where a point is on one hill, in units of that hill's Gaussian, the proposal is on another;
-    from there the same jump leads back (Tjelmeland and Hegstad, 2001, without their local search).
+    A point keeps its coordinates in units of the mode's Gaussian, so that the same jump leads back
+    (Tjelmeland and Hegstad, 2001, without their local search).
 
     Parameters
     ----------
-    hills : tuple of Gaussian
+    modes : tuple of Gaussian
         At least two, of the same places.
     """
 
-    hills: tuple[Gaussian, ...]
+    modes: tuple[Gaussian, ...]
 
     def shift(self, q: Array) -> Array:
-        """From the first hill's middle to that of the hill which the vector q is on, shape (d,)."""
-        depths = [float(h.depth(q[h.places]) + np.log(np.diag(h.factor)).sum()) for h in self.hills]
-        return np.asarray(self.hills[int(np.argmin(depths))].mean - self.hills[0].mean)
+        """Return the shift from the first mode to that of the vector q, shape (d,)."""
+        depths = [float(h.depth(q[h.places]) + np.log(np.diag(h.factor)).sum()) for h in self.modes]
+        return np.asarray(self.modes[int(np.argmin(depths))].mean - self.modes[0].mean)
 
     def move(
         self, q: Array, here: float, density: Callable[[Array], Any], rng: np.random.Generator
     ) -> tuple[Array, float]:
-        """One jump from the vector q, whose log-density is ``here``; both, where it ends."""
-        first, second = (self.hills[i] for i in rng.choice(len(self.hills), 2, replace=False))
+        """Jump from the vector q, whose log-density is ``here``; return both after the jump."""
+        first, second = (self.modes[i] for i in rng.choice(len(self.modes), 2, replace=False))
         moved = q.copy()
         moved[first.places] = second.mean + second.factor @ first.standardised(q[first.places])
         there = float(density(moved))
@@ -183,50 +182,59 @@ class Jumps:
 
 @dataclass_state
 class AdaptiveState(StepMethodState):
-    """Adapted state of the sampler, which every chain begins anew."""
+    """Adapted state of the sampler, with which every chain starts."""
 
     tune: bool
     blocks: list[Gaussian]
 
 
+@dataclass(frozen=True)
+class Schedule:
+    """Numbers of steps of the adaptive sampler.
+
+    Parameters
+    ----------
+    inner : int
+        Steps of a block a round: with a surrogate, those under it for each exact decision.
+    plain : float
+        Probability of one more step without the surrogate: it frees a chain from where that is far
+        too low.
+    thin : int
+        Rounds over the blocks a draw.
+    """
+
+    inner: int = 10
+    plain: float = 0.0
+    thin: int = 1
+
+
 class AdaptiveMetropolis(ArrayStepShared):
     """Block-wise adaptive Metropolis that looks ahead with a surrogate of the posterior.
 
-    With ``rough``, a block makes ``inner`` steps under that cheap posterior, and where they end is
-    accepted or not by the exact one
-    (while tuning, always): the surrogate transition method (Liu, 2001, section 9.4.3;
-    delayed acceptance, Christen and Fox, 2005, is the case of one step). The result is exact
-    whatever ``rough`` is; a good one gives nearly independent draws.
+    With ``rough``, a block makes steps under that cheap posterior, and their end is accepted or
+    rejected by the exact one (while tuning, always accepted): the surrogate transition method (Liu,
+    2001, section 9.4.3; delayed acceptance, Christen and Fox, 2005, is the case of one step). The
+    result is exact whatever ``rough`` is; a good one gives nearly independent draws.
 
     Parameters
     ----------
     vars : list
         The model's random variables, all of them.
     blocks : list of Gaussian
-        What moves together, and a first guess of its posterior; together they hold every entry.
+        Entries that move together, and a first guess of their posterior; together they are all.
     rough : callable, optional
         Log-density of the cheap posterior, up to a constant, at a vector of all variables in the
         sampler's unconstrained space.
-    inner : int
-        Steps of a block a round: under ``rough`` for each one that is judged exactly, where there
-        is one.
-    plain : float
-        Probability of one more step that does not look ahead: it frees a chain from where
-        ``rough`` is far too low.
-    thin : int
-        Rounds over the blocks a draw.
+    schedule : Schedule
+        Numbers of steps.
     jumps : Jumps, optional
-        Between hills, one a round; of one block that is not cheap, whose own hill is the first.
+        Between modes, one a round; of one block that is not cheap, whose mode is the first.
     extra : tensor, optional
         Added to the model's log-density, in terms of its value variables.
-    model : pymc.Model, optional
-        The context's by default.
     initial_point : dict, optional
         As PyMC's samplers pass it.
     rng : Generator or int, optional
         Source of randomness.
-    **kwargs
-        What else PyMC passes to step methods.
     """
 
     name = "adaptive_metropolis"
@@ -244,22 +252,17 @@ class AdaptiveMetropolis(ArrayStepShared):
         *,
         blocks: list[Gaussian],
         rough: Callable[[Array], float] | None = None,
-        inner: int = 10,
-        plain: float = 0.0,
-        thin: int = 1,
+        schedule: Schedule = Schedule(),
         jumps: Jumps | None = None,
         extra: Any = 0.0,
-        model: pm.Model | None = None,
         initial_point: dict[str, Array] | None = None,
         rng: Any = None,
-        **kwargs: Any,
     ) -> None:
-        model = pm.modelcontext(model)
+        model = pm.modelcontext(None)
         point = model.initial_point() if initial_point is None else initial_point
         values = get_value_vars_from_user_vars(vars, model)
         self.tune = True
-        self.blocks, self.rough, self.inner, self.plain = blocks, rough, inner, plain
-        self.thin, self.jumps = thin, jumps
+        self.blocks, self.rough, self.schedule, self.jumps = blocks, rough, schedule, jumps
         (logp,), joined = join_nonshared_inputs(
             point=point, outputs=[model.logp() + extra], inputs=values, shared_inputs={}
         )
@@ -274,20 +277,20 @@ class AdaptiveMetropolis(ArrayStepShared):
         near = self.logp if self.rough is None or not self.tune else self.rough
         here = float(near(q))
         rates, exact = [], []
-        for _ in range(self.thin):
+        for _ in range(self.schedule.thin):
             shift: Any = None
             if self.jumps is not None and near is self.logp:
                 q, here = self.jumps.move(q, here, near, self.rng)
                 shift = self.jumps.shift(q) if self.tune else 0.0
             for block in self.blocks:
                 if self.rough is None or block.cheap or self.tune:
-                    for _ in range(block.cheap or self.inner):
+                    for _ in range(block.cheap or self.schedule.inner):
                         q, here, rate = block.move(q, here, near, self.rng, self.tune, shift)
                         rates.append(rate)
                     continue
                 begin = rough = self.rough(q)
                 y = q
-                for _ in range(self.inner):
+                for _ in range(self.schedule.inner):
                     y, rough, rate = block.move(y, rough, self.rough, self.rng, tune=False)
                     rates.append(rate)
                 if y is not q:
@@ -295,7 +298,7 @@ class AdaptiveMetropolis(ArrayStepShared):
                     exact.append(_rate((there - here) - (rough - begin)))
                     if self.rng.uniform() < exact[-1]:
                         q, here = y, there
-                if self.rng.uniform() < self.plain:
+                if self.rng.uniform() < self.schedule.plain:
                     q, here, _ = block.move(q, here, near, self.rng, tune=False)
         stats = {
             "accept": float(np.mean(rates)),
@@ -312,7 +315,7 @@ def explore(
     rounds: int,
     rng: np.random.Generator,
 ) -> Array:
-    """States of a chain of rounds over the blocks, which adapt on the way.
+    """Return the states of a chain of rounds over the blocks, which adapt.
 
     Parameters
     ----------
@@ -321,7 +324,7 @@ def explore(
     density : callable
         Log-density.
     q : ndarray
-        Where it begins, shape (d,).
+        Start, shape (d,).
     rounds : int
         Steps of each block.
     rng : Generator
@@ -341,5 +344,5 @@ def explore(
 
 
 def _rate(log_ratio: float) -> float:
-    """Probability to accept; none where a density is not a number."""
+    """Return the probability of acceptance; 0 where a density is not a number."""
     return float(np.exp(min(0.0, log_ratio))) if not np.isnan(log_ratio) else 0.0

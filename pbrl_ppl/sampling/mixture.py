@@ -1,4 +1,4 @@
-"""Draws of several configurations of the joints as draws of the one model that holds them all."""
+"""Draws over discrete choices: what joints join, and which parameter set a body has."""
 
 from __future__ import annotations
 
@@ -10,15 +10,26 @@ import pymc as pm
 import xarray as xr
 from numpy.typing import NDArray
 
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.model import build_model
-from pbrl_ppl.modes import ATTRIBUTE, Mode, Pair, Weighed, index_law, stored
-from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
+from pbrl_ppl.modes import (
+    ATTRIBUTE,
+    Mode,
+    Pair,
+    Weighed,
+    choose_from_library,
+    index_law,
+    profile_sigma,
+    stored,
+)
+from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES, ParameterLibrary
 from pbrl_ppl.posterior import Point, from_groups, group, groups
-from pbrl_ppl.sampling.traces import posterior_dataset
+from pbrl_ppl.sampling.traces import as_trace, posterior_dataset
 
 Array = NDArray[np.float64]
 Labels = NDArray[np.int64]
+Ints = NDArray[np.intp]
 
 #: Configurations less probable than this share of the best get no draws: they would be a handful.
 NEGLIGIBLE = 1e-3
@@ -36,7 +47,7 @@ def mix(
 ) -> Any:
     """Sample each configuration that matters, and mix the draws by their probabilities.
 
-    How many draws each has is not left to chance, where they stand in the chains is. A pair's
+    The number of draws of each is fixed, their order in the chains is random. A pair's
     bodies are in the order of ``scene.joinable`` (``i_a < i_b``), for the other order is the same
     joint, unless the two indices have different priors: then each order has its share. A joint that
     joins nothing has ``i_a = i_b`` and anchors from their prior.
@@ -48,13 +59,13 @@ def mix(
     problem : Problem
         Of a scene with joints of unknown bodies.
     found : sequence of Weighed
-        Its configurations.
+        Configurations with their probabilities.
     sample : callable
-        ``sample(model, mode) -> trace`` of a configuration's own model.
+        ``sample(model, mode) -> trace`` of a configuration's model.
     draws, chains : int
-        What each trace is asked for.
+        Draws a chain, and chains.
     seed : int
-        Of the mixture.
+        Seed of the mixture.
 
     Returns
     -------
@@ -88,7 +99,7 @@ def mix(
 
 
 def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:
-    """The mode of the most probable configuration, as a point of the whole model.
+    """Return the mode of the most probable configuration, as a point of the whole model.
 
     Anchors of joints that join nothing are at the centre of their prior.
 
@@ -97,12 +108,12 @@ def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:
     problem : Problem
         Of a scene with joints of unknown bodies.
     found : sequence of Weighed
-        Its configurations.
+        Configurations with their probabilities.
     """
     best = max(found, key=lambda weighed: weighed.probability)
     layout = problem.layout
-    own = dict(zip(best.mode.problem.layout.labels, best.mode.phi.tolist(), strict=True))
-    phi = np.array([own.get(label, np.nan) for label in layout.labels])[None]
+    values = dict(zip(best.mode.problem.layout.labels, best.mode.phi.tolist(), strict=True))
+    phi = np.array([values.get(label, np.nan) for label in layout.labels])[None]
     for joint, pair in best.configuration.pairs:
         a, b = (layout.priors[layout.index(name, joint)].probabilities for name in JOINT_INDICES)
         law = index_law(pair, problem.scene, a, b)
@@ -122,8 +133,8 @@ def allocate(probability: Array, n: int) -> Labels:
     kept = np.where(probability < NEGLIGIBLE * probability.max(), 0.0, probability)
     ideal = n * kept / kept.sum()
     counts = np.floor(ideal).astype(np.int64)
-    left = n - int(counts.sum())
-    counts[np.argsort(counts - ideal, kind="stable")[:left]] += 1
+    rest = n - int(counts.sum())
+    counts[np.argsort(counts - ideal, kind="stable")[:rest]] += 1
     return np.asarray(counts)
 
 
@@ -134,12 +145,12 @@ def _values(
     label: Labels,
     rng: np.random.Generator,
 ) -> dict[str, Array]:
-    """The whole model's variables, shape (chain, draw, ...), from each configuration's trace."""
+    """Return the whole model's variables, shape (chain, draw, ...), from the traces."""
     layout = problem.layout
     phi = np.full((*label.shape, layout.size), np.nan)
-    own = {i: group(t, "posterior").isel(draw=slice(label.shape[1])) for i, t in traces.items()}
-    sigma = next(iter(own.values()))["sigma"].to_numpy().copy()
-    for i, posterior in own.items():
+    drawn = {i: group(t, "posterior").isel(draw=slice(label.shape[1])) for i, t in traces.items()}
+    sigma = next(iter(drawn.values()))["sigma"].to_numpy().copy()
+    for i, posterior in drawn.items():
         here = label == i
         sigma[here] = posterior["sigma"].to_numpy()[here]
         for block in found[i].configuration.problem(problem).layout.blocks:
@@ -162,7 +173,7 @@ def _set_indices(
     pair: Pair,
     rng: np.random.Generator,
 ) -> None:
-    """Draw i_a and i_b of what a joint joins, and turn the anchors round with them, in place."""
+    """Draw i_a and i_b of what a joint joins, and swap its anchors to match, in place."""
     places = (problem.layout.index(name, joint) for name in JOINT_INDICES)
     law = index_law(pair, problem.scene,
                     *(problem.layout.priors[place].probabilities for place in places))  # fmt: skip
@@ -173,7 +184,7 @@ def _set_indices(
 def _put_indices(
     problem: Problem, phi: Array, here: NDArray[np.bool_], joint: str, chosen: Labels
 ) -> None:
-    """Put places in the flat table of (i_a, i_b) into phi, and turn the anchors, in place."""
+    """Put indices of the flat table of (i_a, i_b) into phi, and swap the anchors, in place."""
     layout, own = problem.layout, phi[here]
     a, b = (layout.index(name, joint) for name in JOINT_INDICES)
     own[:, a], own[:, b] = np.divmod(chosen, len(problem.scene.joinable))
@@ -203,7 +214,7 @@ def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator | None)
 
 
 def _stats(traces: Mapping[int, Any], label: Labels) -> xr.Dataset:
-    """The samplers' own record of the draws; what differs in shape is left out."""
+    """Return the samplers' statistics of the draws; those that differ in shape are left out."""
     records = {
         i: group(t, "sample_stats").isel(draw=slice(label.shape[1])) for i, t in traces.items()
     }
@@ -220,3 +231,67 @@ def _stats(traces: Mapping[int, Any], label: Labels) -> xr.Dataset:
             values[label == i] = record[name].to_numpy()[label == i]
         mixed[str(name)] = (variable.dims, values)
     return xr.Dataset(mixed, first.coords)
+
+
+def summed(model: pm.Model, draws: int, chains: int, seed: int) -> tuple[Any, Point]:
+    """Return draws by summing over the choices, and the most probable choice.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        Model with a library.
+    draws, chains, seed : int
+        As for :func:`pbrl_ppl.fit`.
+    """
+    problem = model.problem
+    phi, sigma, index, accepted, best = choose_from_library(problem, draws, chains, seed)
+    values: dict[str, Any] = problem.layout.to_dict(phi)
+    values |= {"library_index": index, "sigma": sigma[..., 0] if problem.scalar_sigma else sigma}
+    return as_trace(model, values, {"accept": accepted}), _point(problem, best)
+
+
+def prior_starts(problem: Problem, rng: np.random.Generator, chains: int) -> list[dict[str, Any]]:
+    """Draw starts of chains: each owner's set from the prior, sigma at its prior's median."""
+    library, median = _library(problem), problem.noise_prior[0]
+    sigma = np.exp(np.log(median).mean()) if problem.scalar_sigma else median
+    laws = [library.prior(owner) for owner in problem.scene.owners]
+    return [
+        {"library_index": np.array([rng.choice(len(p), p=p) for p in laws]), "sigma": sigma}
+        for _ in range(chains)
+    ]
+
+
+def most_frequent(problem: Problem, trace: Any) -> Point:
+    """Return the most frequent choice among the draws, jointly for bodies that meet.
+
+    Parameters
+    ----------
+    problem : Problem
+        Problem with a library.
+    trace : InferenceData or DataTree
+        Its draws.
+    """
+    drawn = group(trace, "posterior")["library_index"].transpose("chain", "draw", ...)
+    index = drawn.to_numpy().reshape(-1, drawn.shape[-1])
+    names = list(problem.scene.owners)
+    best = np.zeros(index.shape[1], dtype=np.intp)
+    for part in problem.simulator.parts:
+        columns = [names.index(owner) for owner in part.physics.scene.owners]
+        found, counts = np.unique(index[:, columns], axis=0, return_counts=True)
+        best[columns] = found[counts.argmax()]
+    return _point(problem, best)
+
+
+def _point(problem: Problem, choice: Ints) -> Point:
+    """Return the parameters of a choice (owner,), with the most probable sigma."""
+    table = _library(problem).table(problem.layout, problem.scene)
+    names = list(problem.scene.owners)
+    owners = [owner for block in problem.layout.blocks for owner in block.owners]
+    phi = table[np.arange(len(owners)), choice[[names.index(owner) for owner in owners]]]
+    return Point(phi, profile_sigma(problem, problem.residual(phi), phi), choice)
+
+
+def _library(problem: Problem) -> ParameterLibrary:
+    if problem.library is None:
+        raise FitError("fit: the model has no library to choose from")
+    return problem.library

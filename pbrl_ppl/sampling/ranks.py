@@ -25,14 +25,14 @@ _BINS, _LEAST_A_BIN = (20, 10, 5, 4, 2), 5
 
 
 def rank(draws: Array, truth: float, effective: float) -> tuple[int, int]:
-    """Rank of a true value among draws, thinned to about independent ones.
+    """Return the rank of a true value among draws, thinned to about independent ones.
 
     Parameters
     ----------
     draws : ndarray
         Posterior draws of one parameter, shape (draw,), chains joined.
     truth : float
-        What the data were simulated with.
+        Value that the data were simulated with.
     effective : float
         Effective sample size of the draws.
 
@@ -55,7 +55,7 @@ def rank(draws: Array, truth: float, effective: float) -> tuple[int, int]:
 
 
 def uniformity(position: Array) -> float:
-    """Chi-squared p-value that positions are uniform on (0, 1).
+    """Return the chi-squared p-value that positions are uniform on (0, 1).
 
     Parameters
     ----------
@@ -72,12 +72,12 @@ def uniformity(position: Array) -> float:
 
 
 def bins(n: int) -> int:
-    """Bins for n positions: at least 5 expected in each, and 100 ranks fall into them evenly."""
+    """Return the number of bins for n positions: a divisor of 100, with 5 or more in each."""
     return next((b for b in _BINS if n >= _LEAST_A_BIN * b), _BINS[-1])
 
 
 def holm(p_values: Array) -> Array:
-    """p-values corrected for their number by Holm's step-down method, shape (m,).
+    """Return p-values corrected for their number by Holm's step-down method, shape (m,).
 
     Examples
     --------
@@ -128,7 +128,7 @@ class Calibration:
         attrs: dict[str, object] | None = None,
         **others: Array,
     ) -> Calibration:
-        """Make one of ranks and numbers of draws, shape (replication, parameter) each.
+        """Return a calibration of ranks and numbers of draws, shape (replication, parameter) each.
 
         Parameters
         ----------
@@ -162,7 +162,7 @@ class Calibration:
         return cls(dataset, failures)
 
     def table(self) -> pd.DataFrame:
-        """One row a parameter: tests of uniform ranks, coverage with its limits, convergence.
+        """Return one row a parameter: tests of uniform ranks, coverage and its limits, convergence.
 
         Returns
         -------

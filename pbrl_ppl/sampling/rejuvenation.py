@@ -21,10 +21,10 @@ _INNER, _NOISE_STEPS = 15, 10
 _PLAIN_STEPS = 5
 #: Standard deviation of the coarse log-likelihood's error up to which it is looked ahead with.
 _CLOSE = 1.0
-#: Rounds end when no parameter's place correlates more than this with where it began; or after so
-#: many. Then copies of one particle have little more in common than strangers have.
+#: Rounds end when no parameter correlates more than this with its start, or after so many: then
+#: copies of one particle are nearly independent.
 _FORGOTTEN, _ROUNDS = 0.5, 20
-#: Numbers held at once: particles go in groups that keep their predictions below this.
+#: Numbers held at once: particles are moved in groups whose predictions are fewer.
 _NUMBERS = 4_000_000
 
 
@@ -37,8 +37,8 @@ def rejuvenate(
 ) -> tuple[Array, Array, float]:
     """Rejuvenate particles of a posterior by Metropolis steps, until they have decorrelated.
 
-    Parts of the scene that have nothing to do with each other are moved and judged each on its own,
-    for given the noise they are independent; then the noise, for which the engine is not needed.
+    Independent parts of the scene are moved and accepted separately, given the noise; then the
+    noise, for which the engine is not needed.
     A wheel's equal descriptions share their prior evenly here; `redescribed` gives each its own.
 
     Where a coarse engine follows the posterior, several steps under it make one proposal, as in
@@ -47,13 +47,13 @@ def rejuvenate(
     Parameters
     ----------
     problem : Problem
-        Whose posterior stays what it is.
+        Problem whose posterior is the target.
     phi, sigma : ndarray
-        Equally weighted draws of it, shapes (particle, p) and (particle, state).
+        Equally weighted draws, shapes (particle, p) and (particle, state).
     rng : Generator
         Of the moves.
     progress : callable
-        Is told of every round.
+        Called with a text after every round.
 
     Returns
     -------
@@ -76,14 +76,14 @@ def rejuvenate(
 
 
 def _correlation(before: Array, after: Array) -> float:
-    """Largest correlation over the columns between the particles before and after."""
+    """Return the largest correlation over the columns between the particles before and after."""
     a, b = before - before.mean(axis=0), after - after.mean(axis=0)
     size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
     return float(((a * b).sum(axis=0) / np.maximum(size, 1e-300)).max(initial=0.0))
 
 
 class _Mover:
-    """Particles in the unconstrained space, and what it takes to move them."""
+    """Particles in the unconstrained space, with their proposals and densities."""
 
     def __init__(self, problem: Problem, phi: Array, sigma: Array) -> None:
         self.problem, self.priors = problem, problem.layout.priors
@@ -107,17 +107,17 @@ class _Mover:
         self.look_ahead: bool | None = None
 
     def groups(self) -> list[slice]:
-        """Particles in groups whose predictions fit into memory."""
+        """Return groups of particles whose predictions fit into memory."""
         size = max(1, _NUMBERS // max(self.problem.observations.values.size, 1))
         return [slice(i, i + size) for i in range(0, len(self.u), size)]
 
     def phi(self, u: Array) -> Array:
-        """Parameters at unconstrained ones, shape (..., p)."""
+        """Return the parameters at unconstrained ones, shape (..., p)."""
         columns = [constrain(prior, u[..., i]) for i, prior in enumerate(self.priors)]
         return np.asarray(inside(self.priors, np.stack(columns, axis=-1)) if columns else u)
 
     def prior(self, u: Array) -> Array:
-        """Log-density of each part's parameters with the transform's, shape (particle, part)."""
+        """Return the log-density of each part's parameters, transformed, shape (particle, part)."""
         phi = self.phi(u)
         layout = self.problem.layout
         terms = layout.log_prior(phi) + evened(layout, phi)
@@ -126,7 +126,7 @@ class _Mover:
         return np.stack([terms[:, part.places].sum(axis=1) for part in self.parts], axis=1)
 
     def likelihood(self, residual: Array, noise: Array, u: Array) -> Array:
-        """Log-likelihood of each part, shape (particle, part), for log sigma (particle, state)."""
+        """Return the log-likelihood of each part at log sigma (particle, state)."""
         problem, sigma = self.problem, np.exp(noise)
         sigma = sigma * np.ones(len(problem.noise_prior[0]))
         measured, phi = problem.observations.measured, self.phi(u)
@@ -142,18 +142,18 @@ class _Mover:
         return result
 
     def exact(self, u: Array, noise: Array) -> tuple[Array, Array]:
-        """Log-density of each part, and the residuals."""
+        """Return the log-density of each part, and the residuals."""
         residual = self.problem.residual(self.phi(u))
         return self.prior(u) + self.likelihood(residual, noise, u), residual
 
     def rough(self, u: Array, noise: Array) -> Array:
-        """Log-density of each part with the coarse engine."""
+        """Return the log-density of each part with the coarse engine."""
         states = self.problem.predict(self.phi(u), self.coarse) + self.correction
         residual = self.problem.observations.residual(states)
         return self.prior(u) + self.likelihood(residual, noise, u)
 
     def move(self, group: slice, rng: np.random.Generator) -> float:
-        """One round of one group of particles; the share of its moves that was accepted."""
+        """Move a group of particles by one round; return the share of accepted moves."""
         u, noise, rates = self.u[group], self.noise[group], []
         here, residual = self.exact(u, noise)
         if self.look_ahead is None:
@@ -175,7 +175,7 @@ class _Mover:
         return float(np.mean(rates))
 
     def _chosen(self, accepted: Bools, y: Array, u: Array) -> Array:
-        """The proposal for the parts (particle, part) that accept it."""
+        """Return the particles with the proposal for the parts (particle, part) that accept it."""
         result = u.copy()
         for j, part in enumerate(self.parts):
             result[:, part.places] = np.where(
@@ -184,7 +184,7 @@ class _Mover:
         return result
 
     def _propose(self, u: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, Array]:
-        """A proposal, and the logarithm of each part's Hastings ratio."""
+        """Return a proposal, and the logarithm of each part's Hastings ratio."""
         y, gain = u.copy(), np.zeros((len(u), len(self.parts)))
         for j, block in enumerate(self.blocks):
             y[:, block.places], gain[:, j] = block.propose(u[:, block.places], walk, rng)
@@ -196,10 +196,9 @@ class _Mover:
             block.lengthen(rate - TARGET_ACCEPTANCE, walk)
 
     def _ahead(self, u: Array, noise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
-        """Proposal by several steps under the coarse posterior, and its log Hastings ratio.
+        """Return a proposal of steps under the coarse posterior, and its log Hastings ratio.
 
-        That is right for steps that are as likely in the reverse order: none may learn from
-        those before it, and all learn at the end.
+        The steps must be as likely in the reverse order: step sizes adapt only at the end.
         """
         begin = here = self.rough(u, noise)
         rates: dict[bool, list[Array]] = {True: [], False: []}
@@ -216,7 +215,7 @@ class _Mover:
         return u, begin - here
 
     def _noisy(self, residual: Array, noise: Array, u: Array, rng: np.random.Generator) -> Array:
-        """Steps of the noise, shape (particle, state), at given residuals."""
+        """Return the noise, shape (particle, state), after steps at given residuals."""
 
         def density(at: Array) -> Array:
             likelihood = self.likelihood(residual, at, u).sum(axis=1)
@@ -235,14 +234,14 @@ class _Mover:
 
 
 def _accepted(log_ratio: Array, rng: np.random.Generator) -> Bools:
-    """Whether each proposal passes; none where a density is not a number."""
+    """Return whether each proposal is accepted; not where a density is not a number."""
     with np.errstate(invalid="ignore"):
         passes = np.log(rng.uniform(size=log_ratio.shape)) < log_ratio
     return np.asarray(passes)
 
 
 def _spread(points: Array, columns: NDArray[np.intp]) -> Array:
-    """Covariance of some columns, never singular."""
+    """Return the covariance of some columns, never singular."""
     if not len(columns):  # of a part whose parameters are known
         return np.zeros((0, 0))
     covariance = np.cov(points[:, columns], rowvar=False).reshape(2 * (len(columns),))
@@ -250,5 +249,5 @@ def _spread(points: Array, columns: NDArray[np.intp]) -> Array:
 
 
 def _of_bodies(nu: float | Array | None, bodies: NDArray[np.intp]) -> float | Array | None:
-    """Degrees of freedom of some bodies."""
+    """Return the degrees of freedom of some bodies."""
     return nu[..., bodies, :] if isinstance(nu, np.ndarray) else nu

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 #: One replication's numbers, by name, each a list over the parameters.
 Record = dict[str, list[float]]
 
-#: A fit with fewer than 99 effective draws is done again with four times the draws, so often.
+#: A fit with fewer than 99 effective draws is repeated so often, with so many times the draws.
 _AGAIN, _LONGER = 2, 4
 #: Draws from the prior are given up where fewer than one in so many is possible.
 _MOST_REDRAWN = 50
@@ -114,7 +114,7 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
 
 
 def _trajectories(design: Problem, phi: Array, sigma: Array, seed: int) -> Array:
-    """Measured states of whole trajectories, 0 where nothing is measured, one set a draw."""
+    """Return measured states of whole trajectories, one set a draw; 0 where nothing is measured."""
     every = [
         simulated_trajectories(design, phi[i], sigma[i], np.random.default_rng([seed, i]))
         for i in range(len(phi))
@@ -124,7 +124,7 @@ def _trajectories(design: Problem, phi: Array, sigma: Array, seed: int) -> Array
 
 
 def simulated(design: Problem, values: Array) -> Problem:
-    """The problem with other next states in place of the measured ones.
+    """Return the problem with other next states in place of the measured ones.
 
     Its history has one trajectory a segment, so that each starts from the design's own state.
 
@@ -208,11 +208,11 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
 
 
 def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
-    """Ranked quantities, shape (draw, quantity): folded phi, sigma and the log-likelihood."""
+    """Return the ranked quantities: folded phi, sigma, log-likelihood, shape (draw, quantity)."""
     sigma = problem.likelihood.free(sigma)
     return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])
 
 
 def labels(problem: Problem) -> tuple[str, ...]:
-    """Names of the ranked quantities, such as ``mass[cart]``."""
+    """Return the names of the ranked quantities, such as ``mass[cart]``."""
     return (*problem.layout.labels, *problem.noise_labels, "log_likelihood")

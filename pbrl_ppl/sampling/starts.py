@@ -1,7 +1,8 @@
-"""Starting points of samplers: the Laplace approximation in their space, and dispersed points."""
+"""Space of the samplers: transforms, log-density, Laplace approximation and starting points."""
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -13,20 +14,20 @@ from scipy.special import expit
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.parameters import Prior, gathered, inside
+from pbrl_ppl.parameters import Prior, Wheel, gathered, inside, wheels
 from pbrl_ppl.posterior import group, parameter_draws
 from pbrl_ppl.sampling.metropolis import Gaussian
 
 Array = NDArray[np.float64]
 
-#: Where a posterior is tried, in standard deviations, and by how much it has fallen at the first.
+#: Distances at which a posterior is evaluated, in standard deviations; its fall at the first one.
 _FAR, _LOW = (2.0, 4.0, 8.0, 16.0), 2.5
-#: Steps of the noise a round. Along trajectories there are two noises, one of which may vanish.
+#: Steps of the noise a round; along trajectories one of the two noises may vanish.
 _CHEAP, _CHEAP_ALONG = 5, 30
 
 
 def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
-    """Blocks from the Laplace approximation: one a part of the scene, and one for the noise."""
+    """Return blocks from the Laplace approximation: one a part of the scene, one for the noise."""
     problem = mode.problem
     places, offset = {}, 0
     point = blank_point(model, problem)
@@ -38,30 +39,30 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
     mean, covariance = _laplace(problem, mode)
     blocks = []
     for part in problem.simulator.parts:
-        own = part.places
-        if len(own):
-            blocks.append(Gaussian(where[own], mean[own], covariance[np.ix_(own, own)]))
-    own = np.concatenate([places[name] for name in problem.noise_variables])
-    noise = own, *_sigma_laplace(problem, mode)
+        i = part.places
+        if len(i):
+            blocks.append(Gaussian(where[i], mean[i], covariance[np.ix_(i, i)]))
+    entries = np.concatenate([places[name] for name in problem.noise_variables])
+    noise_mean, noise_covariance = _sigma_laplace(problem, mode)
     # along trajectories another noise costs a filter's gains; of Eq. 11 it may move with phi
     independent = isinstance(problem.likelihood, TransitionLikelihood)
     if len(blocks) == 1 and independent:
         only = blocks[0]
         return [
             Gaussian(
-                np.concatenate([only.places, noise[0]]),
-                np.concatenate([only.mean, noise[1]]),
-                block_diag(only.covariance, noise[2]),
+                np.concatenate([only.places, entries]),
+                np.concatenate([only.mean, noise_mean]),
+                block_diag(only.covariance, noise_covariance),
             )
         ]
     cheap = _CHEAP if independent else _CHEAP_ALONG
-    return [*blocks, Gaussian(*noise, cheap=cheap)]
+    return [*blocks, Gaussian(entries, noise_mean, noise_covariance, cheap)]
 
 
 def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
-    """Zeros of the shapes of the model's continuous variables, by their names in the sampler.
+    """Return zeros of the shapes of the continuous variables, by their names in the sampler.
 
-    ``model.initial_point()`` has them too, and compiles a function for that.
+    ``model.initial_point()`` would compile a function.
     """
     shapes: dict[str, tuple[int, ...]] = {b.name: (len(b.owners),) for b in problem.layout.blocks}
     shapes |= {name: (len(own),) for name, own in problem.noise_variables.items()}
@@ -74,7 +75,7 @@ def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
 
 
 def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
-    """PyMC's unconstraining transform of a prior's variable at x, and its derivative there.
+    """Return PyMC's unconstraining transform of a prior's variable at x, and its derivative.
 
     Numbers or arrays of any shape.
     """
@@ -87,7 +88,7 @@ def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
 
 
 def constrain(prior: Prior, u: Any) -> Any:
-    """Inverse of :func:`unconstrain`."""
+    """Return the inverse of :func:`unconstrain`."""
     if prior.family in ("log_normal", "half_normal"):
         return np.exp(u)
     if prior.family == "truncated_normal":
@@ -96,7 +97,7 @@ def constrain(prior: Prior, u: Any) -> Any:
 
 
 def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
-    """Mode and Laplace covariance in the sampler's space, no direction wider than a prior's."""
+    """Return mode and Laplace covariance in the sampler's space, no wider than a prior's."""
     pairs = [
         unconstrain(prior, x) for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
     ]
@@ -109,17 +110,17 @@ def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
 
 
 def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Array:
-    """Covariance in the sampler's space, widened where the posterior falls off more slowly.
+    """Return a covariance in the sampler's space, widened where the posterior falls off slowly.
 
-    At a kink or a bump of few contacts the curvature says that a parameter is known, which the
-    posterior farther off does not bear out; an adapting chain would take long to find that.
+    At a kink, or with few contacts, the curvature overstates how well a parameter is known, and an
+    adapting chain would take long to find that.
 
     Parameters
     ----------
     problem : Problem
-        Says what the posterior is.
+        Defines the posterior.
     mode : Mode
-        Where the covariance was taken, with its noise.
+        Point of the covariance, with its noise.
     mean, covariance : ndarray
         The mode in the sampler's space and its Laplace covariance, shapes (p,) and (p, p).
     """
@@ -132,7 +133,7 @@ def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Arr
     # one at a time, for each is a rollout of all data; the others stay where they are
     for i, step in enumerate(np.diag(np.sqrt(variance))):
         fall = top - _log_density(problem, mean + ends * step, mode.sigma)
-        # of either side, no farther than to the first that has fallen
+        # on either side, up to the first point that has fallen
         inside = np.nan_to_num(fall.reshape(2, -1), nan=np.inf) < _LOW
         steps = np.logical_and.accumulate(inside, axis=1).sum(axis=1)
         stretch[i] = np.array([_FAR[0], *_FAR])[steps].mean() / _FAR[0]
@@ -140,9 +141,9 @@ def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Arr
 
 
 def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
-    """Log-posterior but for a constant at points (point, p) of the sampler's space.
+    """Return the log-posterior up to a constant at points (point, p) of the sampler's space.
 
-    There is none where numbers end: at a mass of zero, or at the end of a support.
+    It is -inf on numerical overflow: at a mass of zero, or at the end of a support.
     """
     priors, height = problem.layout.priors, np.full(len(u), -np.inf)
     with np.errstate(all="ignore"):
@@ -151,14 +152,14 @@ def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
         slope = np.log(np.column_stack(slopes)).sum(axis=1)
         there = np.isfinite(phi).all(axis=1) & np.isfinite(slope)
         if there.any():
-            own = phi[there]
-            likelihood = problem.log_density(problem.residual(own), sigma, own).sum(axis=-1)
-            height[there] = likelihood + problem.layout.log_prior(own).sum(axis=-1) - slope[there]
+            x = phi[there]
+            likelihood = problem.log_density(problem.residual(x), sigma, x).sum(axis=-1)
+            height[there] = likelihood + problem.layout.log_prior(x).sum(axis=-1) - slope[there]
     return height
 
 
 def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
-    """Mean and covariance of log sigma: the latter half the inverse of the measurements."""
+    """Return mean and covariance of log sigma: half the inverse of the number of measurements."""
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         return mode.noise_gaussian()
     counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
@@ -167,7 +168,7 @@ def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
 
 
 def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Array]]:
-    """Starts about two posterior standard deviations from the mode, one a chain."""
+    """Draw starts about two posterior standard deviations from the mode, one a chain."""
     problem, priors = mode.problem, mode.problem.layout.priors
     low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
     factor, starts = mode.factor, []
@@ -184,14 +185,14 @@ def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[st
 
 
 def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, Array]]]:
-    """Gaussian approximation of a posterior, in a mode's form, and the last draw of each chain.
+    """Return a Gaussian approximation of a posterior, as a mode, and the last draw of each chain.
 
     Parameters
     ----------
     problem : Problem
         Of the same scene, effects and measured dimensions.
     idata : InferenceData or DataTree
-        Its posterior so far.
+        The posterior.
 
     Returns
     -------
@@ -228,5 +229,47 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
 
 
 def _range(prior: Prior) -> Array:
-    """The 2 % and 98 % quantiles of a prior, by simulation: they only limit where chains begin."""
+    """Return the 2 % and 98 % quantiles of a prior, by simulation: they limit the starts."""
     return np.quantile(prior.sample(np.random.default_rng(0), 2000), [0.02, 0.98])
+
+
+def evened_logp(model: pm.Model, problem: Problem) -> Any:
+    """Return a correction of the model's log-density: `parameters.evened` as an expression.
+
+    With it the prior of each wheel is the same for all its equal descriptions, so that one mode
+    stands for all. The description of each draw is chosen afterwards (`parameters.redescribed`).
+
+    Parameters
+    ----------
+    model : pymc.Model
+        The model of ``problem``.
+    problem : Problem
+        Says which wheels are unknown.
+
+    Returns
+    -------
+    tensor or float
+        In terms of the model's value variables; zero where every prior is even.
+    """
+    uneven = [wheel for wheel in wheels(problem.layout) if wheel.period > 1]
+    if not uneven:
+        return 0.0
+    change = sum(_of_wheel(model, problem, wheel) for wheel in uneven)
+    return model.replace_rvs_by_values([change])[0]
+
+
+def _of_wheel(model: pm.Model, problem: Problem, wheel: Wheel) -> Any:
+    places = {
+        f"{block.name}[{owner}]": (block.name, i)
+        for block in problem.layout.blocks
+        for i, owner in enumerate(block.owners)
+    }
+    angle, *mus = (model[name][i] for name, i in (places[label] for label in wheel.labels))
+    direction, *frictions = wheel.priors
+    terms = []
+    for turns in range(4):
+        term = direction.kappa * pm.math.cos(angle + turns * np.pi / 2 - direction.mu)
+        for mu, prior in zip(mus[:: -1 if turns % 2 else 1], frictions, strict=True):
+            term = term - 0.5 * ((mu - prior.mu) / prior.sigma) ** 2
+        terms.append(term)
+    return reduce(pm.math.logaddexp, terms) - np.log(4.0) - terms[0]

@@ -16,16 +16,16 @@ Array = NDArray[np.float64]
 
 
 def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
-    """A trace in PyMC's form, of draws made without PyMC.
+    """Return a trace in PyMC's form, of draws made without PyMC.
 
     Parameters
     ----------
     model : pymc.Model
-        Of ``physics_model``; says what each variable runs over.
+        As made by ``physics_model``; has the dimensions of each variable.
     draws : mapping of str to ndarray
         By the variables' names, shape (chain, draw, ...).
     stats : mapping of str to ndarray
-        What the sampler says of each draw, shape (chain, draw).
+        The sampler's statistics of each draw, shape (chain, draw).
     """
     problem, posterior = model.problem, posterior_dataset(model, draws)
     segments = problem.segments
@@ -73,7 +73,7 @@ def appended(earlier: Any, trace: Any) -> Any:
 
 
 def posterior_dataset(model: pm.Model, values: Mapping[str, Array]) -> xr.Dataset:
-    """Draws by variable, shape (chain, draw, ...), with the model's dimensions and coordinates."""
+    """Return draws, shape (chain, draw, ...), with the model's dimensions and coordinates."""
     data = {
         name: (("chain", "draw", *(model.named_vars_to_dims.get(name) or ())), value)
         for name, value in values.items()
@@ -83,6 +83,6 @@ def posterior_dataset(model: pm.Model, values: Mapping[str, Array]) -> xr.Datase
 
 
 def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
-    """Variables (dims, values) with the model's coordinates of their dimensions."""
+    """Return variables (dims, values) with the model's coordinates of their dimensions."""
     used = {dim for dims, _ in variables.values() for dim in dims if dim in model.coords}
     return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})

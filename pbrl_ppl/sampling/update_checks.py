@@ -1,60 +1,59 @@
-"""Checks of a posterior and of new data before an update, with a message for each."""
+"""Checks of a posterior and of new data before an update."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import xarray as xr
 from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
-from pbrl_ppl.likelihood import Problem, TransitionLikelihood, cells_of
-from pbrl_ppl.posterior import from_groups, group, parameter_draws, problem_of, recorded, scene_of
+from pbrl_ppl.likelihood import Cells, Problem
+from pbrl_ppl.posterior import (
+    PosteriorRecord,
+    from_groups,
+    group,
+    parameter_draws,
+    problem_of,
+)
 from pbrl_ppl.state import STATE
 
 #: With fewer draws there is nothing to choose from.
 _LEAST_DRAWS = 100
 #: How far the stored likelihood of a transition may be from what the engine gives now.
 _SAME = 0.01
-#: Of how many transitions, one draw each.
+#: Transitions at which that is checked, under one draw.
 _CHECKED = 50
-#: Standard errors by which new transitions are less probable than the posterior's own, at least,
-#: to be predicted worse.
+#: Standard errors by which new transitions must be less probable than the fitted ones to count as
+#: predicted worse.
 _WORSE = 3.0
-_GROUPS = ("posterior_predictive", "observed_data", "constant_data")
 
 
-def checked_log(idata: Any, history: History) -> list[dict[str, Any]]:
-    """Log of earlier updates; refuses posteriors and data that an update cannot use."""
-    for name in ("posterior", "log_likelihood", *_GROUPS):
+def check_posterior(idata: Any, history: History) -> PosteriorRecord:
+    """Return the record of a posterior; refuse posteriors and data that an update cannot use."""
+    for name in ("log_likelihood", "posterior_predictive", "observed_data", "constant_data"):
         group(idata, name)
-    if "data_sha256" not in idata.attrs:
-        raise PosteriorError(
-            "update: the posterior does not say which data it is of; make it with pbrl_ppl.fit"
-        )
+    record = PosteriorRecord.of(idata)
     sizes = group(idata, "posterior").sizes
     if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
         raise PosteriorError(
             f"update: the posterior has {sizes['chain'] * sizes['draw']} draws, expected at least"
             f" {_LEAST_DRAWS} to choose from; fit with a method that samples"
         )
-    done: list[dict[str, Any]] = json.loads(str(idata.attrs.get("updates", "[]")))
-    known = [str(idata.attrs["data_sha256"])]
-    known += [entry[key] for entry in done for key in ("data_sha256", "before_sha256")]
+    known = [record.data_sha256]
+    for entry in record.updates or ():
+        known += [entry["data_sha256"], entry["before_sha256"]]
     if history.data_sha256 in known:
         raise PosteriorError(
             "update: these data are in the posterior already, and would count twice; pass only"
             " what was recorded since"
         )
-    return done
+    return record
 
 
 def as_recorded(idata: Any, history: History) -> History:
-    """The history without unused velocities that the posterior's is without as well."""
+    """Return the history without the unused velocities that the posterior leaves out."""
     given = group(idata, "constant_data")
     if "recorded_observed" not in given:
         return history
@@ -68,9 +67,9 @@ def as_recorded(idata: Any, history: History) -> History:
     return measured_alone(history, unused)
 
 
-def check_history(idata: Any, history: History) -> None:
+def check_history(idata: Any, record: PosteriorRecord, history: History) -> None:
     """Refuse a history of other bodies, dimensions or sampling, or of nothing to go on with."""
-    scene, horizon = scene_of(idata), int(idata.attrs["horizon"])
+    scene, measured = record.scene, record.measured
     names = tuple(body.name for body in scene.moving)
     if history.bodies != names:
         raise HistoryError(
@@ -84,9 +83,8 @@ def check_history(idata: Any, history: History) -> None:
             f" {scene.time_step:g} s; load it with the posterior's scene"
         )
     if "smoothed" not in group(idata, "constant_data"):
-        check_start(history, scene_of(idata))
-    segments = history.segments(horizon)
-    measured = [str(name) for name in group(idata, "observed_data")["state"].values]
+        check_start(history, scene)
+    segments = history.segments(record.horizon)
     extra = [
         name
         for i, name in enumerate(STATE)
@@ -119,31 +117,28 @@ def check_engine(idata: Any, problem: Problem) -> None:
         )
 
 
-def more_noise(problem: Problem, data: Mapping[str, xr.Dataset]) -> list[str]:
-    """Noise parameters of whole trajectories that all data have and the posterior has not."""
-    if isinstance(problem.likelihood, TransitionLikelihood):
-        return []
-    history = recorded(problem.scene, data["constant_data"])
-    cells, own = cells_of(problem.scene, history), problem.noise_variables
+def more_noise(problem: Problem, cells: Cells) -> list[str]:
+    """Return noise parameters that the cells of all data have and the posterior has not."""
+    held = problem.noise_variables
     return [
         f"{name}[{dimension}]"
         for name, dimensions in cells.variables.items()
         for dimension in dimensions
-        if dimension not in own.get(name, ())
+        if dimension not in held.get(name, ())
     ]
 
 
 def judgement(held: NDArray[np.float64], new: NDArray[np.float64]) -> str:
-    """Say whether new transitions may be of the same bodies as those that the posterior is of.
+    """Return a text on whether new transitions may be of the same bodies as the posterior's.
 
     Parameters
     ----------
     held, new : ndarray
         Log-likelihoods of transitions, shape (..., transition), the draws first.
     """
-    own, others = (each.reshape(-1, each.shape[-1]).mean(axis=0) for each in (held, new))
-    error = float(np.sqrt(own.var() / len(own) + others.var() / len(others)))
-    if not float(own.mean() - others.mean()) < _WORSE * error:
+    old, others = (each.reshape(-1, each.shape[-1]).mean(axis=0) for each in (held, new))
+    error = float(np.sqrt(old.var() / len(old) + others.var() / len(others)))
+    if not float(old.mean() - others.mean()) < _WORSE * error:
         return "look whether they are of the same bodies, under the same conditions"
     return (
         "the posterior predicts them as well as its own data, so they may well be of the same"

@@ -1,41 +1,38 @@
-"""A posterior brought up to date with new transitions, without a fit from scratch."""
+"""Update of a posterior with new transitions, without a fit from scratch."""
 
 from __future__ import annotations
 
 import hashlib
-import json
 import warnings
-from collections.abc import Iterable, Mapping
-from functools import partial
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from pbrl_ppl import posterior as files
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import RefitWarning
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
+from pbrl_ppl.likelihood import (
+    Problem,
+    TrajectoryLikelihood,
+    along_trajectories,
+    single_transitions,
+)
 from pbrl_ppl.model import build_model
 from pbrl_ppl.posterior import (
+    CELLS,
     MIN_ESS,
-    both_places,
-    both_recordings,
-    checked,
-    complete,
-    convergence,
-    evaluate,
+    PosteriorRecord,
     from_groups,
     group,
     groups,
     parameter_draws,
-    placed,
-    predicted_rows,
-    prior_groups,
     problem_of,
-    recording,
-    smoothed,
 )
 from pbrl_ppl.sampling.fitting import fit
 from pbrl_ppl.sampling.rejuvenation import rejuvenate
@@ -43,11 +40,10 @@ from pbrl_ppl.sampling.update_checks import (
     as_recorded,
     check_engine,
     check_history,
-    checked_log,
+    check_posterior,
     judgement,
     more_noise,
 )
-from pbrl_ppl.sampling.updated_mode import climb_from
 
 Array = NDArray[np.float64]
 
@@ -57,12 +53,10 @@ BASE = "before_updates"
 #: Share of the draws that the weights are worth: below the first the draws are moved, below the
 #: second all data are fitted anew.
 _MOVE, _REFIT = 0.5, 0.05
-#: Shape of the weights' tail above which they say nothing of their own error.
+#: Shape of the weights' tail above which they do not even show their own error.
 _HEAVY = 0.7
-#: How many draws are moved at most.
+#: Draws that are moved at most.
 _WALKERS = 1000
-#: Dimensions of measured next states.
-CELLS = ("transition", "step", "body", "state")
 
 
 def update(
@@ -73,7 +67,7 @@ def update(
     seed: int = 0,
     progress: bool = True,
 ) -> Any:
-    """Bring a posterior up to date with new transitions.
+    """Return a posterior updated with new transitions.
 
     The draws are weighted by the new transitions' likelihood and resampled within each chain, in
     their order, so that what is repeated shows as autocorrelation in ArviZ's figures (IBIS:
@@ -104,7 +98,7 @@ def update(
         were worth (``share``), ``pareto_k``, and what was done: ``reweighted``, ``moved`` or
         ``refitted``. The group ``before_updates`` holds the draws that the next update starts from.
         The stored mode is climbed to anew from the old one under all data; over a library or joints
-        of unknown bodies, reweighted draws have none.
+        of unknown bodies, it is the most probable of reweighted draws.
 
     Raises
     ------
@@ -132,113 +126,210 @@ def update(
         json.loads(idata.attrs["updates"])[-1]["did"]  # 'reweighted'
     """
     effects = tuple(effects)
-    done = checked_log(idata, history)
+    record = check_posterior(idata, history)
     history = as_recorded(idata, history)
-    check_history(idata, history)
+    check_history(idata, record, history)
     problem = problem_of(idata, effects, history)
     check_engine(idata, problem)
-    result: Any = partial(_updated, idata, problem, effects, seed, progress)
-    while callable(result):  # a refit comes after the warning of it
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            result, how = result()
-        for warning in caught:  # they are the caller's
-            warnings.warn(warning.message, stacklevel=2)
+    rng = np.random.default_rng(seed)
+    new = _weighted(idata, record, problem, rng)
+    how: dict[str, Any] = {"share": new.share, "pareto_k": new.k if np.isfinite(new.k) else None}
+    with _relayed():
+        result, whole, did = _without_fit(idata, new, effects, seed, rng)
+    if result is None:
+        why = f"their tail has a shape k of {new.k:.2g}"
+        if not new.heavy:
+            why = f"worth {new.share:.1%} of the draws"
+        why = f"the new data leave the posterior so far behind ({why})"
+        if new.more_noise:
+            names = ", ".join(new.more_noise)
+            why = f"the new data have noise that the posterior lacks ({names}), so"
+            whole = along_trajectories(single_transitions(whole), np.median(new.phi, axis=0))
+        warnings.warn(
+            f"update: {why} that all of them are fitted anew, which takes as long as a fit;"
+            f" {judgement(new.earlier, new.likelihood)}",
+            RefitWarning,
+            stacklevel=2,
+        )
+        with _relayed():
+            chains = new.base.sizes["chain"]
+            result = fit(build_model(whole), seed=seed, chains=chains, progress=progress)
+        result = files.placed(result, new.base.coords)
+        did = {"did": "refitted"}
     entry = {
         "transitions": problem.segments.n,
         "data_sha256": history.data_sha256,
-        "before_sha256": str(idata.attrs["data_sha256"]),
+        "before_sha256": record.data_sha256,
         "seed": seed,
         **how,
+        **did,
     }
-    if how["did"] != "refitted":
-        climb_from(idata, result, effects)
-    chained = f"{idata.attrs['data_sha256']}{history.data_sha256}"
-    result.attrs["updates"] = json.dumps([*done, entry])
-    result.attrs["data_sha256"] = hashlib.sha256(chained.encode()).hexdigest()
+    updated = PosteriorRecord.of(result)
+    if did["did"] != "refitted":
+        updated = replace(updated, mode=_mode(idata, result, effects))
+    chained = f"{record.data_sha256}{history.data_sha256}"
+    updated = replace(
+        updated,
+        updates=(*(record.updates or ()), entry),
+        data_sha256=hashlib.sha256(chained.encode()).hexdigest(),
+    )
+    result.attrs.update(updated.attributes())
     return result
 
 
-def _updated(
-    idata: Any, problem: Problem, effects: tuple[Effect, ...], seed: int, progress: bool
-) -> tuple[Any, dict[str, Any]]:
-    """The posterior with the problem's transitions, or what fits it anew, and what was done."""
-    rng = np.random.default_rng(seed)
-    base = _base(idata, problem)
+@contextmanager
+def _relayed() -> Iterator[None]:
+    """Issue the warnings of the block again, as the caller's of the function that holds it."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        yield
+    for warning in caught:
+        warnings.warn(warning.message, stacklevel=4)
+
+
+@dataclass(frozen=True, eq=False)
+class _Weighted:
+    """Draws of the last fit, weighted by the likelihood of all transitions since.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the new transitions alone.
+    base : Dataset
+        The draws, their likelihoods and predictions, the new transitions' included.
+    phi, sigma : ndarray
+        The draws as vectors, shapes (draw, p) and (draw, state).
+    data : dict of str to Dataset
+        Observed and constant data, the new ones included.
+    attributes : dict
+        Attributes of the posterior of all data.
+    earlier, likelihood : ndarray
+        Log-likelihoods of earlier and of new transitions, the draws first.
+    weights : ndarray
+        Shape (draw,), adding up to 1.
+    share, k : float
+        Share of the draws that the weights are worth, and the shape of their tail.
+    more_noise : list of str
+        Noise parameters that the data have and the posterior has not.
+    """
+
+    problem: Problem
+    base: xr.Dataset
+    phi: Array
+    sigma: Array
+    data: dict[str, xr.Dataset]
+    attributes: dict[str, Any]
+    earlier: Array
+    likelihood: Array
+    weights: Array
+    share: float
+    k: float
+    more_noise: list[str]
+
+    @property
+    def heavy(self) -> bool:
+        """Whether the tail of the weights is too heavy for them to be used."""
+        return bool(np.isfinite(self.k) and self.k > _HEAVY)
+
+    @property
+    def least_share(self) -> float:
+        """Least share that the weights are worth, of all draws or of those of one chain.
+
+        A chain that the data speak against is elsewhere than the others: then they must mix.
+        """
+        chains = self.base.sizes["chain"]
+        of_chains = self.weights.reshape(chains, -1).sum(axis=1) * chains
+        return float(min(self.share, of_chains.min()))
+
+
+def _weighted(
+    idata: Any, record: PosteriorRecord, problem: Problem, rng: np.random.Generator
+) -> _Weighted:
+    """Weight the draws by the new transitions of a problem."""
+    base = _base(idata)
     names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
     phi, sigma = parameter_draws(problem, from_groups({"posterior": base[names]}, {}))
     rows = base["row"].to_numpy()
     problem = problem.joined(phi[rows], sigma[rows])
-    together = {"together": json.dumps(list(problem.physics.together))}
-    likelihood, predictive = evaluate(problem, phi, sigma, rows, rng)
+    likelihood, predictive = files.evaluate(problem, phi, sigma, rows, rng)
     data = _with_data(idata, problem)
-    held_likelihood = base["log_likelihood"].to_numpy()
+    earlier = base["log_likelihood"].to_numpy()
     base = _with_new(base, likelihood, predictive).assign_coords(data["observed_data"].coords)
     log_weights = base["log_weight"].to_numpy().ravel()
     weights, share, k = np.zeros(len(log_weights)), 0.0, np.inf
     if np.isfinite(log_weights.max()):
-        weights, k = smoothed(log_weights)
+        weights, k = files.smoothed(log_weights)
         share = 1.0 / (len(weights) * float((weights**2).sum()))
-    how = {"share": share, "pareto_k": k if np.isfinite(k) else None}
-    heavy = np.isfinite(k) and k > _HEAVY
-    # a chain that the data speak against sits where the others do not: then they must mix
-    of_chains = weights.reshape(base.sizes["chain"], -1).sum(axis=1) * base.sizes["chain"]
-    louder = more_noise(problem, data)
-    if min(share, of_chains.min()) >= _MOVE and not heavy and not louder:
-        result = _reweighted(problem, base, weights, data, idata.attrs | together, rng)
+    cells, louder = None, []
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
+        cells = files.recorded_cells(problem.scene, data["constant_data"])
+        louder = more_noise(problem, cells)
+    changed = replace(record, together=tuple(problem.physics.together), cells=cells)
+    attributes = dict(idata.attrs) | changed.attributes()
+    return _Weighted(
+        problem, base, phi, sigma, data, attributes, earlier, likelihood, weights, share, k, louder
+    )
+
+
+def _without_fit(
+    idata: Any, new: _Weighted, effects: tuple[Effect, ...], seed: int, rng: np.random.Generator
+) -> tuple[Any, Problem, dict[str, Any]]:
+    """Return the posterior of all data by weights or moves, the problem, and what was done.
+
+    The posterior is None where all data must be fitted.
+    """
+    base = new.base
+    if new.least_share >= _MOVE and not new.heavy and not new.more_noise:
+        result = _reweighted(new, rng)
         if not _worn(base, result):
-            return checked(problem, result), how | {"did": "reweighted"}
+            return files.checked(new.problem, result), new.problem, {"did": "reweighted"}
     # from here on all data are needed
-    whole = problem_of(from_groups(groups(idata) | data, idata.attrs | together), effects)
+    whole = problem_of(from_groups(groups(idata) | new.data, new.attributes), effects)
     # sets of parameters, and which bodies a joint joins, cannot be moved by steps
     chosen_among = whole.library is not None or whole.layout.discrete.any()
-    if share < _REFIT or heavy or chosen_among or louder:
-        why = f"their tail has a shape k of {k:.2g}" if heavy else f"worth {share:.1%} of the draws"
-        why = f"the new data leave the posterior so far behind ({why})"
-        if louder:
-            why = f"the new data have noise that the posterior lacks ({', '.join(louder)}), so"
-            whole = along_trajectories(single_transitions(whole), np.median(phi, axis=0))
-        warnings.warn(
-            f"update: {why} that all of them are fitted anew, which takes as long as a fit;"
-            f" {judgement(held_likelihood, likelihood)}",
-            RefitWarning,
-            stacklevel=2,
-        )
-
-        def refit() -> tuple[Any, dict[str, Any]]:
-            chains = base.sizes["chain"]
-            result = fit(build_model(whole), seed=seed, chains=chains, progress=progress)
-            return placed(result, base.coords), how | {"did": "refitted"}
-
-        return refit, how
+    if new.share < _REFIT or new.heavy or chosen_among or new.more_noise:
+        return None, whole, {}
     draws = min(base.sizes["draw"], -(-_WALKERS // base.sizes["chain"]))
-    chosen = _systematic(weights, base.sizes["chain"] * draws, rng)
-    phi, sigma, accepted = rejuvenate(whole, phi[chosen], sigma[chosen], rng)
-    posterior = _walkers(whole, base[names].isel(draw=slice(draws)), phi, sigma)
+    chosen = _systematic(new.weights, base.sizes["chain"] * draws, rng)
+    phi, sigma, accepted = rejuvenate(whole, new.phi[chosen], new.sigma[chosen], rng)
+    like = base[list(whole.named(phi, sigma))].isel(draw=slice(draws))
+    posterior = like.assign(
+        {
+            name: (like[name].dims, values.reshape(like[name].shape))
+            for name, values in whole.named(phi, sigma).items()
+        }
+    )
     rate = np.full((base.sizes["chain"], draws), accepted)
     stats = xr.Dataset({"accept": (("chain", "draw"), rate)}, _chain_and_draw(posterior))
-    trace = from_groups(data | {"posterior": posterior, "sample_stats": stats}, {})
-    method = str(idata.attrs.get("method", "update"))
-    result = complete(whole, trace, seed=seed, method=method)
-    return placed(result, base.coords), how | {"did": "moved", "draws": draws}
+    trace = from_groups(new.data | {"posterior": posterior, "sample_stats": stats}, {})
+    method = new.attributes["method"]
+    result = files.complete(whole, trace, seed=seed, method=method)
+    return files.placed(result, base.coords), whole, {"did": "moved", "draws": draws}
+
+
+def _mode(earlier: Any, updated: Any, effects: tuple[Effect, ...]) -> Any:
+    """Return the mode of all data for the record of an updated posterior."""
+    problem = problem_of(updated, effects)
+    phi, sigma = parameter_draws(problem, updated)
+    sums = group(updated, "log_likelihood")["next_state"].sum("transition")
+    likelihood = sums.transpose("chain", "draw").to_numpy().ravel()
+    choice = None
+    if problem.library is not None:
+        choice = files.draws(updated)["library_index"].astype(np.intp)
+    begin = files.stored_mode(problem, earlier)
+    return files.updated_mode(problem, begin, (phi, sigma, choice), likelihood)
 
 
 def _worn(base: xr.Dataset, result: Any) -> bool:
-    """Whether the effective sample size fell below its minimum, and was above it before."""
+    """Return whether the effective sample size fell below its minimum by reweighting."""
     if float(base["min_ess"]) < MIN_ESS:
         return False
-    return min(convergence(result)[1].values()) < MIN_ESS
+    return min(files.convergence(result)[1].values()) < MIN_ESS
 
 
-def _reweighted(
-    problem: Problem,
-    base: xr.Dataset,
-    weights: Array,
-    data: Mapping[str, xr.Dataset],
-    attrs: Mapping[str, Any],
-    rng: np.random.Generator,
-) -> Any:
-    """Equally weighted draws: those of the fit, repeated or left out within their chain."""
+def _reweighted(new: _Weighted, rng: np.random.Generator) -> Any:
+    """Return equally weighted draws: those of the fit, repeated or left out within their chain."""
+    base, weights = new.base, new.weights
     chains, n = base.sizes["chain"], base.sizes["draw"]
     ancestor = np.stack(
         [_systematic(chain_weights, n, rng) for chain_weights in weights.reshape(chains, n)]
@@ -246,22 +337,22 @@ def _reweighted(
     where = xr.DataArray(ancestor, dims=("chain", "draw"))
     drawn = base.isel(chain=xr.DataArray(np.arange(chains), dims="chain"), draw=where)
     drawn = drawn.assign_coords(chain=base["chain"], draw=base["draw"])
-    own = ("log_likelihood", "log_weight", "next_state", "min_ess")
-    posterior = _used(drawn[[str(v) for v in base.data_vars if v not in own]])
-    vectors = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
+    added = ("log_likelihood", "log_weight", "next_state", "min_ess")
+    posterior = _used(drawn[[str(v) for v in base.data_vars if v not in added]])
+    vectors = parameter_draws(new.problem, from_groups({"posterior": posterior}, {}))
     rows = _systematic(weights[base["row"].to_numpy()] + 1e-300, base.sizes["row"], rng)
     predictive = base["next_state"].isel(row=rows).rename(row="draw")
     predictive = predictive.assign_coords(draw=np.arange(len(rows))).expand_dims(chain=[0])
     result = {
-        **data,
+        **new.data,
         "posterior": posterior,
         "sample_stats": xr.Dataset({"ancestor": where}, _chain_and_draw(base)),
         "log_likelihood": _used(drawn[["log_likelihood"]].rename(log_likelihood="next_state")),
         "posterior_predictive": _used(predictive.to_dataset()),
-        **prior_groups(problem, posterior, *vectors, int(attrs.get("seed", 0))),
+        **files.prior_groups(new.problem, posterior, *vectors, int(new.attributes["seed"])),
         BASE: base,
     }
-    return from_groups(result, {**attrs, "updates": "[]"})  # what they are is the caller's to say
+    return from_groups(result, new.attributes | {"updates": "[]"})  # the caller adds the entry
 
 
 def _chain_and_draw(data: xr.Dataset) -> dict[str, Any]:
@@ -269,39 +360,41 @@ def _chain_and_draw(data: xr.Dataset) -> dict[str, Any]:
 
 
 def _used(data: xr.Dataset) -> xr.Dataset:
-    """The dataset without coordinates that no variable has."""
+    """Return the dataset without coordinates that no variable has."""
     dims = {dim for variable in data.data_vars.values() for dim in variable.dims}
     return data.drop_vars([str(c) for c in data.coords if not set(data[c].dims) <= dims])
 
 
 def _systematic(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
-    """Systematic resampling: ``n`` places in increasing order, each about as often as it weighs."""
+    """Return ``n`` indices in increasing order by systematic resampling."""
     ends = np.cumsum(weights)
-    places = np.searchsorted(ends / ends[-1], (rng.uniform() + np.arange(n)) / n)
-    return np.minimum(places, len(weights) - 1)
+    indices = np.searchsorted(ends / ends[-1], (rng.uniform() + np.arange(n)) / n)
+    return np.minimum(indices, len(weights) - 1)
 
 
-def _base(idata: Any, problem: Problem) -> xr.Dataset:
-    """The draws of the last fit or move with their likelihoods, weights and predictions."""
+def _base(idata: Any) -> xr.Dataset:
+    """Return the draws of the last fit or move with likelihoods, weights and predictions."""
     held = groups(idata)
     if BASE in held:
         return held[BASE]
     posterior = held["posterior"].transpose("chain", "draw", ...)
     chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
     likelihood = held["log_likelihood"]["next_state"].transpose("chain", "draw", "transition")
-    foreseen = group(idata, "posterior_predictive")
-    predictive = foreseen["next_state"].stack(row=("chain", "draw")).transpose("row", *CELLS)
+    predictions = group(idata, "posterior_predictive")
+    predictive = predictions["next_state"].stack(row=("chain", "draw")).transpose("row", *CELLS)
     variables = {
         "min_ess": ((), float(idata.attrs.get("min_ess", 0.0))),
         "log_likelihood": (("chain", "draw", "transition"), likelihood.to_numpy()),
         "log_weight": (("chain", "draw"), np.zeros((chains, draws))),
         "next_state": (("row", *CELLS), predictive.to_numpy()),
     }
-    return posterior.assign(variables).assign_coords(row=predicted_rows(posterior, foreseen))
+    return posterior.assign(variables).assign_coords(
+        row=files.predicted_rows(posterior, predictions)
+    )
 
 
 def _with_new(base: xr.Dataset, likelihood: Array, predictive: Array) -> xr.Dataset:
-    """The draws with likelihoods (draw, transition) of new transitions, and predictions of them."""
+    """Add likelihoods (draw, transition) of new transitions, and predictions of them."""
     shape = base.sizes["chain"], base.sizes["draw"], -1
     both = [base["log_likelihood"].to_numpy(), likelihood.reshape(shape)]
     predicted = [base["next_state"].to_numpy(), predictive]
@@ -313,38 +406,23 @@ def _with_new(base: xr.Dataset, likelihood: Array, predictive: Array) -> xr.Data
 
 
 def _with_data(idata: Any, problem: Problem) -> dict[str, xr.Dataset]:
-    """The stored data and, after them, the problem's."""
+    """Return the stored data and, after them, the problem's."""
     segments, result = problem.segments, {}
-    new = {
-        "start": segments.start,
-        "actions": problem.inputs,
-        "next_state": problem.measured,
-    }
+    new = {"start": segments.start, "actions": problem.inputs, "next_state": problem.measured}
     for name in ("observed_data", "constant_data"):
         held = group(idata, name)
-        own = held[[key for key in held.data_vars if key in new]].transpose("transition", ...)
-        total = own.sizes["transition"] + segments.n
+        old = held[[key for key in held.data_vars if key in new]].transpose("transition", ...)
+        total = old.sizes["transition"] + segments.n
         both = {
             str(key): (
                 variable.dims,
                 np.concatenate([variable.to_numpy(), new[str(key)]]),
                 variable.attrs,
             )
-            for key, variable in own.data_vars.items()
+            for key, variable in old.data_vars.items()
         }
-        coords = dict(own.drop_dims("transition").coords) | both_places(own, segments)
+        coords = dict(old.drop_dims("transition").coords) | files.both_places(old, segments)
         result[name] = xr.Dataset(both, coords | {"transition": np.arange(total)}, held.attrs)
-    more = both_recordings(group(idata, "constant_data"), recording(problem))
+    more = files.both_recordings(group(idata, "constant_data"), files.recording(problem))
     result["constant_data"] = result["constant_data"].merge(more)
     return result
-
-
-def _walkers(problem: Problem, like: xr.Dataset, phi: Array, sigma: Array) -> xr.Dataset:
-    """Vectors (draw, p) and (draw, state) as named draws, shaped like others."""
-    named = problem.named(phi, sigma)
-    return like.assign(
-        {
-            name: (like[name].dims, values.reshape(like[name].shape))
-            for name, values in named.items()
-        }
-    )

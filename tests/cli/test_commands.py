@@ -25,7 +25,7 @@ from pbrl_ppl.cli.terminal import warnings_in_a_line
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics.table1 import table1
-from pbrl_ppl.posterior import group, load_posterior, record
+from pbrl_ppl.posterior import completion, group, load_posterior
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.places import MODELS, ROOT
@@ -484,10 +484,10 @@ def test_convergence_is_judged_as_it_is_written(monkeypatch: pytest.MonkeyPatch)
     }
     for (r_hat, ess), words in expected.items():
         values = {"m": r_hat}, {"m": ess}
-        monkeypatch.setattr(record, "convergence", lambda idata, values=values: values)
+        monkeypatch.setattr(completion, "convergence", lambda idata, values=values: values)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            record.checked(model.problem, idata)
+            completion.checked(model.problem, idata)
         said = [str(each.message) for each in caught if each.category is ConvergenceWarning]
         assert len(said) == len(words)
         assert all(f"not converged: {word}" in each for word, each in zip(words, said, strict=True))

@@ -8,7 +8,7 @@ from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.ranking import criticise
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History, without_bad_frames
-from pbrl_ppl.posterior.recording import recorded, recording
+from pbrl_ppl.posterior import recorded, recording
 from pbrl_ppl.report.brief import in_brief
 from pbrl_ppl.report.report import render
 from tests.helpers.free_puck import DISC, fitted

@@ -9,7 +9,7 @@ from pbrl_ppl.modes import find_mode
 from pbrl_ppl.modes.evidence import Coordinates
 from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.parameters import ParameterLibrary, prior_draws
-from pbrl_ppl.planning.dynamics import Dynamics
+from pbrl_ppl.posterior import draws, parameter_draws, stored_mode, updated_mode
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
@@ -161,13 +161,12 @@ def test_the_evidence_s_coordinates_have_the_same_density(history) -> None:
 
 @pytest.mark.filterwarnings("ignore:the chains have not converged")  # so few draws
 def test_the_plan_s_draw_is_the_most_probable() -> None:
-    """Without a stored mode, the prior decides of draws with equal likelihoods.
+    """As after an update over a library; the prior decides of draws with equal likelihoods.
 
     It is that of sigma, and of which set a body has.
     """
     model = library()
     idata = fit(model, seed=1, draws=200, chains=2, progress=False)
-    del idata.attrs["mode"]
     posterior = idata["posterior"]
     likelihood = idata["log_likelihood"]["next_state"]
     likelihood.values[...] = 0.0
@@ -182,9 +181,13 @@ def test_the_plan_s_draw_is_the_most_probable() -> None:
         posterior["sigma"].values[where] = median * [1.0, 1.0, 20.0][i] * np.exp(-(spread**2))
         for block, place in problem.layout.slices():
             posterior[block.name].values[where] = table[place, which]
-    chosen = Dynamics.of(idata)
-    np.testing.assert_array_equal(chosen.phi[0], table[:, 1])
-    np.testing.assert_allclose(chosen._noise.sigma[0], median * np.exp(-(spread**2)))
+    phi, sigma = parameter_draws(problem, idata)
+    choice = draws(idata)["library_index"].astype(np.intp)
+    begin = stored_mode(problem, idata)
+    best = updated_mode(problem, begin, (phi, sigma, choice), np.zeros(len(phi)))
+    assert best.sets == {"cart": problem.library.names[1]}
+    np.testing.assert_array_equal(list(best.parameters.values()), table[:, 1])
+    np.testing.assert_allclose(list(best.noise.values()), median * np.exp(-(spread**2)))
 
 
 def test_the_plan_knows_an_anchor_s_prior_by_its_index() -> None:

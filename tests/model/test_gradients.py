@@ -2,6 +2,7 @@
 
 import warnings
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -9,7 +10,7 @@ from scipy.optimize import least_squares
 
 from pbrl_ppl.errors import ConvergenceWarning
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.posterior.store import az, group
+from pbrl_ppl.posterior.store import group
 from pbrl_ppl.sampling import fit, physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history

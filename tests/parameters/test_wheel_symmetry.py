@@ -20,7 +20,7 @@ from pbrl_ppl.parameters import (
 )
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.sampling import physics_model
-from pbrl_ppl.sampling.equal_wheels import evened_logp
+from pbrl_ppl.sampling.starts import evened_logp
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning import Action, ActionSet, Goal, Target
-from pbrl_ppl.planning.risk import tail_mean
+from pbrl_ppl.planning.search import tail_mean
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 from tests.helpers.worlds import body, state
 

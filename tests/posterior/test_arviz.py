@@ -2,6 +2,7 @@
 
 import json
 
+import arviz as az
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -10,13 +11,12 @@ from pymc.stats import compute_log_prior
 
 from pbrl_ppl.parameters import wheels
 from pbrl_ppl.posterior import by_number, from_groups, group, groups, loo_pit, predicted_rows
-from pbrl_ppl.posterior.predictions import predictive_rows
-from pbrl_ppl.posterior.prior_groups import prior_groups
-from pbrl_ppl.posterior.store import DATATREE, az, load_posterior, save_posterior
+from pbrl_ppl.posterior.completion import predictive_rows, prior_groups
+from pbrl_ppl.posterior.store import DATATREE, load_posterior, save_posterior
 from pbrl_ppl.sampling import fit, physics_model, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
-from tests.helpers.stacks import GENERATIONS, SCENE, file, fitted, history
+from tests.helpers.stacks import SCENE, fitted, history
 
 
 @pytest.fixture(scope="module")
@@ -199,22 +199,6 @@ def test_an_update_numbers_trajectories_on(idata, way, monkeypatch) -> None:
             np.testing.assert_allclose(data["time"], [*TIME, *TIME[:4], *TIME[:4]])
 
 
-@pytest.mark.parametrize("way", ["reweighted", "moved"])
-@pytest.mark.filterwarnings("ignore::UserWarning")
-def test_older_files_do_not_say_and_nothing_is_made_up(idata, way, monkeypatch) -> None:
-    monkeypatch.setattr("pbrl_ppl.sampling.updating.MIN_ESS", 0)
-    monkeypatch.setattr("pbrl_ppl.sampling.updating._HEAVY", np.inf)
-    monkeypatch.setattr("pbrl_ppl.sampling.updating._MOVE", 0.0 if way == "reweighted" else 1.0)
-    monkeypatch.setattr("pbrl_ppl.sampling.updating._REFIT", 0.0)
-    old = from_groups(
-        {n: d.drop_vars(("trajectory", "time"), errors="ignore") for n, d in groups(idata).items()},
-        idata.attrs,
-    )
-    new = update(old, history(2, trajectories=1), seed=1)
-    for data in groups(new).values():
-        assert not {"trajectory", "time"} & set(data.coords)
-
-
 def test_predictions_belong_to_draws(idata) -> None:
     """As many of each chain, at the draws that their labels name: residuals are of that noise."""
     posterior, predictive = group(idata, "posterior"), group(idata, "posterior_predictive")
@@ -229,15 +213,6 @@ def test_predictions_belong_to_draws(idata) -> None:
     predicted = predictive["next_state"].values.reshape(200, *problem.measured.shape)
     z = (predicted - problem.predict(phi)) / sigma[rows][:, None, None, None]
     assert (z**2).mean() == pytest.approx(1.0, abs=4 * np.sqrt(2 / z.size))
-
-
-@pytest.mark.parametrize("generation", GENERATIONS)
-def test_predictions_of_older_files(generation) -> None:
-    """50 of them, of one chain for all."""
-    there = load_posterior(file(generation))
-    rows = predicted_rows(group(there, "posterior"), group(there, "posterior_predictive"))
-    np.testing.assert_array_equal(rows, np.linspace(0, 999, 50).astype(int))
-    assert ((loo_pit(there) >= 0) & (loo_pit(there) <= 1)).all()
 
 
 @pytest.mark.parametrize(

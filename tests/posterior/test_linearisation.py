@@ -10,8 +10,7 @@ import pbrl_ppl as pp
 from pbrl_ppl.errors import LinearisationWarning
 from pbrl_ppl.likelihood import declared_problem
 from pbrl_ppl.posterior import from_groups, groups, parameter_draws
-from pbrl_ppl.posterior.linearisation import MOST, linearisation, linearisation_errors
-from pbrl_ppl.posterior.record import complete
+from pbrl_ppl.posterior.completion import MOST, complete, linearisation, linearisation_errors
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history

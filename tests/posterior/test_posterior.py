@@ -1,7 +1,9 @@
 """Posterior files: the same after a round trip, whole or not there, and clear when they are bad."""
 
+import dataclasses
 import logging
 
+import arviz as az
 import h5py
 import numpy as np
 import pytest
@@ -9,11 +11,13 @@ import xarray as xr
 from scipy import stats
 
 from pbrl_ppl.errors import OutputError, PosteriorError
+from pbrl_ppl.likelihood import Cells
+from pbrl_ppl.parameters import ParameterLibrary
+from pbrl_ppl.posterior import PosteriorRecord, scene_of
 from pbrl_ppl.posterior import store as posterior
+from pbrl_ppl.posterior.record import StoredMode
 from pbrl_ppl.posterior.store import (
     DATATREE,
-    attributes,
-    az,
     convergence,
     draws,
     from_groups,
@@ -22,7 +26,6 @@ from pbrl_ppl.posterior.store import (
     interval,
     load_posterior,
     save_posterior,
-    scene_of,
 )
 from pbrl_ppl.scene import Body, Scene, Shape
 
@@ -66,9 +69,26 @@ def datasets(seed: int = 0) -> dict[str, xr.Dataset]:
     }
 
 
+def record(**more) -> PosteriorRecord:
+    values = {
+        "scene": SCENE,
+        "effects": (("linear_drag", "cart"),),
+        "horizon": 1,
+        "substeps": 10,
+        "together": (),
+        "measured": ("x", "omega"),
+        "scalar_sigma": False,
+        "sigma_prior": ((0.1, 0.2), 2.0),
+        "data_sha256": "0" * 64,
+        "seed": 0,
+        "versions": {"python": "3"},
+        "method": "laplace",
+    }
+    return PosteriorRecord(**(values | more))
+
+
 def made(seed: int = 0, **more):
-    attrs = attributes(SCENE, seed=seed, effects=[["linear_drag", "cart"]], **more)
-    return from_groups(datasets(seed), attrs)
+    return from_groups(datasets(seed), record(seed=seed, **more).attributes())
 
 
 @pytest.mark.parametrize("reader", ["arviz", "xarray"])
@@ -99,7 +119,7 @@ def test_a_type_that_arviz_takes() -> None:
 
 
 def test_round_trip(tmp_path) -> None:
-    idata = made(versions={"python": "3"}, max_rhat=1.002)
+    idata = made(max_rhat=1.002)
     save_posterior(idata, tmp_path / "cart.nc")
     loaded = load_posterior(tmp_path / "cart.nc")
     assert type(loaded) is type(idata)
@@ -150,7 +170,7 @@ def test_an_interruption_leaves_nothing_half_written(tmp_path, monkeypatch, olde
         return write(self, *args, **kwargs)
 
     monkeypatch.setattr(xr.Dataset, "to_netcdf", interrupted)
-    with pytest.raises((KeyboardInterrupt, OSError)):
+    with pytest.raises((KeyboardInterrupt, OutputError)):
         save_posterior(made(seed=2), path)
     monkeypatch.undo()
     assert len(calls) == 4
@@ -195,7 +215,7 @@ def test_a_foreign_netcdf_file(tmp_path) -> None:
 def test_an_arviz_file_of_another_model(tmp_path) -> None:
     path = tmp_path / "other.nc"
     from_groups(datasets(), {}).to_netcdf(str(path), engine="h5netcdf")
-    with pytest.raises(PosteriorError, match="no posterior file of pbrl_ppl"):
+    with pytest.raises(PosteriorError, match="no posterior of pbrl_ppl"):
         load_posterior(path)
 
 
@@ -248,7 +268,7 @@ def test_more_draws_than_there_are() -> None:
 
 def test_scene_with_its_effects(tmp_path) -> None:
     scene = SCENE.with_effects("cart", "push_offset")
-    save_posterior(from_groups(datasets(), attributes(scene)), tmp_path / "cart.nc")
+    save_posterior(made(scene=scene), tmp_path / "cart.nc")
     found = scene_of(load_posterior(tmp_path / "cart.nc"))
     assert found == scene
     assert found.body("cart").effects == ("linear_drag", "push_offset")
@@ -259,10 +279,68 @@ def test_no_scene() -> None:
         scene_of(from_groups(datasets(), {}))
 
 
-def test_attributes_are_plain() -> None:
-    found = attributes(SCENE, seed=1, effects=[["a", "b"]], versions={"x": "1"}, note="n", r=1.5)
-    assert all(isinstance(value, (int, float, str)) for value in found.values())
-    assert found["effects"] == '[["a", "b"]]'
+CELLS = Cells(
+    places=np.array([0, 5]),
+    columns=(0, 5),
+    sensor=np.array([0, -1]),
+    fixed=np.array([1e-6, 0.1 + 0.2]),
+    push=np.array([[0.1 / 3, 0.0]]),
+    pushed=np.array([1]),
+    sensors=(0,),
+    rates=(3,),
+    drifts=(0,),
+    memory=0.3,
+)
+#: A value of each field that may be left out.
+OPTIONAL = {
+    "nu": 4.0,
+    "library": ParameterLibrary({"light": {"mass": 1.0}, "heavy": {"mass": 2.0}}),
+    "learned_remainder": "{}",
+    "cells": CELLS,
+    "mode": StoredMode({"mass[cart]": 0.1 + 0.2}, {"sigma[x]": 0.1}, -1.5, {"cart": "light"}),
+    "linearisation": {"draws": 16, "sd": 0.1, "largest": 0.2, "trajectory": 0},
+    "configurations": ({"joints": {"joint1": None}, "probability": 1.0},),
+    "updates": ({"did": "moved", "share": 0.3},),
+    "max_rhat": 1.002,
+    "min_ess": 401.0,
+    "warnings": ("one", "two"),
+    "interrupted": True,
+}
+
+
+@pytest.mark.parametrize("given", [{}, OPTIONAL], ids=["least", "whole"])
+def test_a_record_is_the_same_from_its_file(tmp_path, given) -> None:
+    whole = record(**given)
+    attrs = whole.attributes()
+    assert all(isinstance(value, (int, float, str)) for value in attrs.values())
+    assert attrs["effects"] == '[["linear_drag", "cart"]]'
+    save_posterior(from_groups(datasets(), attrs), tmp_path / "cart.nc")
+    found = PosteriorRecord.of(load_posterior(tmp_path / "cart.nc"))
+    assert found.attributes() == attrs
+    for field in dataclasses.fields(PosteriorRecord):
+        value, read = getattr(whole, field.name), getattr(found, field.name)
+        if isinstance(value, Cells):
+            for each in dataclasses.fields(Cells):
+                np.testing.assert_array_equal(getattr(read, each.name), getattr(value, each.name))
+        else:
+            assert read == value, field.name
+    assert not given or {field.name for field in dataclasses.fields(found)} >= set(OPTIONAL)
+
+
+def test_another_schema_version_is_refused(tmp_path) -> None:
+    other = from_groups(datasets(), record().attributes() | {"schema": 1})
+    save_posterior(other, tmp_path / "old.nc")
+    with pytest.raises(PosteriorError, match=r"old\.nc: .*schema version 1, expected 2; fit it"):
+        load_posterior(tmp_path / "old.nc")
+    with pytest.raises(PosteriorError, match="schema version 1, expected 2"):
+        PosteriorRecord.of(other)
+
+
+def test_a_missing_field_is_named() -> None:
+    attrs = record().attributes()
+    del attrs["substeps"]
+    with pytest.raises(PosteriorError, match="does not say its substeps"):
+        PosteriorRecord.of(from_groups(datasets(), attrs))
 
 
 @pytest.mark.parametrize("prob", [0.5, 0.94])

@@ -21,7 +21,7 @@ from pbrl_ppl.posterior import (
     save_posterior,
     stored_mode,
 )
-from pbrl_ppl.posterior.stored_mode import Point, mode_text
+from pbrl_ppl.posterior.mode import Point, packed_mode
 from pbrl_ppl.sampling import fit, physics_model, update
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -70,9 +70,9 @@ def test_a_mode_that_a_draw_is_above_is_climbed_to_anew(idata) -> None:
     phi, sigma = parameter_draws(problem, idata)
     likelihood = problem.log_density(problem.residual(phi), sigma, phi).sum(axis=-1)
     low = Point(phi[0] + 0.1 * np.eye(len(phi[0]))[0], sigma[0])
-    found = json.loads(mode_text(problem, low, phi, sigma, likelihood))
+    found = packed_mode(problem, low, phi, sigma, likelihood)
     held = json.loads(idata.attrs["mode"])
-    assert found["log_posterior"] == pytest.approx(held["log_posterior"], abs=0.1)
+    assert found.log_posterior == pytest.approx(held["log_posterior"], abs=0.1)
 
 
 def test_a_script_plans_with_exactly_the_mode_of_the_file(idata, tmp_path: Path) -> None:
@@ -104,16 +104,12 @@ def test_a_script_plans_with_exactly_the_mode_of_the_file(idata, tmp_path: Path)
     np.testing.assert_allclose(predicted, there[0], atol=1e-12)
 
 
-def test_a_file_without_a_mode_uses_its_best_draw(idata) -> None:
-    """As one of an older version."""
+def test_a_mode_that_is_missing_or_incomplete_is_named(idata) -> None:
     attrs = {name: value for name, value in idata.attrs.items() if name != "mode"}
-    older = from_groups(groups(idata), attrs)
-    problem = problem_of(older)
-    phi, sigma = parameter_draws(problem, older)
-    best = phi[log_posterior(problem, phi, sigma).argmax()]
-    np.testing.assert_array_equal(Dynamics.of(older).phi[0], best)
-    assert stored_mode(problem, older) is None
-    broken = from_groups(groups(idata), attrs | {"mode": '{"parameters": {}, "noise": {}}'})
+    with pytest.raises(PosteriorError, match="holds no mode; ask for draws"):
+        Dynamics.of(from_groups(groups(idata), attrs))
+    empty = '{"parameters": {}, "noise": {}, "log_posterior": 0.0}'
+    broken = from_groups(groups(idata), attrs | {"mode": empty})
     with pytest.raises(PosteriorError, match=r"its mode has no mass\[cart\]"):
         Dynamics.of(broken)
 

@@ -14,7 +14,7 @@ from pbrl_ppl.criticism.results import Errors
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
-from pbrl_ppl.posterior.comparison import Comparison, LeaveOneOut
+from pbrl_ppl.posterior.cross_validation import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.report import loop as loop_module
 from pbrl_ppl.report import page as page_module

@@ -2,6 +2,7 @@
 
 import warnings
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -12,7 +13,7 @@ from pbrl_ppl.errors import ConvergenceWarning, PosteriorError
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import declared_problem, simulated_trajectories, smoothed
 from pbrl_ppl.posterior import convergence, from_groups, group, groups, parameter_draws
-from pbrl_ppl.posterior.store import az, load_posterior, save_posterior, scalars
+from pbrl_ppl.posterior.store import load_posterior, save_posterior, scalars
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import STATE
 from tests.helpers.carts import CART, cart_scene

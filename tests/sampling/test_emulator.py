@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -9,12 +10,11 @@ import pytest
 from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
 from pbrl_ppl.modes import find_mode, trajectory_mode
-from pbrl_ppl.posterior.store import az, group
-from pbrl_ppl.sampling import emulation, fit, fitting, physics_model
-from pbrl_ppl.sampling.emulation import emulate
+from pbrl_ppl.posterior.store import group
+from pbrl_ppl.sampling import fit, fitting, physics_model, surrogate
 from pbrl_ppl.sampling.emulator import Emulator, Piece, Pieces
 from pbrl_ppl.sampling.starts import gaussian_blocks
-from pbrl_ppl.sampling.surrogate import Surrogate, Unpack
+from pbrl_ppl.sampling.surrogate import Surrogate, Unpack, emulate
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -107,7 +107,7 @@ def test_it_follows_the_engine_over_the_posterior(model) -> None:
     assert found is not None
     rough = Surrogate(model.problem, unpack, found)
     logp = model.compile_logp()
-    wide = emulation.explore(blocks, rough, blocks[0].mean, 2000, np.random.default_rng(4))
+    wide = surrogate.explore(blocks, rough, blocks[0].mean, 2000, np.random.default_rng(4))
     off = []
     for q in wide[::40]:
         phi, sigma, prior = unpack(q)
@@ -123,7 +123,7 @@ def test_runs_reach_farther_than_the_posterior_and_stay_in_the_support(model) ->
     """A kink beyond the first draws was never seen, and a chain beyond it stood still."""
     mode = find_mode(model.problem, seed=1)
     drawn = mode.draws(np.random.default_rng(2), 200)
-    runs = emulation.spread(model.problem, drawn)
+    runs = surrogate.spread(model.problem, drawn)
     np.testing.assert_array_equal(runs[:200], drawn)
     lower, upper = model.problem.layout.supports(runs)
     assert ((runs >= lower) & (runs <= upper)).all()
@@ -135,7 +135,7 @@ def test_errors_count_farther_off_where_the_engine_says_it_is_as_likely() -> Non
     """Of cart-null's kinks an emulator learned one side, whose draws confirmed it."""
     exact = np.array([-1.0, -2.0, -3.0, -4.0, -2.5, -40.0])
     told = exact + np.array([0.1, 0.0, -0.1, 0.0, -6.0, 9.0])
-    np.testing.assert_allclose(emulation.errors(told, exact, 4), [0.1, 0.0, -0.1, 0.0, -6.0])
+    np.testing.assert_allclose(surrogate.errors(told, exact, 4), [0.1, 0.0, -0.1, 0.0, -6.0])
 
 
 def test_none_where_no_polynomial_is_close(model, monkeypatch) -> None:

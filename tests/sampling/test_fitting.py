@@ -5,6 +5,7 @@ import pickle
 import warnings
 from dataclasses import replace
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytest
@@ -19,12 +20,9 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import origin
-from pbrl_ppl.posterior import save_posterior as save
-from pbrl_ppl.posterior.record import MAX_RHAT, MIN_ESS, complete
-from pbrl_ppl.posterior.store import (
-    az,
+from pbrl_ppl.posterior import (
     convergence,
+    data,
     draws,
     from_groups,
     group,
@@ -32,6 +30,8 @@ from pbrl_ppl.posterior.store import (
     load_posterior,
     scene_of,
 )
+from pbrl_ppl.posterior import save_posterior as save
+from pbrl_ppl.posterior.completion import MAX_RHAT, MIN_ESS, complete
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.sampling.fitting import METHODS, fit
 from pbrl_ppl.sampling.starts import unconstrain
@@ -116,7 +116,7 @@ def test_origin(model, fitted) -> None:
     versions = json.loads(attrs["versions"])
     assert versions["pymc"] == pm.__version__
     assert versions["numpy"] == np.__version__
-    assert set(versions) == {"python", *origin.PACKAGES}
+    assert set(versions) == {"python", *data.PACKAGES}
 
 
 def test_convergence_is_stored(fitted) -> None:

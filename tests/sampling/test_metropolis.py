@@ -1,12 +1,13 @@
 """AdaptiveMetropolis on targets with closed forms, in an ordinary pm.Model."""
 
+import arviz as az
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
 import pytest
 
-from pbrl_ppl.posterior.store import az, group
-from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Gaussian, Jumps
+from pbrl_ppl.posterior.store import group
+from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Gaussian, Jumps, Schedule
 
 # Python 3.12 and later warn of a fork in a process with threads; PyMC's chains start by fork
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
@@ -45,7 +46,7 @@ def sample(
             blocks=blocks or [block(mean, covariance)],
             rough=rough,
             jumps=jumps,
-            thin=2,
+            schedule=Schedule(thin=2),
         )
         trace = pm.sample(
             **({"draws": 600, "tune": 500, "cores": 1, "random_seed": 4} | options),
@@ -223,7 +224,7 @@ def test_state_is_restored() -> None:
         step = AdaptiveMetropolis(
             model.free_RVs,
             blocks=[block(np.zeros(3), np.eye(3))],
-            inner=1,
+            schedule=Schedule(inner=1),
             rng=np.random.default_rng(1),
         )
     initial = step.sampling_state

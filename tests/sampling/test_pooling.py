@@ -11,7 +11,7 @@ from pbrl_ppl.effects import attach
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.sampling import pool
-from pbrl_ppl.sampling.population import Population, population
+from pbrl_ppl.sampling.pooling import Population, population
 from pbrl_ppl.scene import Scene
 from tests.helpers.carts import cart_scene
 from tests.helpers.made_up import idata as made_idata

@@ -3,6 +3,7 @@
 import json
 import warnings
 
+import arviz as az
 import numpy as np
 import pytest
 
@@ -21,15 +22,15 @@ from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import along_trajectories
 from pbrl_ppl.model import build_model
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.posterior import loo_pit, problem_of
-from pbrl_ppl.posterior.store import (
-    az,
+from pbrl_ppl.posterior import (
     convergence,
     draws,
     from_groups,
     group,
     groups,
     load_posterior,
+    loo_pit,
+    problem_of,
     save_posterior,
     scalars,
     scene_of,
@@ -259,16 +260,6 @@ def test_reproducible_and_the_same_from_a_file(parts, first, one, tmp_path, monk
     assert group(first, "log_likelihood").sizes["transition"] == 60
 
 
-def test_old_files_have_no_prior_of_the_noise(parts, first, one) -> None:
-    attrs = {k: v for k, v in first.attrs.items() if k != "sigma_prior"}
-    again = quiet(update, from_groups(groups(first), attrs), parts[2].select([0, 1]), seed=5)
-    np.testing.assert_array_equal(draws(again)["mass"], draws(one)["mass"])
-    problem = problem_of(from_groups(groups(first), attrs))
-    median, spread = json.loads(first.attrs["sigma_prior"])
-    np.testing.assert_allclose(problem.likelihood.prior[0], median)
-    assert problem.likelihood.prior[1] == spread
-
-
 @pytest.mark.long
 def test_other_data_are_fitted_anew(parts, first, monkeypatch) -> None:
     """The masses are others now: nearly no draw is left, and the answer is the refit's."""
@@ -440,7 +431,7 @@ def test_refused_posteriors(parts, first) -> None:
     with pytest.raises(PosteriorError, match="40 draws, expected at least 100"):
         update(from_groups(few, first.attrs), new)
     unknown = {k: v for k, v in first.attrs.items() if k != "data_sha256"}
-    with pytest.raises(PosteriorError, match="does not say which data"):
+    with pytest.raises(PosteriorError, match="does not say its data_sha256"):
         update(from_groups(held, unknown), new)
     other = scene_of(first).replace(gravity=(0.0, -9.81))
     with pytest.raises(PosteriorError, match=r"not what this engine gives.*fit all data anew"):

@@ -1,0 +1,428 @@
+"""Completion of a sampler's trace: likelihood, predictions, prior, record and warnings."""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import (
+    BoundWarning,
+    ConvergenceWarning,
+    LinearisationWarning,
+    UninformedWarning,
+)
+from pbrl_ppl.likelihood import (
+    ACCELERATION,
+    DRIFT,
+    JOLT,
+    Problem,
+    TrajectoryLikelihood,
+    exponential,
+    noise_law,
+    smoothed,
+)
+from pbrl_ppl.modes import ATTRIBUTE, doubts
+from pbrl_ppl.parameters import Prior, beside, fold_draws, prior_draws, redescribed
+from pbrl_ppl.posterior.data import CELLS, placed, places, record_of, recording
+from pbrl_ppl.posterior.identifiability import uninformed
+from pbrl_ppl.posterior.mode import Point, packed_mode
+from pbrl_ppl.posterior.record import vectors
+from pbrl_ppl.posterior.store import convergence, from_groups, group, groups
+
+Array = NDArray[np.float64]
+
+#: What a posterior needs before its summaries can be relied on (Vehtari et al., 2021).
+MAX_RHAT, MIN_ESS = 1.01, 400
+#: Draws are simulated in groups of so many, or more if that makes fewer transitions.
+_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE = 64, 20_000
+#: With fewer draws a chain, convergence is not known.
+_LEAST_DRAWS = 4
+#: A parameter is stuck if this share of its draws is within this share of its support's end.
+_STUCK, _NEAR = 0.5, 0.01
+#: Draws for which predictions are stored: at most, at least, and numbers in all.
+_MOST_PREDICTED, _LEAST_PREDICTED, _NUMBERS = 200, 50, 2_000_000
+#: Draws at which the states are smoothed again to check the linearisation.
+_CHECKED_DRAWS = 16
+#: Standard deviation of the differences (nats) above which the linearised posterior is another one:
+#: draws weighted by exp(difference) would be worth exp(-4), 2 %, of their number.
+MOST = 2.0
+
+
+def complete(
+    problem: Problem,
+    trace: Any,
+    *,
+    seed: int,
+    method: str,
+    asked: tuple[int, int] | None = None,
+    mode: Point | None = None,
+) -> Any:
+    """Return a posterior: a trace with likelihood, predictions, prior and the record of the fit.
+
+    Parameters
+    ----------
+    problem : Problem
+        What was fitted.
+    trace : InferenceData or DataTree
+        As PyMC gives it.
+    seed : int
+        Of the draws and of the predictions.
+    method : str
+        The sampler's name.
+    asked : tuple of int, optional
+        Draws a chain, and chains, that were asked for, where an interrupt left fewer.
+    mode : Point, optional
+        The posterior's mode, to be stored.
+
+    Returns
+    -------
+    InferenceData or DataTree
+        The posterior.
+    """
+    posterior = _folded(problem, trace, None if method == "map" else seed)
+    phi, sigma = parameter_draws(problem, from_groups({"posterior": posterior}, {}))
+    chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
+    rng = np.random.default_rng(seed)
+    rows = predictive_rows(chains, n, problem.measured.size)
+    likelihood, predictive = evaluate(problem, phi, sigma, rows.ravel(), rng)
+    data = groups(trace)
+    posterior = _with_units(problem, posterior)
+    coords = {dim: data["observed_data"][dim].values for dim in CELLS}
+    per_draw = {"chain": posterior["chain"], "draw": posterior["draw"]}
+    predicted = {"chain": posterior["chain"], "draw": posterior["draw"][rows[0]], **coords}
+    result = {
+        "posterior": posterior,
+        "sample_stats": data["sample_stats"],
+        "log_likelihood": _next_state(
+            ("chain", "draw", "transition"),
+            likelihood.reshape(chains, n, -1),
+            per_draw | {"transition": coords["transition"]},
+        ),
+        "posterior_predictive": _next_state(
+            ("chain", "draw", *CELLS),
+            predictive.reshape(*rows.shape, *predictive.shape[1:]),
+            predicted,
+        ),
+        **prior_groups(problem, posterior, phi, sigma, seed),
+        "observed_data": _next_state(CELLS, problem.measured, coords),
+        "constant_data": data["constant_data"].merge(recording(problem)),
+    }
+    record = record_of(problem, seed, method)
+    if mode is not None:
+        stored = packed_mode(problem, mode, phi, sigma, likelihood.sum(axis=1))
+        record = replace(record, mode=stored)
+    if isinstance(problem.likelihood, TrajectoryLikelihood) and len(phi) > 1:
+        record = replace(record, linearisation=linearisation(problem, phi, sigma))
+    idata = placed(from_groups(result, record.attributes()), places(problem.segments))
+    if ATTRIBUTE in trace.attrs:
+        idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
+    return checked(problem, idata, asked)
+
+
+def _next_state(dims: tuple[str, ...], values: Array, coords: Any) -> xr.Dataset:
+    return xr.Dataset({"next_state": (dims, values)}, coords)
+
+
+def evaluate(
+    problem: Problem, phi: Array, sigma: Array, rows: Any, rng: np.random.Generator
+) -> tuple[Array, Array]:
+    """Return log-likelihoods of the transitions at draws, and next states drawn from some of them.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says which transitions.
+    phi, sigma : ndarray
+        Shapes (draw, p) and (draw, state).
+    rows : sequence of int
+        Draws to predict with, in increasing order.
+    rng : Generator
+        Of the predictions.
+
+    Returns
+    -------
+    likelihood : ndarray
+        Shape (draw, transition).
+    predictive : ndarray
+        Shape (row, transition, H, body, state).
+    """
+    likelihood = np.empty((len(phi), problem.segments.n))
+    predictive = []
+    wide = problem.with_physics(threads=max(problem.physics.threads, 2))
+    rows = np.asarray(rows, dtype=int)
+    size = max(_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE // problem.segments.n)
+    for begin in range(0, len(phi), size):
+        part = slice(begin, begin + size)
+        # a chain repeats a draw where it rejects a proposal
+        different, which = np.unique(phi[part], axis=0, return_inverse=True)
+        states = wide.predict(different)[which.ravel()]
+        residual = problem.observations.residual(states)
+        likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
+        for i in rows[(begin <= rows) & (rows < begin + size)]:
+            states = wide.predict(phi[i], wide.one_world)
+            predictive.append(problem.next_states(states, sigma[i], rng, phi[i]))
+    return likelihood, np.stack(predictive)
+
+
+def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
+    """Return draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
+    return vectors(trace, problem.layout, problem.noise_variables)
+
+
+def predictive_rows(chains: int, draws: int, cells: int) -> NDArray[np.intp]:
+    """Choose draws to predict with: equally many of each chain, evenly spread, with the last one.
+
+    Parameters
+    ----------
+    chains, draws : int
+        Of the posterior; draws of each chain.
+    cells : int
+        Numbers that one prediction has.
+
+    Returns
+    -------
+    ndarray
+        Shape (chain, draw): indices of the draws, chains joined.
+    """
+    wanted = int(np.clip(_NUMBERS // max(cells, 1), _LEAST_PREDICTED, _MOST_PREDICTED))
+    each = min(draws, -(-wanted // chains))
+    chosen = np.linspace(draws - 1, 0, each).astype(int)[::-1]
+    return np.asarray(draws * np.arange(chains)[:, None] + chosen)
+
+
+def prior_groups(
+    problem: Problem, posterior: xr.Dataset, phi: Array, sigma: Array, seed: int
+) -> dict[str, xr.Dataset]:
+    """Return the groups ``prior`` and ``log_prior``, as ArviZ looks for them.
+
+    Both have the posterior's variables, chains and draws. Each wheel is described as in the
+    posterior where its prior cannot tell its descriptions apart.
+
+    Parameters
+    ----------
+    problem : Problem
+        Says what the prior is.
+    posterior : Dataset
+        Its variables have the dims (chain, draw, ...).
+    phi, sigma : ndarray
+        Its draws as vectors, shapes (draw, p) and (draw, state).
+    seed : int
+        Of the draws from the prior.
+
+    Returns
+    -------
+    dict of str to Dataset
+        Empty for a library, and where which bodies a joint joins is unknown: their prior is not one
+        of independent numbers.
+    """
+    layout = problem.layout
+    if problem.library is not None or layout.discrete.any():
+        return {}
+    centre, spread = noise_law(problem)
+    noise = [Prior("log_normal", mu=float(mu), sigma=spread) for mu in centre]
+    steps = exponential(problem)[: len(centre)]
+    scale = np.exp(centre) / np.log(2.0)
+    # apart from the generator of the predictions
+    rng = np.random.default_rng([seed, 1])
+    drawn = prior_draws(layout.priors, rng, len(phi)) if layout.size else phi
+    noise_drawn = prior_draws(noise, rng, len(phi))
+    noise_drawn = np.where(steps, rng.exponential(scale, noise_drawn.shape), noise_drawn)
+    density = np.stack([prior.log_density(sigma[:, i]) for i, prior in enumerate(noise)], axis=1)
+    density = np.where(steps, -np.log(scale) - sigma[:, : len(scale)] / scale, density)
+
+    def shaped(like: xr.Dataset, of_phi: Array, of_noise: Array) -> xr.Dataset:
+        return xr.Dataset(
+            {
+                name: like[name].copy(data=values.reshape(like[name].shape))
+                for name, values in problem.named(of_phi, of_noise).items()
+            }
+        )
+
+    return {
+        "prior": shaped(posterior, beside(layout, drawn, phi), noise_drawn),
+        "log_prior": shaped(posterior.drop_attrs(), layout.log_prior(phi), density),
+    }
+
+
+def linearisation_errors(problem: Problem, phi: Array, sigma: Array) -> Array:
+    """Return log-likelihoods with the states smoothed at each draw, less the linearised ones.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories.
+    phi, sigma : ndarray
+        Draws, shapes (draw, p) and (draw, parameter).
+
+    Returns
+    -------
+    ndarray
+        Of each trajectory, shape (draw, trajectory), nats. A constant does not matter to a
+        posterior, a difference between draws does.
+    """
+    errors = np.zeros((len(phi), problem.data.history.n_trajectories))
+    for row, point, noise in zip(errors, phi, sigma, strict=True):
+        again, stored = (
+            each.log_density(each.residual(point), noise, point)
+            for each in (smoothed(problem, point, noise), problem)
+        )
+        np.add.at(row, problem.segments.trajectory, again - stored)
+    return errors
+
+
+def linearisation(problem: Problem, phi: Array, sigma: Array) -> dict[str, Any]:
+    """Return a summary of :func:`linearisation_errors` at some of a posterior's draws.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of whole trajectories.
+    phi, sigma : ndarray
+        All draws, at least two, shapes (draw, p) and (draw, parameter).
+
+    Returns
+    -------
+    dict
+        ``draws``, how many; ``sd`` and ``largest``, standard deviation of the differences and the
+        largest from their mean (nats); ``trajectory``, the one, from 0, whose differences vary
+        most.
+    """
+    rows = np.unique(np.linspace(0, len(phi) - 1, _CHECKED_DRAWS).astype(int))
+    errors = linearisation_errors(problem, phi[rows], sigma[rows])
+    total = errors.sum(axis=1)
+    return {
+        "draws": len(rows),
+        "sd": float(total.std(ddof=1)),
+        "largest": float(np.abs(total - total.mean()).max()),
+        "trajectory": int(errors.std(axis=0).argmax()),
+    }
+
+
+def checked(problem: Problem, idata: Any, asked: tuple[int, int] | None = None) -> Any:
+    """Store the warnings of a posterior in its attributes, and issue them."""
+    found = list(_warnings(problem, idata, asked))
+    idata.attrs["warnings"] = json.dumps([message for _, message in found])
+    for kind, message in found:
+        warnings.warn(message, kind, stacklevel=4)
+    return idata
+
+
+def _warnings(
+    problem: Problem, idata: Any, asked: tuple[int, int] | None
+) -> Iterator[tuple[type[Warning], str]]:
+    """Yield category and message of each warning, with the cure."""
+    on = "go on with resume= this posterior"
+    if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
+        on = "name the bodies that were found in the scene, fit that and go on with resume="
+    more = f"raise draws= or thin=, or {on}"
+    if "updates" in idata.attrs:  # resampled draws are no chain that could go on
+        more = "these draws were reweighted by update; fit all data anew"
+    found = json.loads(str(idata.attrs.get("linearisation", '{"sd": 0}')))
+    if not found["sd"] <= MOST:
+        yield (
+            LinearisationWarning,
+            f"the likelihood is linearised where it does not hold: at {found['draws']} draws with"
+            f" the states smoothed anew it differs by {found['sd']:.2g} nats (standard deviation;"
+            f" want <= {MOST:g}), most in trajectory {found['trajectory']}; cut that where"
+            " bodies meet or wheels begin to slip, or compare with a fit of single transitions",
+        )
+    sizes = group(idata, "posterior").sizes
+    if asked is not None:
+        idata.attrs["interrupted"] = 1
+        yield (
+            ConvergenceWarning,
+            f"sampling was interrupted after {sizes['draw']} of {asked[0]} draws in"
+            f" {sizes['chain']} of {asked[1]} chains, which are kept; for more, {on}",
+        )
+    rough = doubts(idata)
+    if rough is not None:
+        yield ConvergenceWarning, rough
+    if sizes["draw"] < _LEAST_DRAWS:
+        if idata.attrs.get("method") != "map":  # a mode alone is one draw
+            yield (
+                ConvergenceWarning,
+                f"with {sizes['draw']} draws a chain there is no R-hat (it takes at least"
+                f" {_LEAST_DRAWS}), so whether the chains have converged is not known; {more}",
+            )
+        return
+    r_hat, ess = convergence(idata)
+    worst_hat, worst_ess = max(r_hat, key=lambda k: r_hat[k]), min(ess, key=lambda k: ess[k])
+    idata.attrs["max_rhat"], idata.attrs["min_ess"] = r_hat[worst_hat], ess[worst_ess]
+    if sizes["chain"] == 1:
+        yield (
+            ConvergenceWarning,
+            "one chain alone cannot show whether it has converged: R-hat compares chains; raise"
+            " chains= to 4",
+        )
+    else:
+        short = []
+        # judged as it is written: 1.0104 is no failure to reach 1.01
+        if not round(r_hat[worst_hat], 3) <= MAX_RHAT:
+            short.append(f"R-hat is {r_hat[worst_hat]:.3f} for {worst_hat} (want <= {MAX_RHAT})")
+        if not ess[worst_ess] >= MIN_ESS:
+            size = f"{np.floor(ess[worst_ess]):.0f} for {worst_ess} (want >= {MIN_ESS})"
+            short.append(f"effective sample size is {size}")
+        if short:
+            text = f"the chains have not converged: {', '.join(short)}; {more}"
+            yield ConvergenceWarning, text
+    if problem.library is not None:  # what follows compares with Table 1
+        return
+    phi, _ = parameter_draws(problem, idata)
+    ends = problem.layout.supports(phi)
+    margin = _NEAR * (ends[1] - ends[0])
+    watched = np.isfinite(margin).all(axis=0) & ~problem.layout.discrete
+    for bound in ends:
+        share = (np.abs(phi - bound) < margin).mean(axis=0)
+        for i in np.flatnonzero(watched & (share > _STUCK)):
+            yield (
+                BoundWarning,
+                f"{problem.layout.labels[i]} is pressed against the end of its support,"
+                f" {np.median(bound[:, i]):g}: {share[i]:.0%} of the draws are there; check the"
+                " shape and the frame of the body; an effect that the model lacks may press too",
+            )
+    silent = uninformed(idata, effects={attached.effect for attached in problem.physics.effects})
+    if silent:
+        yield (
+            UninformedWarning,
+            f"the data say nothing about {', '.join(silent)}: the posterior is the prior; record"
+            " motions that depend on it, or give it in the scene (known = ...)",
+        )
+
+
+def _folded(problem: Problem, trace: Any, seed: int | None) -> xr.Dataset:
+    """Return the posterior with each wheel in one of its equal descriptions, in all chains.
+
+    Between descriptions that the prior can tell apart, the draws are shared out by the prior.
+    """
+    posterior = group(trace, "posterior").copy(deep=True)
+    if problem.library is not None:  # the draws are the library's
+        return posterior
+    layout = problem.layout
+    phi, _ = parameter_draws(problem, trace)
+    if seed is not None:
+        phi = redescribed(layout, phi, np.random.default_rng([seed, len(phi)]))
+    folded = fold_draws(layout, dict(zip(layout.labels, phi.T, strict=True)))
+    for block in layout.blocks:
+        for i, owner in enumerate(block.owners):
+            values = posterior[block.name].values
+            values[..., i] = folded[f"{block.name}[{owner}]"].reshape(values.shape[:2])
+    return posterior
+
+
+def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
+    units = {block.name: block.unit for block in problem.layout.blocks}
+    units["sigma"] = "the unit of each state dimension"
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
+        units |= dict.fromkeys((ACCELERATION, JOLT), "m/s^2, of omega rad/s^2")
+        units[DRIFT] = "the unit of each position"
+    posterior = posterior.copy()
+    for name in units.keys() & set(posterior.data_vars):
+        posterior[str(name)].attrs["units"] = units[str(name)]
+    return posterior

@@ -1,0 +1,335 @@
+"""Cross-validation of posteriors: `az.loo`, `az.compare`, what they leave out, and LOO-PIT."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.posterior.data import CELLS, SMOOTHED
+from pbrl_ppl.posterior.store import DATATREE, arviz, from_groups, group, groups, smoothed
+from pbrl_ppl.state import STATE, THETA, wrapped
+
+#: With fewer draws, the tail that Pareto's law is fitted to has fewer than twenty.
+_LEAST_DRAWS = 100
+#: The dimension over which measured numbers are joined.
+_NUMBER = "number"
+
+
+@dataclass(frozen=True)
+class LeaveOneOut:
+    """Expected log predictive density of a model for data that it was not fitted to.
+
+    Parameters
+    ----------
+    elpd_loo, se : float
+        Summed over all that is left out, and its standard error (nats).
+    p_loo : float
+        Effective number of parameters.
+    high_pareto_k : int
+        Number of units whose weights are unreliable: Pareto k above ``good_k``.
+    good_k : float
+        0.7, or less with few draws (Vehtari et al., 2024).
+    """
+
+    elpd_loo: float
+    se: float
+    p_loo: float
+    high_pareto_k: int
+    good_k: float
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Two models of the same data, by cross-validation.
+
+    Parameters
+    ----------
+    before, after : LeaveOneOut
+        Result for each model.
+    elpd_difference, elpd_difference_se : float
+        Gain of the later model and its standard error; zero if it is the same model.
+    count : int
+        Number of units that were left out, one at a time.
+    left_out : str
+        The unit: ``transition``, or ``trajectory`` for whole trajectories.
+    """
+
+    before: LeaveOneOut
+    after: LeaveOneOut
+    elpd_difference: float
+    elpd_difference_se: float
+    count: int
+    left_out: str = "transition"
+
+    @property
+    def method(self) -> str:
+        """Name of the cross-validation and of its unit."""
+        out = "trajectory-" if self.left_out == "trajectory" else ""
+        plural = {"trajectory": "trajectories", "transition": "transitions"}[self.left_out]
+        return f"Leave-one-{out}out cross-validation on the {self.count} {plural} of the fit"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the contents of ``loo`` in ``report.json``."""
+        return vars(self) | {"before": vars(self.before), "after": vars(self.after)}
+
+
+def compare(before: Any, after: Any) -> Comparison | None:
+    """Compare two posteriors of the same data by leave-one-out cross-validation.
+
+    For whole trajectories, one trajectory is left out at a time, see :func:`by_trajectory`.
+
+    Parameters
+    ----------
+    before, after : InferenceData or DataTree
+        With a group ``log_likelihood``; the same object twice is one model.
+
+    Returns
+    -------
+    Comparison or None
+        None with fewer than 100 draws, or where a likelihood is not finite.
+
+    Raises
+    ------
+    PosteriorError
+        If one is of whole trajectories and the other of single transitions.
+    """
+    unit = left_out(before)
+    if left_out(after) != unit:
+        raise PosteriorError(
+            f"compare: one posterior leaves out one {unit} at a time and the other one"
+            f" {left_out(after)}; fit both with or both without trajectories=True"
+        )
+    for posterior in (before, after):
+        sizes = group(posterior, "posterior").sizes
+        if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
+            return None
+    with warnings.catch_warnings(), np.errstate(all="ignore"):
+        # about Pareto k, which is in the result
+        warnings.simplefilter("ignore")
+        az = arviz()
+        try:
+            first = az.loo(separate(before), pointwise=True)
+            second = first if after is before else az.loo(separate(after), pointwise=True)
+            difference, error = (0.0, 0.0) if after is before else _gain(az, first, second)
+        except Exception:  # a report can do without
+            return None
+    found = Comparison(_summary(first), _summary(second), difference, error, _n(first), unit)
+    numbers = (found.before.elpd_loo, found.after.elpd_loo, difference, error)
+    return found if np.isfinite(numbers).all() else None
+
+
+def _gain(az: Any, first: Any, second: Any) -> tuple[float, float]:
+    """Return the difference of elpd, second less first model, and its standard error."""
+    exact = {"round_to": "none"} if DATATREE else {}
+    table = az.compare({"before": first, "after": second}, **exact)
+    worse = table.iloc[-1]
+    sign = 1.0 if worse.name == "before" else -1.0
+    return sign * abs(float(worse["elpd_diff"])), float(worse["dse"])
+
+
+def _summary(loo: Any) -> LeaveOneOut:
+    """Return the summary of an ArviZ result, whose names differ between 0.x and 1.x."""
+    elpd, p = (loo.elpd, loo.p) if DATATREE else (loo["elpd_loo"], loo["p_loo"])
+    good = float(loo.good_k)
+    # written so that a shape that is not a number counts as high
+    high = int((~(np.asarray(loo.pareto_k) <= good)).sum())
+    return LeaveOneOut(float(elpd), float(loo.se), float(p), high, good)
+
+
+def _n(loo: Any) -> int:
+    return int(loo.n_data_points)
+
+
+def left_out(idata: Any) -> str:
+    """Return the unit that leave-one-out leaves out: ``trajectory`` or ``transition``."""
+    return "trajectory" if SMOOTHED in groups(idata).get("constant_data", ()) else "transition"
+
+
+def by_trajectory(idata: Any) -> Any:
+    """Return a posterior for leave-one-trajectory-out by ``az.loo`` and ``az.compare``.
+
+    In a likelihood of whole trajectories, each transition is conditional on those before it. To
+    leave out one transition is no cross-validation there, for later ones have seen its data.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`, of either likelihood.
+
+    Returns
+    -------
+    InferenceData or DataTree
+        The groups ``posterior`` and ``log_likelihood``, the latter summed over each trajectory,
+        dims (chain, draw, trajectory), nats.
+
+    Examples
+    --------
+    ::
+
+        az.loo(pp.by_trajectory(idata), pointwise=True)
+        az.compare({"one": pp.by_trajectory(one), "other": pp.by_trajectory(other)})
+    """
+    likelihood = group(idata, "log_likelihood")
+    summed = likelihood.groupby("trajectory").sum().transpose("chain", "draw", "trajectory")
+    data = {"posterior": group(idata, "posterior"), "log_likelihood": summed}
+    return from_groups(data, idata.attrs)
+
+
+def separate(idata: Any) -> Any:
+    """Return a posterior with one log-likelihood for each unit that is left out."""
+    return by_trajectory(idata) if left_out(idata) == "trajectory" else idata
+
+
+def by_number(idata: Any) -> Any:
+    """Return a posterior for ``az.loo_pit`` and ``az.plot_loo_pit``.
+
+    These, and ``az.plot_ppc_pit`` of ArviZ 1.x, want predictions of all draws and a log-likelihood
+    of every number. Here each measured number has the log-likelihood of its transition, which is
+    left out with it, and the draws are those that have predictions.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`, of single transitions (Eq. 11).
+
+    Returns
+    -------
+    InferenceData or DataTree
+        The groups ``posterior``, ``posterior_predictive``, ``log_likelihood`` and
+        ``observed_data``; ``next_state`` has the dims (chain, draw, number). Coordinates of
+        ``number`` say ``transition``, ``step``, ``body`` and ``state``. Predicted angles are within
+        half a turn of the measured ones.
+
+    Raises
+    ------
+    PosteriorError
+        If a group is missing, the draws were reweighted by :func:`pbrl_ppl.update`, or the
+        likelihood is of whole trajectories, whose transitions cannot be left out one by one.
+
+    Examples
+    --------
+    ::
+
+        az.plot_loo_pit(pp.by_number(idata), y="next_state")  # ArviZ 0.x
+        az.plot_loo_pit(pp.by_number(idata))  # ArviZ 1.x
+    """
+    if "before_updates" in groups(idata):
+        raise PosteriorError(
+            "by_number: the draws were reweighted by update and do not belong to single"
+            " predictions; fit all data anew"
+        )
+    if left_out(idata) == "trajectory":
+        raise PosteriorError(
+            "by_number: the posterior is of whole trajectories, whose later transitions have seen"
+            " the one left out; fit with trajectories=False, or take az.loo of by_trajectory"
+        )
+    posterior = group(idata, "posterior")
+    predictive = group(idata, "posterior_predictive")["next_state"].transpose(
+        "chain", "draw", *CELLS
+    )
+    chains, draws = predictive.sizes["chain"], predictive.sizes["draw"]
+    rows = predicted_rows(posterior, predictive.to_dataset(name="next_state"))
+    measured = group(idata, "observed_data")["next_state"].transpose(*CELLS)
+    values = measured.to_numpy()
+    seen = np.flatnonzero(np.isfinite(values))
+    places = np.unravel_index(seen, values.shape)
+    off = predictive.to_numpy() - values
+    angle = measured["state"].to_numpy() == STATE[THETA]
+    off[..., angle] = wrapped(off[..., angle])
+    predicted = (values + off).reshape(chains, draws, -1)[..., seen]
+
+    def chosen(variable: xr.DataArray) -> Any:
+        """Return dims after chain and draw, and values at the draws that have predictions."""
+        variable = variable.transpose("chain", "draw", ...)
+        values = variable.to_numpy().reshape(-1, *variable.shape[2:])[rows]
+        return variable.dims[2:], values.reshape(chains, draws, *values.shape[1:])
+
+    thinned = {name: chosen(variable) for name, variable in posterior.data_vars.items()}
+    each = chosen(group(idata, "log_likelihood")["next_state"])[1][..., places[0]]
+    labels = {
+        dim: (_NUMBER, np.asarray(measured[dim])[place])
+        for dim, place in zip(CELLS, places, strict=True)
+    }
+    sampled = ("chain", "draw", _NUMBER)
+    return from_groups(
+        {
+            "posterior": xr.Dataset(
+                {name: (("chain", "draw", *dims), value) for name, (dims, value) in thinned.items()}
+            ),
+            "posterior_predictive": xr.Dataset({"next_state": (sampled, predicted)}, labels),
+            "log_likelihood": xr.Dataset({"next_state": (sampled, each)}, labels),
+            "observed_data": xr.Dataset({"next_state": (_NUMBER, values.ravel()[seen])}, labels),
+        },
+        idata.attrs,
+    )
+
+
+def loo_pit(idata: Any) -> xr.DataArray:
+    """Return the leave-one-out probability integral transform of every measured number.
+
+    The probability that the model, fitted without a transition, gives to values below the measured
+    one. Uniform between 0 and 1 where the predictions are calibrated; too many at the ends mean
+    predictions that are too narrow, too many on one side a bias. It cannot see errors that are
+    correlated from transition to transition. For whole trajectories it is no exact leave-one-out:
+    later transitions have seen the number that is left out.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+
+    Returns
+    -------
+    xarray.DataArray
+        Dims (transition, step, body, state); NaN where nothing was measured.
+
+    Raises
+    ------
+    PosteriorError
+        If it lacks a group, or its draws were reweighted by :func:`pbrl_ppl.update`, after which
+        the predictions are no longer those of single draws.
+    """
+    if "before_updates" in groups(idata):
+        raise PosteriorError(
+            "loo_pit: the draws were reweighted by update and do not belong to single predictions;"
+            " fit all data anew"
+        )
+    predictive = group(idata, "posterior_predictive")
+    rows = predicted_rows(group(idata, "posterior"), predictive)
+    samples = {"sample": ("chain", "draw")}
+    predicted = predictive["next_state"].stack(samples).transpose("sample", *CELLS)
+    likelihood = group(idata, "log_likelihood")["next_state"].stack(samples)
+    likelihood = likelihood.transpose("transition", "sample")
+    measured = group(idata, "observed_data")["next_state"].transpose(*CELLS)
+    # smoothed with all draws: the tail is better known
+    weights = np.stack([smoothed(-each)[0][rows] for each in likelihood.to_numpy()], axis=1)
+    weights /= weights.sum(axis=0)
+    off = predicted.to_numpy() - measured.to_numpy()
+    angle = measured["state"].to_numpy() == STATE[THETA]
+    off[..., angle] = wrapped(off[..., angle])
+    below = np.einsum("rt,rthbs->thbs", weights, off <= 0.0)
+    return measured.copy(data=np.where(np.isfinite(measured), below, np.nan))
+
+
+def predicted_rows(posterior: xr.Dataset, predictive: xr.Dataset) -> NDArray[np.intp]:
+    """Return the draws that stored predictions were made with.
+
+    Parameters
+    ----------
+    posterior, predictive : Dataset
+        The two groups of a fit.
+
+    Returns
+    -------
+    ndarray
+        Indices of the draws, chains joined: one a prediction, chains of these joined too.
+    """
+    chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
+    places = posterior.indexes["draw"].get_indexer(predictive.indexes["draw"])
+    return np.asarray((draws * np.arange(chains)[:, None] + places).ravel())

@@ -1,0 +1,301 @@
+"""Data of a posterior file, the record of a problem, and the problem rebuilt from both."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from pbrl_ppl.effects import Effect, LearnedRemainder, catalogue
+from pbrl_ppl.errors import PosteriorError
+from pbrl_ppl.history import History, Segments, from_segments
+from pbrl_ppl.likelihood import (
+    Problem,
+    Sensitivity,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
+    along_trajectories,
+    cells_of,
+    linearised,
+    with_sensitivity,
+)
+from pbrl_ppl.posterior.record import PosteriorRecord, vectors
+from pbrl_ppl.posterior.store import from_groups, group, groups, likeliest_draw
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import INPUT, STATE
+
+PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
+#: Dimensions of measured next states.
+CELLS = ("transition", "step", "body", "state")
+#: Name of the smoothed states; a posterior of single transitions has none.
+SMOOTHED = "smoothed"
+#: Names of the parameters that the states were smoothed at, and of the states' derivative by them.
+_ORIGIN, _SENSITIVITY = "smoothed_at", "sensitivity"
+#: Variables and dimensions of the recording have this before their names.
+_PREFIX = "recorded_"
+#: Coordinates of the dimension ``transition`` that are no index.
+_PLACES = ("trajectory", "time")
+
+
+def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
+    """Return the record of a fit of a problem: scene, effects, settings, data and versions."""
+    scene, attached, likelihood = problem.scene, problem.physics.effects, problem.likelihood
+    for body in scene.dynamic:
+        new = [
+            each.effect.name
+            for each in attached
+            if each.body == body.name and each.effect.name not in body.effects
+        ]
+        scene = scene.with_effects(body.name, *new)
+    median, spread = problem.noise_prior
+    tables = [e.effect.table for e in attached if isinstance(e.effect, LearnedRemainder)]
+    return PosteriorRecord(
+        scene=scene,
+        effects=tuple((each.effect.name, each.body) for each in attached),
+        horizon=problem.data.horizon,
+        substeps=problem.physics.substeps,
+        together=tuple(problem.physics.together),
+        measured=problem.observations.names,
+        scalar_sigma=problem.scalar_sigma,
+        sigma_prior=(tuple(float(value) for value in median), float(spread)),
+        data_sha256=problem.data.history.data_sha256,
+        seed=seed,
+        versions=versions(),
+        method=method,
+        nu=problem.likelihood.nu,
+        library=problem.library,
+        learned_remainder=tables[-1] if tables else None,
+        cells=likelihood.noise.cells if isinstance(likelihood, TrajectoryLikelihood) else None,
+    )
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that a posterior depends on."""
+    found = {"python": ".".join(map(str, sys.version_info[:3]))}
+    for name in PACKAGES:
+        try:
+            found[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+def problem_of(
+    idata: Any, effects: Iterable[Effect] = catalogue, history: History | None = None
+) -> Problem:
+    """Return the problem that a posterior was fitted to, from what the posterior holds.
+
+    A user's own effects are not in it.
+
+    Parameters
+    ----------
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+    effects : iterable of Effect
+        Where the names of its effects are looked up.
+    history : History, optional
+        Other data for the same problem, the noise's prior included.
+
+    Raises
+    ------
+    PosteriorError
+        If it has another schema version or lacks a group.
+    EffectError
+        If an effect is not among ``effects``.
+    """
+    record = PosteriorRecord.of(idata)
+    given, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
+    columns = tuple(STATE.index(name) for name in record.measured)
+    start, actions = given["start"].to_numpy(), given["actions"].to_numpy()
+    other = history is not None
+    if history is None:
+        values = measured.transpose(*CELLS).to_numpy()
+        observed = np.full((*values.shape[:3], len(STATE)), np.nan)
+        observed[..., columns] = values
+        history = from_segments(record.scene, start, actions, observed)
+    elif actions.shape[-1] == len(INPUT):  # recorded since
+        # after a trajectory's end there is none: of the first interval alone
+        history = history.numbered(float(actions[:, 0, :, INPUT.index("trajectory")].max()) + 1.0)
+    problem = Problem.of(
+        record.scene,
+        history,
+        record.attached(effects),
+        horizon=record.horizon,
+        substeps=record.substeps,
+        columns=columns,
+        likelihood=TransitionLikelihood(
+            scalar=record.scalar_sigma, nu=record.nu, prior=record.sigma_prior
+        ),
+        library=record.library,
+        together=record.together,
+    )
+    stored = with_recording(problem, given, record.data_sha256)
+    if not other or isinstance(stored.likelihood, TransitionLikelihood):
+        return stored
+    # linearised where the posterior is
+    phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
+    best = likeliest_draw(idata)
+    problem = along_trajectories(problem, phi[best], sigma[best], stored.trajectory_noise.cells)
+    return with_sensitivity(problem, phi[best], sigma[best])
+
+
+def linearised_as(problem: Problem, idata: Any) -> Problem:
+    """Return the problem with its trajectories linearised as in a posterior of the same data.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of the posterior's scene, effects and data; returned itself if of single transitions.
+    idata : InferenceData or DataTree
+        As made by :func:`pbrl_ppl.fit`.
+
+    Raises
+    ------
+    PosteriorError
+        If one is of whole trajectories and the other of single transitions, or the data or the
+        parameters are others.
+    """
+    given, posterior = group(idata, "constant_data"), group(idata, "posterior")
+    kind = {True: "whole trajectories", False: "single transitions"}
+    whole = isinstance(problem.likelihood, TrajectoryLikelihood)
+    if (SMOOTHED in given) != whole:
+        raise PosteriorError(
+            f"posterior: it is of {kind[not whole]}, expected {kind[whole]} as the model; make"
+            f" that with trajectories={not whole}"
+        )
+    measured = group(idata, "observed_data")["next_state"].transpose(*CELLS).to_numpy()
+    if not np.array_equal(measured, problem.measured, equal_nan=True):
+        raise PosteriorError(
+            f"posterior: it is of {len(measured)} transitions that are not the model's"
+            f" {len(problem.measured)}; pass the history that it was fitted to"
+        )
+    names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
+    missing = [name for name in names if name not in posterior]
+    if missing:
+        raise PosteriorError(f"posterior: it has no {', '.join(missing)}; of another model?")
+    if not whole:
+        return problem
+    problem = with_recording(problem, given, problem.data.history.data_sha256)
+    return problem.with_likelihood(prior=PosteriorRecord.of(idata).sigma_prior)
+
+
+def recording(problem: Problem) -> xr.Dataset:
+    """Return the recording and linearisation of whole trajectories; empty for other problems."""
+    noise = problem.trajectory_noise
+    if noise is None:
+        return xr.Dataset()
+    dataset = problem.data.history.dataset
+    kept = dataset.rename(
+        {name: f"{_PREFIX}{name}" for name in (*dataset.dims, *dataset.data_vars)}
+    )
+    kept = kept.drop_vars([name for name in kept.coords if name not in kept.dims])
+    dims = tuple(f"{_PREFIX}{name}" for name in ("trajectory", "time", "body", "state"))
+    kept[SMOOTHED] = (dims, problem.data.smoothed_states)
+    kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
+    kept["linearised_at"] = (("noise_parameter",), noise.sigma)
+    if noise.cells.drifts:
+        kept["memory"] = noise.cells.memory
+    if noise.sensitivity is not None:
+        kept[_ORIGIN] = (("transition", "parameter"), noise.sensitivity.phi)
+        dims = ("transition", "cell_before", "parameter")
+        kept[_SENSITIVITY] = (dims, noise.sensitivity.before)
+    return kept.assign_attrs({})
+
+
+def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Problem:
+    """Return a problem with the whole trajectories of a posterior's constant data, if it has."""
+    if SMOOTHED not in given:
+        return problem
+    history = recorded(problem.scene, given, data_sha256)
+    cells = recorded_cells(problem.scene, given)
+    states = given[SMOOTHED].to_numpy()
+    data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
+    noise = linearised(
+        problem.on(data), cells, given["slope"].to_numpy(), given["linearised_at"].to_numpy()
+    )
+    if _SENSITIVITY in given:
+        origin, before = given[_ORIGIN].to_numpy(), given[_SENSITIVITY].to_numpy()
+        follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
+        noise = replace(noise, sensitivity=follow)
+    return problem.on(data).along(noise, scalar=False)
+
+
+def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:
+    """Return the history that a posterior's constant data hold."""
+    names = [str(name) for name in given.data_vars if str(name).startswith(_PREFIX)]
+    back = {
+        name: str(name).removeprefix(_PREFIX)
+        for name in (*names, *given.dims)
+        if str(name).startswith(_PREFIX)
+    }
+    dataset = given[names].rename(back)
+    dataset = dataset.assign_coords(
+        kinematic=("body", [body.kinematic for body in scene.moving])
+    ).assign_attrs(time_step=scene.time_step, data_sha256=data_sha256)
+    return History(dataset)
+
+
+def recorded_cells(scene: Scene, given: xr.Dataset) -> Any:
+    """Return the cells of the history that a posterior's constant data hold."""
+    cells = cells_of(scene, recorded(scene, given))
+    return cells.drifting(float(given["memory"])) if "memory" in given else cells
+
+
+def both_recordings(held: xr.Dataset, new: xr.Dataset) -> xr.Dataset:
+    """Return one recording after the other; empty where there are none."""
+    if SMOOTHED not in new:
+        return xr.Dataset()
+    by_transition = [name for name in ("slope", _ORIGIN, _SENSITIVITY) if name in new]
+    whole = [str(name) for name in new.data_vars if f"{_PREFIX}trajectory" in new[name].dims]
+    result = new[[name for name in ("linearised_at", "memory") if name in new]]
+    result = result.drop_vars([str(name) for name in result.coords])
+    for names, dim in ((by_transition, "transition"), (whole, f"{_PREFIX}trajectory")):
+        parts = [given[names].reset_coords(drop=True) for given in (held, new)]
+        parts = [part.drop_vars([dim], errors="ignore") for part in parts]
+        result = result.merge(xr.concat(parts, dim, join="outer"))
+    result[SMOOTHED] = result[SMOOTHED].fillna(0.0)
+    return result
+
+
+def places(segments: Segments) -> dict[str, xr.Variable]:
+    """Return the coordinates ``trajectory`` and ``time`` of segments, for a posterior's groups.
+
+    The first is the trajectory's number in its recording, from 0, the second the clock of the row
+    that the segment starts from (s).
+    """
+    first = segments.inputs[:, 0, 0]  # all bodies have the same clock
+    number, begin = first[:, INPUT.index("trajectory")], first[:, INPUT.index("begin")]
+    return {
+        "trajectory": xr.Variable("transition", number.astype(np.int64)),
+        "time": xr.Variable("transition", begin, {"units": "s"}),
+    }
+
+
+def both_places(held: xr.Dataset, segments: Segments) -> dict[str, xr.Variable]:
+    """Return coordinates of a posterior's transitions and, after them, of new ones.
+
+    Trajectories are numbered on, so that those of two recordings stay apart.
+    """
+    new = {name: variable.to_numpy() for name, variable in places(segments).items()}
+    new["trajectory"] += int(held["trajectory"].max()) + 1 - new["trajectory"].min()
+    return {
+        name: xr.Variable("transition", np.concatenate([held[name], values]), held[name].attrs)
+        for name, values in new.items()
+    }
+
+
+def placed(idata: Any, coords: Mapping[Any, Any]) -> Any:
+    """Return the posterior with the trajectory and time of these coordinates, and no others."""
+    chosen = {name: coords[name] for name in _PLACES}
+    data = {
+        name: dataset.drop_vars(_PLACES, errors="ignore").assign_coords(chosen)
+        if "transition" in dataset.dims
+        else dataset
+        for name, dataset in groups(idata).items()
+    }
+    return from_groups(data, idata.attrs)

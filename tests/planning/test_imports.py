@@ -1,0 +1,23 @@
+"""Planning needs numpy, the physics and a posterior file, and loads nothing of the samplers."""
+
+import subprocess
+import sys
+
+#: Modules that a plan does not need.
+HEAVY = ("pymc", "pytensor", "arviz", "matplotlib")
+#: Modules of the package that planning may load.
+MOST = 90
+
+
+def test_planning_loads_no_sampler() -> None:
+    script = (
+        "import sys, pbrl_ppl.planning\n"
+        f"print(*sorted({{m.split('.')[0] for m in sys.modules}} & set({HEAVY!r})))\n"
+        "print(sum(m.startswith('pbrl_ppl') for m in sys.modules))\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], check=True, capture_output=True, text=True
+    )
+    heavy, count = done.stdout.split("\n")[:2]
+    assert heavy == ""
+    assert int(count) < MOST
