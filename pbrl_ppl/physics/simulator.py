@@ -20,8 +20,8 @@ from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
 from pbrl_ppl.physics.inputs import after_recording, check_shapes
+from pbrl_ppl.physics.joints import on_rod
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
-from pbrl_ppl.physics.rods import on_rod
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
 
@@ -288,7 +288,7 @@ class Simulator:
         own = self._properties
         patches, wheels = own.under if slides else ((), ())
         rods = tuple(compress(own.tied, there))
-        return World(self.scene, own.joints.hinges, joined, own.n_discs, patches, wheels, rods)
+        return World(self.scene, own.joints.kinds, joined, own.n_discs, patches, wheels, rods)
 
     def _run_plain(
         self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array
