@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.physics import lockstep_solver as solver
 from pbrl_ppl.physics.compilation import compiled
-from pbrl_ppl.physics.compiled import act, scratch
+from pbrl_ppl.physics.compiled import act
 from pbrl_ppl.physics.joints import ROD
 from pbrl_ppl.physics.lockstep_solver import BLOCK, LINK_ROWS, POINT_ROWS, ROWS, X0, Y0
 from pbrl_ppl.physics.properties import COLUMN
@@ -82,11 +82,12 @@ def rollout(free, batch, first, last, out, left, trail):  # type: ignore[no-unty
     ``left``, shape (last - first,), is set for items that come near an obstacle or diverge: the
     engine must predict those.
     """
-    bodies, joints, discs, _, _ = batch.given
+    bodies, joints, discs, command_parameters, force_parameters = batch.given
     start, inputs, normal_gravity = batch.start, batch.inputs, batch.normal_gravity
     n, horizon = len(inputs), inputs.shape[1]
     timed = bodies.shape[1] > 1
-    acting = len(batch.commands[0]) + len(batch.forces[0]) > 0
+    commands, forces = batch.commands, batch.forces
+    acting = len(commands[0]) + len(forces[0]) > 0
     watch = len(free.obstacles) + discs.shape[1] > 0
     z = np.zeros(ROWS)
     links = np.zeros((len(free.link_joint), LINK_ROWS))
@@ -94,8 +95,8 @@ def rollout(free, batch, first, last, out, left, trail):  # type: ignore[no-unty
     slowing, patch_radius = np.zeros(BLOCK), np.zeros(BLOCK)
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
     touched = np.zeros(BLOCK, dtype=np.bool_)
-    buffers = scratch(1, 0)
-    state, wrench = buffers.state, buffers.wrench
+    state, signal = np.empty((1, 6)), np.empty(8)
+    previous, command, wrench = np.empty((1, 3)), np.empty((1, 3)), np.empty((1, 3))
     own = state[0]  # once: a view costs as much as its use
     for begin in range(first, last, BLOCK):
         width = min(BLOCK, last - begin)
@@ -133,8 +134,9 @@ def rollout(free, batch, first, last, out, left, trail):  # type: ignore[no-unty
                             p, t = (begin + i) // n, (begin + i) % n
                             solver.get_state(z, i, own)
                             act(
-                                batch, p, state, inputs[t, h], s / substeps, (s + 1) / substeps,
-                                buffers,
+                                state, inputs[t, h], commands, command_parameters[p], forces,
+                                force_parameters[p], s / substeps, (s + 1) / substeps, signal,
+                                previous, command, wrench,
                             )  # fmt: skip
                             solver.set_wrench(z, i, wrench[0])
                     if shifted:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.physics import lockstep_joints as joined
 from pbrl_ppl.physics import lockstep_solver as solver
 from pbrl_ppl.physics.compilation import compiled
-from pbrl_ppl.physics.compiled import act, scratch
+from pbrl_ppl.physics.compiled import act
 from pbrl_ppl.physics.joints import ROD
 from pbrl_ppl.physics.lockstep_joints import JOINT_ROWS, M_MAX, MJ, SHARE, Block
 from pbrl_ppl.physics.lockstep_solver import BLOCK, POINT_ROWS, ROWS, X0, Y0
@@ -106,11 +106,12 @@ def rollout(chain, batch, items, out, left):  # type: ignore[no-untyped-def]
     ``left``, shape (item,), is set for items that come near an obstacle or diverge. A block takes
     as long as the transition of the most iterations: items of similar numbers should be neighbours.
     """
-    rows, joint_rows, discs, _, _ = batch.given
+    rows, joint_rows, discs, command_parameters, force_parameters = batch.given
     start, inputs, normal_gravity = batch.start, batch.inputs, batch.normal_gravity
     n, horizon, moving, levels = len(inputs), inputs.shape[1], len(chain.radii), len(batch.counts)
     timed = rows.shape[1] > 1
-    acting = len(batch.commands[0]) + len(batch.forces[0]) > 0
+    commands, forces = batch.commands, batch.forces
+    acting = len(commands[0]) + len(forces[0]) > 0
     watch = len(chain.obstacles) + discs.shape[1] > 0 or chain.can_touch.sum() > moving
     bodies = np.zeros((moving + 1, ROWS))  # the last is fixed
     joints = np.zeros((len(chain.link_joint), JOINT_ROWS))
@@ -120,7 +121,8 @@ def rollout(chain, batch, items, out, left):  # type: ignore[no-untyped-def]
     block = Block(bodies, joints, patches, slowing, patch_radius, rough, most)
     own_discs = np.zeros((BLOCK, discs.shape[1], 3))
     touched = np.zeros(BLOCK, dtype=np.bool_)
-    states, buffers = np.empty((BLOCK, moving, 6)), scratch(moving, 0)
+    states, signal = np.empty((BLOCK, moving, 6)), np.empty(8)
+    previous, command, wrench = np.empty((3, moving, 3))
     for begin in range(0, len(items), BLOCK):
         width = min(BLOCK, len(items) - begin)
         touched[:] = False
@@ -168,11 +170,12 @@ def rollout(chain, batch, items, out, left):  # type: ignore[no-untyped-def]
                             for k in range(moving):
                                 solver.get_state(bodies[k], i, states[i, k])
                             act(
-                                batch, p, states[i], inputs[t, h], s / substeps,
-                                (s + 1) / substeps, buffers,
+                                states[i], inputs[t, h], commands, command_parameters[p], forces,
+                                force_parameters[p], s / substeps, (s + 1) / substeps, signal,
+                                previous, command, wrench,
                             )  # fmt: skip
                             for k in range(moving):
-                                solver.set_wrench(bodies[k], i, buffers.wrench[k])
+                                solver.set_wrench(bodies[k], i, wrench[k])
                     if shifted:
                         for k in range(moving):
                             solver.lever(bodies[k])

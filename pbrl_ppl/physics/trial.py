@@ -135,11 +135,9 @@ def _applied(effect: Effect, state: Array, parameters: Array) -> Array:
         measured = stage.measure(state[None].copy(), flat)
         return np.concatenate([np.ravel(measured), np.ravel(stage.invert(measured, flat))])
     if isinstance(stage, Structure):
-        added: list[tuple[Array, ...]] = [
-            (disc.x, disc.y, disc.radius) for disc in stage.discs(named)
-        ]
-        added += [] if stage.rod is None else [tuple(stage.rod(named))]
-        return np.concatenate([np.ravel(numbers) for numbers in added])
+        discs = [(disc.x, disc.y, disc.radius) for disc in stage.discs(named)]
+        rods = [] if stage.rod is None else [tuple(stage.rod(named))]
+        return np.concatenate([np.ravel(numbers) for numbers in (*discs, *rods)])
     if isinstance(stage, Noise):
         return np.ravel(np.asarray(stage.tail(named), dtype=float))
     raise EffectError(f"effect {effect.name}: {stage!r} is no stage")
