@@ -31,7 +31,7 @@ from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History, fill_hinges
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.parameters import Layout, box, differentiate
-from pbrl_ppl.physics import PartedSimulator, Physics, build_layout, calls, pointers
+from pbrl_ppl.physics import PartedSimulator, Physics, build_layout, calls
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Joint, Wall
 
@@ -211,7 +211,7 @@ def bare(simulator: Simulator, phi: np.ndarray, start: np.ndarray) -> Callable[[
     world = World(simulator.physics.scene)
     given = simulator._properties(phi[None])
     world.set_properties(given.bodies[0, 0], given.joints[0])
-    where = pointers.pointers(world)
+    where = calls.pointers(world)
 
     def run() -> None:
         _bare(calls.FUNCTIONS, where, start, TIME_STEP / SUBSTEPS, SUBSTEPS)

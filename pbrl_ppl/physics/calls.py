@@ -1,8 +1,8 @@
-"""Calls of the engine's C functions, and of effects' laws, by address from compiled code.
+"""Calls of the engine's C functions and of effects' laws by address, from compiled code.
 
 A vector argument of the C functions is a struct of two doubles passed by value. Under the System V
 and AArch64 calling conventions that is the same as two doubles, which is what is passed here; on
-other platforms :data:`AVAILABLE` is false and the plain path serves.
+other platforms :data:`AVAILABLE` is false and the reference path serves.
 """
 
 from __future__ import annotations
@@ -10,146 +10,112 @@ from __future__ import annotations
 import platform
 import sys
 from collections import namedtuple
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numba
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 from pymunk import _chipmunk_cffi
 
 from pbrl_ppl.effects import Law
 from pbrl_ppl.errors import EffectError
+from pbrl_ppl.physics.joints import JOINT_KINDS
+from pbrl_ppl.physics.world import RING, World
 
-#: The engine's functions in use, each by the name of its address.
+#: Addresses of the engine's C functions, by their names. Those that set a joint's anchors are in
+#: `Pointers.link_settings`.
 Functions = namedtuple(
     "Functions",
-    [
-        "cpSpaceStep",
-        "cpSpaceSetIterations",
-        "cpSpaceAddShape",
-        "cpSpaceRemoveShape",
-        "cpBodySetMass",
-        "cpBodySetMoment",
-        "cpBodySetCenterOfGravity",
-        "cpBodySetPosition",
-        "cpBodySetAngle",
-        "cpBodySetVelocity",
-        "cpBodySetAngularVelocity",
-        "cpBodySetForce",
-        "cpBodySetTorque",
-        "cpBodyGetPosition",
-        "cpBodyGetAngle",
-        "cpBodyGetVelocity",
-        "cpBodyGetAngularVelocity",
-        "cpShapeSetElasticity",
-        "cpShapeSetFriction",
-        "cpConstraintSetMaxForce",
-        "cpCircleShapeSetOffset",
-        "cpCircleShapeSetRadius",
-        "cpPivotJointSetAnchorA",
-        "cpPivotJointSetAnchorB",
-        "cpPinJointSetAnchorA",
-        "cpPinJointSetAnchorB",
-        "cpPinJointSetDist",
-        "cpDampedRotarySpringSetDamping",
-    ],
+    """
+    cpSpaceStep cpSpaceSetIterations cpSpaceAddShape cpSpaceRemoveShape
+    cpBodySetMass cpBodySetMoment cpBodySetCenterOfGravity cpBodySetPosition cpBodySetAngle
+    cpBodySetVelocity cpBodySetAngularVelocity cpBodySetForce cpBodySetTorque
+    cpBodyGetPosition cpBodyGetAngle cpBodyGetVelocity cpBodyGetAngularVelocity
+    cpShapeSetElasticity cpShapeSetFriction cpCircleShapeSetOffset cpCircleShapeSetRadius
+    cpConstraintSetMaxForce cpPivotJointSetAnchorA cpPinJointSetAnchorA cpPinJointSetAnchorB
+    cpDampedRotarySpringSetDamping
+    """,
 )
+#: C functions that set the anchors and lengths of joints.
+SETTERS = sorted({s.function for kind in JOINT_KINDS.values() for s in kind.settings})
+_PLACE, _DOUBLE = ir.IntType(64), ir.DoubleType()
 
 
-def _addresses() -> Any:
-    """Addresses of the C functions, or None where they cannot be called this way."""
+def _addresses(names: Sequence[str]) -> dict[str, int]:
+    """Return the addresses of C functions; none where they cannot be called this way."""
     registers = platform.machine().lower() in ("x86_64", "amd64", "aarch64", "arm64")
     if sys.platform == "win32" or not registers:
-        return None
+        return {}
     ffi, lib = _chipmunk_cffi.ffi, _chipmunk_cffi.lib
     try:
-        return Functions(
-            *(int(ffi.cast("intptr_t", ffi.addressof(lib, name))) for name in Functions._fields)
-        )
+        return {name: int(ffi.cast("intptr_t", ffi.addressof(lib, name))) for name in names}
     except (AttributeError, ffi.error):
-        return None
+        return {}
 
 
-FUNCTIONS = _addresses()
-AVAILABLE = FUNCTIONS is not None
+_FOUND = _addresses([*Functions._fields, *SETTERS])
+AVAILABLE = bool(_FOUND)
+FUNCTIONS = Functions(*map(_FOUND.get, Functions._fields)) if AVAILABLE else None
 
 
-def _void_call(n_doubles: int) -> Any:
-    """Make ``call(function, pointer, double...)`` for C functions that return nothing."""
+def _calling(result: Any, *kinds: Any) -> Any:
+    """Return numba's code generator for a call by address of a C function of such arguments."""
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kinds = [ir.IntType(64)] + [ir.DoubleType()] * n_doubles
-        function = builder.inttoptr(args[0], ir.FunctionType(ir.VoidType(), kinds).as_pointer())
-        builder.call(function, args[1:])
-        return context.get_dummy_value()
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        function, *values = arguments
+        kind = ir.FunctionType(result, kinds).as_pointer()
+        returned = builder.call(builder.inttoptr(function, kind), values)
+        return context.get_dummy_value() if isinstance(result, ir.VoidType) else returned
 
-    doubles = [types.float64] * n_doubles
-    signature = types.void(types.int64, types.int64, *doubles)
-    if n_doubles == 1:
-
-        @intrinsic
-        def one_double(typing: Any, function: Any, pointer: Any, a: Any) -> Any:
-            return signature, codegen
-
-        return one_double
-
-    @intrinsic
-    def two_doubles(typing: Any, function: Any, pointer: Any, a: Any, b: Any) -> Any:
-        return signature, codegen
-
-    return two_doubles
+    return codegen
 
 
-call1 = _void_call(1)
-call2 = _void_call(2)
+@intrinsic
+def call1(typing: Any, function: Any, pointer: Any, a: Any) -> Any:
+    """Call a C function of a pointer and a double that returns nothing."""
+    signature = types.void(types.int64, types.int64, types.float64)
+    return signature, _calling(ir.VoidType(), _PLACE, _DOUBLE)
+
+
+@intrinsic
+def call2(typing: Any, function: Any, pointer: Any, a: Any, b: Any) -> Any:
+    """Call a C function of a pointer and a vector that returns nothing."""
+    signature = types.void(types.int64, types.int64, types.float64, types.float64)
+    return signature, _calling(ir.VoidType(), _PLACE, _DOUBLE, _DOUBLE)
 
 
 @intrinsic
 def call_int(typing: Any, function: Any, pointer: Any, value: Any) -> Any:
     """Call a C function of a pointer and an int that returns nothing."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64), ir.IntType(32)]).as_pointer()
-        value = builder.trunc(args[2], ir.IntType(32))
-        builder.call(builder.inttoptr(args[0], kind), [args[1], value])
-        return context.get_dummy_value()
-
-    return types.void(types.int64, types.int64, types.int64), codegen
+    signature = types.void(types.int64, types.int64, types.int32)
+    return signature, _calling(ir.VoidType(), _PLACE, ir.IntType(32))
 
 
 @intrinsic
 def call_pointer(typing: Any, function: Any, pointer: Any, other: Any) -> Any:
-    """Call a C function of two pointers; what it returns, if anything, is left."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)] * 2).as_pointer()
-        builder.call(builder.inttoptr(args[0], kind), args[1:])
-        return context.get_dummy_value()
-
-    return types.void(types.int64, types.int64, types.int64), codegen
+    """Call a C function of two pointers, whatever it returns."""
+    signature = types.void(types.int64, types.int64, types.int64)
+    return signature, _calling(ir.VoidType(), _PLACE, _PLACE)
 
 
 @intrinsic
 def get1(typing: Any, function: Any, pointer: Any) -> Any:
     """Call a C function of a pointer that returns a double."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(ir.DoubleType(), [ir.IntType(64)]).as_pointer()
-        return builder.call(builder.inttoptr(args[0], kind), args[1:])
-
-    return types.float64(types.int64, types.int64), codegen
+    return types.float64(types.int64, types.int64), _calling(_DOUBLE, _PLACE)
 
 
 @intrinsic
 def get2(typing: Any, function: Any, pointer: Any) -> Any:
     """Call a C function of a pointer that returns a vector."""
+    call = _calling(ir.LiteralStructType([_DOUBLE, _DOUBLE]), _PLACE)
 
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        vector = ir.LiteralStructType([ir.DoubleType(), ir.DoubleType()])
-        kind = ir.FunctionType(vector, [ir.IntType(64)]).as_pointer()
-        value = builder.call(builder.inttoptr(args[0], kind), args[1:])
-        parts = [builder.extract_value(value, 0), builder.extract_value(value, 1)]
+    def codegen(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        value = call(context, builder, signature, arguments)
+        parts = [builder.extract_value(value, i) for i in range(2)]
         return context.make_tuple(builder, signature.return_type, parts)
 
     return types.UniTuple(types.float64, 2)(types.int64, types.int64), codegen
@@ -157,14 +123,8 @@ def get2(typing: Any, function: Any, pointer: Any) -> Any:
 
 @intrinsic
 def call_law(typing: Any, function: Any, a: Any, b: Any, c: Any, d: Any) -> Any:
-    """Call an effect's force law: four pointers to doubles."""
-
-    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-        kind = ir.FunctionType(ir.VoidType(), [ir.IntType(64)] * 4).as_pointer()
-        builder.call(builder.inttoptr(args[0], kind), args[1:])
-        return context.get_dummy_value()
-
-    return types.void(*[types.int64] * 5), codegen
+    """Call an effect's law: four pointers to doubles."""
+    return types.void(*[types.int64] * 5), _calling(ir.VoidType(), *[_PLACE] * 4)
 
 
 _DOUBLES = types.CPointer(types.float64)
@@ -172,7 +132,7 @@ _LAWS: dict[Law, Any] = {}
 
 
 def law_address(law: Law) -> int:
-    """Compile an effect's law to a C function, once, and give its address."""
+    """Return the address of an effect's law, compiled to a C function once."""
     if law not in _LAWS:
         try:
             _LAWS[law] = numba.cfunc(types.void(_DOUBLES, _DOUBLES, _DOUBLES, _DOUBLES))(law)
@@ -182,3 +142,88 @@ def law_address(law: Law) -> int:
                 f" ({' '.join(str(error).split())[:200]})"
             ) from None
     return int(_LAWS[law].address)
+
+
+#: A property of a joint: the C function that sets it, the joint, its row, and which columns.
+SETTING = np.dtype(
+    [(name, np.int64) for name in ("function", "link", "joint", "column", "vector")], align=True
+)
+
+
+class Pointers(NamedTuple):
+    """Addresses of the C objects of a world, and what else the compiled rollout needs of it."""
+
+    space: int
+    iterations: int
+    chained: NDArray[np.bool_]
+    padding: int
+    bodies: NDArray[np.int64]
+    kinematic: NDArray[np.bool_]
+    shapes: NDArray[np.int64]
+    shape_body: NDArray[np.int64]
+    wheels: NDArray[np.int64]  # (2, wheel): the rod along x, the rod along y
+    wheel_body: NDArray[np.int64]
+    links: NDArray[np.int64]
+    link_settings: NDArray[np.void]  # of dtype SETTING
+    discs: NDArray[np.int64]
+    pivots: NDArray[np.int64]  # (2, pivot): the motor, the damper
+    pivot_body: NDArray[np.int64]
+    patches: NDArray[np.int64]  # (2, patch, point of the ring): what holds it, the rod
+    patch_body: NDArray[np.int64]
+    ring: NDArray[np.float64]
+    radii: NDArray[np.float64]
+    obstacles: NDArray[np.float64]
+    can_touch: NDArray[np.bool_]
+
+
+def pointers(world: World) -> Pointers:
+    """Return the addresses of a world's C objects; the world must be kept alive."""
+    ffi = _chipmunk_cffi.ffi
+
+    def at(*objects: Any) -> NDArray[np.int64]:
+        places = [int(ffi.cast("intptr_t", c_object)) for c_object in objects]
+        return np.array(places, dtype=np.int64)
+
+    def whole(*numbers: int) -> NDArray[np.int64]:
+        return np.array(numbers, dtype=np.int64)
+
+    wheels, pivots, patches = world.wheels, world.pivots, world.patches
+    links = at(*(link.constraint._constraint for link in world.links))
+    settings = [
+        (_FOUND[s.function], address, link.joint, s.columns[0], len(s.columns) == 2)
+        for link, address in zip(world.links, links, strict=True)
+        for s in link.kind.settings
+    ]
+    patch_joints = [
+        *(joint for patch in patches for joint in patch.holds),
+        *(joint for patch in patches for joint in patch.rods),
+    ]
+    return Pointers(
+        space=int(ffi.cast("intptr_t", world.space._space)),
+        iterations=world.iterations,
+        chained=world.chained,
+        padding=world.padding,
+        bodies=at(*(body._body for body in world.bodies)),
+        kinematic=world.kinematic,
+        shapes=at(*(shape._shape for _, shape in world.shapes)),
+        shape_body=whole(*(i for i, _ in world.shapes)),
+        wheels=at(
+            *(wheel.along_x._constraint for wheel in wheels),
+            *(wheel.along_y._constraint for wheel in wheels),
+        ).reshape(2, -1),
+        wheel_body=whole(*(wheel.body for wheel in wheels)),
+        links=links,
+        link_settings=np.array(settings, dtype=SETTING),
+        discs=at(*(disc._shape for disc in world.discs)),
+        pivots=at(
+            *(pivot.motor._constraint for pivot in pivots),
+            *(pivot.damper._constraint for pivot in pivots),
+        ).reshape(2, -1),
+        pivot_body=whole(*(pivot.body for pivot in pivots)),
+        patches=at(*(joint._constraint for joint in patch_joints)).reshape(2, -1, len(RING)),
+        patch_body=whole(*(patch.body for patch in patches)),
+        ring=np.array(RING),
+        radii=world.radii,
+        obstacles=world.obstacles,
+        can_touch=world.can_touch,
+    )

@@ -1,18 +1,18 @@
-"""The compiled rollout: numba code that steps the engine's C functions, without the GIL."""
+"""The compiled rollout: a loop in machine code that steps the engine without the GIL."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 from pbrl_ppl.physics.calls import call1, call2, call_int, call_law, call_pointer, get1, get2
+from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.setters import (
-    EXTRA_X,
-    EXTRA_Y,
-    MASS,
-    W_THETA,
     arm,
     drive,
     iterations,
@@ -28,13 +28,24 @@ from pbrl_ppl.physics.world import DIVERGED, FAR, FINER, TINY
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
 
+class Scratch(NamedTuple):
+    """Arrays of a transition."""
+
+    state: NDArray[np.float64]  # (body, 6)
+    axes: NDArray[np.float64]  # (wheel, 2): cos and sin of the wheel's angle on the body
+    signal: NDArray[np.float64]  # (8,): command, command before, begin and end of the substep
+    previous: NDArray[np.float64]  # (body, 3): commands of the interval before
+    command: NDArray[np.float64]  # (body, 3)
+    wrench: NDArray[np.float64]  # (body, 3)
+
+
 @numba.njit(inline="always")
 def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-untyped-def]
-    """Clear what the engine remembers of the last transition.
+    """Clear the contacts and impulses that the engine keeps of the last transition.
 
-    Contacts go with their shapes, which are taken out and put back as in a new world: far from each
-    other, and numbered alike. Where nothing has touched, and nothing will, that is left out. A
-    joint's stored impulse is clipped to its greatest force, here zero.
+    Contacts go with their shapes, which are removed and added as in a new world: far from each
+    other, and in the same numbering. That is needed only after a contact. A joint's stored impulse
+    is limited to its greatest force, here zero.
     """
     if touched == _FREE and len(world.wheel_body) + len(world.links) + len(world.patch_body) == 0:
         return  # nothing to forget
@@ -58,9 +69,9 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
     set_strengths(fn, world, bodies, normal_gravity, 1.0)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-untyped-def]
-    """Whether body ``i`` may touch an obstacle or a body before it: as in plain.py."""
+    """Return whether body ``i`` may touch an obstacle or a body before it."""
     x, y = state[i, 0], state[i, 1]
     for j in range(len(obstacles)):
         ax, ay = obstacles[j, 0], obstacles[j, 1]
@@ -82,21 +93,16 @@ def _near_contact(i, state, radii, obstacles, can_touch):  # type: ignore[no-unt
     return False
 
 
-@numba.njit(nogil=True, cache=True)
-def _meeting(discs):  # type: ignore[no-untyped-def]
-    """How many times finer to step what comes near something."""
-    for i in range(len(discs)):
-        if discs[i, 2] > 0.0:
-            return FINER
-    return 1
-
-
-@numba.njit(nogil=True, cache=True)
-def act(  # type: ignore[no-untyped-def]
+@compiled
+def act(  # type: ignore[no-untyped-def]  # arrays one by one: tuples of them cost 40 % here
     state, interval, commands, command_parameters, forces, force_parameters, begin, end, signal,
     previous, command, wrench,
 ):  # fmt: skip
-    """The wrench on each body in a substep: the command stage, then the force stage."""
+    """Compute the wrench on each body in a substep: the command stage, then the force stage.
+
+    ``state`` is (body, 6) and ``interval`` the inputs of the interval, (body, 3 or 9); ``begin``
+    and ``end`` of the substep are shares of the interval.
+    """
     k = len(state)
     addresses, owners, first, memory = commands
     known = interval.shape[1] > 3
@@ -136,25 +142,32 @@ def act(  # type: ignore[no-untyped-def]
         )
 
 
+@compiled
+def intervals(bodies, p, t, horizon):  # type: ignore[no-untyped-def]
+    """Return the properties in a transition's intervals; one row if they do not change."""
+    if bodies.shape[1] > 1:
+        return bodies[p, t * horizon : (t + 1) * horizon]
+    return bodies[p]
+
+
 @numba.njit(inline="always")  # a call costs as much as a substep: the world is many arrays
-def _transition(  # type: ignore[no-untyped-def]
-    fn, world, properties, joints, commands, command_parameters, forces, force_parameters, start,
-    inputs, time_step, normal_gravity, substeps, room, out,
-):  # fmt: skip
-    """One transition of horizon H into ``out`` (H, body, 6); says what became of it."""
+def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore[no-untyped-def]
+    """Step one transition of horizon H into ``out`` (H, body, 6); return how it ended."""
     k = len(world.bodies)
-    step = time_step / substeps
-    state, signal, previous, command, wrench, axes = room
-    for i in range(k):
-        for d in range(6):
-            state[i, d] = start[i, d]
+    step = batch.time_step / substeps
+    state, axes, signal, previous, command, wrench = scratch
+    commands, forces = batch.commands, batch.forces
+    command_parameters, force_parameters = batch.given[3][p], batch.given[4][p]
+    start, inputs, normal_gravity = batch.start, batch.inputs[t], batch.normal_gravity
+    properties, joints = intervals(batch.given[0], p, t, len(inputs)), batch.given[1][p]
+    state[:] = start[p if len(start) > 1 else 0, t]
     bodies = properties[0]
     for j in range(len(axes)):
-        turn = bodies[world.wheel_body[j], W_THETA]
+        turn = bodies[world.wheel_body[j], COLUMN.w_theta]
         axes[j, 0], axes[j, 1] = math.cos(turn), math.sin(turn)
     touched = _FREE
     driven = world.kinematic.any()
-    acting = len(commands[0]) + len(forces[0]) > 0
+    acting = len(batch.commands[0]) + len(batch.forces[0]) > 0
     sliding = len(world.patch_body) > 0
     watch = len(world.obstacles) > 0 or k > 1
     place_bodies(fn, world, bodies, state)
@@ -167,9 +180,7 @@ def _transition(  # type: ignore[no-untyped-def]
             call_int(fn.cpSpaceSetIterations, world.space, iterations(world, bodies))
         if driven:
             drive(fn, world, state, inputs[h])
-        for i in range(k):
-            for w in range(3):
-                wrench[i, w] = inputs[h, i, w]
+        wrench[:] = inputs[h, :, :3]
         for s in range(substeps):
             if acting:
                 act(
@@ -179,8 +190,8 @@ def _transition(  # type: ignore[no-untyped-def]
             for i in range(k):
                 if driven and world.kinematic[i]:
                     continue
-                weight_x = bodies[i, MASS] * bodies[i, EXTRA_X]
-                weight_y = bodies[i, MASS] * bodies[i, EXTRA_Y]
+                weight_x = bodies[i, COLUMN.mass] * bodies[i, COLUMN.extra_gravity_x]
+                weight_y = bodies[i, COLUMN.mass] * bodies[i, COLUMN.extra_gravity_y]
                 call2(
                     fn.cpBodySetForce, world.bodies[i], wrench[i, 0] + weight_x,
                     wrench[i, 1] + weight_y,
@@ -210,70 +221,61 @@ def _transition(  # type: ignore[no-untyped-def]
     return touched
 
 
-@numba.njit(nogil=True, cache=True)
-def rollout(  # type: ignore[no-untyped-def]
-    fn, world, given, commands, forces, start, inputs, time_step, normal_gravity, counts, weights,
-    items, out,
-):  # fmt: skip
-    """Predict ``items``, of proposals x transitions, into ``out``.
+@compiled
+def rollout(fn, world, batch, items, out):  # type: ignore[no-untyped-def]
+    """Predict ``items`` of ``out``, whose shape is (proposal * transition, H, body, 6).
 
-    ``given`` holds the arrays of an `EngineInput` but the indices; ``start`` is (1 or proposal,
-    transition, body, 6). ``out`` has shape (proposal * transition, H, body, 6). The transition is
-    run with each number of substeps in ``counts``, the finest first, and the weighted sum taken,
-    which cancels the leading errors; where shapes came close the finest run stands alone: a
-    collision's time is no smooth function of the substep. With hidden discs it is finer still.
+    Each transition is run with every number of substeps in ``batch.counts``, the finest first, and
+    the weighted sum cancels the leading errors. Where shapes came close the finest run stands
+    alone, since the time of a collision is no smooth function of the substep; with hidden discs it
+    is refined.
 
-    Returns the place among the items at which the engine diverged (its world is then of no more
-    use), or their number.
+    Returns the place among the items at which the engine diverged (its world must then be
+    replaced), or the number of items.
     """
-    bodies, joints, discs, command_parameters, force_parameters = given
-    n, horizon = len(inputs), inputs.shape[1]
-    scratch = np.empty((horizon, inputs.shape[2], 6))
-    total = np.empty_like(scratch)
+    bodies, joints, discs, _, _ = batch.given
+    n, horizon = len(batch.inputs), batch.inputs.shape[1]
+    states = np.empty((horizon, batch.inputs.shape[2], 6))
+    total = np.empty_like(states)
     timed = bodies.shape[1] > 1
     k = len(world.bodies)
-    room = (
-        np.empty((k, 6)), np.empty(8), np.empty((k, 3)), np.empty((k, 3)), np.empty((k, 3)),
-        np.empty((len(world.wheel_body), 2)),
-    )  # fmt: skip
+    previous, command, wrench = np.empty((3, k, 3))
+    axes = np.empty((len(world.wheel_body), 2))
+    scratch = Scratch(np.empty((k, 6)), axes, np.empty(8), previous, command, wrench)
     proposal, finer = -1, 1
-    state = _TOUCHED  # what an earlier call left behind is unknown
+    outcome = _TOUCHED  # an earlier call may have left contacts
     for place in range(len(items)):
         item = items[place]
         p, t = item // n, item % n
-        properties = bodies[p, t * horizon : (t + 1) * horizon] if timed else bodies[p]
+        first = intervals(bodies, p, t, horizon)[0]
         if p != proposal:
             proposal = p
-            set_properties(fn, world, properties[0], joints[p])
+            set_properties(fn, world, first, joints[p])
             set_discs(fn, world, discs[p])
-            finer = _meeting(discs[p])
+            finer = FINER if (discs[p, :, 2] > 0.0).any() else 1
         total[:] = 0.0
-        for level in range(len(counts)):
-            before, substeps = state, counts[level]
+        for level in range(len(batch.counts)):
+            before, substeps = outcome, batch.counts[level]
             for _ in range(2):
                 if timed:
-                    set_properties(fn, world, properties[0], joints[p])
-                _forget(fn, world, properties[0], normal_gravity, before)
-                state = _transition(
-                    fn, world, properties, joints[p], commands, command_parameters[p], forces,
-                    force_parameters[p], start[p if len(start) > 1 else 0, t], inputs[t],
-                    time_step, normal_gravity, substeps, room, scratch,
-                )  # fmt: skip
-                if substeps > counts[level] and state == _FREE:
-                    state = _TOUCHED  # by a hair not: what stands alone is the same for all
-                fine = substeps == counts[level] * finer
-                if state != _TOUCHED or (before == _TOUCHED and fine):
+                    set_properties(fn, world, first, joints[p])
+                _forget(fn, world, first, batch.normal_gravity, before)
+                outcome = _transition(fn, world, batch, p, t, substeps, scratch, states)
+                if substeps > batch.counts[level] and outcome == _FREE:
+                    outcome = _TOUCHED  # the first run touched: a refined one is not extrapolated
+                fine = substeps == batch.counts[level] * finer
+                if outcome != _TOUCHED or (before == _TOUCHED and fine):
                     break
-                # contacts in the order of a new world: once more from there
-                before, substeps = _TOUCHED, counts[level] * finer
-            if state == _LOST:
+                # again with the contacts in the order of a new world, and refined
+                before, substeps = _TOUCHED, batch.counts[level] * finer
+            if outcome == _LOST:
                 return place
             if level == 0:
-                out[item] = scratch
-            if state == _TOUCHED:
+                out[item] = states
+            if outcome == _TOUCHED:
                 break
-            total += weights[level] * scratch
-        if state == _FREE and len(counts) > 1:
+            total += batch.weights[level] * states
+        if outcome == _FREE and len(batch.counts) > 1:
             for i in range(k):
                 if world.kinematic[i]:  # the weights' sum is 1 but for rounding
                     total[:, i] = out[item, :, i]

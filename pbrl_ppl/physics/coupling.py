@@ -1,4 +1,4 @@
-"""Independent parts of a scene: bodies that come near, share a joint or parameters, together."""
+"""Independent parts of a scene, and how near two bodies come in an interval."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from scipy.sparse.csgraph import connected_components
 from pbrl_ppl.history import History
 from pbrl_ppl.scene import WORLD, Scene
 
-#: Room that bodies must leave each other: a share of their size, and of how far they move apart or
-#: towards each other in an interval, within which they do not go straight.
+#: Distance that bodies of different parts must keep: a share of their size plus the same share of
+#: their relative motion in an interval, since paths are not straight.
 SHARE = 0.25
 
 Parts = tuple[tuple[str, ...], ...]
@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 
 def joined_parts(parts: Parts, together: Collection[str]) -> Parts:
-    """The parts, with those that hold any of these bodies made one.
+    """Return the parts, with those that contain any of the bodies ``together`` merged.
 
     Examples
     --------
@@ -39,20 +39,20 @@ def joined_parts(parts: Parts, together: Collection[str]) -> Parts:
 
 
 def independent_parts(scene: Scene, history: History) -> Parts:
-    """Moving bodies in parts that never come near each other and share no joint or parameters.
+    """Return the moving bodies in parts that never come near and share no joint or parameters.
 
-    A kinematic body counts as any other: bodies that it meets are in one part, for it is in one.
+    A kinematic body counts as any other: all bodies that it meets are in its part.
 
-    Each part has a likelihood of its own given the noise, so that many bodies cost what each of
-    them costs alone. That is for the likelihood: bodies that were apart in the data may meet in a
-    prediction, which one world with all of them makes.
+    Given the noise, the likelihood factorises over the parts, so that many bodies cost the sum of
+    their costs alone. Bodies that were apart in the data may meet in a prediction, for which there
+    is :class:`OneWorld`.
 
     Parameters
     ----------
     scene : Scene
         Shapes, joints and classes. A joint of unknown bodies may join any two.
     history : History
-        Where the bodies were; one whose place is not known at some time may have been anywhere.
+        Measured places; a body whose place is missing at some time may have been anywhere.
 
     Returns
     -------
@@ -96,26 +96,23 @@ def independent_parts(scene: Scene, history: History) -> Parts:
             near = come_near(begin[:, i] - begin[:, j], end[:, i] - end[:, j], least)
             together[i, j] |= near.any()
     count, part = connected_components(together, directed=False)
-    driven = np.array([body.kinematic for body in scene.moving])
-    for which in range(count):  # a kinematic body that meets none goes with the first that moves
-        if driven[part == which].all():
-            part[part == which] = part[~driven][0]
-    return tuple(
-        tuple(name for name, own in zip(names, part, strict=True) if own == which)
-        for which in np.unique(part)
-    )
+    kinematic = np.array([body.kinematic for body in scene.moving])
+    for label in range(count):  # a kinematic body that meets none joins the first dynamic one
+        if kinematic[part == label].all():
+            part[part == label] = part[~kinematic][0]
+    return tuple(tuple(np.array(names)[part == label].tolist()) for label in np.unique(part))
 
 
 def come_near(begin: Array, end: Array, least: float) -> NDArray[np.bool_]:
-    """Whether two bodies come nearer than ``least`` (m), or may have where a place is unknown.
+    """Return whether two bodies come nearer than ``least`` (m), or may where places are missing.
 
     Parameters
     ----------
     begin, end : ndarray
         Place of one relative to the other before and after an interval, shape (..., 2), m.
     """
-    way = end - begin
-    length = (way**2).sum(axis=-1)
-    share = np.clip(-(begin * way).sum(axis=-1) / np.where(length > 0, length, 1.0), 0.0, 1.0)
-    nearest = np.linalg.norm(begin + share[..., None] * way, axis=-1)
-    return np.asarray(~(nearest >= least + SHARE * np.sqrt(length)))
+    path = end - begin
+    square = (path**2).sum(axis=-1)
+    share = np.clip(-(begin * path).sum(axis=-1) / np.where(square > 0, square, 1.0), 0.0, 1.0)
+    nearest = np.linalg.norm(begin + share[..., None] * path, axis=-1)
+    return np.asarray(~(nearest >= least + SHARE * np.sqrt(square)))

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.physics import calls, compiled, lockstep, lockstep_chain
+from pbrl_ppl.physics.calls import pointers
 from pbrl_ppl.physics.lockstep import free_bodies
-from pbrl_ppl.physics.pointers import pointers
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.world import World
 
@@ -128,7 +128,7 @@ class Engine:
                 " or joints that the fast path lacks; use 'auto' or 'chipmunk'"
             )
         while len(items):
-            done = compiled.rollout(calls.FUNCTIONS, self.pointers, *batch, items, out)
+            done = compiled.rollout(calls.FUNCTIONS, self.pointers, batch, items, out)
             if done < len(items):  # diverged: that world is spoilt, and the item is lost
                 out[items[done]] = np.nan
                 self._renew()
@@ -141,13 +141,13 @@ class Engine:
         left = np.zeros(last - first, dtype=bool)
         if len(self.free) == 1:
             no_trail = np.empty((0, 0, 2))
-            lockstep.rollout(self.free[0], *alone[0], first, last, out[first:last], left, no_trail)
+            lockstep.rollout(self.free[0], alone[0], first, last, out[first:last], left, no_trail)
             return left
         steps = alone[0].inputs.shape[1] * int(alone[0].counts.sum())
         trails = np.empty((len(self.free), last - first, steps, 2))
         for i, (free, batch) in enumerate(zip(self.free, alone, strict=True)):
             own = np.empty((last - first, *out.shape[1:2], 1, 6))
-            lockstep.rollout(free, *batch, first, last, own, left, trails[i])
+            lockstep.rollout(free, batch, first, last, own, left, trails[i])
             out[first:last, :, i] = own[:, :, 0]
         for i, j in combinations(range(len(self.free)), 2):
             reach = self.free[i].radius + self.free[j].radius
@@ -158,11 +158,11 @@ class Engine:
         self, chain: lockstep_chain.Chain, batch: Batch, items: NDArray[np.int64], out: Array
     ) -> NDArray[np.int64]:
         """Predict joined bodies where they come near nothing, and say which items are left."""
-        mass = batch.given[0][:, 0, chain.chained, COLUMN["mass"]]
+        mass = batch.given[0][:, 0, chain.chained, COLUMN.mass]
         ratio = mass.max(axis=1) / mass.min(axis=1)  # as iterations go
         items = items[np.argsort(ratio[items // len(batch.inputs)], kind="stable")]
         left = np.zeros(len(items), dtype=bool)
-        lockstep_chain.rollout(chain, *batch, items, out, left)
+        lockstep_chain.rollout(chain, batch, items, out, left)
         return np.sort(items[left])
 
 

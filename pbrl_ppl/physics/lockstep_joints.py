@@ -1,19 +1,25 @@
-"""Joints of two bodies side by side: Chipmunk's pivot joint, pin joint, motor and rotary damper.
+"""Joints between two moving bodies in the contact-free fast path, and a substep of all bodies.
 
-``a`` and ``b`` are the rows of the bodies' numbers, ``own`` those of the joint; a joint to what
-does not move is a link of `lockstep_solver`, of the same rows.
+The arithmetic is that of Chipmunk's pivot joint, pin joint, motor and rotary damper. ``a`` and
+``b`` are the rows of the bodies' numbers, ``own`` those of the joint. A joint to something fixed is
+a link of `lockstep_solver`, with the same rows.
 """
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
-import numba
+import numpy as np
+from numpy.typing import NDArray
 
-from pbrl_ppl.physics import lockstep_solver as single
+from pbrl_ppl.physics import lockstep_solver as solver
+from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.joints import A_X, A_Y, B_X, B_Y, LENGTH
 from pbrl_ppl.physics.lockstep_solver import (
     AX,
     AY,
+    BLOCK,
     BX,
     BY,
     DX,
@@ -22,13 +28,16 @@ from pbrl_ppl.physics.lockstep_solver import (
     II,
     KXY,
     KYY,
-    LANES,
     LINK_ROWS,
     LX,
     LY,
     MI,
     MX,
     MY,
+    OX,
+    OY,
+    PX,
+    PY,
     RM,
     RX,
     RY,
@@ -43,20 +52,51 @@ from pbrl_ppl.physics.lockstep_solver import (
     Y,
     limited,
 )
+from pbrl_ppl.physics.properties import COLUMN
 
-_FIRST = LINK_ROWS // LANES
-# The other body's anchor and arm; a link's are the second body's.
-A1X, A1Y, R1X, R1Y = (i * LANES for i in range(_FIRST, _FIRST + 4))
+_FIRST = LINK_ROWS // BLOCK
+# Anchor and arm of the first body; those of a link are the second body's.
+A1X, A1Y, R1X, R1Y = (i * BLOCK for i in range(_FIRST, _FIRST + 4))
 # Motor and damper in a hinge: greatest and stored impulse, moment; share of the speed that the
-# damper takes, as given and in use, and its aim.
-M_MAX, MJ, MM, SHARE, TAKEN, GOAL = (i * LANES for i in range(_FIRST + 4, _FIRST + 10))
-JOINT_ROWS = LINK_ROWS + 10 * LANES
+# damper removes, as given and in use, and its target.
+M_MAX, MJ, MM, SHARE, TAKEN, GOAL = (i * BLOCK for i in range(_FIRST + 4, _FIRST + 10))
+JOINT_ROWS = LINK_ROWS + 10 * BLOCK
 
 
-@numba.njit(nogil=True, cache=True)
+class Block(NamedTuple):
+    """Numbers of the bodies, joints and patches of a block of transitions."""
+
+    bodies: NDArray[np.float64]  # (body + 1, ROWS): the last is fixed
+    joints: NDArray[np.float64]  # (joint, JOINT_ROWS)
+    patches: NDArray[np.float64]  # (patch, point, POINT_ROWS)
+    slowing: NDArray[np.float64]  # (patch, BLOCK): deceleration by friction (m/s^2)
+    patch_radius: NDArray[np.float64]  # (patch, BLOCK), m
+    rough: NDArray[np.bool_]  # (joint,): whether there is friction in it
+    iterations: NDArray[np.int64]  # (BLOCK,)
+
+
+@compiled
+def set_joint(own, i, bodies, chain, j, joint, row, step):  # type: ignore[no-untyped-def]
+    """Set the numbers of link ``j`` in transition ``i`` for an interval."""
+    a, b, pose = bodies[chain.link_ends[j, 0]], bodies[chain.link_ends[j, 1]], chain.link_pose[j]
+    first, second = (joint[A_X], joint[A_Y]), (joint[B_X], joint[B_Y])
+    if chain.link_turned[j]:
+        first, second = second, first
+    own[A1X + i], own[A1Y + i] = first[0] - a[OX + i], first[1] - a[OY + i]
+    own[AX + i], own[AY + i] = second[0] - b[OX + i], second[1] - b[OY + i]
+    own[PX + i] = pose[0] + pose[2] * first[0] - pose[3] * first[1]
+    own[PY + i] = pose[1] + pose[3] * first[0] + pose[2] * first[1]
+    own[L + i] = joint[LENGTH]
+    if chain.link_pivot[j] >= 0:
+        own[M_MAX + i] = row[COLUMN.pivot_torque] * step
+        damping = row[COLUMN.pivot_damping] * (a[II + i] + b[II + i])
+        own[SHARE + i] = 1.0 - math.exp(-damping * step) if damping else 0.0
+
+
+@compiled
 def place(a, b, own, rod, step):  # type: ignore[no-untyped-def]
-    """Arms, drift to correct and masses of a hinge or rod, where the bodies now are."""
-    for i in range(LANES):
+    """Set arms, drift and masses of a hinge or rod at the bodies' present places."""
+    for i in range(BLOCK):
         x_1 = a[C + i] * own[A1X + i] - a[S + i] * own[A1Y + i]
         y_1 = a[S + i] * own[A1X + i] + a[C + i] * own[A1Y + i]
         x_2 = b[C + i] * own[AX + i] - b[S + i] * own[AY + i]
@@ -82,17 +122,17 @@ def place(a, b, own, rod, step):  # type: ignore[no-untyped-def]
             own[K + i], own[KXY + i], own[KYY + i] = yy * inverse, -xy * inverse, xx * inverse
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def begin(a, b, own, rod):  # type: ignore[no-untyped-def]
     """Apply the impulse of the substep before."""
-    for i in range(LANES):
+    for i in range(BLOCK):
         j_x, j_y = own[LX + i], own[LY + i]
         if rod:
             j_x, j_y = own[DX + i] * own[LX + i], own[DY + i] * own[LX + i]
         _push(a, b, own, i, j_x, j_y)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def _push(a, b, own, i, j_x, j_y):  # type: ignore[no-untyped-def]
     """Apply an impulse to the second body, and its opposite to the first."""
     a[VX + i] -= j_x * a[MI + i]
@@ -103,10 +143,10 @@ def _push(a, b, own, i, j_x, j_y):  # type: ignore[no-untyped-def]
     b[W + i] += b[II + i] * (own[RX + i] * j_y - own[RY + i] * j_x)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def solve(a, b, own, rod):  # type: ignore[no-untyped-def]
-    """One iteration of a hinge or rod."""
-    for i in range(LANES):
+    """Do one iteration of a hinge or rod."""
+    for i in range(BLOCK):
         w_1, w_2 = a[W + i], b[W + i]
         v_x = (b[VX + i] - own[RY + i] * w_2) - (a[VX + i] - own[R1Y + i] * w_1)
         v_y = (b[VY + i] + own[RX + i] * w_2) - (a[VY + i] + own[R1X + i] * w_1)
@@ -124,20 +164,20 @@ def solve(a, b, own, rod):  # type: ignore[no-untyped-def]
             _push(a, b, own, i, j_x, j_y)
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def begin_pivot(a, b, own):  # type: ignore[no-untyped-def]
     """Apply the motor's impulse of the substep before."""
-    for i in range(LANES):
+    for i in range(BLOCK):
         own[MM + i], own[TAKEN + i] = 1.0 / (a[II + i] + b[II + i]), own[SHARE + i]
         own[GOAL + i] = 0.0
         a[W + i] -= own[MJ + i] * a[II + i]
         b[W + i] += own[MJ + i] * b[II + i]
 
 
-@numba.njit(nogil=True, cache=True)
+@compiled
 def solve_pivot(a, b, own):  # type: ignore[no-untyped-def]
-    """One iteration of friction in a hinge: the motor, then the damper."""
-    for i in range(LANES):
+    """Do one iteration of friction in a hinge: the motor, then the damper."""
+    for i in range(BLOCK):
         i_1, i_2, mass = a[II + i], b[II + i], own[MM + i]
         w_1, w_2, most, old = a[W + i], b[W + i], own[M_MAX + i], own[MJ + i]
         new = limited(old - (w_2 - w_1) * mass, most)
@@ -151,84 +191,79 @@ def solve_pivot(a, b, own):  # type: ignore[no-untyped-def]
         b[W + i] = w_2 - change * mass * i_2
 
 
-@numba.njit(nogil=True, cache=True)
-def rest(bodies, joints, patches, i):  # type: ignore[no-untyped-def]
-    """Let further iterations change nothing in lane ``i``."""
-    for z in bodies:
+@compiled
+def _finish(block, i):  # type: ignore[no-untyped-def]
+    """Make further iterations change nothing in transition ``i``."""
+    for z in block.bodies:
         z[MX + i] = z[MY + i] = 0.0
-    for own in joints:
+    for own in block.joints:
         own[K + i] = own[KXY + i] = own[KYY + i] = own[MM + i] = own[TAKEN + i] = 0.0
-    for points in patches:
+    for points in block.patches:
         for own in points:
             own[K + i] = own[KXY + i] = own[KYY + i] = own[RM + i] = 0.0
-            own[H_MAX + i] = math.inf  # else rounding clips once more what is on the limit
+            own[H_MAX + i] = math.inf  # else rounding clips an impulse on the limit once more
 
 
-@numba.njit(nogil=True, cache=True)
-def _iterate(  # type: ignore[no-untyped-def]
-    bodies, joints, patches, wheel, ends, rods, rough, patch_body, times
-):
-    """Iterate all constraints, in the order in which the engine has them."""
+@compiled
+def _iterate(block, chain, times):  # type: ignore[no-untyped-def]
+    """Iterate all constraints, in the engine's order."""
+    bodies, joints, patches = block.bodies, block.joints, block.patches
     for _ in range(times):
-        for k in range(len(wheel)):
-            if wheel[k]:
-                single.solve_wheel(bodies[k])
+        for k in range(len(chain.wheel)):
+            if chain.wheel[k]:
+                solver.solve_wheel(bodies[k])
         for j in range(len(joints)):
-            a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
-            if ends[j, 0] < 0:
-                single.solve_link(b, joints[j], rods[j])
+            a, b = bodies[chain.link_ends[j, 0]], bodies[chain.link_ends[j, 1]]
+            if chain.link_ends[j, 0] < 0:
+                solver.solve_link(b, joints[j], chain.link_rod[j])
             else:
-                solve(a, b, joints[j], rods[j])
-            if rough[j]:
+                solve(a, b, joints[j], chain.link_rod[j])
+            if block.rough[j]:
                 solve_pivot(a, b, joints[j])
         for j in range(len(patches)):
-            single.solve_patch(bodies[patch_body[j]], patches[j])
+            solver.solve_patch(bodies[chain.patch_body[j]], patches[j])
 
 
-@numba.njit(nogil=True, cache=True)
-def substep(  # type: ignore[no-untyped-def]
-    bodies, joints, patches, chain, rough, slowing, patch_radius, step, most
-):
-    """One step of the engine, of ``most`` iterations a lane, shape (LANES,)."""
-    moving, ends = len(chain.radii), chain.link_ends
+@compiled
+def substep(block, chain, step):  # type: ignore[no-untyped-def]
+    """Do one step of the engine, with the iterations of each transition of the block."""
+    bodies, joints, patches = block.bodies, block.joints, block.patches
+    moving, ends, most = len(chain.radii), chain.link_ends, block.iterations
     for k in range(moving):
-        single.turn(bodies[k], step)
+        solver.turn(bodies[k], step)
     for j in range(len(patches)):
         z = bodies[chain.patch_body[j]]
-        single.place_patch(z, patches[j], chain.ring, slowing[j], patch_radius[j], step)
+        solver.place_patch(z, patches[j], chain.ring, block.slowing[j], block.patch_radius[j], step)
     for j in range(len(joints)):
         a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
         if ends[j, 0] < 0:
-            single.place_link(b, joints[j], chain.link_rod[j], step)
+            solver.place_link(b, joints[j], chain.link_rod[j], step)
         else:
             place(a, b, joints[j], chain.link_rod[j], step)
     for k in range(moving):
-        single.accelerate(bodies[k], chain.gravity, step)
+        solver.accelerate(bodies[k], chain.gravity, step)
     for k in range(moving):
         if chain.wheel[k]:
-            single.begin_wheel(bodies[k])
+            solver.begin_wheel(bodies[k])
     for j in range(len(joints)):
         a, b = bodies[ends[j, 0]], bodies[ends[j, 1]]
         if ends[j, 0] < 0:
-            single.begin_link(b, joints[j], chain.link_rod[j])
+            solver.begin_link(b, joints[j], chain.link_rod[j])
         else:
             begin(a, b, joints[j], chain.link_rod[j])
-        if rough[j]:
+        if block.rough[j]:
             begin_pivot(a, b, joints[j])
     for j in range(len(patches)):
-        single.begin_patch(bodies[chain.patch_body[j]], patches[j])
+        solver.begin_patch(bodies[chain.patch_body[j]], patches[j])
     done, longest = 0, most.max()
     while done < longest:
         until = longest
-        for i in range(LANES):
+        for i in range(BLOCK):
             if most[i] > done:
                 until = min(until, most[i])
-        _iterate(
-            bodies, joints, patches, chain.wheel, ends, chain.link_rod, rough,
-            chain.patch_body, until - done,
-        )  # fmt: skip
+        _iterate(block, chain, until - done)
         if until < longest:
-            for i in range(LANES):
+            for i in range(BLOCK):
                 if most[i] == until:
-                    rest(bodies, joints, patches, i)
+                    _finish(block, i)
         done = until

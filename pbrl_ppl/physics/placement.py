@@ -1,4 +1,4 @@
-"""Checks of start states: bodies that interpenetrate, joints whose anchors are apart."""
+"""Checks of start states: interpenetrating bodies, and joints whose anchors are apart."""
 
 from __future__ import annotations
 
@@ -8,24 +8,25 @@ import numpy as np
 
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import History, Segments
+from pbrl_ppl.physics.joints import JOINT_KINDS
 from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.solids import Pairs, circles, depth, put, scenery
 from pbrl_ppl.scene import WORLD, Joint, Scene
 
-#: What is put down to noise and resting contact: a share of the smaller body's size.
+#: Violation that noise and resting contact may explain, as a share of the smaller body's size.
 ALLOWED = 0.25
 _ORIGIN = (0.0, 0.0, 0.0)
 _CHUNK = 2048  # transitions at a time, to spare memory
 
 
 def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | None = None) -> None:
-    """Refuse start states in which bodies lie deep inside each other or joints are apart.
+    """Raise an error if bodies overlap deeply, or joints are apart, in start states.
 
-    The engine would throw such bodies apart, and a fit would explain that by physics. Shallow
-    overlaps are measurement noise or resting contact. Bodies that a joint joins do not collide in
-    the engine, nor does a body that is joined to the world with the walls: they may overlap, and
-    where an inferred joint could join any two, any two may. A body whose state is not finite is
-    left out, as is a joint that is not known.
+    The engine would push such bodies apart, and a fit would explain that by physics. Shallow
+    overlaps are measurement noise or resting contact. Joined bodies do not collide in the engine,
+    nor does a body that is joined to the world with the walls: they may overlap. If a joint of
+    unknown bodies could join any two, any two may. Bodies whose state is not finite and joints that
+    are not known are left out.
 
     Parameters
     ----------
@@ -35,7 +36,7 @@ def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | No
         Start states, shape (transition, body, 6), bodies in the order of ``scene.moving``:
         x, y, theta, vx, vy, omega (m, m, rad, m/s, m/s, rad/s).
     where : callable, optional
-        ``where(i)`` is what a message calls transition ``i``; ``transition i`` by default.
+        ``where(i)`` names transition ``i`` in a message; ``transition i`` by default.
 
     Raises
     ------
@@ -77,7 +78,7 @@ def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | No
 
 
 def check_history(scene: Scene, history: History, segments: Segments) -> None:
-    """Refuse a history with start states that cannot be; see :func:`check_placement`.
+    """Raise an error if start states of a history are impossible; see :func:`check_placement`.
 
     Parameters
     ----------
@@ -86,7 +87,7 @@ def check_history(scene: Scene, history: History, segments: Segments) -> None:
     history : History
         Gives the trajectories their names.
     segments : Segments
-        Of the history.
+        Segments of the history.
     """
     names = history.dataset["trajectory"].values
 
@@ -97,10 +98,10 @@ def check_history(scene: Scene, history: History, segments: Segments) -> None:
 
 
 def overlap(scene: Scene, poses: Array) -> Array:
-    """Penetration depth of the deepest two shapes (m), shape (n,).
+    """Return the penetration depth of the deepest two shapes (m), shape (n,).
 
-    Negative where bodies are apart by so much at least, no more than their bounding circles are;
-    pairs that a joint joins do not count.
+    Negative values are lower bounds of the distance between bodies, at most that of their bounding
+    circles. Joined bodies do not count.
 
     Parameters
     ----------
@@ -109,7 +110,7 @@ def overlap(scene: Scene, poses: Array) -> Array:
     poses : ndarray
         Shape (n, body, 3), bodies in the order of ``scene.moving``: x, y, theta (m, m, rad).
     """
-    world, pairs = scenery(scene), _may_not(scene)
+    world, pairs = scenery(scene), _colliding(scene)
     poses = world.with_fixed(poses)
     deepest = np.full(len(poses), -np.inf)
     if not pairs:
@@ -117,18 +118,15 @@ def overlap(scene: Scene, poses: Array) -> Array:
     bound = circles(world.solids, pairs, poses)
     for pair, (i, j) in enumerate(pairs):
         rows = np.flatnonzero(bound[:, pair] > 0)
-        own = bound[:, pair].copy()
+        found = bound[:, pair].copy()
         if len(rows):
-            own[rows] = depth(world.solids[i], poses[rows, i], world.solids[j], poses[rows, j])
-        deepest = np.maximum(deepest, own)
+            found[rows] = depth(world.solids[i], poses[rows, i], world.solids[j], poses[rows, j])
+        deepest = np.maximum(deepest, found)
     return deepest
 
 
-# -- joints ----------------------------------------------------------------------------------------
-
-
 def _apart(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
-    """First transition and message of every known joint whose anchors are not where they must."""
+    """Yield the first transition and a message for each known joint with wrong anchors."""
     moving = {body.name: i for i, body in enumerate(scene.moving)}
     reference = {body.name: body.pose or _ORIGIN for body in scene.bodies} | {WORLD: _ORIGIN}
     for joint in scene.joints:
@@ -139,7 +137,7 @@ def _apart(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
             poses[:, moving[name]] if name in moving else pose
             for name, pose in zip(joint.bodies, fixed, strict=True)
         ]
-        length = _anchor_distance(joint, fixed)[0] if joint.kind == "distance" else 0.0
+        length = JOINT_KINDS[joint.kind].gap(_anchor_distance(joint, fixed)[0])
         found = _anchor_distance(joint, now)
         smaller = min(scene.body(n).shape.bounding_radius for n in joint.bodies if n in moving)
         off = np.flatnonzero(np.abs(found - length) > ALLOWED * smaller)
@@ -159,11 +157,8 @@ def _anchor_distance(joint: Joint, poses: list[Array]) -> Array:
     return np.asarray(np.hypot(*np.moveaxis(a - b, -1, 0))[:, 0])
 
 
-# -- shapes ----------------------------------------------------------------------------------------
-
-
-def _may_not(scene: Scene) -> Pairs:
-    """Pairs of solids that may not overlap."""
+def _colliding(scene: Scene) -> Pairs:
+    """Return the pairs of solids that must not overlap."""
     pairs = scenery(scene).pairs
     if all(joint.bodies is not None for joint in scene.joints):
         return pairs
@@ -173,13 +168,13 @@ def _may_not(scene: Scene) -> Pairs:
 
 
 def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
-    """First transition and message of every two shapes that lie deep inside each other."""
-    world, pairs = scenery(scene), _may_not(scene)
+    """Yield the first transition and a message for each two shapes that overlap deeply."""
+    world, pairs = scenery(scene), _colliding(scene)
     if not pairs:
         return
     poses, solids = world.with_fixed(poses), world.solids
     smaller = [ALLOWED * min(solids[i].width, solids[j].width) for i, j in pairs]
-    # shapes overlap by no more than the circles about them do
+    # shapes overlap by no more than their bounding circles
     near = circles(solids, pairs, poses) > np.array(smaller)
     for pair in np.flatnonzero(near.any(axis=0)):
         i, j = pairs[pair]

@@ -1,8 +1,10 @@
-"""The reference rollout in plain Python: a new engine world a transition, which is slow."""
+"""The slow reference rollout in plain Python: a new engine world for each transition."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pymunk
@@ -11,7 +13,7 @@ from pbrl_ppl.effects import Attached, Command, Force, at_stage
 from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput
 from pbrl_ppl.physics.world import DIVERGED, RING, STICKING, World
 
-_EXTRA = [COLUMN["extra_gravity_x"], COLUMN["extra_gravity_y"]]
+_EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
 
 
 def rollout(
@@ -24,26 +26,25 @@ def rollout(
     inputs: Array,
     substeps: int,
 ) -> tuple[Array, bool]:
-    """Step one transition of the horizon H through a new world.
+    """Step one transition of horizon H through a new world.
 
     Parameters
     ----------
     world : World
         A new one.
     effects : tuple of Attached
-        Effects; their command and force laws act every substep.
+        Effects, whose command and force laws act every substep.
     given : EngineInput
-        What the engine is given.
+        The engine's numbers of all proposals.
     proposal, item : int
-        Which proposal, and which transition.
+        Indices of the proposal and of the transition.
     start : ndarray
         Start state, shape (body, 6), SI units.
     inputs : ndarray
-        What acts in each interval, shape (H, body, 3 or more): wrenches in N and N m, of a
-        kinematic body its velocity in m/s and rad/s, and the rest
-        as in :data:`pbrl_ppl.state.INPUT`.
+        Inputs of each interval, shape (H, body, 3 or 9): wrenches in N and N m (of a kinematic
+        body, velocities in m/s and rad/s), and the rest as in :data:`pbrl_ppl.state.INPUT`.
     substeps : int
-        Engine steps an interval.
+        Engine steps in an interval.
 
     Returns
     -------
@@ -59,8 +60,8 @@ def rollout(
     world.set_discs(given.discs[proposal])
     _place_bodies(world, start)
     names = [body.name for body in world.scene.moving]
-    commands = _laws(effects, Command, given.commands[proposal], names)
-    forces = _laws(effects, Force, given.forces[proposal], names)
+    commands = list(_laws(effects, Command, given.commands[proposal], names))
+    forces = list(_laws(effects, Force, given.forces[proposal], names))
     step = world.scene.time_step / substeps
     states = np.empty((len(inputs), len(names), 6))
     touched = False
@@ -69,22 +70,27 @@ def rollout(
             bodies = properties[item * len(inputs) + h]
             world.set_properties(bodies, joints)
             _place_bodies(world, states[h - 1])
-        _drive(world, interval)
+        for i, body in enumerate(world.bodies):
+            if world.kinematic[i]:
+                body.velocity, body.angular_velocity = tuple(interval[i, :2]), interval[i, 2]
         for s in range(substeps):
             command = interval[:, :3].copy()
             previous = interval[:, 3:6].copy() if interval.shape[1] > 3 else None
             phase = s / substeps, (s + 1) / substeps
-            for i, attached, parameters in commands:
-                _command(attached, _state(world, i), command, previous, i, phase, parameters)
+            for i, stage, parameters in commands:
+                state = _state(world, i)
+                before = np.zeros(3) if previous is None else previous[i]
+                stage.law(state, np.array([*command[i], *before, *phase]), parameters, command[i])
+                if previous is not None and not stage.memory:
+                    signal = np.array([*before, *before, *phase])
+                    stage.law(state, signal, parameters, previous[i])
             wrench = command.copy()
-            for i, attached, parameters in forces:
-                if isinstance(attached.effect.stage, Force):
-                    state = _state(world, i)
-                    attached.effect.stage.law(state, command[i], parameters, wrench[i])
+            for i, stage, parameters in forces:
+                stage.law(_state(world, i), command[i], parameters, wrench[i])
             for i, body in enumerate(world.bodies):
                 if world.kinematic[i]:
                     continue
-                weight = bodies[i, COLUMN["mass"]] * bodies[i, _EXTRA]
+                weight = bodies[i, COLUMN.mass] * bodies[i, _EXTRA]
                 x, y = _arm(body)
                 body.force = tuple(wrench[i, :2] + weight)
                 body.torque = wrench[i, 2] - (x * wrench[i, 1] - y * wrench[i, 0])
@@ -101,47 +107,20 @@ def rollout(
 
 
 def _laws(
-    effects: tuple[Attached, ...], stage: type, parameters: Array, names: list[str]
-) -> list[tuple[int, Attached, Array]]:
-    """Body, effect and parameters of each law of a stage."""
-    acting = at_stage(effects, stage)
-    edges = np.cumsum([0, *(len(attached.effect.parameters) for attached in acting)])
-    return [
-        (names.index(attached.body), attached, parameters[begin:end])
-        for attached, begin, end in zip(acting, edges[:-1], edges[1:], strict=True)
-    ]
-
-
-def _command(
-    attached: Attached,
-    state: Array,
-    command: Array,
-    previous: Array | None,
-    i: int,
-    phase: tuple[float, float],
-    parameters: Array,
-) -> None:
-    """Apply a command law to a body's command, and to the one before where that is known."""
-    stage = attached.effect.stage
-    if not isinstance(stage, Command):
-        return
-    before = np.zeros(3) if previous is None else previous[i]
-    stage.law(state, np.array([*command[i], *before, *phase]), parameters, command[i])
-    if previous is not None and not stage.memory:
-        stage.law(state, np.array([*before, *before, *phase]), parameters, previous[i])
-
-
-def _drive(world: World, action: Array) -> None:
-    """Give the kinematic bodies the velocities of the interval that begins."""
-    for i in np.flatnonzero(world.kinematic):
-        body = world.bodies[i]
-        body.velocity, body.angular_velocity = tuple(action[i, :2]), action[i, 2]
+    effects: tuple[Attached, ...], kind: type, parameters: Array, names: list[str]
+) -> Iterator[tuple[int, Any, Array]]:
+    """Yield body, stage and parameters of each law of a kind of stage."""
+    first = 0
+    for attached in at_stage(effects, kind):
+        last = first + len(attached.effect.parameters)
+        yield names.index(attached.body), attached.effect.stage, parameters[first:last]
+        first = last
 
 
 def _place_bodies(world: World, states: Array) -> None:
-    """Put the bodies in a state: the engine's velocity is that of the centre of mass."""
+    """Set the bodies' states; the engine's velocity is that of the centre of mass."""
     for body, state in zip(world.bodies, states, strict=True):
-        body.angle = state[2]  # first: the place of the centre hangs on it
+        body.angle = state[2]  # first: the centre's place depends on it
         body.position = tuple(state[:2])
         x, y = _arm(body)
         body.velocity = state[3] - state[5] * y, state[4] + state[5] * x
@@ -149,13 +128,14 @@ def _place_bodies(world: World, states: Array) -> None:
 
 
 def _arm(body: pymunk.Body) -> tuple[float, float]:
-    """From a body's origin to its centre of mass, in the world's frame."""
+    """Return the arm from a body's origin to its centre of mass, in the world's frame."""
     x, y = body.center_of_gravity
     c, s = math.cos(body.angle), math.sin(body.angle)
     return c * x - s * y, s * x + c * y
 
 
 def _state(world: World, i: int) -> Array:
+    """Return the state of a body's origin, shape (6,)."""
     body = world.bodies[i]
     x, y = _arm(body)
     turn = body.angular_velocity
@@ -164,43 +144,43 @@ def _state(world: World, i: int) -> Array:
 
 
 def _centre(world: World, i: int) -> Array:
-    """As the state, of the centre of mass, which goes straight within a substep."""
+    """Return the state of the centre of mass, which moves straight in a substep."""
     body = world.bodies[i]
     place = body.local_to_world(body.center_of_gravity)
     return np.array([*place, body.angle, *body.velocity, body.angular_velocity], dtype=float)
 
 
 def _place_wheels(world: World, bodies: Array, step: float) -> None:
-    """Put the rods' ends on the wheels' axes, as they will be when the engine solves for forces."""
+    """Put the rods' ends on the wheels' axes as predicted for the end of the substep."""
     for wheel in world.wheels:
         row = bodies[wheel.body]
         at_x, at_y, angle, v_x, v_y, omega = _centre(world, wheel.body)
         theta = angle + omega * step
         c, s = math.cos(theta), math.sin(theta)
-        x, y = row[COLUMN["w_x"]] - row[COLUMN["com_x"]], row[COLUMN["w_y"]] - row[COLUMN["com_y"]]
+        x, y = row[COLUMN.w_x] - row[COLUMN.com_x], row[COLUMN.w_y] - row[COLUMN.com_y]
         at_x, at_y = at_x + v_x * step + c * x - s * y, at_y + v_y * step + s * x + c * y
-        c, s = math.cos(theta + row[COLUMN["w_theta"]]), math.sin(theta + row[COLUMN["w_theta"]])
+        c, s = math.cos(theta + row[COLUMN.w_theta]), math.sin(theta + row[COLUMN.w_theta])
         wheel.along_x.anchor_b, wheel.along_y.anchor_b = (at_x + c, at_y + s), (at_x - s, at_y + c)
 
 
 def _place_patches(world: World, bodies: Array, step: float) -> None:
-    """Put each point's rod along its velocity, and share its friction with what holds it."""
+    """Put each point's rod along its velocity; split its friction with the pivot joint."""
     for patch in world.patches:
         row = bodies[patch.body]
         at_x, at_y, angle, v_x, v_y, omega = _centre(world, patch.body)
-        radius = row[COLUMN["patch_radius"]]
-        slowing = row[COLUMN["patch_mu"]] * world.scene.normal_gravity
-        most = slowing * row[COLUMN["mass"]] / len(RING)
+        radius = row[COLUMN.patch_radius]
+        slowing = row[COLUMN.patch_mu] * world.scene.normal_gravity
+        most = slowing * row[COLUMN.mass] / len(RING)
         theta = angle + omega * step
         c, s = math.cos(theta), math.sin(theta)
         for (x, y), hold, rod in zip(RING, patch.holds, patch.rods, strict=True):
-            x, y = x * radius - row[COLUMN["com_x"]], y * radius - row[COLUMN["com_y"]]
+            x, y = x * radius - row[COLUMN.com_x], y * radius - row[COLUMN.com_y]
             x, y = c * x - s * y, s * x + c * y
             along_x, along_y = v_x - omega * y, v_y + omega * x
             speed = math.sqrt(along_x * along_x + along_y * along_y)
             slow = STICKING * slowing * step
             share = 1.0 if speed >= slow else speed / slow
-            if speed == 0.0:  # any direction will do: the point rests
+            if speed == 0.0:  # at rest any direction will do
                 along_x, speed = 1.0, 1.0
             rod.anchor_b = (
                 at_x + v_x * step + x + along_x / speed,
@@ -210,7 +190,7 @@ def _place_patches(world: World, bodies: Array, step: float) -> None:
 
 
 def near_contact(world: World) -> bool:
-    """Whether bounding circles reach a wall or each other: the same test as the compiled path's."""
+    """Return whether bounding circles reach a wall or each other, as the compiled path does."""
     for i, body in enumerate(world.bodies):
         x, y = body.position
         for segment in world.obstacles:

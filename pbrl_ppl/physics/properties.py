@@ -1,8 +1,9 @@
-"""Phi and effects -> the numbers that the engine is given for each body, joint, disc and law."""
+"""Translation of phi and effects into the engine's numbers of bodies, joints, discs and laws."""
 
 from __future__ import annotations
 
-from typing import NamedTuple, NoReturn
+from collections import namedtuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +21,15 @@ from pbrl_ppl.effects import (
 )
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import BODY_PARAMETERS, Layout
-from pbrl_ppl.physics.scene_joints import JOINT_COLUMNS, SceneJoints
+from pbrl_ppl.physics.joints import JOINT_COLUMNS, SceneJoints
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
 #: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
 #: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
-#: (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m) are of the friction
-#: under it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) come on top of the scene's gravity.
+#: (N m s) act in the body's hinge, ``patch_mu`` (1) and ``patch_radius`` (m) describe the friction
+#: under it, ``extra_gravity_x`` and ``extra_gravity_y`` (m/s^2) are added to the scene's gravity.
 COLUMNS = (
     *BODY_PARAMETERS,
     "moment",
@@ -41,29 +42,27 @@ COLUMNS = (
     "com_x",
     "com_y",
 )
-COLUMN = {name: i for i, name in enumerate(COLUMNS)}
-_MAX = np.finfo(float).max
+#: Index of each column, by name.
+COLUMN: Any = namedtuple("COLUMN", COLUMNS)(*range(len(COLUMNS)))
 _POSITIVE = ("mass", "moment")
-#: How strong the friction under a body is: of a ring that carries it, and of a wheel.
+#: Columns of the friction coefficients of a ring under a body, and of a wheel.
 _PATCH, _WHEEL = ("patch_mu",), ("mu_x", "mu_y")
-_ANYTHING = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y", "com_x", "com_y")
-#: What an effect sees in place of a column: the moment follows from the mass, gravity is the whole.
-_GIVEN = {
+_ANY_SIGN = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y", "com_x", "com_y")
+#: Names that effects see in place of a column: moment per mass and the whole gravity.
+_SEEN = {
     "moment_per_mass": "moment",
     "gravity_x": "extra_gravity_x",
     "gravity_y": "extra_gravity_y",
 }
 #: Least value of each column.
-_LEAST = np.array(
-    [
-        np.nextafter(0, 1) if name in _POSITIVE else -_MAX if name in _ANYTHING else 0.0
-        for name in COLUMNS
-    ]
-)
+_LEAST = np.zeros(len(COLUMNS))
+_LEAST[[COLUMNS.index(name) for name in _POSITIVE]] = np.nextafter(0, 1)
+_LEAST[[COLUMNS.index(name) for name in _ANY_SIGN]] = -np.finfo(float).max
+_NEVER = np.full((1, 1), np.inf)
 
 
 class EngineInput(NamedTuple):
-    """What the engine is given, for each proposal.
+    """Numbers for the engine, for each proposal.
 
     Attributes
     ----------
@@ -77,7 +76,8 @@ class EngineInput(NamedTuple):
     commands, forces : ndarray
         Parameters of the command and of the force laws, one after the other, shape (proposal, q).
     indices : ndarray
-        Which of ``scene.joinable`` an inferred joint holds; shape (proposal, free joint, 2).
+        Indices into ``scene.joinable`` of an inferred joint's bodies, shape (proposal, free
+        joint, 2).
     """
 
     bodies: Array
@@ -88,15 +88,14 @@ class EngineInput(NamedTuple):
     indices: NDArray[np.int64]
 
 
-def _sets(attached: Attached) -> frozenset[str]:
-    """Names of a body's numbers that an effect changes, by a trial evaluation."""
+def _changed_columns(attached: Attached) -> frozenset[str]:
+    """Return the names of the body's numbers that an effect changes, by a trial evaluation."""
     stage = attached.effect.stage
     if not isinstance(stage, Properties):
         return frozenset()
-    row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *_GIVEN)}
+    row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *_SEEN)}
     centre = {p.name: np.full((1, 1), p.prior.centre) for p in attached.effect.parameters}
-    never = np.full((1, 1), np.inf)
-    stage.modify(row, centre, Clock(never, never, never))
+    stage.modify(row, centre, Clock(_NEVER, _NEVER, _NEVER))
     return frozenset(name for name, value in row.items() if value.any())
 
 
@@ -122,17 +121,18 @@ class EngineProperties:
         for i, body in enumerate(scene.moving):
             known = dict(body.known) | ({"mass": 1.0} if body.kinematic else {})  # not used
             for name in BODY_PARAMETERS:
-                self._known[i, COLUMN[name]] = known.get(name, 0.0)
+                index = COLUMNS.index(name)
+                self._known[i, index] = known.get(name, 0.0)
                 place = places.get(f"{name}[{body.owner}]")
                 if place is not None:
-                    moved.append((place, i, COLUMN[name]))
+                    moved.append((place, i, index))
         self._moved = np.array(moved, dtype=int).reshape(-1, 3).T
         self._unit_moment = np.array([body.shape.unit_moment for body in scene.moving])
         self._places = places
         stages = (Structure, Properties, Command, Force, Sensor)
         self._acting: dict[type, list[Attached]] = {s: at_stage(effects, s) for s in stages}
         self._bodies = bodies
-        #: Whether a body's numbers depend on the time.
+        #: Whether a body's numbers depend on time.
         self.timed = any(
             isinstance(attached.effect.stage, Properties) and attached.effect.stage.timed
             for attached in effects
@@ -142,11 +142,11 @@ class EngineProperties:
             for attached in self._acting[Structure]
             if isinstance(attached.effect.stage, Structure) and attached.effect.stage.rod
         ]
-        #: How many discs the structure stage adds.
+        #: Number of discs that the structure stage adds.
         self.n_discs = self._discs(np.zeros((1, layout.size))).shape[1]
-        #: Bodies that effects put friction under: rings, and wheels.
+        #: Bodies under which effects put a ring of friction, and a wheel.
         self.under = (self._changed(effects, _PATCH), self._changed(effects, _WHEEL))
-        #: Bodies that effects tie to a place, and each rod's place after the scene's joints.
+        #: Body and row among all joints of each rod that an effect adds.
         self.tied = tuple(
             (bodies.index(attached.body), len(scene.joints) + j)
             for j, (attached, _) in enumerate(self._tying)
@@ -154,22 +154,22 @@ class EngineProperties:
         self.joints = SceneJoints(scene, places)
 
     def _changed(self, effects: tuple[Attached, ...], names: tuple[str, ...]) -> tuple[int, ...]:
-        """Bodies of which effects change one of these numbers."""
-        own = {attached.body for attached in effects if _sets(attached).intersection(names)}
-        return tuple(i for i, name in enumerate(self._bodies) if name in own)
+        """Return the bodies for which effects change one of these columns."""
+        changed = {e.body for e in effects if _changed_columns(e).intersection(names)}
+        return tuple(i for i, name in enumerate(self._bodies) if name in changed)
 
     def slides(self, bodies: Array) -> NDArray[np.bool_]:
-        """Whether there is any of it, shape (proposal,), in numbers (proposal, 1, body, column)."""
+        """Return which proposals have floor friction from effects, shape (proposal,)."""
         found = np.zeros(len(bodies), dtype=bool)
-        for own, names in zip(self.under, (_PATCH, _WHEEL), strict=True):
-            columns = [COLUMN[name] for name in names]
-            found |= (bodies[:, :, list(own)][..., columns] > 0).any(axis=(1, 2, 3))
+        for under, names in zip(self.under, (_PATCH, _WHEEL), strict=True):
+            columns = [COLUMNS.index(name) for name in names]
+            found |= (bodies[:, :, list(under)][..., columns] > 0).any(axis=(1, 2, 3))
         return found
 
     def values(self, attached: Attached, phi: Array, axes: int = 0) -> dict[str, Array]:
-        """An effect's parameters by name, shape (proposal, 1, ...) with so many further axes.
+        """Return an effect's parameters by name, shape (proposal, 1, ...) with ``axes`` ones.
 
-        One that is not in phi has its null value.
+        A parameter that is not in phi has its null value.
         """
         result = {}
         for parameter, label in zip(attached.effect.parameters, attached.labels, strict=True):
@@ -179,26 +179,22 @@ class EngineProperties:
         return result
 
     def sensors(self, phi: Array) -> list[tuple[int, Sensor, Values]]:
-        """Body, sensor and its parameters, shape (proposal, 1, 1), in their order."""
+        """Return body, sensor and its parameters, shape (proposal, 1, 1), in the sensors' order."""
         return [
-            (
-                self._bodies.index(attached.body),
-                attached.effect.stage,
-                self.values(attached, phi, 2),
-            )
+            (self._bodies.index(attached.body), stage, self.values(attached, phi, 2))
             for attached in self._acting[Sensor]
-            if isinstance(attached.effect.stage, Sensor)
+            if isinstance(stage := attached.effect.stage, Sensor)
         ]
 
     def __call__(self, phi: Array, clock: Clock | None = None) -> EngineInput:
-        """Translate.
+        """Return the engine's numbers for proposals.
 
         Parameters
         ----------
         phi : ndarray
             Proposals, shape (proposal, p), in SI units.
         clock : Clock, optional
-            When the intervals are; after the recording without it.
+            Times of the intervals; by default they are after the recording.
 
         Raises
         ------
@@ -207,7 +203,12 @@ class EngineProperties:
             an index names nothing; the message names the body or joint.
         """
         if not np.isfinite(phi).all():
-            self._refuse_phi(phi)
+            first = int(np.argwhere(~np.isfinite(phi))[0, 1])
+            name, owner = self._layout.labels[first][:-1].split("[")
+            raise ParameterError(
+                f"{self._layout.owner_kind(first)} {owner!r}: {name} is not finite; give a finite"
+                " number"
+            )
         bodies = np.repeat(self._known[None], len(phi), axis=0)
         place, body, column = self._moved
         bodies[:, body, column] = phi[:, place]
@@ -220,46 +221,42 @@ class EngineProperties:
         return EngineInput(bodies, joints, self._discs(phi), commands, forces, indices)
 
     def _modified(self, bodies: Array, phi: Array, clock: Clock | None) -> Array:
-        """The properties stage, and the moments that follow from it."""
+        """Return properties after the properties stage, with the moments of inertia."""
         modifying = self._acting[Properties]
-        bodies[..., COLUMN["moment"]] = bodies[..., COLUMN["mass"]] * self._unit_moment
+        bodies[..., COLUMN.moment] = bodies[..., COLUMN.mass] * self._unit_moment
         if not modifying:
             return bodies[:, None]
-        never = np.full((1, 1), np.inf)
-        clock = clock if self.timed and clock is not None else Clock(never, never, never)
+        clock = clock if self.timed and clock is not None else Clock(_NEVER, _NEVER, _NEVER)
         m, gravity = clock.begin.shape[1], self._scene.gravity
         result = np.repeat(bodies[:, None], m, axis=1)
         for name in dict.fromkeys(attached.body for attached in modifying):
             i = self._bodies.index(name)
-            row = {key: result[:, :, i, column].copy() for key, column in COLUMN.items()}
-            for key in _GIVEN.values():
-                del row[key]
+            row = {
+                key: result[:, :, i, column].copy()
+                for column, key in enumerate(COLUMNS)
+                if key not in _SEEN.values()
+            }
             row["moment_per_mass"] = np.full((len(phi), m), self._unit_moment[i])
-            for key, own in zip(("gravity_x", "gravity_y"), gravity, strict=True):
-                row[key] = np.full((len(phi), m), own)
+            for key, value in zip(("gravity_x", "gravity_y"), gravity, strict=True):
+                row[key] = np.full((len(phi), m), value)
             for attached in modifying:
                 if attached.body == name and isinstance(attached.effect.stage, Properties):
                     attached.effect.stage.modify(row, self.values(attached, phi, 1), clock)
             row["moment"] = row["mass"] * row["moment_per_mass"]
             row["extra_gravity_x"] = row["gravity_x"] - gravity[0]
             row["extra_gravity_y"] = row["gravity_y"] - gravity[1]
-            for key, column in COLUMN.items():
+            for column, key in enumerate(COLUMNS):
                 result[:, :, i, column] = row[key]
         return result
 
     def _law_parameters(self, phi: Array, stage: type) -> Array:
-        """Parameters of the laws of a stage, one after the other, shape (proposal, q)."""
-        if not self._acting[stage]:
-            return np.empty((len(phi), 0))
-        columns = [
-            column
-            for attached in self._acting[stage]
-            for column in self.values(attached, phi).values()
-        ]
-        return np.stack(columns, axis=1)
+        """Return the parameters of the laws of a stage, one after another, shape (proposal, q)."""
+        laws = self._acting[stage]
+        columns = [column for law in laws for column in self.values(law, phi).values()]
+        return np.stack(columns, axis=1) if columns else np.empty((len(phi), 0))
 
     def _discs(self, phi: Array) -> Array:
-        """The structure stage's discs, shape (proposal, disc, 3)."""
+        """Return the structure stage's discs, shape (proposal, disc, 3)."""
         rows = [
             np.stack(np.broadcast_arrays(disc.x, disc.y, disc.radius), axis=-1)
             for attached in self._acting[Structure]
@@ -277,7 +274,7 @@ class EngineProperties:
         return discs
 
     def _rods(self, phi: Array) -> Array:
-        """The structure stage's rods, shape (proposal, rod, 5)."""
+        """Return the structure stage's rods, shape (proposal, rod, 5)."""
         rods = np.empty((len(phi), len(self._tying), len(JOINT_COLUMNS)))
         for j, (attached, rod) in enumerate(self._tying):
             ends = rod(self.values(attached, phi))
@@ -289,24 +286,14 @@ class EngineProperties:
             )
         return rods
 
-    def _refuse_phi(self, phi: Array) -> NoReturn:
-        """Name the first value that is not finite."""
-        place = int(np.argwhere(~np.isfinite(phi))[0, 1])
-        label = self._layout.labels[place]
-        name, owner = label[:-1].split("[")
-        raise ParameterError(
-            f"{self._layout.owner_kind(place)} {owner!r}: {name} is not finite; give a finite"
-            " number"
-        )
-
     def _check(self, bodies: Array) -> None:
-        """Refuse numbers that no body can have."""
+        """Refuse impossible numbers of bodies."""
         possible = (bodies >= _LEAST) & (bodies < np.inf)
         if possible.all():
             return
-        where_not = tuple(np.argwhere(~possible)[0])
-        *_, body, column = where_not
-        found, name = bodies[where_not], COLUMNS[column]
+        first = tuple(np.argwhere(~possible)[0])
+        *_, body, column = first
+        found, name = bodies[first], COLUMNS[column]
         where = f"body {self._scene.moving[body].name!r}: {name}"
         if not np.isfinite(found):
             raise ParameterError(f"{where} is not finite; give a finite number")

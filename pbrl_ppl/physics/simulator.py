@@ -20,8 +20,8 @@ from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
 from pbrl_ppl.physics.inputs import after_recording, check_shapes
+from pbrl_ppl.physics.joints import on_rod
 from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
-from pbrl_ppl.physics.rods import on_rod
 from pbrl_ppl.physics.world import FINER, World
 
 if TYPE_CHECKING:
@@ -270,8 +270,8 @@ class Simulator:
         own = self._properties
         patches, wheels = own.under if slides else ((), ())
         rods = tuple(compress(own.tied, there))
-        scene, hinges = self.physics.scene, own.joints.hinges
-        return World(scene, hinges, joined, own.n_discs, patches, wheels, rods)
+        scene, kinds = self.physics.scene, own.joints.kinds
+        return World(scene, kinds, joined, own.n_discs, patches, wheels, rods)
 
     def _run_plain(
         self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array

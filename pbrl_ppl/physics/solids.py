@@ -1,4 +1,4 @@
-"""Solids of convex parts, and how deep they lie in each other."""
+"""Solids of convex parts: penetration depths, and contacts within an interval."""
 
 from __future__ import annotations
 
@@ -8,20 +8,26 @@ from itertools import combinations, product
 
 import numpy as np
 import pymunk
+from numpy.typing import NDArray
 
 from pbrl_ppl.physics.properties import Array
-from pbrl_ppl.physics.world import _shapes
+from pbrl_ppl.physics.world import engine_shapes
 from pbrl_ppl.scene import WORLD, Body, Scene
 
 Pairs = tuple[tuple[int, int], ...]
+#: Number of poses checked along each body's path.
+_POSES = 5
+#: Accuracy of outlines as a share of a body's width (engines round corners by about as much), and
+#: greatest distance from the nearest checked pose as a share of the path.
+_OUTLINE, _SHARE = 0.05, 0.5 / (_POSES - 1)
 
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A body in its own frame, or a wall in the world's.
+    """A body in its frame, or a wall in the world's.
 
-    ``parts`` are convex: corners (k, 2) counter-clockwise and a radius about them; one corner is a
-    circle, two are a wall. All of them are within ``reach`` of the ``core``, a segment (2, 2).
+    ``parts`` are convex: corners (k, 2) counter-clockwise and a radius around them; one corner is a
+    circle, two are a wall. All parts are within ``reach`` of the ``core``, a segment (2, 2).
     """
 
     name: str
@@ -32,16 +38,15 @@ class Solid:
 
 
 def solid_of(body: Body) -> Solid:
-    """Describe a moving or static body."""
-    parts: list[tuple[Array, float]] = []
-    for shape in _shapes(body, pymunk.Body()):
-        if isinstance(shape, pymunk.Poly):
-            parts.append((np.array(shape.get_vertices()), 0.0))
-        else:
-            parts.append((np.zeros((1, 2)), float(body.shape.radius or 0.0)))
+    """Return the solid of a moving or static body."""
+    if body.shape.radius:
+        parts = [(np.zeros((1, 2)), float(body.shape.radius))]
+    else:
+        shapes = engine_shapes(body, pymunk.Body())
+        parts = [(np.array(s.get_vertices()), 0.0) for s in shapes if isinstance(s, pymunk.Poly)]
     x_min, x_max, y_min, y_max = body.shape.bounds
     width = min(x_max - x_min, y_max - y_min)
-    if len(parts) > 1:  # no part of a thin frame can lie as deep as the whole is wide
+    if len(parts) > 1:  # a part of a thin frame is never as deep as the frame is wide
         width = min(width, max(float(np.ptp(corners, axis=0).min()) for corners, _ in parts))
     return Solid(body.name, tuple(parts), np.zeros((2, 2)), body.shape.bounding_radius, width)
 
@@ -50,8 +55,8 @@ def solid_of(body: Body) -> Solid:
 class Scenery:
     """Solids of a scene: moving bodies, then walls and static bodies.
 
-    ``fixed`` are the poses of those that do not move, shape (fixed, 3); ``pairs`` are the solids
-    that nothing joins, the first of which moves.
+    ``fixed`` are the poses of walls and static bodies, shape (fixed, 3); ``pairs`` are the pairs of
+    solids without a common joint, a moving body first.
     """
 
     solids: tuple[Solid, ...]
@@ -59,7 +64,7 @@ class Scenery:
     pairs: Pairs
 
     def with_fixed(self, moving: Array) -> Array:
-        """Poses or states (n, body, 3 or 6) of all solids, shape (n, solid, 3 or 6)."""
+        """Return poses or states (n, body, 3 or 6) of all solids, shape (n, solid, 3 or 6)."""
         n, _, width = moving.shape
         still = np.zeros((n, len(self.fixed), width))
         still[..., :3] = self.fixed
@@ -68,7 +73,7 @@ class Scenery:
 
 @lru_cache(maxsize=16)
 def scenery(scene: Scene) -> Scenery:
-    """Describe what a scene's bodies may meet."""
+    """Return the solids of a scene, and which of them may touch."""
     static = [body for body in scene.bodies if body.static]
     walls = [np.array([wall.start, wall.end]) for wall in scene.walls]
     solids = [solid_of(body) for body in scene.moving]
@@ -86,13 +91,13 @@ def scenery(scene: Scene) -> Scenery:
 
 
 def depth(a: Solid, poses_a: Array, b: Solid, poses_b: Array) -> Array:
-    """Penetration depth of the deepest parts of two solids at each pose (m), shape (n,)."""
+    """Return the greatest penetration depth of two solids' parts at each pose (m), shape (n,)."""
     parts = product(a.parts, b.parts)
     return np.asarray(np.max([depth_of(p, poses_a, q, poses_b) for p, q in parts], axis=0))
 
 
 def circles(solids: tuple[Solid, ...], pairs: Pairs, poses: Array) -> Array:
-    """Penetration depth of each pair's bounding circles, or of one and a wall: (n, pair)."""
+    """Return penetration depths of bounding circles, or of one and a wall (m): (n, pair)."""
     i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
     cores = np.array([solid.core for solid in solids])
     reach = np.array([solid.reach for solid in solids])
@@ -102,7 +107,7 @@ def circles(solids: tuple[Solid, ...], pairs: Pairs, poses: Array) -> Array:
 
 
 def put(points: Array, poses: Array) -> Array:
-    """Points (k, 2) of a body's frame in the world, at each pose (n, 3): shape (n, k, 2)."""
+    """Return points (k, 2) of a body's frame in the world at each pose (n, 3): (n, k, 2)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = points.T
     return np.stack([c * x - s * y + poses[:, :1], s * x + c * y + poses[:, 1:2]], axis=-1)
@@ -111,9 +116,9 @@ def put(points: Array, poses: Array) -> Array:
 def depth_of(
     part_a: tuple[Array, float], poses_a: Array, part_b: tuple[Array, float], poses_b: Array
 ) -> Array:
-    """Penetration depth of two convex parts at each pose (m); negative if they are apart.
+    """Return the penetration depth of two convex parts at each pose (m); negative if apart.
 
-    The engine's own answer is not used: it is zero for polygons whose centres coincide.
+    The engine's answer is not used: it is zero for polygons whose centres coincide.
     """
     a, b = put(part_a[0], poses_a), put(part_b[0], poses_b)
     radii = part_a[1] + part_b[1]
@@ -125,7 +130,7 @@ def depth_of(
 
 
 def _behind(a: Array, b: Array) -> Array:
-    """Least depth of corners b behind an edge of a (separating axes), shape (n,)."""
+    """Return the least depth of corners b behind an edge of a (separating axes), (n,)."""
     least = np.full(len(a), np.inf)
     for corner, after in zip(
         np.moveaxis(a, 1, 0), np.moveaxis(np.roll(a, -1, 1), 1, 0), strict=True
@@ -138,7 +143,7 @@ def _behind(a: Array, b: Array) -> Array:
 
 
 def _distance(point: Array, corners: Array) -> Array:
-    """Distance of a point (n, 2) from corners (n, k, 2), negative inside a polygon, shape (n,)."""
+    """Return the distance of points (n, 2) from polygons (n, k, 2), negative inside, (n,)."""
     edge = np.roll(corners, -1, axis=1) - corners
     arm = point[:, None] - corners
     distance = to_segment(arm, edge).min(axis=1)
@@ -148,7 +153,70 @@ def _distance(point: Array, corners: Array) -> Array:
 
 
 def to_segment(arm: Array, edge: Array) -> Array:
-    """Distance of points from segments, given from each one's begin (..., 2); it may be a point."""
+    """Return the distance of points from segments, both relative to the begin (..., 2)."""
     square = np.maximum((edge**2).sum(axis=-1), np.finfo(float).tiny)
     share = np.clip((arm * edge).sum(axis=-1) / square, 0.0, 1.0)
     return np.asarray(np.hypot(*np.moveaxis(arm - share[..., None] * edge, -1, 0)))
+
+
+def touching(scene: Scene, begin: Array, end: Array) -> NDArray[np.bool_]:
+    """Return whether bodies touch within an interval, or come so near that they may.
+
+    Parameters
+    ----------
+    scene : Scene
+        Shapes, walls and static bodies. Joined bodies do not collide, and bodies that follow a
+        path are left out.
+    begin, end : ndarray
+        States, shape (transition, body, 6), SI units.
+
+    Returns
+    -------
+    ndarray of bool
+        Shape (transition,).
+    """
+    world = scenery(scene)
+    begin, end = world.with_fixed(begin), world.with_fixed(end)
+    kinematic = {i for i, body in enumerate(scene.moving) if body.kinematic}
+    touched = np.zeros(len(begin), dtype=bool)
+    pairs = tuple(pair for pair in world.pairs if kinematic.isdisjoint(pair))
+    if not pairs:
+        return touched
+    near = _near(world, pairs, begin, scene.time_step) | _near(world, pairs, end, scene.time_step)
+    for p in np.flatnonzero(near.any(axis=0)):
+        (i, j), rows = pairs[p], np.flatnonzero(near[:, p])
+        first, last = begin[rows][:, (i, j)], end[rows][:, (i, j)]
+        touched[rows] |= _touch_on_path(
+            world.solids[i], world.solids[j], first, last, scene.time_step
+        )
+    return touched
+
+
+def _near(world: Scenery, pairs: Pairs, states: Array, dt: float) -> NDArray[np.bool_]:
+    """Return the pairs whose bounding circles may meet within an interval, (n, pair)."""
+    i, j = np.array(pairs).T
+    width = np.array([solid.width for solid in world.solids])
+    rate = states[:, i, 3:5] - states[:, j, 3:5]
+    way = dt * (1.0 + _SHARE) * np.hypot(rate[..., 0], rate[..., 1])
+    way += _OUTLINE * np.minimum(width[i], width[j])
+    return np.asarray(circles(world.solids, pairs, states) > -way)
+
+
+def _touch_on_path(a: Solid, b: Solid, begin: Array, end: Array, dt: float) -> NDArray[np.bool_]:
+    """Return whether two solids touch on a free path from begin or end, (transition, 2, 6).
+
+    If they touched, they would overlap on one of the paths that they would take without contact.
+    """
+    outline = _OUTLINE * min(a.width, b.width)
+    touched = np.zeros(len(begin), dtype=bool)
+    for state, way in ((begin, dt), (end, -dt)):
+        rate = state[:, 0, 3:5] - state[:, 1, 3:5]
+        reach = outline + dt * _SHARE * np.hypot(rate[:, 0], rate[:, 1])
+        gap = reach + dt * _SHARE * np.abs(state[..., 5]) @ np.array([a.reach, b.reach])
+        for share in np.linspace(0.0, 1.0, _POSES if state[..., 3:].any() else 1):
+            at = state[..., :3] + share * way * state[..., 3:]
+            # bounding circles hold however fast a body turns
+            near = np.flatnonzero(circles((a, b), ((0, 1),), at)[:, 0] > -reach)
+            if len(near):
+                touched[near] |= depth(a, at[near, 0], b, at[near, 1]) > -gap[near]
+    return touched

@@ -1,8 +1,9 @@
-"""Trial of a user's own effect, in plain Python, before it runs inside a fit."""
+"""Trial evaluation of a user's effect in plain Python, before it runs inside a fit."""
 
 from __future__ import annotations
 
 import threading
+from concurrent.futures import Future, wait
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,6 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import (
     Clock,
     Command,
-    Disc,
     Effect,
     Force,
     Noise,
@@ -26,51 +26,48 @@ from pbrl_ppl.scene import Body, Scene
 
 Array = NDArray[np.float64]
 
-#: A trial that takes longer (s) hangs.
+#: Time after which a trial counts as an endless loop (s).
 PATIENCE = 10.0
 #: Parameter values drawn from the prior, beside the null value.
 _DRAWS = 4
 
 
 def try_effect(effect: Effect, scene: Scene, history: History, patience: float = PATIENCE) -> None:
-    """Run what an effect is made of once, at measured states and values from its prior.
+    """Evaluate an effect's functions at a measured state and at parameters from its prior.
 
-    Compiled into the rollout, a law that raises would stop half way without a word, and one that
-    hangs could not be interrupted.
+    In the compiled rollout, a law that raises would stop silently, and an endless one could not be
+    interrupted.
 
     Parameters
     ----------
     effect : Effect
-        To try.
+        Effect to evaluate.
     scene, history : Scene and History
-        What it would act on.
+        Scene and data that it would act on.
     patience : float
         Time limit (s).
 
     Raises
     ------
     EffectError
-        If it raises, gives what is not a finite number, or does not return in time.
+        If it raises, returns a number that is not finite, or does not return in time.
     """
-    outcome: list[Exception | None] = []
+    outcome: Future[None] = Future()
 
     def run() -> None:
         try:
             _try(effect, scene, history)
+            outcome.set_result(None)
         except Exception as error:
-            outcome.append(error)
-        else:
-            outcome.append(None)
+            outcome.set_exception(error)
 
-    thread = threading.Thread(target=run, daemon=True)
-    thread.start()
-    thread.join(patience)
-    if not outcome:
+    threading.Thread(target=run, daemon=True).start()  # an endless one must not keep the process
+    if not wait([outcome], patience).done:
         raise EffectError(
             f"effect {effect.name} did not return within {patience:g} s when it was tried once; is"
             " there a loop in it that does not end?"
         )
-    error = outcome[0]
+    error = outcome.exception()
     if isinstance(error, EffectError):
         raise error
     if error is not None:
@@ -87,11 +84,11 @@ def _try(effect: Effect, scene: Scene, history: History) -> None:
     values = np.vstack([effect.null, drawn.T])
     for body in bodies:
         if effect.scan is not None:
-            looks = np.asarray(effect.scan(scene, history, body), dtype=float)
-            if looks.ndim != 2 or looks.shape[1] != len(effect.parameters):
+            points = np.asarray(effect.scan(scene, history, body), dtype=float)
+            if points.ndim != 2 or points.shape[1] != len(effect.parameters):
                 raise EffectError(
-                    f"effect {effect.name}: scan gave shape {looks.shape}, expected"
-                    f" (look, {len(effect.parameters)})"
+                    f"effect {effect.name}: scan gave shape {points.shape}, expected"
+                    f" (point, {len(effect.parameters)})"
                 )
         state = _middle(history, body)
         for row in values:
@@ -108,14 +105,14 @@ def _try(effect: Effect, scene: Scene, history: History) -> None:
 
 
 def _middle(history: History, body: Body) -> Array:
-    """A measured state of a body, 0 where there is none, shape (6,)."""
+    """Return a complete measured state of a body, or zeros, shape (6,)."""
     states = history.dataset["start"].sel(body=body.name).to_numpy().reshape(-1, 6)
-    whole = states[np.isfinite(states).all(axis=1)]
-    return np.asarray(whole[len(whole) // 2] if len(whole) else np.zeros(6))
+    states = states[np.isfinite(states).all(axis=1)]
+    return np.asarray(states[len(states) // 2] if len(states) else np.zeros(6))
 
 
 def _applied(effect: Effect, state: Array, parameters: Array) -> Array:
-    """What the effect makes of a state at values of its parameters, as one array."""
+    """Return the results of an effect's functions at a state and parameters, as one array."""
     stage: Any = effect.stage
     named = {
         parameter.name: np.array([[value]])
@@ -138,10 +135,9 @@ def _applied(effect: Effect, state: Array, parameters: Array) -> Array:
         measured = stage.measure(state[None].copy(), flat)
         return np.concatenate([np.ravel(measured), np.ravel(stage.invert(measured, flat))])
     if isinstance(stage, Structure):
-        discs: tuple[Disc, ...] = stage.discs(named)
-        rods = () if stage.rod is None else (stage.rod(named),)
-        added = [(disc.x, disc.y, disc.radius) for disc in discs] + [tuple(rod) for rod in rods]
-        return np.concatenate([np.ravel(numbers) for numbers in added])
+        discs = [(disc.x, disc.y, disc.radius) for disc in stage.discs(named)]
+        rods = [] if stage.rod is None else [tuple(stage.rod(named))]
+        return np.concatenate([np.ravel(numbers) for numbers in (*discs, *rods)])
     if isinstance(stage, Noise):
         return np.ravel(np.asarray(stage.tail(named), dtype=float))
     raise EffectError(f"effect {effect.name}: {stage!r} is no stage")

@@ -1,10 +1,13 @@
-"""The contact-free rollout says what the engine says, whatever a lone body hangs in or drags."""
+"""The contact-free fast path of single bodies agrees with the engine."""
+
+import dataclasses
 
 import numpy as np
 import pytest
 
 from pbrl_ppl.effects import attach
 from pbrl_ppl.physics import Physics, Simulator, build_layout, calls, compiled, lockstep
+from pbrl_ppl.physics.joints import HINGE
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.engines import ARM, BOX, proposals
@@ -123,7 +126,7 @@ def test_it_agrees_with_the_engine(name) -> None:
 
 
 @pytest.mark.parametrize("name", ["wheel", "walls", "patch", "hinge"])
-def test_lanes_do_not_depend_on_each_other(name) -> None:
+def test_transitions_of_a_block_do_not_depend_on_each_other(name) -> None:
     simulator, phi, start, inputs = case(name)
     whole = simulator(phi, start, inputs)
     order = np.random.default_rng(1).permutation(len(start))
@@ -132,7 +135,7 @@ def test_lanes_do_not_depend_on_each_other(name) -> None:
     np.testing.assert_array_equal(one, whole[1, :10])
 
 
-def test_arrays_of_every_kind_take_what_is_compiled_already() -> None:
+def test_arrays_of_every_layout_use_the_same_machine_code() -> None:
     """The rollouts take ten seconds to compile, and would again for another kind of array."""
     for name in ("wheel", "walls", "sensor"):
         simulator, phi, start, inputs = case(name)
@@ -145,7 +148,7 @@ def test_arrays_of_every_kind_take_what_is_compiled_already() -> None:
         assert len(compiled_once.signatures) == 1
 
 
-def test_what_comes_near_something_is_left_to_the_engine() -> None:
+def test_contacts_are_left_to_the_engine() -> None:
     """Near the walls as the engine has it, and elsewhere as if there were none."""
     near, phi, start, inputs = case("walls")
     far = case("wheel")[0]
@@ -157,7 +160,7 @@ def test_what_comes_near_something_is_left_to_the_engine() -> None:
 
 @pytest.mark.parametrize("at_the_wall", [(0,), (1,), (2,), (0, 2), ()])
 def test_one_of_several_bodies_at_a_wall_is_enough(at_the_wall) -> None:
-    """It bounces off, whichever it is, and whatever the others do."""
+    """Any of them bounces off, whatever the others do."""
     wall = Wall((-1.0, -90.0), (-1.0, 90.0))
     known = {"mass": 2.0, "r": 0.5, "mu_c": 0.3}
     bodies = tuple(Body(name, Shape.circle(0.2), known=known) for name in "abc")
@@ -176,12 +179,19 @@ def test_one_of_several_bodies_at_a_wall_is_enough(at_the_wall) -> None:
     assert (ours[:, -1, :, 0] > -0.85).all()
 
 
-def test_bodies_that_nothing_ties_are_free() -> None:
+def test_bodies_without_joints_to_others_are_free() -> None:
     assert len(lockstep.free_bodies(World(SCENES["wheel"]))) == 1
     bodies = (Body("a", BOX), Body("b", BOX, wheel=True))
     two = SCENES["wheel"].replace(bodies=bodies)
     assert [free.wheel for free in lockstep.free_bodies(World(two))] == [False, True]
     joint = Joint("hinge", ("a", "b"), (0.5, 0.0), (-0.5, 0.0))
-    assert not lockstep.free_bodies(World(two.replace(joints=(joint,)), (True,)))
+    assert not lockstep.free_bodies(World(two.replace(joints=(joint,)), (HINGE,)))
     pushed = (bodies[0], Body("finger", BOX, kinematic=True))
     assert not lockstep.free_bodies(World(two.replace(bodies=pushed)))
+
+
+def test_a_joint_without_contact_free_arithmetic_is_left_to_the_engine() -> None:
+    slider = dataclasses.replace(HINGE, contact_free=False)
+    scene = SCENES["hinge"]
+    assert lockstep.free_bodies(World(scene, (HINGE,)))
+    assert not lockstep.free_bodies(World(scene, (slider,)))

@@ -1,4 +1,4 @@
-"""Joined bodies side by side: the engine's numbers, whatever shares a block, and nothing lost."""
+"""The contact-free fast path of joined bodies agrees with the engine."""
 
 import dataclasses
 
@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.physics import Physics, Simulator, calls, compiled, lockstep_chain
+from pbrl_ppl.physics.joints import HINGE
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Body, Scene, Wall
 from tests.helpers.chains import LINK, cart_with_trailers, case, chain
@@ -38,7 +39,7 @@ def like(sim: Simulator, **options) -> Simulator:
 
 @pytest.fixture
 def engine_items(monkeypatch) -> list[int]:
-    """Which items go to the engine."""
+    """Items that go to the engine."""
     items: list[int] = []
     rollout = compiled.rollout
 
@@ -57,7 +58,7 @@ def test_it_agrees_with_the_engine(name, extrapolate, engine_items) -> None:
     sim = like(sim, extrapolate=extrapolate)
     got = sim(phi, start, inputs)
     expected = like(sim, extrapolate=extrapolate, engine="python")(phi, start, inputs)
-    assert not engine_items  # and it is the lane that said so
+    assert not engine_items  # the fast path predicted all of them
     assert np.isfinite(expected).all()
     np.testing.assert_allclose(got, expected, rtol=1e-11, atol=1e-11)
 
@@ -86,7 +87,7 @@ def unequal() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
     return sim, phi, start, inputs
 
 
-def test_iterations_are_each_ones_own(engine_items) -> None:
+def test_iterations_depend_on_each_proposal_alone(engine_items) -> None:
     sim, phi, start, inputs = unequal()
     whole = sim(phi, start, inputs)
     for one, expected in zip(phi, whole, strict=True):
@@ -96,7 +97,7 @@ def test_iterations_are_each_ones_own(engine_items) -> None:
     assert not engine_items
     plain = like(sim, engine="python")(phi, start[:2], inputs[:2])
     np.testing.assert_allclose(whole[:, :2], plain, rtol=1e-11, atol=1e-11)
-    # the most unequal ones do hang on their number
+    # the most unequal masses do depend on the number of iterations
     fewer = sim(phi[1], start[:2], inputs[:2])
     assert np.abs(fewer - whole[3, :2]).max() > 1e-3
 
@@ -115,7 +116,7 @@ def test_wheels_and_patches_rest_when_their_iterations_are_done(name) -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_lanes_do_not_depend_on_each_other(name) -> None:
+def test_transitions_of_a_block_do_not_depend_on_each_other(name) -> None:
     sim, phi, start, inputs = case(*CASES[name], seed=4, n=40)
     whole = sim(phi, start, inputs)
     order = np.random.default_rng(1).permutation(len(start))
@@ -125,7 +126,7 @@ def test_lanes_do_not_depend_on_each_other(name) -> None:
         np.testing.assert_array_equal(like(sim, threads=threads)(phi, start, inputs), whole)
 
 
-def test_what_comes_near_something_is_left_to_the_engine(engine_items) -> None:
+def test_contacts_are_left_to_the_engine(engine_items) -> None:
     """A wall beside the chain, and links that fold up."""
     walls = (Wall((0.4, -9.0), (0.4, 9.0)),)
     sim, phi, start, inputs = case(chain("hhh", walls=walls), ("com_offset",), seed=6, n=30)
@@ -187,11 +188,13 @@ def test_energy_and_momentum_are_kept() -> None:
     assert drifts("-hh", 40)[1] / drifts("-hh", 80)[1] > 5.0
 
 
-def test_which_worlds_are_for_it() -> None:
-    assert lockstep_chain.chain_of(World(chain("hh"), (True, True))) is not None
-    assert lockstep_chain.chain_of(World(chain("h"), (True,))) is None  # nothing is joined to it
+def test_worlds_for_the_fast_path() -> None:
+    assert lockstep_chain.chain_of(World(chain("hh"), (HINGE, HINGE))) is not None
+    assert (
+        lockstep_chain.chain_of(World(chain("h"), (HINGE,))) is None
+    )  # no two moving bodies are joined
     pushed = chain("hh").replace(bodies=(*chain("hh").bodies, Body("finger", LINK, kinematic=True)))
-    assert lockstep_chain.chain_of(World(pushed, (True, True))) is None
+    assert lockstep_chain.chain_of(World(pushed, (HINGE, HINGE))) is None
 
 
 # -- single bodies ---------------------------------------------------------------------------------

@@ -1,6 +1,8 @@
 """Every way of running the engine gives the same answer."""
 
 import pickle
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.physics import Physics, Simulator, build_layout, calls
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.engines import BOX, CASES, chain, mixed, proposals, ring
+from tests.helpers.places import ROOT
 from tests.helpers.worlds import body, simulator, state
 
 pytestmark = [
@@ -216,3 +219,26 @@ def test_one_substep_is_not_extrapolated() -> None:
     np.testing.assert_allclose(one[0, 0, 0], state(vy=-0.1), atol=1e-15)
     two = simulator(scene, substeps=2)(phi, start, actions)
     np.testing.assert_allclose(two[0, 0, 0], state(y=-0.005, vy=-0.1), atol=1e-15)
+
+
+CODE = """
+from concurrent.futures import ThreadPoolExecutor
+import numpy as np
+from tests.helpers.engines import cart, proposals
+
+sim, start, actions = cart(walls=True)
+phi = proposals(sim.physics.layout, 20)
+expected = sim(phi, start, actions)
+with ThreadPoolExecutor(3) as pool:
+    results = list(pool.map(lambda _: sim(phi, start, actions), range(9)))
+same = [np.array_equal(result, expected, equal_nan=True) for result in results]
+raise SystemExit(not all(same))
+"""
+
+
+def test_calls_at_the_same_time_do_not_disturb_each_other() -> None:
+    """Chains in threads share the Op; the engine would abort the whole process, hence a child."""
+    done = subprocess.run(
+        [sys.executable, "-c", CODE], cwd=ROOT, timeout=60, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr

@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import check_placement
-from pbrl_ppl.physics.world import _shapes
+from pbrl_ppl.physics.world import engine_shapes
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.places import ROOT
 from tests.helpers.worlds import body, predict, state
@@ -322,7 +322,7 @@ def outlines(body: Body, pose) -> list[np.ndarray]:
         way = np.linspace(0, 2 * np.pi, 400, endpoint=False)
         parts = [body.shape.radius * np.column_stack([np.cos(way), np.sin(way)])]
     else:
-        parts = [np.array(part.get_vertices()) for part in _shapes(body, pymunk.Body())]
+        parts = [np.array(part.get_vertices()) for part in engine_shapes(body, pymunk.Body())]
     return [part @ turn.T + (x, y) for part in parts]
 
 

@@ -78,5 +78,5 @@ def test_a_scan_of_another_shape_is_refused(history) -> None:
         Force(lambda state, command, parameters, wrench: None),
         scan=scan,
     )
-    with pytest.raises(EffectError, match=r"scan gave shape \(3, 2\), expected \(look, 1\)"):
+    with pytest.raises(EffectError, match=r"scan gave shape \(3, 2\), expected \(point, 1\)"):
         try_effect(effect, PUCK, history)

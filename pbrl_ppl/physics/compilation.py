@@ -1,0 +1,52 @@
+"""Compilation of this room's loops to machine code, and the cache of it on disk."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+
+from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
+
+
+def sources_digest(folder: Path) -> str:
+    """Return a digest of a folder's Python files and of the columns that they index by number."""
+    digest = hashlib.sha256(repr((BODY_PARAMETERS, JOINT_ANCHORS)).encode())
+    for path in sorted(folder.glob("*.py")):
+        digest.update(f"{path.name}\0".encode() + path.read_bytes() + b"\0")
+    return digest.hexdigest()
+
+
+SOURCES = sources_digest(Path(__file__).parent)
+
+
+def disk_cache(function: Callable[..., Any], digest: str) -> FunctionCache:
+    """Return numba's cache of a function, whose entries are valid for one digest of the sources.
+
+    Numba itself compares the time and size of the file that defines the function, and misses
+    changes of the functions and constants that it uses from other files.
+
+    Raises
+    ------
+    RuntimeError
+        If neither the package's folder nor the user's cache folder can be written to.
+    """
+    cache = FunctionCache(function)
+    cache._cache_file = IndexDataCacheFile(cache.cache_path, cache._impl.filename_base, digest)
+    return cache
+
+
+def compiled(function: Callable[..., Any]) -> Any:
+    """Return a function as numba compiles it, without the GIL and with a cache on disk.
+
+    Where no folder can be written to, each process compiles it again.
+    """
+    dispatcher = numba.njit(nogil=True)(function)
+    with suppress(RuntimeError):
+        dispatcher._cache = disk_cache(function, SOURCES)
+    return dispatcher

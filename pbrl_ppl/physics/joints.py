@@ -1,0 +1,235 @@
+"""Joints in the engine: a table of their kinds, their numbers from phi, and states on rods."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import pymunk
+from numpy.typing import NDArray
+
+from pbrl_ppl.errors import ParameterError
+from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
+from pbrl_ppl.scene import WORLD, Scene
+
+Array = NDArray[np.float64]
+
+#: Columns of a joint's numbers: its anchors and its length (m).
+JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
+A_X, A_Y, B_X, B_Y, LENGTH = range(len(JOINT_COLUMNS))
+#: A distance joint shorter than this (m) is a hinge in the engine.
+_NO_LENGTH = 1e-9
+#: Newton steps of :func:`on_rod`; each squares the remaining relative error.
+_STEPS = 3
+
+
+class Setting(NamedTuple):
+    """A property of a pymunk constraint, the C function that sets it, and the columns it takes."""
+
+    attribute: str
+    function: str
+    columns: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class JointKind:
+    """What a kind of joint is in the engine.
+
+    A new kind is one more entry of :data:`JOINT_KINDS`; without contact-free arithmetic, worlds
+    that have one are left to the engine.
+
+    Attributes
+    ----------
+    constraint : callable
+        Makes the pymunk constraint of two bodies, with both anchors at their origins.
+    settings : tuple of Setting
+        Properties of the constraint, in the order in which they are set.
+    gap : callable
+        Distance of the anchors from that in the reference poses (m).
+    friction : bool
+        Whether the effects of friction and damping in a hinge act in it.
+    contact_free : bool
+        Whether the contact-free fast path has its arithmetic.
+    """
+
+    constraint: Callable[[pymunk.Body, pymunk.Body], pymunk.Constraint]
+    settings: tuple[Setting, ...]
+    gap: Callable[[float], float]
+    friction: bool = False
+    contact_free: bool = False
+
+
+HINGE = JointKind(
+    constraint=lambda a, b: pymunk.PivotJoint(a, b, (0, 0), (0, 0)),
+    settings=(
+        Setting("anchor_a", "cpPivotJointSetAnchorA", (A_X, A_Y)),
+        Setting("anchor_b", "cpPivotJointSetAnchorB", (B_X, B_Y)),
+    ),
+    gap=lambda distance: 0.0,
+    friction=True,
+    contact_free=True,
+)
+ROD = JointKind(
+    constraint=lambda a, b: pymunk.PinJoint(a, b, (0, 0), (0, 0)),
+    settings=(
+        Setting("anchor_a", "cpPinJointSetAnchorA", (A_X, A_Y)),
+        Setting("anchor_b", "cpPinJointSetAnchorB", (B_X, B_Y)),
+        Setting("distance", "cpPinJointSetDist", (LENGTH,)),
+    ),
+    gap=lambda distance: distance,
+    contact_free=True,
+)
+#: Every kind that a scene can declare.
+JOINT_KINDS = {"hinge": HINGE, "distance": ROD}
+
+
+class SceneJoints:
+    """Translates parameter vectors into the numbers of the joints that a scene declares.
+
+    Parameters
+    ----------
+    scene : Scene
+        Its joints, and the poses that their lengths follow from.
+    places : dict of str to int
+        Place of each label in phi.
+    """
+
+    def __init__(self, scene: Scene, places: dict[str, int]) -> None:
+        self._scene = scene
+        self._anchors = np.zeros((len(scene.joints), 4))
+        self._held = np.zeros((len(scene.joints), 2), dtype=int)
+        fixed = (body.name for body in scene.bodies if body.static or body.kinematic)
+        holders = [*scene.joinable, *fixed]
+        poses = {body.name: body.pose for body in scene.bodies} | {WORLD: None}
+        self._poses = np.array([poses[name] or (0.0, 0.0, 0.0) for name in holders])
+        moved, free = [], []
+        for j, (owner, joint) in enumerate(zip(scene.joint_names, scene.joints, strict=True)):
+            self._anchors[j] = (*(joint.anchor_a or (0, 0)), *(joint.anchor_b or (0, 0)))
+            for column, name in enumerate(JOINT_ANCHORS):
+                place = places.get(f"{name}[{owner}]")
+                if place is not None:
+                    moved.append((place, j, column))
+            if joint.bodies is not None:
+                self._held[j] = [holders.index(name) for name in joint.bodies]
+            else:
+                free.append((j, *(places[f"{name}[{owner}]"] for name in JOINT_INDICES)))
+        self._moved_anchors = np.array(moved, dtype=int).reshape(-1, 3).T
+        self._free = np.array(free, dtype=int).reshape(-1, 3)
+        lengths = self._lengths(self._anchors, self._held)
+        #: Kind of each joint in the engine.
+        self.kinds = tuple(
+            HINGE
+            if joint.kind == "distance" and joint.known and length < _NO_LENGTH
+            else JOINT_KINDS[joint.kind]
+            for joint, length in zip(scene.joints, lengths, strict=True)
+        )
+
+    def _lengths(self, anchors: Array, held: NDArray[np.int64]) -> Array:
+        """Return the distances of anchors (..., 4) in the reference poses, shape (...,)."""
+        poses = self._poses[held]
+        c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+        x, y = anchors[..., 0::2], anchors[..., 1::2]
+        at_x = poses[..., 0] + c * x - s * y
+        at_y = poses[..., 1] + s * x + c * y
+        return np.asarray(np.hypot(at_x[..., 0] - at_x[..., 1], at_y[..., 0] - at_y[..., 1]))
+
+    def __call__(self, phi: Array) -> tuple[Array, NDArray[np.int64]]:
+        """Return anchors and lengths, and the bodies that joints of unknown bodies hold.
+
+        Parameters
+        ----------
+        phi : ndarray
+            Proposals, shape (proposal, p), SI units.
+
+        Returns
+        -------
+        joints : ndarray
+            Shape (proposal, joint, 5), columns as in :data:`JOINT_COLUMNS`, m.
+        indices : ndarray
+            Indices into ``scene.joinable`` of an inferred joint's bodies, shape (proposal, free
+            joint, 2).
+
+        Raises
+        ------
+        ParameterError
+            If an index names nothing.
+        """
+        n, count = len(phi), len(self._anchors)
+        joints = np.empty((n, count, len(JOINT_COLUMNS)))
+        if not count:
+            return joints, np.empty((n, 0, 2), dtype=np.int64)
+        joints[..., :4] = self._anchors
+        place, joint, column = self._moved_anchors
+        joints[:, joint, column] = phi[:, place]
+        indices = phi[:, self._free[:, 1:]]
+        choices = len(self._scene.joinable)
+        wrong = (indices != np.floor(indices)) | (indices < 0) | (indices >= choices)
+        if wrong.any():
+            raise ParameterError(
+                f"joint index is {indices[wrong][0]:g}, expected a whole number from 0 to"
+                f" {choices - 1}: {', '.join(self._scene.joinable)}"
+            )
+        held = np.repeat(self._held[None], n, axis=0)
+        held[:, self._free[:, 0]] = indices
+        joints[..., LENGTH] = self._lengths(joints[..., :4], held)
+        return joints, indices.astype(np.int64)
+
+
+def on_rod(states: Array, rod: Array, unit_moment: float) -> Array:
+    """Return start states that satisfy the rod of an effect, with the least correction.
+
+    Measured states violate the rod by the noise. The engine would correct the whole drift in one
+    substep: the shorter the substep, the faster the body. The velocity along the rod is removed.
+
+    Parameters
+    ----------
+    states : ndarray
+        States of one body, shape (proposal, transition, 6).
+    rod : ndarray
+        Ends on the body and in the world, and length, shape (proposal, 5), m. A length of 0 is no
+        rod.
+    unit_moment : float
+        The body's moment of inertia for each unit of mass (m^2).
+
+    Returns
+    -------
+    ndarray
+        Same shape as ``states``.
+
+    Examples
+    --------
+    >>> on_rod(np.array([[[1.1, 0.0, 0.0, 0.3, 1.0, 0.0]]]), np.array([[0, 0, 0, 0, 1.0]]), 0.1)
+    array([[[1., 0., 0., 0., 1., 0.]]])
+    """
+    exists = rod[:, LENGTH] > 0
+    if not exists.any():
+        return states
+    held, (a_x, a_y, b_x, b_y, length) = states[exists], rod[exists].T[..., None]
+
+    def geometry() -> tuple[Array, Array, Array, Array, Array]:
+        """Return length, direction (x, y), lever arm, and the inverse mass along the rod."""
+        c, s = np.cos(held[..., 2]), np.sin(held[..., 2])
+        arm_x, arm_y = c * a_x - s * a_y, s * a_x + c * a_y
+        x, y = held[..., 0] + arm_x - b_x, held[..., 1] + arm_y - b_y
+        distance = np.maximum(np.hypot(x, y), 1e-9)
+        n_x, n_y = x / distance, y / distance
+        lever = arm_x * n_y - arm_y * n_x
+        return distance, n_x, n_y, lever, 1.0 + lever**2 / unit_moment
+
+    def push(impulse: Array, first: int, n_x: Array, n_y: Array, lever: Array) -> None:
+        """Apply an impulse per unit of mass along the rod to poses (0) or velocities (3)."""
+        held[..., first] += impulse * n_x
+        held[..., first + 1] += impulse * n_y
+        held[..., first + 2] += impulse * lever / unit_moment
+
+    for _ in range(_STEPS):
+        distance, n_x, n_y, lever, inverse_mass = geometry()
+        push((length - distance) / inverse_mass, 0, n_x, n_y, lever)
+    _, n_x, n_y, lever, inverse_mass = geometry()
+    speed = held[..., 3] * n_x + held[..., 4] * n_y + held[..., 5] * lever
+    push(-speed / inverse_mass, 3, n_x, n_y, lever)
+    result = states.copy()
+    result[exists] = held
+    return result

@@ -1,0 +1,110 @@
+"""The cache of machine code on disk, and the private pymunk symbols that compiled code calls."""
+
+import importlib.util
+
+import numba
+import pymunk
+import pytest
+from pymunk import _chipmunk_cffi
+
+from pbrl_ppl.physics import calls, compiled, lockstep, lockstep_chain
+from pbrl_ppl.physics.compilation import SOURCES, disk_cache, sources_digest
+from pbrl_ppl.physics.compilation import compiled as decorator
+
+#: Functions by the kinds of their arguments after the object, and of what they return.
+SIGNATURES = {
+    ("double",): (
+        "cpSpaceStep cpBodySetMass cpBodySetMoment cpBodySetAngle cpBodySetAngularVelocity"
+        " cpBodySetTorque cpShapeSetElasticity cpShapeSetFriction cpConstraintSetMaxForce"
+        " cpCircleShapeSetRadius cpPinJointSetDist cpDampedRotarySpringSetDamping"
+    ),
+    ("struct cpVect",): (
+        "cpBodySetCenterOfGravity cpBodySetPosition cpBodySetVelocity cpBodySetForce"
+        " cpCircleShapeSetOffset cpPivotJointSetAnchorA cpPivotJointSetAnchorB"
+        " cpPinJointSetAnchorA cpPinJointSetAnchorB"
+    ),
+    ("int",): "cpSpaceSetIterations",
+    ("struct cpShape *",): "cpSpaceAddShape cpSpaceRemoveShape",
+    (): "cpBodyGetPosition cpBodyGetAngle cpBodyGetVelocity cpBodyGetAngularVelocity",
+}
+RETURNED = {
+    "cpBodyGetPosition": "struct cpVect",
+    "cpBodyGetVelocity": "struct cpVect",
+    "cpBodyGetAngle": "double",
+    "cpBodyGetAngularVelocity": "double",
+    "cpSpaceAddShape": "struct cpShape *",
+}
+
+
+def test_pymunk_has_the_functions_that_compiled_code_calls() -> None:
+    """A vector must be two doubles: it is passed as such."""
+    ffi, lib = _chipmunk_cffi.ffi, _chipmunk_cffi.lib
+    assert [(name, field.type.cname) for name, field in ffi.typeof("cpVect").fields] == [
+        ("x", "double"),
+        ("y", "double"),
+    ]
+    known = {name: kinds for kinds, names in SIGNATURES.items() for name in names.split()}
+    assert set(known) == {*calls.Functions._fields, *calls.SETTERS}
+    for name, kinds in known.items():
+        kind = ffi.typeof(getattr(lib, name))
+        first, *others = (argument.cname for argument in kind.args)
+        assert first.startswith("struct cp") and first.endswith("*"), name
+        assert tuple(others) == kinds, name
+        assert kind.result.cname == RETURNED.get(name, "void"), name
+
+
+def test_pymunk_objects_hold_pointers_to_their_structs() -> None:
+    space, body = pymunk.Space(), pymunk.Body(1.0, 1.0)
+    joint = pymunk.PinJoint(body, space.static_body)
+    for pointer, struct in (
+        (space._space, "cpSpace"),
+        (body._body, "cpBody"),
+        (pymunk.Circle(body, 1.0)._shape, "cpShape"),
+        (joint._constraint, "cpConstraint"),
+    ):
+        kind = _chipmunk_cffi.ffi.typeof(pointer)
+        assert kind.cname in (f"struct {struct} *", f"{struct} *")
+
+
+def test_the_digest_follows_contents_and_names(tmp_path) -> None:
+    source = tmp_path / "loop.py"
+    source.write_text("STEP = 1\n")
+    first = sources_digest(tmp_path)
+    source.touch()
+    assert sources_digest(tmp_path) == first
+    source.write_text("STEP = 2\n")
+    assert sources_digest(tmp_path) != first
+    source.write_text("STEP = 1\n")
+    assert sources_digest(tmp_path) == first
+    source.rename(tmp_path / "other.py")
+    assert sources_digest(tmp_path) != first
+
+
+def test_another_digest_compiles_anew(tmp_path) -> None:
+    path = tmp_path / "loop.py"
+    path.write_text("def double(x):\n    return 2.0 * x\n")
+    spec = importlib.util.spec_from_file_location("loop", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+
+    def hits(digest: str) -> int:
+        dispatcher = numba.njit(module.double)
+        dispatcher._cache = disk_cache(module.double, digest)
+        assert dispatcher(1.5) == 3.0
+        return sum(dispatcher.stats.cache_hits.values())
+
+    assert [hits(digest) for digest in ("a", "a", "b", "b", "a")] == [0, 1, 0, 1, 0]
+
+
+@pytest.mark.parametrize("rollout", [compiled.rollout, lockstep.rollout, lockstep_chain.rollout])
+def test_rollouts_are_cached_by_the_digest(rollout) -> None:
+    assert rollout._cache._cache_file._source_stamp == SOURCES
+
+
+def test_without_a_folder_to_write_to_there_is_no_cache() -> None:
+    """Numba finds no place for the cache of a function that is in no file."""
+    names: dict = {}
+    exec("def double(x):\n    return 2.0 * x\n", names)
+    function = decorator(names["double"])
+    assert function._cache.cache_path is None
+    assert function(1.5) == 3.0
