@@ -21,7 +21,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import loop
+from pbrl_ppl.criticism import closing, score
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
@@ -74,9 +74,9 @@ def measure_loop() -> Iterator[Row]:
     problem = Problem.of(scene, train, attach(scene), threads=2)
     mode = trajectory_mode(problem, find_mode(problem, seed=1).phi)
     lacking = candidates(scene, problem.physics.effects)
-    loop.rank_candidates(mode, lacking)  # laws are compiled by now, as they are in the loop
+    score.rank_candidates(mode, lacking)  # laws are compiled by now, as they are in the loop
     begin = time.perf_counter()
-    loop.rank_candidates(mode, lacking)
+    score.rank_candidates(mode, lacking)
     rank = time.perf_counter() - begin
     begin = time.perf_counter()
     for _ in range(10):
@@ -85,7 +85,7 @@ def measure_loop() -> Iterator[Row]:
     begin = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = loop.revise(scene, train, test, seed=1)
+        found = closing.revise(scene, train, test, seed=1)
     took = time.perf_counter() - begin
     what = f"cart, {train.n_transitions} transitions, {len(lacking)} candidates: "
     yield "loop_seconds", what + "the whole loop (s)", "< 100", took

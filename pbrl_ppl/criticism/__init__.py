@@ -1,10 +1,10 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
+from pbrl_ppl.criticism.closing import revise
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.cross_validation import Change, gain
 from pbrl_ppl.criticism.dependence import PRODUCTS
-from pbrl_ppl.criticism.findings import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
-from pbrl_ppl.criticism.loop import revise
+from pbrl_ppl.criticism.loop import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
 from pbrl_ppl.criticism.prior_check import (
     PriorCheck,
     prior_predictive_check,

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.criticism import findings
+from pbrl_ppl.criticism import loop as findings
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.findings import Findings
 from pbrl_ppl.criticism.held_out import HeldOut
+from pbrl_ppl.criticism.loop import Findings
 from pbrl_ppl.criticism.misfit import Misfit
 from pbrl_ppl.criticism.resolution import shift
 from pbrl_ppl.criticism.results import (

@@ -5,7 +5,6 @@ from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
 from pbrl_ppl.report.contact_plots import draw_contacts
 from pbrl_ppl.report.effect_plots import plot_candidates
 from pbrl_ppl.report.error_plots import plot_errors, plot_rollout
-from pbrl_ppl.report.loop import Loop, check_folder, close_loop
 from pbrl_ppl.report.manifest import Log, read_manifest
 from pbrl_ppl.report.many import ManyLoops, close_loop_many
 from pbrl_ppl.report.many_page import in_words
@@ -14,6 +13,7 @@ from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
 from pbrl_ppl.report.posterior_report import render_posterior
 from pbrl_ppl.report.scene_plots import animate_plan, draw_goal, draw_motion, draw_scene
 from pbrl_ppl.report.style import png
+from pbrl_ppl.report.write import Loop, check_folder, close_loop
 
 __all__ = [
     "Log",

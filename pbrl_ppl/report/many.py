@@ -18,7 +18,6 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
 from pbrl_ppl.history import write_atomically
 from pbrl_ppl.posterior import load_posterior
-from pbrl_ppl.report.loop import check_folder
 from pbrl_ppl.report.manifest import Log, read_manifest
 from pbrl_ppl.report.many_page import effect_table, in_words, page, summary_table
 from pbrl_ppl.report.one_log import (
@@ -32,6 +31,7 @@ from pbrl_ppl.report.one_log import (
     settle,
 )
 from pbrl_ppl.report.page import Source
+from pbrl_ppl.report.write import check_folder
 from pbrl_ppl.sampling import Pooled, pool
 
 #: The files of all logs together; the first says what the folder is.

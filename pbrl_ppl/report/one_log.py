@@ -21,8 +21,8 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError
 from pbrl_ppl.history import History, write_atomically
-from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.report.manifest import Log
+from pbrl_ppl.report.write import FILES, Loop, close_loop
 from pbrl_ppl.scene import Scene
 
 #: What a finished log is known by, and written last; what a failed one leaves in its place.

@@ -15,8 +15,8 @@ from rich.console import Console
 from pbrl_ppl import report
 from pbrl_ppl.cli import main, terminal
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
-from pbrl_ppl.report import loop as loop_module
-from pbrl_ppl.report.loop import FILES, Loop
+from pbrl_ppl.report import write as loop_module
+from pbrl_ppl.report.write import FILES, Loop
 from tests.helpers.made_up import made_up
 from tests.helpers.places import ROOT
 

@@ -10,8 +10,8 @@ import pytest
 
 from pbrl_ppl import report
 from pbrl_ppl.cli import main
-from pbrl_ppl.report import loop as loop_module
-from pbrl_ppl.report.loop import Loop
+from pbrl_ppl.report import write as loop_module
+from pbrl_ppl.report.write import Loop
 from pbrl_ppl.scene import Scene
 from tests.helpers.made_up import made_up
 from tests.helpers.places import MODELS, ROOT

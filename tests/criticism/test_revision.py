@@ -14,7 +14,7 @@ import pytest
 from scipy.stats import norm
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import loop as loop_module
+from pbrl_ppl.criticism import closing as loop_module
 from pbrl_ppl.criticism import revise
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.histories import checked_histories

@@ -6,7 +6,7 @@ from typing import Any
 import arviz as az
 import numpy as np
 
-from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.loop import Findings
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.loop import Findings
 from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.loop import Findings
 from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.parameters import Prior

@@ -16,15 +16,15 @@ from pbrl_ppl.history import UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.posterior.comparison import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
-from pbrl_ppl.report import loop as loop_module
 from pbrl_ppl.report import page as page_module
+from pbrl_ppl.report import write as loop_module
 from pbrl_ppl.report.error_plots import plot_rollout, unwrap
 from pbrl_ppl.report.glossary import PARAMETERS
-from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.report import render
 from pbrl_ppl.report.words import number, rejected_in_words, verdict_in_words
+from pbrl_ppl.report.write import FILES, Loop, close_loop
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 
