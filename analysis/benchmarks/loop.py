@@ -25,6 +25,7 @@ from pbrl_ppl.criticism import closing, score
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.model import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
+from pbrl_ppl.report import loop_page
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import MODELS
@@ -46,14 +47,14 @@ def closed(scene_file: Path, folder: Path) -> tuple[float, pp.Loop]:
         scene = pp.Scene.load(scene_file)
         train, test = (pp.History.load(folder / f"{name}.csv", scene) for name in ("train", "test"))
         found = pp.close_loop(scene, train, test, seed=1)
-        found.save(Path(out) / "loop")
+        found.save(Path(out) / "loop", page=loop_page(found))
     return time.perf_counter() - begin, found
 
 
 def told(found: pp.Loop) -> str:
     """What a loop was about, and what it found."""
     names = ", ".join(f"{one.effect} on {one.body}" for one in found.added) or "nothing"
-    count = found.findings.provenance["transitions"]
+    count = found.provenance["transitions"]
     return f"{count} transitions; {found.verdict}, added: {names}"
 
 
@@ -85,7 +86,7 @@ def measure_loop() -> Iterator[Row]:
     begin = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = closing.revise(scene, train, test, seed=1)
+        found = closing.close_loop(scene, train, test, seed=1)
     took = time.perf_counter() - begin
     what = f"cart, {train.n_transitions} transitions, {len(lacking)} candidates: "
     yield "loop_seconds", what + "the whole loop (s)", "< 100", took

@@ -32,7 +32,8 @@ from pbrl_ppl.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from pbrl_ppl.report import Loop, Source
+    from pbrl_ppl.criticism import Loop
+    from pbrl_ppl.report import Source
 
 
 class Method(StrEnum):
@@ -148,11 +149,10 @@ def close_loop(
         progress("loading the sampler")
         # nobody is there to see a window
         os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl import report
-        from pbrl_ppl.criticism import NOT_CONVERGED
+        from pbrl_ppl import criticism, report
 
-        report.check_folder(output, overwrite)
-        loop = report.close_loop(
+        criticism.check_folder(output, overwrite)
+        loop = criticism.close_loop(
             declared,
             *histories,
             seed=seed,
@@ -162,15 +162,15 @@ def close_loop(
         )
         progress("writing the report")
         source = report.Source(str(scene), str(train), str(test or ""), command_line(context))
-        loop.save(output, overwrite=overwrite, source=source)
+        loop.save(output, overwrite, page=report.loop_page(loop, source))
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     if as_json:
-        print_json(loop.findings.to_dict() | {"report": output / "report.html"} | remainder)
+        print_json(loop.to_dict() | {"report": output / "report.html"} | remainder)
     else:
         words = remainder["learned_remainder"]["words"] if remainder else ""
-        for line in report.in_brief(loop.findings, output, words):
+        for line in report.in_brief(loop, output, words):
             typer.echo(line)
-    if loop.verdict == NOT_CONVERGED:
+    if loop.verdict == criticism.NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
 
 
@@ -179,6 +179,7 @@ def _remainder(
 ) -> dict[str, dict[str, Any]]:
     """Learn a force for the residual and save it with the results, or say why there is none."""
     from pbrl_ppl.errors import FitError
+    from pbrl_ppl.report import loop_page
 
     path = folder / "remainder.nc"
     path.unlink(missing_ok=True)  # of an earlier run
@@ -187,5 +188,5 @@ def _remainder(
     except FitError as error:
         return {"learned_remainder": {"words": str(error), "posterior": None}}
     progress("writing the report with it")
-    loop.save(folder, overwrite=True, source=source)
+    loop.save(folder, overwrite=True, page=loop_page(loop, source))
     return {"learned_remainder": {"words": loop.remainder_words, "posterior": path}}

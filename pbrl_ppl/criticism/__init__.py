@@ -1,10 +1,10 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
-from pbrl_ppl.criticism.closing import revise
-from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.closing import close_loop
+from pbrl_ppl.criticism.criteria import DECISIVE, DEFAULT, TRIED, Criteria
 from pbrl_ppl.criticism.cross_validation import Change, gain
 from pbrl_ppl.criticism.dependence import PRODUCTS
-from pbrl_ppl.criticism.loop import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
+from pbrl_ppl.criticism.loop import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Loop, check_folder
 from pbrl_ppl.criticism.prior_check import (
     PriorCheck,
     prior_predictive_check,
@@ -21,8 +21,7 @@ from pbrl_ppl.criticism.results import (
     Unexplained,
 )
 from pbrl_ppl.criticism.rivals import Rival, fit_rivals, kept_groups, named_effects
-from pbrl_ppl.criticism.score import DECISIVE, Signature, inseparable, rank_candidates, twins
-from pbrl_ppl.criticism.selection import TRIED
+from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
 
 __all__ = [
     "ADEQUATE",
@@ -38,13 +37,15 @@ __all__ = [
     "Change",
     "Criteria",
     "Errors",
-    "Findings",
+    "Loop",
     "PriorCheck",
     "Ranking",
     "ResidualTest",
     "Rival",
     "Signature",
     "Unexplained",
+    "check_folder",
+    "close_loop",
     "criticise",
     "fit_rivals",
     "gain",
@@ -54,7 +55,6 @@ __all__ = [
     "named_effects",
     "prior_predictive_check",
     "rank_candidates",
-    "revise",
     "telling_horizon",
     "twins",
 ]

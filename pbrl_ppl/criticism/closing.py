@@ -1,30 +1,43 @@
-"""Closing the loop: fit, criticise, add an effect, confirm on held-out data, go round again."""
+"""The closed loop: fit, score, add effects, test the residual, compare on held-out data."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pbrl_ppl.criticism.assembly import Models, converged, put_together
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.drift import same_noise, with_correlated_errors
-from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
-from pbrl_ppl.criticism.histories import checked_histories
-from pbrl_ppl.criticism.loop import Findings
-from pbrl_ppl.criticism.misfit import PRIOR, beside_names, find_misfit
-from pbrl_ppl.criticism.outliers import outliers
+from pbrl_ppl.criticism.held_out import (
+    HeldOut,
+    example_rollout,
+    longest_rollout,
+    rollout_horizon,
+)
+from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
+from pbrl_ppl.criticism.misfit import PRIOR, Misfit, find_misfit, with_negligible_acceleration
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import declared_mode
-from pbrl_ppl.criticism.results import ResidualTest
-from pbrl_ppl.criticism.score import Signature, rank_candidates
+from pbrl_ppl.criticism.recordings import checked_histories, outliers
+from pbrl_ppl.criticism.refinement import same_noise, shift, with_correlated_errors
+from pbrl_ppl.criticism.results import (
+    Acceleration,
+    Added,
+    Errors,
+    Estimate,
+    Numerical,
+    ResidualTest,
+    Unexplained,
+)
+from pbrl_ppl.criticism.rivals import keep_groups
+from pbrl_ppl.criticism.score import Signature
 from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.criticism.unexplained import (
-    Left,
+    UnexplainedAcceleration,
+    noise_alone,
     unexplained_acceleration,
     without_acceleration,
 )
@@ -35,18 +48,18 @@ from pbrl_ppl.history import History, without_measurements
 from pbrl_ppl.model import Problem, build_model
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import try_effect
+from pbrl_ppl.posterior import compare, identify, interval, versions
+from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Scene
 
 #: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
 DRAWS, INDEPENDENT, LEAST_TUNE = (300, 1000), (125,), 100
-#: Times that the noise is mended and the search for effects begun again, at most.
-_NOISES = 4
-#: Draws from the prior, of which some must reach what was measured.
+#: Draws from the prior, some of which must reach the measurements.
 PRIOR_DRAWS = 100
 
 
-def revise(
+def close_loop(
     scene: Scene,
     train: History,
     test: History | None = None,
@@ -58,34 +71,36 @@ def revise(
     method: str = "metropolis",
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
-) -> Findings:
-    """Fit a declared model, trace its residual to missing effects, add them, and compare.
+) -> Loop:
+    """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
 
     Parameters
     ----------
     scene : Scene
-        The declared model.
-    train, test : History
-        Measured transitions to fit and to judge by; without ``test``, a quarter of the whole
-        trajectories of ``train`` is held out.
+        The declared scene.
+    train : History
+        Measured transitions that the model is fitted to.
+    test : History, optional
+        Held-out trajectories that errors are measured on; by default a seeded quarter of the
+        trajectories of ``train``.
     catalogue : iterable of Effect
         Effects to consider; add your own to the package's.
     seed : int
-        The same seed gives the same findings.
+        The same seed gives the same result.
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws of each chain; by default 300, or 1000 where chains have not converged.
+        Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
     method : str
-        Of :func:`pbrl_ppl.fit`, for the posteriors; with ``laplace`` the verdict stands on modes.
+        Sampler of :func:`pbrl_ppl.fit`; with ``laplace`` the verdict relies on modes.
     criteria : Criteria
         Thresholds of the decisions.
     progress : callable, optional
-        Told the name of each stage.
+        Called with the name of each stage.
 
     Returns
     -------
-    Findings
+    Loop
         Verdict, effects, errors before and after, and both posteriors.
 
     Raises
@@ -99,195 +114,353 @@ def revise(
     -----
     PriorWarning
         Before anything is fitted, if the declared prior could not have made ``train``.
+
+    Examples
+    --------
+    ::
+
+        loop = pp.close_loop(scene, train, test, seed=1)
+        loop.verdict  # 'effects-added'
+        pp.report(loop, "report.html")
     """
-    # matrices are small: threads of linear algebra only get in each other's way
-    with threadpool_limits(1, "blas"):
-        return _revised(
-            scene, train, test, tuple(catalogue), seed, substeps, draws, method, criteria,
-            progress or (lambda stage: None),
-        )  # fmt: skip
-
-
-def _revised(
-    scene: Scene,
-    train: History,
-    test: History | None,
-    catalogue: tuple[Effect, ...],
-    seed: int,
-    substeps: int | None,
-    draws: int | None,
-    method: str,
-    criteria: Criteria,
-    say: Callable[[str], None],
-) -> Findings:
-    """Go through the stages of :func:`revise`."""
+    say = progress or (lambda stage: None)
+    task = _Task(scene, tuple(catalogue), seed, substeps, draws, method, criteria, say)
     if test is None:
         train, test = train.split(0.25, seed)
-    elif scene.test_is_later:  # what lasts from some trajectory on holds in it
-        test = test.numbered(float(train.dataset["number"].max()) + 1.0)
-    if substeps is not None:
-        scene.replace(substeps=substeps)  # it is checked there
+        given = test
+    else:
+        given = test
+        if scene.test_is_later:  # an effect from some trajectory on still acts in the test
+            test = test.numbered(float(train.dataset["number"].max()) + 1.0)
+    # matrices are small: threads of linear algebra only get in each other's way
+    with threadpool_limits(1, "blas"):
+        return replace(_closed(task, train, test), held_out=given, catalogue=task.catalogue)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """Arguments of :func:`close_loop`."""
+
+    scene: Scene
+    catalogue: tuple[Effect, ...]
+    seed: int
+    substeps: int | None
+    draws: int | None
+    method: str
+    criteria: Criteria
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """A fitted model: mode, unexplained acceleration, posterior, and held-out trajectories."""
+
+    mode: Mode
+    excess: UnexplainedAcceleration
+    posterior: Any
+    held_out: HeldOut
+
+
+class _Search(NamedTuple):
+    """Result of a search for effects: the declared model's ranking, the mode, the added effects."""
+
+    first: list[Signature]
+    mode: Mode
+    steps: list[Step]
+
+
+def _closed(task: _Task, train: History, test: History) -> Loop:
+    """Go through the stages of :func:`close_loop`."""
+    scene, seed, criteria, say = task.scene, task.seed, task.criteria, task.say
+    if task.substeps is not None:
+        scene.replace(substeps=task.substeps)  # it is checked there
     train, test, unused, bad = checked_histories(scene, train, test)
     for sentence in (*(velocity.sentence for velocity in unused), *bad):
         say(sentence)
-    held_out = HeldOut(test, seed)
-    for effect in catalogue:
+    for effect in task.catalogue:
         if effect not in full_catalogue:
             try_effect(effect, scene, train)
-    selection = Selection(scene, catalogue, criteria, say)
-    effects = attach(scene, (), catalogue)
+    selection = Selection(scene, task.catalogue, criteria, say)
+    effects = attach(scene, (), task.catalogue)
     say("looking whether the prior could have made the data")
-    prior = _prior_test(scene, train, effects, seed)
-    if not prior.passed:  # of wrong units nobody wants the fit
+    prior = _prior_test(task, train, effects)
+    if not prior.passed:  # nobody wants the fit of wrong units
         hint = "the declared prior does not explain this recording, unless a missing effect is why"
         warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
     say("fitting the declared model")
-    declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
-    first, current, added = _with_effects(declared, selection, criteria, say, mendable=True)
-    # under the right noise effects may show that were hidden before
-    for again in reversed(range(_NOISES)):
-        train, frames = without_measurements(train, outliers(current))
+    declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
+    search = _add_effects(declared, selection, provisional=True)
+    # with the right noise model effects may show that were hidden before
+    for again in reversed(range(criteria.noise_rounds)):
+        train, frames = without_measurements(train, outliers(search.mode, criteria))
         if frames:
             for sentence in map(str, frames):
                 say(sentence)
             bad += tuple(map(str, frames))
-            declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
+            declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
         else:
-            tracked = with_correlated_errors(current, criteria)
-            if tracked is None:
+            correlated = with_correlated_errors(search.mode, criteria)
+            if correlated is None:
                 break
             say("errors of measuring are correlated: looking again")
-            declared = same_noise(declared, tracked)
-        first, current, added = _with_effects(
-            declared, selection, criteria, say, mendable=again > 0
-        )
-    as_tested = replace(current, problem=held_out.problem(current))
-    test, frames = without_measurements(test, outliers(as_tested))
-    if frames:
-        held_out, bad = HeldOut(test, seed), (*bad, *(f"held out: {frame}" for frame in frames))
+            declared = same_noise(declared, correlated)
+        search = _add_effects(declared, selection, provisional=again > 0)
+    revised, steps = search.mode, search.steps
+    tested = replace(revised, problem=HeldOut.of(revised, test).problem)
+    test, frames = without_measurements(test, outliers(tested, criteria))
+    bad += tuple(f"held out: {frame}" for frame in frames)
     say("testing what is left")
-    before, left = (unexplained_acceleration(mode, criteria) for mode in (declared, current))
+    before, after = (unexplained_acceleration(mode, criteria) for mode in (declared, revised))
     horizon = rollout_horizon(train, scene.time_step)
     with_added = prior
-    if added and not prior.passed:  # what was missing may be why
-        own = dict(zip(current.problem.layout.labels, current.phi.tolist(), strict=True))
-        held = {label: own[label] for each in added for label in each.signature.attached.labels}
-        effects = current.problem.physics.effects
-        with_added = _prior_test(scene, train, effects, seed, held)
-    misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(with_added)
-    remains = _remains(before, left) if added and misfit.unexplained is not None else 0.0
-    small = left.worst < criteria.negligible
-    large = remains > (criteria.large_if_small if small else criteria.large_remainder)
-    if large and not misfit.random:
+    if steps and not prior.passed:  # the missing effect may be why
+        values = dict(zip(revised.problem.layout.labels, revised.phi.tolist(), strict=True))
+        held = {label: values[label] for step in steps for label in step.signature.attached.labels}
+        with_added = _prior_test(task, train, revised.problem.physics.effects, held)
+    misfit = find_misfit(revised, after, horizon=horizon, seed=seed).with_test(with_added)
+    if steps and _too_much_remains(misfit, before, after):
         without = find_misfit(declared, before, horizon=horizon, seed=seed)
+        share = after.square / before.square
         followed = misfit.predictable < criteria.most_predictable * without.predictable
-        if remains > criteria.large_if_small or not followed:
-            # part of a misfit goes to whatever is there: no name is to be had from that
+        if share > criteria.large_if_small or not followed:
+            # any effect takes up a part of a misfit, so no name follows from that
             say("no effect of the catalogue explains what is missing")
-            selection.withdraw(added)
-            added, current, left = [], declared, before
+            selection.withdraw(steps)
+            steps, revised, after = [], declared, before
             misfit = without.with_test(prior)
-    if added:
-        misfit = beside_names(misfit, current, left)
+    if steps:
+        misfit = with_negligible_acceleration(misfit, revised, after)
     say("sampling the posterior of the declared model")
-    posterior = _posterior(declared, method, seed, draws, criteria, say)
-    revised = posterior
-    if added:
+    posterior = _posterior(task, declared)
+    first = last = _Model(declared, before, posterior, HeldOut.of(declared, test))
+    if steps:
         say("sampling the posterior of the revised model")
-        revised = _posterior(current, method, seed, draws, criteria, say)
+        posterior = _posterior(task, revised)
+    if revised is not declared:
+        last = _Model(revised, after, posterior, HeldOut.of(revised, test))
     say("comparing errors on held-out data")
-    models = Models(declared, current, posterior, revised, before, left)
-    told = selection.explained(first), tuple(selection.small)
-    findings = put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
-    return replace(findings, velocities_not_used=unused, bad_frames=bad)
+    rollout = longest_rollout(test, horizon)
+    return replace(
+        _put_together(task, train, first, last, steps, misfit, rollout),
+        candidates=selection.explained(search.first),
+        small=tuple(selection.small),
+        velocities_not_used=unused,
+        bad_frames=bad,
+    )
 
 
-def _with_effects(
-    declared: Mode,
-    selection: Selection,
-    criteria: Criteria,
-    say: Callable[[str], None],
-    *,
-    mendable: bool,
-) -> tuple[list[Signature], Mode, list[Step]]:
-    """The ranking of the declared model, the model with effects added one by one, and those.
+def _add_effects(declared: Mode, selection: Selection, *, provisional: bool) -> _Search:
+    """Rank candidates and add effects one by one, each ranked beside those before.
 
-    If the noise is ``mendable`` it ends where outliers show, the last effect unconfirmed.
+    If ``provisional``, the search ends where outliers show, the last effect unconfirmed.
     """
+    criteria, say = selection.criteria, selection.say
     say("scoring what the model might lack")
-    first = rank_candidates(declared, selection.missing(declared))
-    current, ranked = declared, first
-    added: list[Step] = []
-    while ranked and len(added) < criteria.most_added:
-        if mendable and np.isfinite(outliers(current)).any():
-            return first, current, added
-        step = selection.best_addition(current, ranked, provisional=mendable)
-        if step is None and unexplained_acceleration(current, criteria).remains.any():
-            alone = without_acceleration(current)
-            hidden = rank_candidates(alone, selection.missing(current))
-            step = selection.best_addition(current, hidden)
+    first = selection.rank(declared)
+    mode, ranked = declared, first
+    steps: list[Step] = []
+    while ranked and len(steps) < criteria.most_added:
+        if provisional and np.isfinite(outliers(mode, criteria)).any():
+            return _Search(first, mode, steps)
+        step = selection.best_addition(mode, ranked, provisional=provisional)
+        if step is None and unexplained_acceleration(mode, criteria).remains.any():
+            # a random force follows smooth effects, whose scores are small beside it
+            step = selection.best_addition(mode, selection.rank(mode, without_acceleration(mode)))
         if step is None:
             break
         say(f"added {step.signature.candidate.effect} on {step.signature.candidate.body}")
-        added.append(step)
-        current = step.after
-        ranked = rank_candidates(current, selection.missing(current))
-    if len(added) > 1:
+        steps.append(step)
+        mode = step.after
+        ranked = selection.rank(mode)
+    if len(steps) > 1:
         say("checking that each added effect is still needed")
-        current, added = selection.prune(current, added)
-    return first, current, added
+        mode, steps = selection.prune(mode, steps)
+    return _Search(first, mode, steps)
 
 
 def _prior_test(
-    scene: Scene,
+    task: _Task,
     train: History,
     effects: tuple[Attached, ...],
-    seed: int,
     held: Mapping[str, float] | None = None,
 ) -> ResidualTest:
-    """Whether the prior could have made the data, with some parameters held, as a test."""
-    problem = Problem.of(scene, train, effects, horizon=telling_horizon(train), threads=2)
-    model = build_model(problem)
-    checked = prior_predictive_check(model, draws=PRIOR_DRAWS, seed=seed, held=held)
+    """Test whether the prior, with some parameters held, could have made the data."""
+    horizon = telling_horizon(train, task.criteria.prior)
+    problem = Problem.of(task.scene, train, effects, horizon=horizon, threads=2)
+    checked = prior_predictive_check(
+        build_model(problem), draws=PRIOR_DRAWS, seed=task.seed, held=held,
+        criteria=task.criteria.prior,
+    )  # fmt: skip
     share = float(checked.dataset["share_beyond"].max())
-    said, *more = checked.summary
+    sentence, *more = checked.summary
     if more:
-        said = f"{said}; so it is with {len(more)} more"
-    return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, said)
+        sentence = f"{sentence}; so it is with {len(more)} more"
+    return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, sentence)
 
 
-def _remains(before: Left, after: Left) -> float:
-    """Share of what was missing, of its square, that remains."""
-    return after.square / before.square if before.square > 0 else 0.0
+def _too_much_remains(
+    misfit: Misfit, before: UnexplainedAcceleration, after: UnexplainedAcceleration
+) -> bool:
+    """Return whether too much of the unexplained acceleration remains, and is not random."""
+    if misfit.unexplained is None or misfit.random or not before.square > 0:
+        return False
+    criteria = after.criteria
+    small = after.worst < criteria.negligible
+    limit = criteria.large_if_small if small else criteria.large_remainder
+    return after.square / before.square > limit
 
 
-def _posterior(
-    mode: Mode,
-    method: str,
-    seed: int,
-    draws: int | None,
-    criteria: Criteria,
-    say: Callable[[str], None],
-) -> Any:
-    """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
-    # a chain a processor: more threads would wait for each other
+def _posterior(task: _Task, mode: Mode) -> Any:
+    """Sample a mode's model, with more draws if the chains have not converged."""
+    # one thread a chain: more would wait for each other
     mode = replace(mode, problem=mode.problem.with_physics(threads=1))
     model = build_model(mode.problem)
-    chains = method != "laplace"
-    for n in (DRAWS if chains else INDEPENDENT) if draws is None else (draws,):
+    chains = task.method != "laplace"
+    for n in (DRAWS if chains else INDEPENDENT) if task.draws is None else (task.draws,):
         tune = max(LEAST_TUNE, 5 * n // 8)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             fitted = fit(
-                model, method=method, seed=seed, draws=n, tune=tune, start=mode,
+                model, method=task.method, seed=task.seed, draws=n, tune=tune, start=mode,
                 progress=False,
             )  # fmt: skip
-        if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
+        if "interrupted" in fitted.attrs:  # half a posterior gives no verdict
             raise KeyboardInterrupt
-        if converged(fitted, criteria):
+        if _converged(fitted, task.criteria):
             break
-        say(f"the chains have not converged after {n} draws each")
-    for warning in caught:  # of the last; independent draws are no chains that converge
+        task.say(f"the chains have not converged after {n} draws each")
+    for warning in caught:  # of the last fit; independent draws are no chains that converge
         if chains or not issubclass(warning.category, ConvergenceWarning):
             warnings.warn(warning.message, stacklevel=2)
     return fitted
+
+
+def _converged(posterior: Any, criteria: Criteria) -> bool:
+    """Return whether chains agree well enough for a verdict; warnings begin earlier."""
+    r_hat, ess = posterior.attrs.get("max_rhat", np.inf), posterior.attrs.get("min_ess", 0.0)
+    return bool(r_hat <= criteria.worst_rhat and ess >= criteria.least_ess)
+
+
+def _put_together(
+    task: _Task,
+    train: History,
+    declared: _Model,
+    revised: _Model,
+    steps: list[Step],
+    misfit: Misfit,
+    rollout: int,
+) -> Loop:
+    """Return the result of the stages; errors are forecasts of ``rollout`` intervals."""
+    scene, held_out, criteria = task.scene, revised.held_out, task.criteria
+    test = held_out.problem.data.history
+    before = declared.held_out.errors(held_out, declared.posterior, rollout, task.seed)
+    after = before
+    if revised is not declared:
+        after = held_out.errors(held_out, revised.posterior, rollout, task.seed)
+    verdict = EFFECTS_ADDED if steps else ADEQUATE
+    unexplained = misfit.unexplained
+    # added effects that leave an acceleration unexplained are at best near the right ones
+    if unexplained is not None and not (steps and misfit.predicts):
+        verdict = UNEXPLAINED
+    if steps and after.normalised_rmse > (1.0 + criteria.negligible) * before.normalised_rmse:
+        verdict, unexplained = UNEXPLAINED, unexplained or _worse(before, after)
+    if not all(_converged(model.posterior, criteria) for model in (declared, revised)):
+        verdict = NOT_CONVERGED
+    added = tuple(_added(step, revised) for step in steps)
+    keep_groups(revised.posterior, added)
+    noise = noise_alone(revised.mode, revised.excess)
+    return Loop(
+        scene=scene,
+        verdict=verdict,
+        numerical=Numerical(
+            scene.substeps, revised.mode.problem.physics.substeps, shift(revised.mode)
+        ),
+        candidates=(),
+        added=added,
+        unexplained=unexplained,
+        before=before,
+        after=after,
+        noise_floor=held_out.noise_floor(noise, rollout),
+        posterior_before=declared.posterior,
+        posterior_after=revised.posterior,
+        residuals_before=declared.held_out.residuals(held_out),
+        residuals_after=held_out.residuals(held_out),
+        rollout=example_rollout(declared.held_out, held_out),
+        rollout_horizon=rollout,
+        provenance={
+            "seed": task.seed,
+            "versions": versions(),
+            "data_sha256": train.data_sha256,
+            "test_sha256": test.data_sha256,
+            "transitions": train.n_transitions,
+            "test_transitions": test.n_transitions,
+            "rollout_horizon": rollout,
+            "rollout_seconds": rollout * scene.time_step,
+        },
+        tests=misfit.tests,
+        acceleration=_acceleration(declared.excess, revised.excess),
+        correlations=misfit.correlations,
+        growth=misfit.growth,
+        identifiability=identify(revised.posterior, mode=revised.mode),
+        loo=compare(declared.posterior, revised.posterior),
+    )
+
+
+def _acceleration(before: UnexplainedAcceleration, after: UnexplainedAcceleration) -> Acceleration:
+    """Return the unexplained accelerations of both models by name."""
+
+    def named(excess: UnexplainedAcceleration, values: Any) -> dict[str, Any]:
+        return dict(zip(excess.names, values.tolist(), strict=True))
+
+    return Acceleration(
+        named(before, before.size),
+        named(after, after.size),
+        named(before, before.relative),
+        named(after, after.relative),
+        named(after, after.certain),
+    )
+
+
+def _worse(before: Errors, after: Errors) -> Unexplained:
+    """Return what is unexplained where the revised model's held-out error is the larger one."""
+    rise = after.normalised_rmse / before.normalised_rmse - 1.0
+    return Unexplained(
+        body="",
+        dimension="",
+        depends_on="nothing that was recorded",
+        share=0.0,
+        p_value=float("nan"),
+        sentence=(
+            "the revised model forecasts the held-out trajectories worse than the declared one: its"
+            f" error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
+            f" {before.normalised_rmse:.3g} times the noise"
+        ),
+    )
+
+
+def _added(step: Step, revised: _Model) -> Added:
+    """Return an added effect with its posterior."""
+    candidate, effect = step.signature.candidate, step.signature.attached.effect
+    drawn = posterior_draws(revised.posterior)
+    bodies = [
+        attached.body
+        for attached in revised.mode.problem.physics.effects
+        if attached.effect.name == effect.name
+    ]
+    estimates = {}
+    for parameter in effect.parameters:
+        values = drawn[effect.variable(parameter)][:, bodies.index(candidate.body)]
+        estimates[parameter.name] = Estimate(
+            float(values.mean()), float(values.std()), interval(values), parameter.unit
+        )
+    return Added(
+        effect=candidate.effect,
+        body=candidate.body,
+        sentence=candidate.sentence,
+        statistic=candidate.statistic,
+        p_value=candidate.p_value,
+        parameters=estimates,
+        not_separable_from=step.not_separable_from,
+        elpd_difference=step.elpd_difference,
+        elpd_difference_se=step.elpd_difference_se,
+    )

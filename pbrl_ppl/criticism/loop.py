@@ -1,14 +1,19 @@
-"""Findings of the loop as plain results, and the JSON contract they are written in."""
+"""Result of a closed loop, and the files that it is saved in."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, is_dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.criticism.remainder import learn_remainder, remainder_in_words
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
@@ -21,20 +26,26 @@ from pbrl_ppl.criticism.results import (
     Rollout,
     Unexplained,
 )
-from pbrl_ppl.history import UnusedVelocity
-from pbrl_ppl.posterior import Comparison, Identifiability
+from pbrl_ppl.effects import Effect
+from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.errors import FitError, OutputError
+from pbrl_ppl.history import History, UnusedVelocity
+from pbrl_ppl.posterior import Comparison, Identifiability, save_posterior
 from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: The verdicts; the last is none, for the chains do not agree.
+#: The verdicts; the last one means that there is none, for the chains do not agree.
 ADEQUATE, EFFECTS_ADDED, UNEXPLAINED = "adequate", "effects-added", "unexplained"
 NOT_CONVERGED = "not-converged"
+#: Files of a saved loop and its report; beside them, the posterior with a learned remainder.
+FILES = ("report.html", "report.json", "before.nc", "after.nc")
+REMAINDER = "remainder.nc"
 
 
-@dataclass(frozen=True, eq=False)
-class Findings:
-    """Findings of the closed loop.
+@dataclass(frozen=True, eq=False, repr=False)
+class Loop:
+    """Result of :func:`pbrl_ppl.close_loop`: verdict, added effects, errors and both posteriors.
 
     Parameters
     ----------
@@ -43,17 +54,17 @@ class Findings:
     verdict : str
         ``adequate``, ``effects-added``, ``unexplained``, or ``not-converged``.
     numerical : Numerical
-        Whether the engine's own error is small enough.
+        Engine substeps, and the numerical error that is left.
     candidates : tuple of Candidate
         All candidates of the first round, best first.
     added : tuple of Added
         Effects added, in order.
     unexplained : Unexplained or None
-        What remains.
+        Structure that no effect in the catalogue explains.
     before, after, noise_floor : Errors
-        On held-out data, of the declared model, the revised one, and a perfect one.
+        Held-out errors of the declared model, of the revised one, and of the noise alone.
     posterior_before, posterior_after : InferenceData or DataTree
-        What ArviZ's functions take; the same object twice if nothing was added.
+        Posteriors of both models; the same object twice if nothing was added.
     residuals_before, residuals_after : dict of str to ndarray
         Held-out residuals in units of noise per state dimension, 1-d arrays.
     rollout : Rollout
@@ -63,23 +74,29 @@ class Findings:
     provenance : dict
         Seed, versions, hash of the data, number of transitions, horizons.
     tests : tuple of ResidualTest
-        Tests of what the model after revision leaves.
+        Tests of the revised model's residual.
     acceleration : Acceleration
-        What a step adds beyond the model, before and after.
+        Unexplained acceleration of both models.
     correlations : Correlations
-        Of the innovations of the model after revision.
+        Correlations of the revised model's innovations.
     growth : Growth
-        Of the errors of its forecasts.
+        Growth of the revised model's forecast errors.
     small : tuple of Candidate
-        Effects that are certain, and change predictions by less than 1 %; they were not added.
+        Effects that are significant and negligible; they were not added.
     identifiability : Identifiability or None
-        Which parameters of the model after revision the data inform.
+        Which parameters of the revised model the data inform.
     loo : Comparison or None
         Leave-one-out cross-validation of both models on the data they were fitted to.
     velocities_not_used : tuple of UnusedVelocity
         Velocity columns that were computed from positions or lag them.
     bad_frames : tuple of str
         A sentence for each single bad frame that was left out, of either history.
+    held_out : History, optional
+        The held-out trajectories; reports animate them.
+    catalogue : tuple of Effect
+        Where the names of effects are looked up.
+    remainder : InferenceData or DataTree, optional
+        A posterior that :meth:`learn_remainder` gave: reports name it, and ``save`` writes it.
     """
 
     scene: Scene
@@ -107,63 +124,194 @@ class Findings:
     loo: Comparison | None = None
     velocities_not_used: tuple[UnusedVelocity, ...] = ()
     bad_frames: tuple[str, ...] = ()
+    held_out: History | None = None
+    catalogue: tuple[Effect, ...] = tuple(full_catalogue)
+    remainder: Any = None
+
+    def __repr__(self) -> str:
+        added = [f"{one.effect} on {one.body}" for one in self.added]
+        return f"Loop(verdict={self.verdict!r}, added={added})"
+
+    @property
+    def remainder_words(self) -> str:
+        """Return in a sentence what the learned remainder does; empty without one."""
+        if self.remainder is None:
+            return ""
+        return remainder_in_words(self.posterior_after, self.remainder)
+
+    def learn_remainder(
+        self,
+        body: str | None = None,
+        *,
+        seed: int = 0,
+        progress: Callable[[str], None] | None = None,
+    ) -> Any:
+        """Learn a force for the unexplained residual; the verdict and the added effects stay.
+
+        Parameters
+        ----------
+        body : str, optional
+            The body that lacks a force; by default the one with the largest residual.
+        seed : int
+            The same seed gives the same posterior.
+        progress : callable, optional
+            Called with the name of each stage.
+
+        Returns
+        -------
+        InferenceData or DataTree
+            The posterior with the effect ``learned_remainder``, to save, plan with and update; see
+            :func:`pbrl_ppl.criticism.learn_remainder`.
+
+        Raises
+        ------
+        FitError
+            If nothing is unexplained, or the residual does not depend on the body's velocity.
+
+        Examples
+        --------
+        ::
+
+            loop.verdict  # 'unexplained'
+            pp.save_posterior(loop.learn_remainder(seed=1), "remainder.nc")
+        """
+        if self.verdict != UNEXPLAINED:
+            raise FitError(f"nothing to learn: the verdict is {self.verdict}")
+        found = self.unexplained.body if self.unexplained is not None else ""
+        bodies = [moving.name for moving in self.scene.dynamic]
+        body = body or found or (bodies[0] if len(bodies) == 1 else "")
+        if not body:
+            raise FitError(f"remainder: no body stands out; give body=, one of {bodies}")
+        return learn_remainder(
+            self.posterior_after, body, catalogue=self.catalogue, seed=seed, progress=progress
+        )
 
     def to_dict(self) -> dict[str, Any]:
-        """The contents of ``report.json``; numbers that are not finite become null."""
+        """Return the contents of ``report.json``; numbers that are not finite become null."""
         contents: dict[str, Any] = _clean(
             {
                 "verdict": self.verdict,
-                "numerical": vars(self.numerical),
-                "added": [
-                    {
-                        "effect": added.effect,
-                        "body": added.body,
-                        "statistic": added.statistic,
-                        "p_value": added.p_value,
-                        "parameters": {name: vars(e) for name, e in added.parameters.items()},
-                        "not_separable_from": added.not_separable_from,
-                        "elpd_difference": added.elpd_difference,
-                        "elpd_difference_se": added.elpd_difference_se,
-                    }
-                    for added in self.added
-                ],
-                "candidates": [
-                    {
-                        "effect": candidate.effect,
-                        "body": candidate.body,
-                        "statistic": candidate.statistic,
-                        "dof": candidate.dof,
-                        "p_value": candidate.p_value,
-                        "estimate": candidate.estimate,
-                        "identifiable": candidate.identifiable,
-                        "looks": candidate.looks,
-                        "detectable": candidate.detectable,
-                        "caps": candidate.caps,
-                        "why": candidate.why,
-                    }
-                    for candidate in self.candidates
-                ],
+                "numerical": self.numerical,
+                "added": [_fields(added, "sentence") for added in self.added],
+                "candidates": [_fields(each, "sentence", "units") for each in self.candidates],
                 "small": [[candidate.effect, candidate.body] for candidate in self.small],
-                "tests": [vars(test) for test in self.tests],
-                "unexplained_acceleration": vars(self.acceleration),
-                "unexplained": None if self.unexplained is None else vars(self.unexplained),
+                "tests": self.tests,
+                "unexplained_acceleration": self.acceleration,
+                "unexplained": self.unexplained,
                 "error": {
-                    "before": vars(self.before),
-                    "after": vars(self.after),
-                    "noise_floor": vars(self.noise_floor),
+                    "before": self.before,
+                    "after": self.after,
+                    "noise_floor": self.noise_floor,
                 },
                 "identifiability": self.identifiability and self.identifiability.to_dict(),
                 "loo": self.loo and self.loo.to_dict(),
-                "velocities_not_used": [vars(each) for each in self.velocities_not_used],
+                "velocities_not_used": self.velocities_not_used,
                 "bad_frames": self.bad_frames,
                 "provenance": self.provenance,
             }
         )
+        if self.remainder is not None:
+            contents["learned_remainder"] = self.remainder_words
         return contents
+
+    def save(self, folder: str | Path, overwrite: bool = False, *, page: str = "") -> Path:
+        """Write report.json, before.nc, after.nc (and remainder.nc), all or nothing.
+
+        Parameters
+        ----------
+        folder : str or pathlib.Path
+            Made if missing; other files in it are left alone.
+        overwrite : bool
+            Whether a folder that has content may be written to.
+        page : str
+            HTML of the report, written as report.html with the other files; none if empty.
+
+        Returns
+        -------
+        pathlib.Path
+            The folder.
+
+        Raises
+        ------
+        OutputError
+            If the folder cannot be written, or has content and ``overwrite`` is false.
+
+        Examples
+        --------
+        ::
+
+            loop.save("out")
+            pp.report(loop, "out/report.html")
+        """
+        folder = Path(folder)
+        nearest = check_folder(folder, overwrite)
+        try:
+            # on the same file system as the folder, so that only a rename is left at the end
+            with tempfile.TemporaryDirectory(prefix=".pbrl-ppl-", dir=nearest) as temporary:
+                made = Path(temporary) / "result"
+                made.mkdir()
+                if page:
+                    (made / "report.html").write_text(page, encoding="utf-8")
+                save_posterior(self.posterior_before, made / "before.nc")
+                save_posterior(self.posterior_after, made / "after.nc")
+                if self.remainder is not None:
+                    save_posterior(self.remainder, made / REMAINDER)
+                text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
+                (made / "report.json").write_text(text + "\n", encoding="utf-8")
+                if nearest == folder:
+                    # it may be a mount or a working directory: fill it, do not replace it
+                    for file in made.iterdir():
+                        file.replace(folder / file.name)
+                else:
+                    folder.parent.mkdir(parents=True, exist_ok=True)
+                    made.rename(folder)
+        except OutputError:
+            raise
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written: {error}") from error
+        return folder
+
+
+def check_folder(folder: Path, overwrite: bool) -> Path:
+    """Check that results can be written to ``folder``, and return its nearest existing parent.
+
+    Raises
+    ------
+    OutputError
+        If they cannot, or if the folder has content and ``overwrite`` is false.
+    """
+    nearest = folder
+    # a dangling link counts as there: it cannot be made a folder
+    while not (nearest.exists() or nearest.is_symlink()) and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not nearest.is_dir():
+        raise OutputError(
+            f"output folder {folder}: {nearest} is a file, expected a folder; choose another path"
+        )
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise OutputError(f"output folder {folder}: no permission to write in {nearest}")
+    if nearest != folder:
+        return nearest
+    if not overwrite and any(folder.iterdir()):
+        raise OutputError(
+            f"output folder {folder}: it has content already; choose another, or allow"
+            " overwriting: overwrite=True"
+        )
+    for name in (*FILES, REMAINDER):
+        if (folder / name).is_dir():
+            raise OutputError(f"output folder {folder}: {name} in it is a folder; remove it")
+    return folder
+
+
+def _fields(value: Any, *left_out: str) -> dict[str, Any]:
+    """Return the fields of a dataclass without those named."""
+    return {name: field for name, field in vars(value).items() if name not in left_out}
 
 
 def _clean(value: Any) -> Any:
-    """Plain JSON values."""
+    """Return plain JSON values."""
+    if is_dataclass(value):
+        value = vars(value)
     if isinstance(value, Mapping):
         return {str(key): _clean(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, np.ndarray)):

@@ -1,4 +1,10 @@
-"""Plots and reports; the only place that imports matplotlib."""
+"""Plots and reports; the only place that imports matplotlib.
+
+``pp.report`` is this subpackage, and can be called: ``pp.report(loop, path)``.
+"""
+
+import sys
+from types import ModuleType
 
 from pbrl_ppl.report.brief import in_brief
 from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
@@ -13,16 +19,13 @@ from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
 from pbrl_ppl.report.posterior_report import render_posterior
 from pbrl_ppl.report.scene_plots import animate_plan, draw_goal, draw_motion, draw_scene
 from pbrl_ppl.report.style import png
-from pbrl_ppl.report.write import Loop, check_folder, close_loop
+from pbrl_ppl.report.write import loop_page, report
 
 __all__ = [
     "Log",
-    "Loop",
     "ManyLoops",
     "Source",
     "animate_plan",
-    "check_folder",
-    "close_loop",
     "close_loop_many",
     "draw_contacts",
     "draw_goal",
@@ -30,6 +33,7 @@ __all__ = [
     "draw_scene",
     "in_brief",
     "in_words",
+    "loop_page",
     "plot_calibration",
     "plot_candidates",
     "plot_errors",
@@ -40,6 +44,21 @@ __all__ = [
     "png",
     "read_manifest",
     "render_posterior",
+    "report",
     "summary",
     "write_page",
 ]
+
+
+class _Report(ModuleType):
+    """Class of this subpackage, which writes a report when it is called.
+
+    Python sets ``pbrl_ppl.report`` to the subpackage on its first import, and the public function
+    has the same name, so the subpackage must be both.
+    """
+
+    __call__ = staticmethod(report)
+
+
+sys.modules[__name__].__class__ = _Report
+globals()["report"] = sys.modules[__name__]  # `pp.report` is the same, whatever was imported first

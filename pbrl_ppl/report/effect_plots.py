@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.stats import chi2, gaussian_kde
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import scalars
 from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, legend
@@ -25,7 +25,7 @@ HARDLY = 0.01
 MOST_CANDIDATES, MOST_ADDED = 20, 12
 
 
-def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
+def plot_candidates(findings: Loop, width: float = WIDE) -> Figure:
     """Score statistic of the candidates, best on top, with the threshold of each."""
     added = {(addition.effect, addition.body) for addition in findings.added}
     shown = [
@@ -82,7 +82,7 @@ def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_added(findings: Findings, width: float = WIDE) -> Figure:
+def plot_added(findings: Loop, width: float = WIDE) -> Figure:
     """Posterior of every parameter of the added effects, with the value that means no effect."""
     shown = [
         (added, name, estimate)

@@ -11,14 +11,14 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.report.style import AFTER, BAND, BEFORE, UNITS, WIDE, blank_figure, legend
 
 Array = NDArray[np.float64]
 
 
-def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
+def plot_residuals(findings: Loop, width: float = WIDE) -> Figure:
     """Held-out residuals of each state dimension before and after, in units of noise."""
     names = list(findings.residuals_before)
     figure, (axes,) = blank_figure(width, 3.6, 1, 1)
@@ -58,7 +58,7 @@ def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
+def plot_errors(findings: Loop, width: float = WIDE) -> Figure:
     """Held-out errors before and after, one step ahead and at the end of a rollout."""
     kinds = [
         ("one_step_rmse", "one step ahead"),
@@ -105,7 +105,7 @@ def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
+def plot_rollout(findings: Loop, width: float = WIDE) -> Figure:
     """One held-out trajectory: measured, and predicted before and after."""
     rollout = findings.rollout
     count = len(rollout.names)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import group, problem_of
@@ -101,7 +101,7 @@ class Evidence:
         return order[: int(np.searchsorted(total, share * total[-1])) + 1]
 
 
-def find_evidence(findings: Findings, effects: Iterable[Effect]) -> Evidence | None:
+def find_evidence(findings: Loop, effects: Iterable[Effect]) -> Evidence | None:
     """Trace the gain of the revised model to the measured numbers that it comes from.
 
     None where nothing was added, or a posterior does not hold its recording.

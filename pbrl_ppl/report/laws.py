@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import PRODUCTS, Findings
+from pbrl_ppl.criticism import PRODUCTS, Loop
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.model import Problem
 from pbrl_ppl.posterior import problem_of
@@ -64,7 +64,7 @@ class Law:
     curve_share: float
 
 
-def find_laws(findings: Findings, effects: Iterable[Effect], most: int = 3) -> list[Law]:
+def find_laws(findings: Loop, effects: Iterable[Effect], most: int = 3) -> list[Law]:
     """Return residual forces against the quantity that they depend on, and others like it.
 
     The residual force is what each step adds to the smoothed states beyond the model, over the time

@@ -8,7 +8,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import Candidate, Findings
+from pbrl_ppl.criticism import Candidate, Loop
 from pbrl_ppl.effects import Effect, Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.report.words import number, plain, quantity
@@ -20,7 +20,7 @@ _DRAWS = 20_000
 
 
 def measured_parameters(
-    candidate: Candidate, findings: Findings, effects: Iterable[Effect]
+    candidate: Candidate, findings: Loop, effects: Iterable[Effect]
 ) -> tuple[str, ...]:
     """Return a candidate's parameters without those of state dimensions that were not measured.
 
@@ -28,7 +28,7 @@ def measured_parameters(
     ----------
     candidate : Candidate
         Of the findings.
-    findings : Findings
+    findings : Loop
         Their residuals name the state dimensions that were measured.
     effects : iterable of Effect
         Where the candidate's name is looked up.
@@ -40,7 +40,7 @@ def measured_parameters(
     return tuple(name for name in names if name not in STATE or name in findings.residuals_after)
 
 
-def limits_in_words(candidate: Candidate, findings: Findings, effects: Iterable[Effect]) -> str:
+def limits_in_words(candidate: Candidate, findings: Loop, effects: Iterable[Effect]) -> str:
     """Write the detection limit of each parameter; empty where there is none.
 
     Limits beyond what the effect's prior allows are no limits: no plausible size would be seen.

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.criticism import Candidate, Findings
+from pbrl_ppl.criticism import Candidate, Loop
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.report.evidence import Evidence
 from pbrl_ppl.report.limits import limits_in_words, measured_parameters
@@ -19,7 +19,7 @@ from pbrl_ppl.report.words import chance, number, percent, plain, quantity
 _CARRIERS = 8
 
 
-def error_tables(findings: Findings) -> list[Table]:
+def error_tables(findings: Loop) -> list[Table]:
     """Held-out errors by state dimension, one interval and a rollout ahead, and in all."""
     tables = []
     seconds = findings.rollout_horizon * findings.scene.time_step
@@ -54,21 +54,21 @@ def error_tables(findings: Findings) -> list[Table]:
 
 
 def _row(
-    findings: Findings, name: str, before: Any, after: Any, floor: Any, *unit: str, digits: int = 3
+    findings: Loop, name: str, before: Any, after: Any, floor: Any, *unit: str, digits: int = 3
 ) -> tuple[str, ...]:
     both = [before, after] if findings.added else [before]
     return (name, *(number(value, digits) for value in (*both, floor)), *unit)
 
 
 def _before_after(
-    findings: Findings, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
+    findings: Loop, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
 ) -> Table:
     both = ("Before", "After") if findings.added else ("Declared model",)
     columns = (name, *both, "Noise floor", *last)
     return Table(caption, columns, rows, words=(len(columns) - 1,) if last else ())
 
 
-def loo_table(findings: Findings) -> Table | None:
+def loo_table(findings: Loop) -> Table | None:
     """Leave-one-out cross-validation of both models."""
     loo = findings.loo
     if loo is None:
@@ -90,7 +90,7 @@ def loo_table(findings: Findings) -> Table | None:
     )
 
 
-def acceleration_table(findings: Findings) -> Table:
+def acceleration_table(findings: Loop) -> Table:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
     told = findings.acceleration
     rows = []
@@ -118,7 +118,7 @@ def acceleration_table(findings: Findings) -> Table:
     )
 
 
-def residual_test_table(findings: Findings) -> Table:
+def residual_test_table(findings: Loop) -> Table:
     """Tabulate the tests of the model's residual."""
     which = "revised" if findings.added else "declared"
     return Table(
@@ -138,7 +138,7 @@ def residual_test_table(findings: Findings) -> Table:
     )
 
 
-def candidate_table(findings: Findings, effects: Iterable[Effect]) -> Table:
+def candidate_table(findings: Loop, effects: Iterable[Effect]) -> Table:
     """Tabulate the candidates of the first round."""
     effects = tuple(effects)
     added = {(each.effect, each.body) for each in findings.added}

@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED
+from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED, check_folder
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
 from pbrl_ppl.history import write_atomically
@@ -31,7 +31,6 @@ from pbrl_ppl.report.one_log import (
     settle,
 )
 from pbrl_ppl.report.page import Source
-from pbrl_ppl.report.write import check_folder
 from pbrl_ppl.sampling import Pooled, pool
 
 #: The files of all logs together; the first says what the folder is.

@@ -17,12 +17,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from pbrl_ppl.criticism import Loop, close_loop
+from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError
 from pbrl_ppl.history import History, write_atomically
 from pbrl_ppl.report.manifest import Log
-from pbrl_ppl.report.write import FILES, Loop, close_loop
 from pbrl_ppl.scene import Scene
 
 #: What a finished log is known by, and written last; what a failed one leaves in its place.

@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from scipy.stats import rankdata
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.posterior import DATATREE, HDI_PROB, convergence, from_groups, scalars
 from pbrl_ppl.report.style import BAND, NARROW, WIDE, blank_figure
 
@@ -52,12 +52,12 @@ def most_interesting(of: Any, table: pd.DataFrame | None = None) -> list[str]:
 
     Parameters
     ----------
-    of : Findings, InferenceData or DataTree
+    of : Loop, InferenceData or DataTree
         Findings, of which the posterior after revision is looked at, or a posterior.
     table : pandas.DataFrame, optional
         Its :func:`summary`, where that is at hand.
     """
-    revised = isinstance(of, Findings)
+    revised = isinstance(of, Loop)
     table = summary(of.posterior_after if revised else of) if table is None else table
     own = [
         f"{added.effect}_{name}[{added.body}]"
@@ -73,7 +73,7 @@ def plot_trace(of: Any, parameters: Sequence[str] | None = None, width: float = 
 
     Parameters
     ----------
-    of : Findings, InferenceData or DataTree
+    of : Loop, InferenceData or DataTree
         Findings, of which the posterior after revision is shown, or a posterior.
     parameters : sequence of str, optional
         Labels such as ``mass[cart]``; by default those of most interest: of added effects, and with
@@ -128,7 +128,7 @@ def plot_rank(of: Any, parameters: Sequence[str] | None = None, width: float = W
 def _chosen(of: Any, parameters: Sequence[str] | None) -> xr.Dataset:
     """Draws of the parameters to show."""
     names = most_interesting(of) if parameters is None else list(parameters)
-    return scalars(of.posterior_after if isinstance(of, Findings) else of)[names]
+    return scalars(of.posterior_after if isinstance(of, Loop) else of)[names]
 
 
 def _trace(draws: xr.Dataset, width: float) -> Figure:

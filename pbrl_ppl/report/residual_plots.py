@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, WIDE, blank_figure
 
 Array = NDArray[np.float64]
@@ -19,7 +19,7 @@ CHANCE = 0.01
 _NAMED = 4
 
 
-def plot_correlations(findings: Findings, width: float = WIDE) -> Figure:
+def plot_correlations(findings: Loop, width: float = WIDE) -> Figure:
     """Correlations of errors with those before and with commands, and the band of noise alone."""
     told = findings.correlations
     panels = 2 if told.commands else 1
@@ -63,7 +63,7 @@ def _panel(
     axes.set_xticks(lags)
 
 
-def plot_growth(findings: Findings, width: float = WIDE) -> Figure:
+def plot_growth(findings: Loop, width: float = WIDE) -> Figure:
     """Errors of forecasts over their length, in units of what noise alone makes at each length."""
     growth = findings.growth
     names = [name for name in growth.floor[-1] if growth.floor[-1][name] > 0]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -14,10 +13,8 @@ from pbrl_ppl.criticism import (
     TRIED,
     UNEXPLAINED,
     Added,
-    Findings,
+    Loop,
 )
-from pbrl_ppl.model import ACCELERATION
-from pbrl_ppl.posterior import draws, group
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -27,20 +24,7 @@ _SMALLEST_P = 1e-16
 _TOO_LARGE = 1.5
 
 
-def remainder_in_words(before: Any, after: Any) -> str:
-    """What a learned remainder does, from the posteriors without and with it."""
-    sizes = [draws(each)[ACCELERATION].mean(axis=0) for each in (before, after)]
-    names = group(after, "posterior")[ACCELERATION]
-    worst = int(np.argmax(sizes[0] - sizes[1]))
-    name = str(names[names.dims[-1]].values[worst])
-    unit = "rad/s²" if name == "omega" else "m/s²"
-    return (
-        f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
-        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {unit}"
-    )
-
-
-def verdict_in_words(findings: Findings) -> str:
+def verdict_in_words(findings: Loop) -> str:
     """Say the verdict in a sentence or two, for a reader who knows no statistics."""
     found = joined(
         f"{added.sentence.rstrip('.')} ({plain(added.effect)}) on the {plain(added.body)}"
@@ -69,7 +53,7 @@ def verdict_in_words(findings: Findings) -> str:
     return f"Something was missing: {found}."
 
 
-def _adequate(findings: Findings) -> str:
+def _adequate(findings: Loop) -> str:
     """Say how adequate the model is: what passed, and which negligible misfit is significant."""
     tested = sum(test.tested for test in findings.tests)
     passed = f"the declared model passes all {tested} tests of its residual"
@@ -92,26 +76,26 @@ def _adequate(findings: Findings) -> str:
     return f"{missing} found missing: {passed}.{small}"
 
 
-def significant_acceleration(findings: Findings) -> float:
+def significant_acceleration(findings: Loop) -> float:
     """Return the largest significant unexplained acceleration over that of the bodies, or 0."""
     told = findings.acceleration
     sizes = (told.relative_after[name] for name, sure in told.certain_after.items() if sure)
     return max(sizes, default=0.0)
 
 
-def accepted(findings: Findings) -> tuple[Added, ...]:
+def accepted(findings: Loop) -> tuple[Added, ...]:
     """Return the added effects that the verdict stands for: none where it is another."""
     stands = findings.verdict not in (UNEXPLAINED, NOT_CONVERGED)
     return findings.added if stands else ()
 
 
-def depends_on_records(findings: Findings) -> bool:
+def depends_on_records(findings: Loop) -> bool:
     """Return whether the residual depends on a recorded quantity: the dependence test failed."""
     left = findings.unexplained
     return left is not None and not left.depends_on.startswith("nothing")
 
 
-def error_in_words(findings: Findings) -> str:
+def error_in_words(findings: Loop) -> str:
     """Say what a held-out error means where its figure alone would contradict the verdict."""
     model, after = "revised" if findings.added else "declared", findings.after.normalised_rmse
     if findings.unexplained is not None or significant_acceleration(findings):
@@ -127,7 +111,7 @@ def error_in_words(findings: Findings) -> str:
     return ""
 
 
-def rejected_in_words(findings: Findings) -> str:
+def rejected_in_words(findings: Loop) -> str:
     """Say why the leading significant candidates were not added."""
     there = {(added.effect, added.body) for added in findings.added}
     told = [
@@ -138,7 +122,7 @@ def rejected_in_words(findings: Findings) -> str:
     return f"Not added: {'; '.join(told[:TRIED])}." if told else ""
 
 
-def left_out_in_words(findings: Findings) -> str:
+def left_out_in_words(findings: Loop) -> str:
     """Say which single bad frames were left out of the histories, the first few one by one."""
     first, more = findings.bad_frames[:TRIED], len(findings.bad_frames) - TRIED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""

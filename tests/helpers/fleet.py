@@ -14,11 +14,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
+from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.report import Source, close_loop_many
 from pbrl_ppl.report.manifest import Log
 from pbrl_ppl.report.many_page import page
-from pbrl_ppl.report.write import FILES
 
 #: One line a log that was begun and one a log that was kept: what was done how often.
 BEGUN, KEPT = "begun.txt", "kept.txt"

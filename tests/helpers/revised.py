@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from pbrl_ppl.criticism.loop import Findings
+from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
@@ -26,7 +26,7 @@ def recordings() -> tuple[History, History]:
 
 
 @cache
-def revised() -> Findings:
+def revised() -> Loop:
     """Findings as made up, with the posteriors of a puck without drag and with it."""
     train, _ = recordings()
     drag = [effect for effect in catalogue if effect.name == "linear_drag"]
@@ -39,7 +39,7 @@ def revised() -> Findings:
     )
 
 
-def unexplained() -> Findings:
+def unexplained() -> Loop:
     """The same where no effect has a name."""
     left = Unexplained("puck", "vx", "velocity x", 0.5, 0.001, "vx of puck depends on velocity x")
     before = revised().posterior_before
