@@ -5,11 +5,7 @@ from pbrl_ppl.criticism.criteria import DECISIVE, DEFAULT, TRIED, Criteria
 from pbrl_ppl.criticism.cross_validation import Change, gain
 from pbrl_ppl.criticism.dependence import PRODUCTS
 from pbrl_ppl.criticism.loop import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Loop, check_folder
-from pbrl_ppl.criticism.prior_check import (
-    PriorCheck,
-    prior_predictive_check,
-    telling_horizon,
-)
+from pbrl_ppl.criticism.prior_check import PriorCheck, prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import Ranking, criticise
 from pbrl_ppl.criticism.remainder import learn_remainder
 from pbrl_ppl.criticism.results import (

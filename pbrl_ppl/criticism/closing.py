@@ -11,12 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.held_out import (
-    HeldOut,
-    example_rollout,
-    longest_rollout,
-    rollout_horizon,
-)
+from pbrl_ppl.criticism.held_out import HeldOut, example_rollout, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
 from pbrl_ppl.criticism.misfit import PRIOR, Misfit, find_misfit, with_negligible_acceleration
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
@@ -246,6 +241,7 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         small=tuple(selection.small),
         velocities_not_used=unused,
         bad_frames=bad,
+        criteria=criteria,
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.remainder import learn_remainder, remainder_in_words
 from pbrl_ppl.criticism.results import (
     Acceleration,
@@ -91,6 +92,8 @@ class Loop:
         Velocity columns that were computed from positions or lag them.
     bad_frames : tuple of str
         A sentence for each single bad frame that was left out, of either history.
+    criteria : Criteria
+        Thresholds of the decisions.
     held_out : History, optional
         The held-out trajectories; reports animate them.
     catalogue : tuple of Effect
@@ -124,6 +127,7 @@ class Loop:
     loo: Comparison | None = None
     velocities_not_used: tuple[UnusedVelocity, ...] = ()
     bad_frames: tuple[str, ...] = ()
+    criteria: Criteria = DEFAULT
     held_out: History | None = None
     catalogue: tuple[Effect, ...] = tuple(full_catalogue)
     remainder: Any = None
@@ -183,8 +187,9 @@ class Loop:
         if not body:
             raise FitError(f"remainder: no body stands out; give body=, one of {bodies}")
         return learn_remainder(
-            self.posterior_after, body, catalogue=self.catalogue, seed=seed, progress=progress
-        )
+            self.posterior_after, body, catalogue=self.catalogue, seed=seed,
+            criteria=self.criteria, progress=progress,
+        )  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
         """Return the contents of ``report.json``; numbers that are not finite become null."""

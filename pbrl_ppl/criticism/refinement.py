@@ -12,13 +12,7 @@ from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.model import Problem, noise_medians, ranges
-from pbrl_ppl.modes import (
-    Mode,
-    nearby_mode,
-    profile_sigma,
-    trajectory_evidence,
-    trajectory_mode,
-)
+from pbrl_ppl.modes import Mode, nearby_mode, profile_sigma, trajectory_evidence, trajectory_mode
 
 Array = NDArray[np.float64]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
@@ -15,65 +15,58 @@ from pbrl_ppl.report.page import Table
 from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import chance, number, percent, plain, quantity
 
-#: Transitions in the table of those that carry most.
+#: Transitions in the table of those with the largest gains.
 _CARRIERS = 8
+T = TypeVar("T")
 
 
-def error_tables(findings: Loop) -> list[Table]:
-    """Held-out errors by state dimension, one interval and a rollout ahead, and in all."""
+def error_tables(loop: Loop) -> list[Table]:
+    """Tabulate held-out errors by state dimension, one interval and a rollout ahead, and in all."""
+    step = loop.scene.time_step
+    seconds = number(loop.rollout_horizon * step)
+    kinds = {
+        "one_step_rmse": f"One interval ahead, {step:g} s",
+        "rollout_rmse": f"{loop.rollout_horizon} intervals ahead, {seconds} s",
+    }
+    models = (*_both(loop, loop.before, loop.after), loop.noise_floor)
+    columns = (*_both(loop, *_heads(loop)), "Noise floor")
     tables = []
-    seconds = findings.rollout_horizon * findings.scene.time_step
-    kinds = [
-        ("one_step_rmse", f"One interval ahead, {findings.scene.time_step:g} s"),
-        ("rollout_rmse", f"{findings.rollout_horizon} intervals ahead, {number(seconds)} s"),
-    ]
-    for kind, title in kinds:
-        before, after, floor = (
-            getattr(errors, kind)
-            for errors in (findings.before, findings.after, findings.noise_floor)
-        )
-        if before:
-            rows = [
-                _row(findings, name, before[name], after.get(name), floor.get(name), UNITS[name])
-                for name in before
-            ]
+    for kind, title in kinds.items():
+        errors = [getattr(model, kind) for model in models]
+        rows = [
+            (name, *(number(error.get(name)) for error in errors), UNITS[name])
+            for name in errors[0]
+        ]
+        heads = ("State dimension", *columns, "Unit")
+        if rows:
             caption = f"{title} (root mean square error)"
-            tables.append(_before_after(findings, caption, "State dimension", rows, "Unit"))
+            tables.append(Table(caption, heads, rows, words=(len(heads) - 1,)))
     rows = [
-        _row(
-            findings, "Error in units of the noise", findings.before.normalised_rmse,
-            findings.after.normalised_rmse, findings.noise_floor.normalised_rmse,
+        ("Error in units of the noise", *(number(model.normalised_rmse) for model in models)),
+        (
+            "Log predictive density in nats (more is better)",
+            *(number(model.elpd, 4) for model in models),
         ),
-        _row(
-            findings, "Log predictive density in nats (more is better)", findings.before.elpd,
-            findings.after.elpd, findings.noise_floor.elpd, digits=4,
-        ),
-    ]  # fmt: skip
-    tables.append(_before_after(findings, "Overall", "Measure", rows))
-    return tables
+    ]
+    return [*tables, Table("Overall", ("Measure", *columns), rows)]
 
 
-def _row(
-    findings: Loop, name: str, before: Any, after: Any, floor: Any, *unit: str, digits: int = 3
-) -> tuple[str, ...]:
-    both = [before, after] if findings.added else [before]
-    return (name, *(number(value, digits) for value in (*both, floor)), *unit)
+def _both(loop: Loop, before: T, after: T) -> tuple[T, ...]:
+    """Return both values, or the first alone if nothing was added."""
+    return (before, after) if loop.added else (before,)
 
 
-def _before_after(
-    findings: Loop, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
-) -> Table:
-    both = ("Before", "After") if findings.added else ("Declared model",)
-    columns = (name, *both, "Noise floor", *last)
-    return Table(caption, columns, rows, words=(len(columns) - 1,) if last else ())
+def _heads(loop: Loop) -> tuple[str, str]:
+    """Return the heads of both models' columns."""
+    return ("Before" if loop.added else "Declared model", "After")
 
 
-def loo_table(findings: Loop) -> Table | None:
-    """Leave-one-out cross-validation of both models."""
-    loo = findings.loo
+def loo_table(loop: Loop) -> Table | None:
+    """Tabulate the leave-one-out cross-validation of both models."""
+    loo = loop.loo
     if loo is None:
         return None
-    models = [loo.before, loo.after] if findings.added else [loo.before]
+    models = _both(loop, loo.before, loo.after)
     rows = [
         ("elpd_loo (more is better)", *(number(model.elpd_loo, 4) for model in models)),
         ("Standard error", *(number(model.se) for model in models)),
@@ -83,39 +76,27 @@ def loo_table(findings: Loop) -> Table | None:
             *(str(model.high_pareto_k) for model in models),
         ),
     ]
-    return Table(
-        f"{loo.method} (az.loo, az.compare)",
-        ("Measure", *(("Before", "After") if findings.added else ("Declared model",))),
-        rows,
-    )
+    heads = ("Measure", *_both(loop, *_heads(loop)))
+    return Table(f"{loo.method} (az.loo, az.compare)", heads, rows)
 
 
-def acceleration_table(findings: Loop) -> Table:
+def acceleration_table(loop: Loop) -> Table:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
-    told = findings.acceleration
-    rows = []
-    for name, before in told.before.items():
-        shares = [told.relative_before[name], told.relative_after[name]]
-        values = [before, told.after[name]]
-        if not findings.added:
-            shares, values = shares[1:], values[:1]
-        rows.append(
-            (
-                name,
-                *(number(value) for value in values),
-                *(percent(share) for share in shares),
-                "rad/s²" if name == "omega" else "m/s²",
-                "yes" if told.certain_after.get(name) else "no",
-            )
+    sizes = loop.acceleration
+    rows = [
+        (
+            name,
+            *map(number, _both(loop, before, sizes.after[name])),
+            *map(percent, _both(loop, sizes.relative_before[name], sizes.relative_after[name])),
+            "rad/s²" if name == "omega" else "m/s²",
+            "yes" if sizes.certain_after.get(name) else "no",
         )
-    both = ("Before", "After") if findings.added else ("Declared model",)
-    shared = ("Before, share", "After, share") if findings.added else ("Share",)
-    return Table(
-        "Unexplained acceleration (standard deviation in an interval)",
-        ("Velocity", *both, *shared, "Unit", "Significant"),
-        rows,
-        words=(1 + len(both) + len(shared), 2 + len(both) + len(shared)),
-    )
+        for name, before in sizes.before.items()
+    ]
+    shares = ("Before, share", "After, share") if loop.added else ("Share",)
+    heads = ("Velocity", *_both(loop, *_heads(loop)), *shares, "Unit", "Significant")
+    caption = "Unexplained acceleration (standard deviation in an interval)"
+    return Table(caption, heads, rows, words=(len(heads) - 2, len(heads) - 1))
 
 
 def residual_test_table(findings: Loop) -> Table:
@@ -175,7 +156,7 @@ def _estimates(candidate: Candidate, names: Iterable[str]) -> str:
 
 
 def carrier_table(evidence: Evidence) -> Table:
-    """The transitions that carry most of the evidence."""
+    """Tabulate the transitions with the largest gains in log predictive density."""
     gains = evidence.by_transition
     shown = np.argsort(-gains, kind="stable")[:_CARRIERS]
     return Table(

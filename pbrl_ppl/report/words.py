@@ -8,7 +8,6 @@ import numpy as np
 
 from pbrl_ppl.criticism import (
     ADEQUATE,
-    DEFAULT,
     NOT_CONVERGED,
     TRIED,
     UNEXPLAINED,
@@ -62,7 +61,7 @@ def _adequate(findings: Loop) -> str:
     # beside what was added the table of candidates has them
     small = "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
-        " less than 1 %."
+        f" less than {100 * findings.criteria.negligible:g} %."
         for one in findings.small
     )
     remains = significant_acceleration(findings)
@@ -117,7 +116,7 @@ def rejected_in_words(findings: Loop) -> str:
     told = [
         f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
         for one in findings.candidates
-        if one.why and one.p_value < DEFAULT.try_p and (one.effect, one.body) not in there
+        if one.why and one.p_value < findings.criteria.try_p and (one.effect, one.body) not in there
     ]
     return f"Not added: {'; '.join(told[:TRIED])}." if told else ""
 
