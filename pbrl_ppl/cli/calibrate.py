@@ -69,7 +69,7 @@ def calibrate(
         )  # fmt: skip
         declared = stated_noise(declared, noise)
         os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl import report
+        import pbrl_ppl.report as report
         from pbrl_ppl.history import write_atomically
         from pbrl_ppl.sampling import calibration
 

@@ -149,7 +149,8 @@ def close_loop(
         progress("loading the sampler")
         # nobody is there to see a window
         os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl import criticism, report
+        import pbrl_ppl.report as report
+        from pbrl_ppl import criticism
 
         criticism.check_folder(output, overwrite)
         loop = criticism.close_loop(

@@ -109,7 +109,8 @@ def fit(
         declared = with_substeps(stated_noise(declared, noise), substeps)
         progress("loading the sampler")
         os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl import report, sampling
+        import pbrl_ppl.report as report
+        from pbrl_ppl import sampling
         from pbrl_ppl.physics import check_history
         from pbrl_ppl.posterior import group, load_posterior, save_posterior
 

@@ -36,7 +36,7 @@ def close_loop_many(
         check_can_make(output)
         progress("reading the manifest")
         os.environ.setdefault("MPLBACKEND", "Agg")
-        from pbrl_ppl import report
+        import pbrl_ppl.report as report
 
         logs = report.read_manifest(manifest)  # its errors come before a cluster is looked for
         with _executor(jobs, scheduler) as executor:

@@ -23,7 +23,7 @@ class EngineCriteria:
     large : float
         An unexplained acceleration above this share of the bodies' is no numerical error.
     still : float
-        Nor is one that a doubling of the substeps moves by less than this share of itself.
+        One that a doubling of the substeps moves by a smaller share is no numerical error either.
     """
 
     error_factor: float = 3.0
@@ -45,15 +45,15 @@ class ScoreCriteria:
     visible : float
         A change below this, in units of noise, is the engine's rounding.
     parallel : float
-        Effects whose projected signatures have a larger cosine than this are not separable,
+        Effects whose projected signatures have a larger cosine are not separable.
     decisive : float
-        unless their score statistics differ by this.
+        Effects whose score statistics differ by this are separable all the same.
     same : float
         Signatures with a larger cosine than this are the same physics.
     detection_p : float
-        P-value at which a detection limit is stated,
+        P-value of a detection limit.
     detection_power : float
-        and the probability that an effect of that size reaches it.
+        Probability that an effect at the detection limit reaches that p-value.
     """
 
     absorbed: float = 1e-3
@@ -131,11 +131,11 @@ class OutlierCriteria:
     Parameters
     ----------
     deviations : float
-        Robust standard deviations of its residual: 1 of 10^14 of Gaussian noise.
+        Its residual exceeds this many robust standard deviations: 1 of 10^14 of Gaussian noise.
     errors : float
-        Measurement errors from the smoothed state, which it pulls towards itself.
+        It is this many measurement errors from the smoothed state, which it attracts.
     neighbours : float
-        Times as far off as its neighbours: an event that lasts moves those, too.
+        It is this many times as far off as its neighbours, which an event that lasts moves, too.
     most : float
         If a larger share of a coordinate's measurements is far off, none is left out.
     least_measurements : int
@@ -159,7 +159,7 @@ class PriorCriteria:
         Share of measurements beyond all draws from the prior. Measured with 200 draws: at most
         0.08 on sound problems, at least 0.14 with a mass 100 times too large.
     chance : float
-        So many beyond must also be less likely than this: of few measurements one soon is.
+        That share must also be less likely than this under the prior: few measurements vary.
     slack : float
         Share of the usual change by which draws may miss where velocities were not measured.
     least_draws : int
@@ -167,7 +167,7 @@ class PriorCriteria:
     signal : float
         A horizon is long enough if changes are this many times the measurement errors.
     unit_factor : float
-        How far a factor of wrong units may lie beyond the range of the prior's factors.
+        A factor of wrong units may lie this far beyond the range of the prior's factors.
     """
 
     most_beyond: float = 0.11
@@ -191,10 +191,11 @@ class Criteria:
         Probability that a test of a single quantity fails without cause.
     try_p : float
         A candidate is refitted if its p-value, corrected for all candidates, is below this.
-    min_elpd, min_elpd_se : float
-        Gain in cross-validated log predictive density that an effect needs, in nats and in standard
-        errors; the latter are widened to Student's t for few folds. A signed-rank test of the folds
-        at the same level does, too.
+    min_elpd : float
+        Gain in cross-validated log predictive density (nats) that an effect needs.
+    min_elpd_se : float
+        Standard errors that this gain needs, widened to Student's t for few folds. A signed-rank
+        test of the folds at the same level is enough, too.
     min_evidence : float
         Gain in log-evidence (nats) that an effect needs instead, where trajectories are too few for
         cross-validation over them.
@@ -208,14 +209,18 @@ class Criteria:
         Times that the noise model is corrected and the search for effects begins again, at most.
     min_remainder : float
         Log marginal likelihood (nats) that a learned force must gain over noise alone.
-    large_remainder, large_if_small : float
-        Share of the square of the unexplained acceleration that may remain beside a name; and where
-        what remains is negligible.
+    large_remainder : float
+        Added effects are withdrawn if a larger share of the unexplained acceleration's square
+        remains: any effect takes up a part of a misfit.
+    large_if_small : float
+        The same share where the remaining acceleration is negligible.
     most_predictable : float
-        A larger remainder may stay where less than this share of what could be predicted of the
-        innovations still can be: what remains is then random.
-    worst_rhat, least_ess : float
-        Chains with a larger R-hat or a smaller effective sample size give no verdict.
+        A remainder up to ``large_if_small`` may also stay if the predictable share of the
+        innovations falls below this multiple of what it was: the remainder is then random.
+    worst_rhat : float
+        Chains with a larger R-hat give no verdict.
+    least_ess : float
+        Chains with a smaller effective sample size give no verdict.
     engine, score, selection, residual, outliers, prior
         Thresholds of single stages.
 
