@@ -253,6 +253,7 @@ class Selection:
         return tuple(replace(one.candidate, why=self.why.get(_key(one), "")) for one in ranked)
 
     def _note(self, signature: Signature, why: str) -> None:
+        """Record the decision on a candidate."""
         self.why[_key(signature)] = why
 
     def _without(self, mode: Mode, effect: Attached) -> Mode:

@@ -148,6 +148,7 @@ def candidate_table(findings: Loop, effects: Iterable[Effect]) -> Table:
 
 
 def _estimates(candidate: Candidate, names: Iterable[str]) -> str:
+    """Return the first estimates of some parameters with their units."""
     return ", ".join(
         f"{plain(name)} {quantity(candidate.estimate[name], candidate.units[name])}"
         for name in names

@@ -1,9 +1,9 @@
-"""Many robots, many logs: the loop closed on each over any executor, and one page of it all."""
+"""Many logs: close the loop on each over any executor, and write a page of all."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, as_completed
 from contextlib import closing
 from dataclasses import dataclass
@@ -33,27 +33,27 @@ from pbrl_ppl.report.one_log import (
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.sampling import Pooled, pool
 
-#: The files of all logs together; the first says what the folder is.
+#: Files of all logs together; the first identifies the folder.
 _SUMMARY, _TABLE, _EFFECTS, _PAGE = "summary.json", "summary.csv", "effects.csv", "index.html"
 _KIND = "pbrl_ppl logs 1"
 
 
 @dataclass(frozen=True, eq=False)
 class ManyLoops:
-    """What was found in many logs.
+    """Results of many logs.
 
     Parameters
     ----------
     folder : Path
-        Has ``index.html``, ``summary.csv``, ``effects.csv``, ``summary.json``, and each log's
-        folder.
+        Folder with ``index.html``, ``summary.csv``, ``effects.csv``, ``summary.json``, and each
+        log's folder.
     rows : tuple of dict
         One a log, in the manifest's order: its status (``done``, ``failed``, ``waiting``), verdict
-        and effects, or what went wrong.
+        and effects, or the error.
     pooled : mapping of str to Pooled
-        By kind, hyper-parameters that its robots share, and each robot's parameters given these.
+        By kind: hyper-parameters that its robots share, and each robot's parameters given them.
     not_pooled : mapping of str to str
-        Why a kind's robots were not.
+        By kind: why its robots were not pooled.
     """
 
     folder: Path
@@ -63,15 +63,15 @@ class ManyLoops:
 
     @property
     def failed(self) -> tuple[str, ...]:
-        """Names of the logs that failed."""
+        """Return the names of the logs that failed."""
         return tuple(row["name"] for row in self.rows if row["status"] == "failed")
 
     def table(self) -> pd.DataFrame:
-        """One row a log: status, verdict, effects, errors before and after, message, folder."""
+        """Return a row a log: status, verdict, effects, errors before and after, message, folder."""
         return summary_table(self.rows)
 
     def effects(self) -> pd.DataFrame:
-        """Which effects were found where: one row an effect and log, with its estimate."""
+        """Return a row for each effect found in a log, with its estimate."""
         return effect_table(self.rows)
 
     def __repr__(self) -> str:
@@ -100,43 +100,43 @@ def close_loop_many(
 ) -> ManyLoops:
     """Close the loop on each log of a manifest, and write a page of which effects are where.
 
-    Each log gets a folder of its own with what :meth:`Loop.save` writes. A log whose folder has a
-    report of the same files and settings is not run again, so the same call goes on after an
-    interrupt; one that fails leaves ``error.json`` there, does not stop the rest, and is tried
+    Each log gets a folder with its report and the files of :meth:`Loop.save`. A log whose folder
+    has a report of the same files and settings is not run again, so the same call continues after
+    an interrupt; one that fails leaves ``error.json`` there, does not stop the rest, and is tried
     again by the next call.
 
     Parameters
     ----------
     manifest : str, Path or iterable of Log
-        As of :func:`read_manifest`.
+        A file for :func:`read_manifest`, or its logs.
     folder : str or Path
-        Of all results; made if missing.
+        Folder of all results; made if missing.
     executor : concurrent.futures.Executor, optional
-        Where the loops are closed; by default here, one after another. ``client.get_executor()`` of
-        Dask is one, whose workers must see the files by the same paths. A process works on one log
+        Runs the loops; by default this process does, one after another. ``client.get_executor()``
+        of Dask is one; its workers must see the files by the same paths. A process works on one log
         at a time.
     seed, substeps, draws, method, catalogue : optional
-        As of :func:`pbrl_ppl.close_loop`; each log is what that gives with this seed.
+        Arguments of :func:`pbrl_ppl.close_loop` for each log.
     noise : mapping of str to float, optional
-        Known errors of measuring, ``{"x": 0.002}``; they replace those of the scenes.
+        Known measurement noise, ``{"x": 0.002}``; it replaces that of the scenes.
     estimate_velocities, columns, units : optional
-        As of :meth:`History.load`.
+        Arguments of :meth:`History.load`.
     time_step : float, optional
-        In place of the scenes' (s); uneven samples are interpolated to it.
+        Replaces the scenes' (s); uneven samples are interpolated to it.
     again : bool
         Whether finished logs are run again too.
     run : callable
-        What closes the loop on a log, if not the package.
+        Closes the loop on a log; its result has a ``save(folder)``.
     progress : callable, optional
-        Told of each log that is finished.
+        Called with a line for each finished log.
     source : Source, optional
-        The command that makes the page again.
+        The command that writes the page again.
 
     Returns
     -------
     ManyLoops
-        Rows, and for each kind of the manifest the robots' shared hyper-parameters. Logs without
-        an adequate model at the end (``unexplained``, ``not-converged``) take no part in those.
+        Rows, and for each kind of the manifest the robots' shared hyper-parameters, without logs
+        that have no adequate model (``unexplained``, ``not-converged``).
 
     Raises
     ------
@@ -152,7 +152,7 @@ def close_loop_many(
         with distributed.Client("tcp://scheduler:8786") as client:
             loops = pp.close_loop_many("logs.csv", "out", executor=client.get_executor())
         loops.effects()
-        loops.pooled["cart"].scene  # the next cart's, with what is known of carts
+        loops.pooled["cart"].scene  # prior for the next cart
     """
     if source is None:
         given = repr(str(manifest)) if isinstance(manifest, str | Path) else "logs"
@@ -194,6 +194,7 @@ def close_loop_many(
 
 
 def _row_in_words(row: Mapping[str, Any]) -> str:
+    """Return a line on a finished log."""
     if row["status"] == "failed":
         return f"{row['name']}: failed: {row['message']}"
     found = ", ".join(f"{each['effect']}[{each['body']}]" for each in row["effects"])
@@ -201,7 +202,7 @@ def _row_in_words(row: Mapping[str, Any]) -> str:
 
 
 def _results(tasks: Mapping[Log, Callable[[], Any]], executor: Executor | None) -> Any:
-    """Each task's log, and a call that gives its row or raises its error."""
+    """Yield each task's log, and a function that returns its row or raises its error."""
     if executor is None:
         yield from tasks.items()
         return
@@ -215,13 +216,13 @@ def _results(tasks: Mapping[Log, Callable[[], Any]], executor: Executor | None) 
 
 
 def _ordered(logs: Iterable[Log], rows: Mapping[str, Any]) -> tuple[Mapping[str, Any], ...]:
-    """Rows in the manifest's order; logs without one are waiting."""
+    """Return rows in the manifest's order; logs without one are waiting."""
     waiting = {"status": "waiting"}
     return tuple(rows.get(log.name, {"name": log.name, "kind": log.kind} | waiting) for log in logs)
 
 
 def _opened(folder: Path) -> Path:
-    """Make the folder of many logs, or check that it is one."""
+    """Make the folder of many logs, or check that it is one, and return its absolute path."""
     check_folder(folder, overwrite=True)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -247,16 +248,15 @@ def _opened(folder: Path) -> Path:
 
 
 def _pooled(
-    logs: Iterable[Log], rows: Mapping[str, Mapping[str, Any]], folder: Path
+    logs: Sequence[Log], rows: Mapping[str, Mapping[str, Any]], folder: Path
 ) -> tuple[dict[str, Pooled], dict[str, str]]:
-    """Hyper-parameters of each kind with two adequate models or more."""
-    kinds: dict[str, list[str]] = {}
+    """Return the hyper-parameters of kinds with two adequate models, or why there are none."""
+    kinds: dict[str, list[str]] = {log.kind: [] for log in logs if log.kind}
     for log in logs:
-        own = kinds.setdefault(log.kind, [])
         row = rows[log.name]
-        if row["status"] == "done" and row["verdict"] not in (UNEXPLAINED, NOT_CONVERGED):
-            own.append(log.name)
-    kinds.pop("", None)
+        adequate = row["status"] == "done" and row["verdict"] not in (UNEXPLAINED, NOT_CONVERGED)
+        if log.kind and adequate:
+            kinds[log.kind].append(log.name)
     found, reasons = {}, {}
     for kind, names in kinds.items():
         if len(names) < 2:
@@ -276,7 +276,7 @@ def _write_summary(
     pooled: Mapping[str, Pooled],
     not_pooled: Mapping[str, str],
 ) -> None:
-    """Write what concerns all logs, each file whole or not at all."""
+    """Write the files of all logs together, each whole or not at all."""
     contents = {
         "contents": _KIND,
         "logs": rows,

@@ -1,4 +1,4 @@
-"""One of many logs, where a worker has it: its loop closed, kept, and found again later."""
+"""One of many logs in a worker: close its loop, save it, and read it again later."""
 
 from __future__ import annotations
 
@@ -24,29 +24,30 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import PbrlError
 from pbrl_ppl.history import History, write_atomically
 from pbrl_ppl.report.manifest import Log
+from pbrl_ppl.report.write import loop_page
 from pbrl_ppl.scene import Scene
 
-#: What a finished log is known by, and written last; what a failed one leaves in its place.
+#: File of a finished log, written last; file of a failed one.
 DONE, FAILED = "report.json", "error.json"
-#: Warnings and figures are a process's, not a thread's: one log at a time in each.
+#: Warnings and figures belong to the process: one log at a time in each.
 _ONE = threading.Lock()
 _MAKING = ".making-"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What is the same for all logs; as of :func:`pbrl_ppl.close_loop` and `History.load`.
+    """Settings of all logs, as in :func:`pbrl_ppl.close_loop` and `History.load`.
 
     Parameters
     ----------
     seed, substeps, draws, method, catalogue : optional
-        Of the loop; the whole catalogue without one.
+        Arguments of the loop; the whole catalogue by default.
     noise : mapping of str to float
-        Known errors of measuring, by state dimension.
+        Known measurement noise, by state dimension.
     estimate_velocities, columns, units : optional
-        How histories are read.
+        Arguments of `History.load`.
     time_step : float, optional
-        In place of the scene's (s); uneven samples are then interpolated to it.
+        Replaces the scene's (s); uneven samples are interpolated to it.
     """
 
     seed: int = 0
@@ -61,18 +62,29 @@ class Settings:
     time_step: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
-        """All that results depend on, as JSON has it."""
+        """Return all settings that results depend on, for JSON."""
         effects = None
         if self.catalogue is not None:
             effects = [[effect.name, repr(effect.parameters)] for effect in self.catalogue]
         return vars(self) | {"catalogue": effects}
 
 
-#: Closes the loop on one log; what it gives has a ``save(folder)`` that writes a loop's files.
+#: Closes the loop on one log; its result has a ``save(folder)`` that writes a loop's files.
 Run = Callable[[Log, Settings], Any]
 
 
-def close_log(log: Log, settings: Settings) -> Loop:
+@dataclass(frozen=True, eq=False)
+class LoopWithPage:
+    """A closed loop, saved together with its page."""
+
+    loop: Loop
+
+    def save(self, folder: Path) -> None:
+        """Write the loop's files and its report."""
+        self.loop.save(folder, page=loop_page(self.loop))
+
+
+def close_log(log: Log, settings: Settings) -> LoopWithPage:
     """Read a log's files and close the loop."""
     scene = Scene.load(log.scene)
     if settings.noise:
@@ -97,14 +109,16 @@ def close_log(log: Log, settings: Settings) -> Loop:
     if train is None:  # the manifest does not allow it
         raise ValueError(f"log {log.name} has no train")
     catalogue = full_catalogue if settings.catalogue is None else settings.catalogue
-    return close_loop(
-        scene, train, test, catalogue=catalogue, seed=settings.seed, draws=settings.draws,
-        method=settings.method,
+    return LoopWithPage(
+        close_loop(
+            scene, train, test, catalogue=catalogue, seed=settings.seed, draws=settings.draws,
+            method=settings.method,
+        )
     )  # fmt: skip
 
 
 def inputs_sha256(log: Log, settings: Settings) -> str:
-    """Hash of all that a log's result depends on: its files, the settings, the version."""
+    """Return the hash of all that a log's result depends on: files, settings, version."""
     digest = hashlib.sha256()
     for path in (log.scene, log.train, log.test):
         content = b""
@@ -120,31 +134,31 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
 
 
 def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) -> dict[str, Any]:
-    """Close the loop on one log, unless that was done; whatever goes wrong, say so in a file.
+    """Close the loop on one log unless it is finished; write a file with the error if it fails.
 
-    Files are made aside and renamed into the log's folder, the one that says it is done last, so
-    that a worker may die at any moment.
+    Files are written elsewhere and moved into the log's folder, ``report.json`` last, so that a
+    worker may die at any moment.
 
     Parameters
     ----------
     log : Log
-        Which.
+        The log.
     folder : Path
-        Of all logs.
+        Folder of all logs.
     settings : Settings
-        Of all logs.
+        Settings of all logs.
     inputs : str
-        As of :func:`inputs_sha256`.
+        Hash from :func:`inputs_sha256`.
     run : callable
         :func:`close_log`, or another.
 
     Returns
     -------
     dict
-        As of :func:`row_of`.
+        Row of the log, see :func:`row_of`.
     """
     with _ONE:
-        # on a cluster, a result that was lost with its worker is asked for again
+        # a cluster runs a task again whose result was lost with its worker
         if row := row_of(log, folder, inputs):
             return row
         place, begin = folder / log.name, time.monotonic()
@@ -152,8 +166,8 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
             place.mkdir(parents=True, exist_ok=True)
             for name in (DONE, FAILED):
                 (place / name).unlink(missing_ok=True)
-            for left in place.glob(f"{_MAKING}*"):  # by a worker that died
-                shutil.rmtree(left, ignore_errors=True)
+            for old in place.glob(f"{_MAKING}*"):  # from a worker that died
+                shutil.rmtree(old, ignore_errors=True)
             with warnings.catch_warnings(record=True) as caught:
                 warnings.simplefilter("always", UserWarning)
                 loop = run(log, settings)
@@ -165,11 +179,11 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
         except Exception as error:
             return failed(log, folder, error)
     row = row_of(log, folder, inputs)
-    return row or failed(log, folder, OSError(f"{place / DONE}: it was not there once written"))
+    return row or failed(log, folder, OSError(f"{place / DONE}: missing after it was written"))
 
 
 def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:
-    """Write a loop's files into a log's folder, what says that it is done last."""
+    """Write a loop's files into a log's folder, ``report.json`` last."""
     with tempfile.TemporaryDirectory(prefix=_MAKING, dir=place) as aside:
         made = Path(aside) / "result"
         loop.save(made)
@@ -181,7 +195,7 @@ def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:
 
 
 def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
-    """The row of a log that failed; the message is kept in its folder, where that can be."""
+    """Return the row of a log that failed, and write the message into its folder if possible."""
     message = " ".join(str(error).split()) or type(error).__name__
     if not isinstance(error, PbrlError):
         message = f"{type(error).__name__}: {message}"
@@ -197,12 +211,12 @@ def failed(log: Log, folder: Path, error: BaseException) -> dict[str, Any]:
 
 
 def row_of(log: Log, folder: Path, inputs: str) -> dict[str, Any] | None:
-    """What a finished log's ``report.json`` says in short; None if there is none of these inputs.
+    """Return the summary of a finished log's ``report.json``; None if its inputs are others.
 
     Parameters
     ----------
     log, folder, inputs
-        As of :func:`settle`.
+        Arguments of :func:`settle`.
 
     Returns
     -------
@@ -236,4 +250,4 @@ def row_of(log: Log, folder: Path, inputs: str) -> dict[str, Any] | None:
             "warnings": about["warnings"],
         }
     except (OSError, ValueError, KeyError, TypeError):
-        return None  # none, or not one of these: it is made anew
+        return None  # missing, or of other contents: the log is run again
