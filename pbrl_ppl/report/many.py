@@ -51,7 +51,7 @@ class ManyLoops:
         One a log, in the manifest's order: its status (``done``, ``failed``, ``waiting``), verdict
         and effects, or the error.
     pooled : mapping of str to Pooled
-        By kind: hyper-parameters that its robots share, and each robot's parameters given them.
+        By kind: hyper-parameters that robots share, and each robot's parameters given them.
     not_pooled : mapping of str to str
         By kind: why its robots were not pooled.
     """
@@ -67,7 +67,7 @@ class ManyLoops:
         return tuple(row["name"] for row in self.rows if row["status"] == "failed")
 
     def table(self) -> pd.DataFrame:
-        """Return a row a log: status, verdict, effects, errors before and after, message, folder."""
+        """Return a row a log: status, verdict, effects, errors, message and folder."""
         return summary_table(self.rows)
 
     def effects(self) -> pd.DataFrame:
