@@ -2,6 +2,7 @@
 
 import copy
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -452,6 +453,12 @@ def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         with pytest.raises(OutputError, match="cannot be written"):
             pp.report(made_up(), place)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_report_is_function_and_subpackage() -> None:
+    """Whichever was imported first."""
+    assert callable(pp.report)
+    assert pp.report is sys.modules["pbrl_ppl.report"] is pp.report.report
 
 
 def test_velocities_that_are_not_used_are_named() -> None:
