@@ -15,8 +15,9 @@ from .agents import act as act
 from .agents import run_episode as run_episode
 from .agents import run_episodes as run_episodes
 from .criticism import Criteria as Criteria
-from .criticism import Findings as Findings
+from .criticism import Loop as Loop
 from .criticism import PriorCheck as PriorCheck
+from .criticism import close_loop as close_loop
 from .criticism import prior_predictive_check as prior_predictive_check
 from .effects import Attached as Attached
 from .effects import Effect as Effect
@@ -58,10 +59,9 @@ from .posterior import loo_pit as loo_pit
 from .posterior import save_posterior as save_posterior
 from .posterior import uninformed as uninformed
 from .posterior import updated_scene as updated_scene
-from .report import Loop as Loop
 from .report import ManyLoops as ManyLoops
-from .report import close_loop as close_loop
 from .report import close_loop_many as close_loop_many
+from .report import report as report
 from .sampling import Calibration as Calibration
 from .sampling import Pooled as Pooled
 from .sampling import calibrate as calibrate

@@ -151,7 +151,7 @@ def test_a_twin_is_a_right_name(attribution, row) -> None:
 
 def test_excess_and_baselines_by_hand(attribution, row) -> None:
     found = row("catalogued", "effects-added", "linear_drag")
-    found.findings["error"]["after"]["rollout_rmse"] = {"x": 0.011, "vx": 0.11}
+    found["error"]["after"]["rollout_rmse"] = {"x": 0.011, "vx": 0.11}
     # the loop may leave out a velocity that looks as if computed from positions
     oracle = attribution.oracle.Oracle(99.0, 1e-9, {"x": 0.01, "vx": 0.1, "vy": 0.1})
     rows = [
@@ -397,7 +397,7 @@ def test_a_failure_is_a_row(attribution, monkeypatch) -> None:
     def breaks(*args, **settings):
         raise pp.PbrlError("no way; try another")
 
-    monkeypatch.setattr(attribution.one_case, "revise", breaks)
+    monkeypatch.setattr(attribution.one_case, "close_loop", breaks)
     row = attribution.one_case.run_case(puck(attribution), seed=0)
     assert row.verdict == "failed"
     assert "PbrlError: no way" in row.error
@@ -405,7 +405,9 @@ def test_a_failure_is_a_row(attribution, monkeypatch) -> None:
 
 @pytest.mark.skipif(not hasattr(signal, "SIGALRM"), reason="no alarms on this system")
 def test_a_case_that_takes_too_long_is_a_failure(attribution, monkeypatch) -> None:
-    monkeypatch.setattr(attribution.one_case, "revise", lambda *args, **settings: time.sleep(30))
+    monkeypatch.setattr(
+        attribution.one_case, "close_loop", lambda *args, **settings: time.sleep(30)
+    )
     begin = time.monotonic()
     row = attribution.one_case.run_case(puck(attribution, n_train=2), seed=0, limit=2)
     assert time.monotonic() - begin < 20

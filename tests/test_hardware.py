@@ -237,8 +237,8 @@ def test_a_simulated_folder_is_run_as_a_measured_one(measured, folder, monkeypat
         loops.append(measured_revise(*given, **options))
         return loops[-1]
 
-    measured_revise = measured.revise
-    monkeypatch.setattr(measured, "revise", kept)
+    measured_revise = measured.close_loop
+    monkeypatch.setattr(measured, "close_loop", kept)
     own = measured.Recording("disc", folder)
     result, picture = measured.run(own)
     assert (result.error, result.verdict) == (None, "effects-added")
@@ -260,7 +260,7 @@ def test_a_simulated_folder_is_run_as_a_measured_one(measured, folder, monkeypat
     # none of the held-out trajectories is as long as 3 s
     asked = replace(own, ahead=(measured.Ahead(0.5, "position"), measured.Ahead(3.0, "angle")))
     train, test = measured.load_recording(own)[1:]
-    half, long = measured.errors_ahead(asked, found, train, test, seed=0)
+    half, long = measured.errors_ahead(asked, found, train, test)
     assert half["after"] < place["after"] * 3
     assert long["before"] is None and long["after"] is None
 

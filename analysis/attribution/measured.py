@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from running import sources
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import Findings, revise
+from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
-from pbrl_ppl.criticism.histories import checked_histories
+from pbrl_ppl.criticism.recordings import checked_histories
 from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import trajectory_mode
@@ -261,9 +261,9 @@ def run(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the result says what matters of them
             scene, train, test = load_recording(recording)
-            found = revise(scene, train, test, seed=seed, method=method, progress=progress)
+            found = close_loop(scene, train, test, seed=seed, method=method, progress=progress)
             seconds = time.perf_counter() - begin
-            errors = errors_ahead(recording, found, train, test, seed)
+            errors = errors_ahead(recording, found, train, test)
     except Exception as error:  # the other recordings are run all the same
         why = f"{type(error).__name__}: {error}"
         return replace(result, error=why, seconds=time.perf_counter() - begin), None
@@ -279,12 +279,11 @@ def run(
 
 
 def errors_ahead(
-    recording: Recording, found: Findings, train: pp.History, test: pp.History, seed: int
+    recording: Recording, found: Loop, train: pp.History, test: pp.History
 ) -> tuple[dict[str, Any], ...]:
     """Return held-out errors of each forecast, before and after; None for short trajectories."""
     scene = found.scene
     train, test, *_ = checked_histories(scene, train, test)
-    judged = HeldOut(test, seed)
     by_name = {effect.name: effect for effect in pp.catalogue}
     added = [by_name[each.effect].on(each.body) for each in found.added]
     models = [(found.posterior_before, ())]
@@ -297,7 +296,7 @@ def errors_ahead(
         )
         vectors = problem.layout.to_vectors(draws(posterior), len(draws(posterior)["sigma"]))
         mode = trajectory_mode(problem, vectors.mean(axis=0))
-        fitted.append((judged.problem(mode), mode))
+        fitted.append((HeldOut.of(mode, test).problem, mode))
     own = found.rollout_horizon * scene.time_step
     asked = recording.ahead or tuple(Ahead(own, quantity) for quantity in QUANTITIES)
     rows = []
@@ -316,8 +315,8 @@ def errors_ahead(
     return tuple(row for row in rows if row["before"] is not None)
 
 
-def picture(found: Findings) -> bytes:
-    """Return a PNG of a held-out trajectory, measured and forecast from its start."""
+def picture(found: Loop) -> bytes:
+    """PNG of positions and angle of a held-out trajectory, measured and forecast from its start."""
     shown = found.rollout
     columns = [place for place, name in enumerate(shown.names) if name not in _VELOCITIES]
 

@@ -17,7 +17,7 @@ import pbrl_ppl as pp
 from attribution.baselines import ask_baselines
 from attribution.cases import CATALOGUED, Case
 from attribution.oracle import Oracle, ask, declared_mode, sized, true_parameters
-from pbrl_ppl.criticism import revise
+from pbrl_ppl.criticism import close_loop
 
 #: Parameters of which more than one value is the truth: any number between two trajectories.
 _AMBIGUOUS = {("mass_change", "trajectory")}
@@ -163,7 +163,7 @@ def _loop(
     """Return the loop's findings, and the start times of its stages (s)."""
     begin = time.perf_counter()
     stages: list[tuple[float, str]] = []
-    found = revise(
+    found = close_loop(
         case.body.scene,
         train,
         test,

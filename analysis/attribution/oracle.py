@@ -13,8 +13,8 @@ from attribution.cases import OUTSIDE, Case
 from attribution.outside import OUTSIDE_EFFECTS, parameters_of
 from attribution.sizes import STRONGEST
 from pbrl_ppl.criticism.forecast import forecast
-from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
-from pbrl_ppl.criticism.resolution import with_enough_substeps
+from pbrl_ppl.criticism.held_out import HeldOut, longest_rollout, rollout_horizon
+from pbrl_ppl.criticism.refinement import with_enough_substeps
 from pbrl_ppl.effects import Attached, attach
 from pbrl_ppl.likelihood import Problem, bodies_acceleration
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
@@ -125,12 +125,12 @@ def ask(case: Case, declared: Mode, test: pp.History, seed: int) -> Oracle:
     """Fit the declared model with the hidden effect and without, and compare the likelihoods."""
     without, best, statistic = _compared(case, declared)
     # what lasts lasts in what was recorded later
-    held_out = HeldOut(test.numbered(case.body.setups[0].n_train), seed)
-    horizon = held_out.longest(
-        rollout_horizon(without.problem.data.history, case.body.scene.time_step)
+    test = test.numbered(case.body.setups[0].n_train)
+    horizon = longest_rollout(
+        test, rollout_horizon(without.problem.data.history, case.body.scene.time_step)
     )
     plain, errors = (
-        forecast(held_out.problem(mode), mode.phi, mode.sigma, horizon).rmse()
+        forecast(HeldOut.of(mode, test).problem, mode.phi, mode.sigma, horizon).rmse()
         for mode in (without, best)
     )
     noise = case.body.noise

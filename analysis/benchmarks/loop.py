@@ -21,10 +21,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import loop
+from pbrl_ppl.criticism import closing, score
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
+from pbrl_ppl.report import loop_page
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import MODELS
@@ -46,14 +47,14 @@ def closed(scene_file: Path, folder: Path) -> tuple[float, pp.Loop]:
         scene = pp.Scene.load(scene_file)
         train, test = (pp.History.load(folder / f"{name}.csv", scene) for name in ("train", "test"))
         found = pp.close_loop(scene, train, test, seed=1)
-        found.save(Path(out) / "loop")
+        found.save(Path(out) / "loop", page=loop_page(found))
     return time.perf_counter() - begin, found
 
 
 def told(found: pp.Loop) -> str:
     """Return a sentence on a loop's recording and findings."""
     names = ", ".join(f"{one.effect} on {one.body}" for one in found.added) or "nothing"
-    count = found.findings.provenance["transitions"]
+    count = found.provenance["transitions"]
     return f"{count} transitions; {found.verdict}, added: {names}"
 
 
@@ -74,9 +75,9 @@ def measure_loop() -> Iterator[Row]:
     problem = Problem.of(scene, train, attach(scene), threads=2)
     mode = trajectory_mode(problem, find_mode(problem, seed=1).phi)
     lacking = candidates(scene, problem.physics.effects)
-    loop.rank_candidates(mode, lacking)  # laws are compiled by now, as they are in the loop
+    score.rank_candidates(mode, lacking)  # laws are compiled by now, as they are in the loop
     begin = time.perf_counter()
-    loop.rank_candidates(mode, lacking)
+    score.rank_candidates(mode, lacking)
     rank = time.perf_counter() - begin
     begin = time.perf_counter()
     for _ in range(10):
@@ -85,7 +86,7 @@ def measure_loop() -> Iterator[Row]:
     begin = time.perf_counter()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        found = loop.revise(scene, train, test, seed=1)
+        found = closing.close_loop(scene, train, test, seed=1)
     took = time.perf_counter() - begin
     what = f"cart, {train.n_transitions} transitions, {len(lacking)} candidates: "
     yield "loop_seconds", what + "the whole loop (s)", "< 100", took

@@ -60,7 +60,7 @@ cart
 # cross-validation decides.
 
 # %%
-figure = plot_candidates(cart.findings)
+figure = plot_candidates(cart)
 figure.savefig(OUT / "03_candidates.png", dpi=100)
 figure
 
@@ -88,7 +88,7 @@ print("unexplained:", cart.unexplained)
 # the missing effect accumulates.
 
 # %%
-figure = plot_errors(cart.findings)
+figure = plot_errors(cart)
 figure.savefig(OUT / "03_errors.png", dpi=100)
 figure
 
@@ -97,7 +97,7 @@ pd.DataFrame(
     {
         "before": cart.before.rollout_rmse,
         "after": cart.after.rollout_rmse,
-        "noise floor": cart.findings.noise_floor.rollout_rmse,
+        "noise floor": cart.noise_floor.rollout_rmse,
     }
 ).round(4)
 
@@ -106,16 +106,16 @@ pd.DataFrame(
 # models.
 
 # %%
-figure = plot_rollout(cart.findings)
+figure = plot_rollout(cart)
 figure.savefig(OUT / "03_rollout.png", dpi=100)
 figure
 
 # %% [markdown]
-# `cart.report(path)` writes all this as one page, and `cart.save(folder)` the posteriors too. The
-# posteriors are ordinary ones: `cart.posterior_after` goes into ArviZ or a planner.
+# `pp.report(cart, path)` writes all this as one page, and `cart.save(folder)` the posteriors. These
+# are ordinary ones: `cart.posterior_after` goes into ArviZ or a planner.
 
 # %%
-print(cart.report(OUT / "03_cart.html").name)
+print(pp.report(cart, OUT / "03_cart.html").name)
 
 # %% [markdown]
 # ## A measured pendulum
@@ -152,11 +152,11 @@ if pendulum is not None:
     print("error before:", pendulum.before.rollout_rmse)
     print("error after: ", pendulum.after.rollout_rmse)
     for name, draw in (("errors", plot_errors), ("rollout", plot_rollout)):
-        figure = draw(pendulum.findings)
+        figure = draw(pendulum)
         figure.savefig(OUT / f"03_pendulum_{name}.png", dpi=100)
 
 # %%
-plot_rollout(pendulum.findings) if pendulum is not None else None
+plot_rollout(pendulum) if pendulum is not None else None
 
 # %% [markdown]
 # ## A measured block, pushed over a table
@@ -199,7 +199,7 @@ if block is not None:
         last = errors.rollout_rmse
         far, turned = 1e3 * np.hypot(last["x"], last["y"]), np.degrees(last["theta"])
         print(f"error {label}: {far:.1f} mm, {turned:.1f} degrees")
-    plot_candidates(block.findings).savefig(OUT / "03_block_candidates.png", dpi=100)
+    plot_candidates(block).savefig(OUT / "03_block_candidates.png", dpi=100)
 
 # %%
-plot_candidates(block.findings) if block is not None else None
+plot_candidates(block) if block is not None else None

@@ -125,7 +125,7 @@ print(f"simulated with {STRENGTH} N/m")
 # it come next.
 
 # %%
-figure = plot_candidates(loop.findings)
+figure = plot_candidates(loop)
 figure.savefig(OUT / "04_candidates.png", dpi=100)
 figure
 
@@ -138,7 +138,7 @@ errors = pd.DataFrame(
         "declared": loop.before.rollout_rmse,
         "without swirl in the catalogue": without.after.rollout_rmse,
         "with it": loop.after.rollout_rmse,
-        "noise floor": loop.findings.noise_floor.rollout_rmse,
+        "noise floor": loop.noise_floor.rollout_rmse,
     }
 )
 errors.round(4)

@@ -13,7 +13,7 @@ from typing import Any
 from running import cache_file, limited, sources
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import ADEQUATE, revise
+from pbrl_ppl.criticism import ADEQUATE, close_loop
 from recordings.cases import Case
 from recordings.oracle import Oracle, ask
 
@@ -121,7 +121,7 @@ def run_case(case: Case, seed: int, bare: bool, limit: int) -> Row:
             known["oracle"] = ask(case, recordings[0])
             train, test = (case.history(each, bare) for each in recordings)
             begin = time.perf_counter()
-            found = revise(case.scene, train, test, method="laplace", seed=seed)
+            found = close_loop(case.scene, train, test, method="laplace", seed=seed)
             known["findings"] = found.to_dict()
     except Exception as error:
         known["error"] = f"{type(error).__name__}: {error} ({_where(error)})"

@@ -54,7 +54,7 @@ def calibrate(
         declared, (design,) = options.load(
             scene, [history], reading, time_step=time_step, noise=noise
         )
-        from pbrl_ppl import report
+        import pbrl_ppl.report as report
         from pbrl_ppl.files import write_atomically
         from pbrl_ppl.sampling import calibration
 

@@ -26,7 +26,8 @@ from pbrl_ppl.cli.terminal import (
 from pbrl_ppl.errors import OutputError
 
 if TYPE_CHECKING:
-    from pbrl_ppl.report import Loop, Source
+    from pbrl_ppl.criticism import Loop
+    from pbrl_ppl.report import Source
 
 
 class Method(StrEnum):
@@ -137,11 +138,11 @@ def close_loop(
             scene, paths, reading, time_step=time_step, noise=noise, substeps=substeps
         )
         progress("loading the sampler")
-        from pbrl_ppl import report
-        from pbrl_ppl.criticism import NOT_CONVERGED
+        import pbrl_ppl.report as report
+        from pbrl_ppl import criticism
 
-        report.check_folder(output, overwrite)
-        loop = report.close_loop(
+        criticism.check_folder(output, overwrite)
+        loop = criticism.close_loop(
             declared,
             *histories,
             seed=seed,
@@ -153,15 +154,15 @@ def close_loop(
         source = report.Source(
             str(scene), str(train), str(test or ""), options.command_line(context)
         )
-        loop.save(output, overwrite=overwrite, source=source)
+        loop.save(output, overwrite, page=report.loop_page(loop, source))
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     if as_json:
-        print_json(loop.findings.to_dict() | {"report": output / "report.html"} | remainder)
+        print_json(loop.to_dict() | {"report": output / "report.html"} | remainder)
     else:
         words = remainder["learned_remainder"]["words"] if remainder else ""
-        for line in report.in_brief(loop.findings, output, words):
+        for line in report.in_brief(loop, output, words):
             typer.echo(line)
-    if loop.verdict == NOT_CONVERGED:
+    if loop.verdict == criticism.NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
 
 
@@ -170,6 +171,7 @@ def _remainder(
 ) -> dict[str, dict[str, Any]]:
     """Learn a force for the residual and save it with the results, or return why there is none."""
     from pbrl_ppl.errors import FitError
+    from pbrl_ppl.report import loop_page
 
     path = folder / "remainder.nc"
     path.unlink(missing_ok=True)  # of an earlier run
@@ -178,7 +180,7 @@ def _remainder(
     except FitError as error:
         return {"learned_remainder": {"words": str(error), "posterior": None}}
     progress("writing the report with it")
-    loop.save(folder, overwrite=True, source=source)
+    loop.save(folder, overwrite=True, page=loop_page(loop, source))
     return {"learned_remainder": {"words": loop.remainder_words, "posterior": path}}
 
 
@@ -198,7 +200,7 @@ def _close_many(
     with interruptible(kept), stages(quiet) as progress:
         check_can_make(output)
         progress("reading the manifest")
-        from pbrl_ppl import report
+        import pbrl_ppl.report as report
 
         logs = report.read_manifest(manifest)  # its errors come before a cluster is sought
         with _executor(jobs, scheduler) as executor:

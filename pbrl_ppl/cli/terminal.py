@@ -208,7 +208,7 @@ def check_can_make(folder: Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (NotADirectoryError, FileExistsError):
-        pass  # a file is in the way, and `report.check_folder` says which
+        pass  # a file is in the way, and `criticism.check_folder` says which
     except OSError as error:
         raise OutputError(
             f"output folder {folder}: it cannot be made or written ({error.strerror}); choose"

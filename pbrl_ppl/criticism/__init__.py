@@ -1,15 +1,11 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
-from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.closing import close_loop
+from pbrl_ppl.criticism.criteria import DECISIVE, DEFAULT, TRIED, Criteria
 from pbrl_ppl.criticism.cross_validation import Change, gain
 from pbrl_ppl.criticism.dependence import QUANTITIES, recorded_quantities
-from pbrl_ppl.criticism.findings import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Findings
-from pbrl_ppl.criticism.loop import revise
-from pbrl_ppl.criticism.prior_check import (
-    PriorCheck,
-    prior_predictive_check,
-    telling_horizon,
-)
+from pbrl_ppl.criticism.loop import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Loop, check_folder
+from pbrl_ppl.criticism.prior_check import PriorCheck, prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import Ranking, criticise
 from pbrl_ppl.criticism.remainder import learn_remainder
 from pbrl_ppl.criticism.results import (
@@ -21,8 +17,7 @@ from pbrl_ppl.criticism.results import (
     Unexplained,
 )
 from pbrl_ppl.criticism.rivals import Rival, fit_rivals, kept_groups, named_effects
-from pbrl_ppl.criticism.score import DECISIVE, Signature, inseparable, rank_candidates, twins
-from pbrl_ppl.criticism.selection import TRIED
+from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.criticism.stages import Stage
 
 __all__ = [
@@ -39,7 +34,7 @@ __all__ = [
     "Change",
     "Criteria",
     "Errors",
-    "Findings",
+    "Loop",
     "PriorCheck",
     "Ranking",
     "ResidualTest",
@@ -47,6 +42,8 @@ __all__ = [
     "Signature",
     "Stage",
     "Unexplained",
+    "check_folder",
+    "close_loop",
     "criticise",
     "fit_rivals",
     "gain",
@@ -57,7 +54,6 @@ __all__ = [
     "prior_predictive_check",
     "rank_candidates",
     "recorded_quantities",
-    "revise",
     "telling_horizon",
     "twins",
 ]

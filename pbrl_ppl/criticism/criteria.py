@@ -6,6 +6,179 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
+class EngineCriteria:
+    """When the engine's numerical error is small enough.
+
+    Parameters
+    ----------
+    error_factor : float
+        An acceleration is the engine's error below this many times what doubling the substeps
+        changes; that change is about half of the error, and the data's maker has one, too.
+    small_shift : float
+        A doubling of the substeps may move innovations by this share of their noise.
+    most_substeps : int
+        Substeps of an interval, at most.
+    better_mode : float
+        A mode is replaced by one smoothed anew whose log-posterior is higher by this (nats).
+    large : float
+        An unexplained acceleration above this share of the bodies' is no numerical error.
+    still : float
+        One that a doubling of the substeps moves by a smaller share is no numerical error either.
+    """
+
+    error_factor: float = 3.0
+    small_shift: float = 0.1
+    most_substeps: int = 640
+    better_mode: float = 5.0
+    large: float = 0.1
+    still: float = 0.1
+
+
+@dataclass(frozen=True)
+class ScoreCriteria:
+    """When a signature is absorbed, and when two signatures are the same.
+
+    Parameters
+    ----------
+    absorbed : float
+        Where the declared parameters leave less than this share of a signature they absorb it.
+    visible : float
+        A change below this, in units of noise, is the engine's rounding.
+    parallel : float
+        Effects whose projected signatures have a larger cosine are not separable.
+    decisive : float
+        Effects whose score statistics differ by this are separable all the same.
+    same : float
+        Signatures with a larger cosine than this are the same physics.
+    detection_p : float
+        P-value of a detection limit.
+    detection_power : float
+        Probability that an effect at the detection limit reaches that p-value.
+    """
+
+    absorbed: float = 1e-3
+    visible: float = 1e-3
+    parallel: float = 0.95
+    decisive: float = 10.0
+    same: float = 0.9999
+    detection_p: float = 0.01
+    detection_power: float = 0.9
+
+
+@dataclass(frozen=True)
+class SelectionCriteria:
+    """Which candidates are refitted, and how refits compare.
+
+    Parameters
+    ----------
+    refits : int
+        Candidates that are refitted in a round, at most.
+    worth_a_refit : float
+        A candidate with less than this share of the leader's statistic is refitted only once the
+        leader has failed.
+    informed : float
+        The data inform a parameter whose posterior is narrower than this share of its prior.
+    tie : float
+        Log-likelihoods that differ by less (nats) do not choose between effects: the order of the
+        catalogue does.
+    least_trajectories : int
+        With fewer trajectories, cross-validation leaves out runs of them, and evidence decides.
+    """
+
+    refits: int = 4
+    worth_a_refit: float = 0.5
+    informed: float = 0.7
+    tie: float = 1.0
+    least_trajectories: int = 8
+
+
+@dataclass(frozen=True)
+class ResidualCriteria:
+    """When a test of the residual can fail, and what it ignores.
+
+    Parameters
+    ----------
+    dependence_p : float
+        Significance of the permutation test: chance of calling clean data unexplained.
+    dependence_share : float
+        A smaller share of a residual's variance that recorded quantities predict is negligible.
+    least_transitions : int
+        Transitions that the permutation test needs.
+    correlation_share : float
+        A smaller squared correlation of innovations is negligible.
+    least_pairs : int
+        A correlation counts if it is taken over more pairs than this.
+    lags : int
+        Intervals up to which innovations are correlated with earlier ones and with commands.
+    most_error : float
+        A forecast's error counts for no more than this many times its expected size: a single one
+        that a bad frame or a grazing contact spoils is no misfit.
+    """
+
+    dependence_p: float = 0.01
+    dependence_share: float = 0.02
+    least_transitions: int = 20
+    correlation_share: float = 0.02
+    least_pairs: int = 10
+    lags: int = 5
+    most_error: float = 3.0
+
+
+@dataclass(frozen=True)
+class OutlierCriteria:
+    """When a single measurement is left out; it must meet the first three.
+
+    Parameters
+    ----------
+    deviations : float
+        Its residual exceeds this many robust standard deviations: 1 of 10^14 of Gaussian noise.
+    errors : float
+        It is this many measurement errors from the smoothed state, which it attracts.
+    neighbours : float
+        It is this many times as far off as its neighbours, which an event that lasts moves, too.
+    most : float
+        If a larger share of a coordinate's measurements is far off, none is left out.
+    least_measurements : int
+        Measurements of a coordinate that are needed to call one far off.
+    """
+
+    deviations: float = 8.0
+    errors: float = 4.0
+    neighbours: float = 2.0
+    most: float = 0.05
+    least_measurements: int = 12
+
+
+@dataclass(frozen=True)
+class PriorCriteria:
+    """When the declared prior could not have made the data.
+
+    Parameters
+    ----------
+    most_beyond : float
+        Share of measurements beyond all draws from the prior. Measured with 200 draws: at most
+        0.08 on sound problems, at least 0.14 with a mass 100 times too large.
+    chance : float
+        That share must also be less likely than this under the prior: few measurements vary.
+    slack : float
+        Share of the usual change by which draws may miss where velocities were not measured.
+    least_draws : int
+        Draws from the prior that the check needs.
+    signal : float
+        A horizon is long enough if changes are this many times the measurement errors.
+    unit_factor : float
+        A factor of wrong units may lie this far beyond the range of the prior's factors.
+    """
+
+    most_beyond: float = 0.11
+    chance: float = 1e-3
+    slack: float = 0.25
+    least_draws: int = 50
+    signal: float = 5.0
+    unit_factor: float = 1.5
+
+
+@dataclass(frozen=True)
 class Criteria:
     """Thresholds of the loop's decisions, none of them taken from a data set.
 
@@ -18,30 +191,45 @@ class Criteria:
         Probability that a test of a single quantity fails without cause.
     try_p : float
         A candidate is refitted if its p-value, corrected for all candidates, is below this.
-    min_elpd, min_elpd_se : float
-        Gain in cross-validated log predictive density that an effect needs, in nats and in standard
-        errors; the latter are widened to Student's t for few folds. A signed-rank test of the folds
-        at the same level does, too.
+    min_elpd : float
+        Gain in cross-validated log predictive density (nats) that an effect needs.
+    min_elpd_se : float
+        Standard errors that this gain needs, widened to Student's t for few folds. A signed-rank
+        test of the folds at the same level is enough, too.
     min_evidence : float
         Gain in log-evidence (nats) that an effect needs instead, where trajectories are too few for
         cross-validation over them.
     far_out : float
         Prior scales from the prior's centre beyond which an effect's size is not accepted.
-    engines : float
-        An acceleration is the engine's own error below this many times what doubling the substeps
-        changes; that change is about half of the error, and the data's maker has one, too.
     worse_forecast : float
         Forecasts may have this many times the error that noise and a negligible acceleration make.
     most_added : int
         Effects added at most.
-    large_remainder, large_if_small : float
-        Share of the square of the unexplained acceleration that may remain beside a name; and where
-        what remains is negligible.
+    noise_rounds : int
+        Times that the noise model is corrected and the search for effects begins again, at most.
+    min_remainder : float
+        Log marginal likelihood (nats) that a learned force must gain over noise alone.
+    large_remainder : float
+        Added effects are withdrawn if a larger share of the unexplained acceleration's square
+        remains: any effect takes up a part of a misfit.
+    large_if_small : float
+        The same share where the remaining acceleration is negligible.
     most_predictable : float
-        A larger remainder may stay where less than this share of what could be predicted of the
-        innovations still can be: what remains is then random.
-    worst_rhat, least_ess : float
-        Chains with a larger R-hat or a smaller effective sample size give no verdict.
+        A remainder up to ``large_if_small`` may also stay if the predictable share of the
+        innovations falls below this multiple of what it was: the remainder is then random.
+    worst_rhat : float
+        Chains with a larger R-hat give no verdict.
+    least_ess : float
+        Chains with a smaller effective sample size give no verdict.
+    engine, score, selection, residual, outliers, prior
+        Thresholds of single stages.
+
+    Examples
+    --------
+    ::
+
+        strict = pp.Criteria(try_p=1e-3, most_added=2)
+        pp.close_loop(scene, train, test, criteria=strict)
     """
 
     negligible: float = 0.01
@@ -51,15 +239,24 @@ class Criteria:
     min_elpd_se: float = 2.0
     min_evidence: float = 4.0
     far_out: float = 6.0
-    engines: float = 3.0
     worse_forecast: float = 1.5
     most_added: int = 5
+    noise_rounds: int = 4
+    min_remainder: float = 6.0
     large_remainder: float = 0.2
     large_if_small: float = 0.5
     most_predictable: float = 0.1
     worst_rhat: float = 1.05
     least_ess: float = 100.0
+    engine: EngineCriteria = EngineCriteria()
+    score: ScoreCriteria = ScoreCriteria()
+    selection: SelectionCriteria = SelectionCriteria()
+    residual: ResidualCriteria = ResidualCriteria()
+    outliers: OutlierCriteria = OutlierCriteria()
+    prior: PriorCriteria = PriorCriteria()
 
 
-#: Those that the loop decides by unless it is given others.
+#: The defaults of :class:`Criteria`.
 DEFAULT = Criteria()
+#: Defaults of two thresholds that other subpackages use.
+DECISIVE, TRIED = DEFAULT.score.decisive, DEFAULT.selection.refits

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm, t, wilcoxon
 
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.likelihood import TransitionLikelihood, robust
 from pbrl_ppl.modes import Mode, profile_sigma
@@ -17,8 +18,6 @@ from pbrl_ppl.parameters import box, differentiate, inside, prior_residual, prio
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-#: With fewer trajectories than this, folds are runs of transitions within them.
-LEAST_FOLDS = 8
 #: A step that a bound shortens by more than this (standard deviations) is stopped by it.
 _ROUNDING = 1e-6
 #: Steps of derivatives are a posterior standard deviation where that is less than this share of the
@@ -28,7 +27,7 @@ _INFORMED, _NEAR = 0.7, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Each fold under the posterior of all others.
+    """Predictions of each fold from a fit to all others.
 
     Parameters
     ----------
@@ -45,7 +44,7 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """Sum over folds of what one model gains over another.
+    """Sum over folds of one model's gain over another.
 
     Parameters
     ----------
@@ -56,8 +55,8 @@ class Change:
     folds : int
         Number of folds.
     signed_rank : float
-        One-sided p-value of Wilcoxon's signed-rank test that folds gain: a fold that gains far more
-        than others makes the standard error large, and no gain less certain.
+        One-sided p-value of Wilcoxon's signed-rank test that folds gain: one fold that gains far
+        more than others makes the standard error large, but the gain no less certain.
     """
 
     total: float
@@ -74,41 +73,41 @@ class Change:
         return cls(float(gains.sum()), error, n, ranked)
 
     def needed(self, errors: float) -> float:
-        """Smallest sum that is as certain as so many standard errors of many folds are."""
+        """Return the smallest sum that is as certain as so many standard errors of many folds."""
         if self.folds < 2:
             return np.inf
         return float(t.isf(norm.sf(errors), self.folds - 1)) * self.error
 
     def certain(self, errors: float) -> bool:
-        """Whether the gain is as certain as one of so many standard errors of many folds."""
+        """Return whether the gain is as certain as so many standard errors of many folds."""
         if self.total <= 0:
             return False
         return self.total >= self.needed(errors) or self.signed_rank < norm.sf(errors)
 
 
-def folds(mode: Mode) -> Ints:
-    """Fold of each transition, shape (transition,): its trajectory, or a run of it.
+def folds(mode: Mode, criteria: Criteria = DEFAULT) -> Ints:
+    """Return the fold of each transition, shape (transition,): its trajectory, or a run of it.
 
-    Given what was measured before, a run's innovations do not depend on those of another.
+    Given the measurements before, innovations of different runs are independent.
     """
     segments = mode.problem.segments
     trajectory, step = segments.trajectory, segments.step
-    count = len(np.unique(trajectory))
-    if count >= LEAST_FOLDS:
+    count, least = trajectory_count(mode), criteria.selection.least_trajectories
+    if count >= least:
         return np.unique(trajectory, return_inverse=True)[1].astype(np.intp)
-    runs = -(-LEAST_FOLDS // count)
+    runs = -(-least // count)
     length = np.array([(trajectory == t).sum() for t in trajectory])
     run = np.minimum(step * runs // np.maximum(length, 1), runs - 1)
     return np.unique(trajectory * runs + run, return_inverse=True)[1].astype(np.intp)
 
 
-def few_trajectories(mode: Mode) -> bool:
-    """Whether there are too few trajectories to leave out whole ones."""
-    return len(np.unique(mode.problem.segments.trajectory)) < LEAST_FOLDS
+def trajectory_count(mode: Mode) -> int:
+    """Return the number of trajectories that a mode was fitted to."""
+    return len(np.unique(mode.problem.segments.trajectory))
 
 
 def leave_out(mode: Mode, fold: Ints) -> LeftOut:
-    """Fit each fold's complement and judge the fold by it.
+    """Return the predictions of each fold from a fit to all others.
 
     The noise is estimated anew without the fold, whose measurements count as missing. The whitened
     residual z under that noise is linear in the parameters about the mode, with Jacobian J and
@@ -120,7 +119,7 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
     Parameters
     ----------
     mode : Mode
-        Of whole trajectories.
+        Fitted to whole trajectories.
     fold : ndarray of int
         Fold of each transition, from 0 on.
     """
@@ -146,7 +145,7 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
         out, inner = (jacobian[rows].reshape(z[rows].size, len(phi)) for rows in (own, ~own))
         rest = inner.T @ inner + prior
         whole = rest + out.T @ out
-        # a climb ends near the top, and what one fold alone knows of would be pulled far from there
+        # the optimiser stops near the top; the rest of the step must not count for this fold
         gradient = out.T @ z[own].ravel() + inner.T @ z[~own].ravel() + pull
         move, free = _to_top(mode, whole, gradient, scale)
         at_top = z[own].ravel() + out @ move
@@ -163,23 +162,23 @@ def leave_out(mode: Mode, fold: Ints) -> LeftOut:
     return LeftOut(density, phis, sigmas)
 
 
-def gain(before: Mode, after: Mode) -> Change:
-    """Gain in cross-validated log predictive density of one model over another."""
-    fold = folds(after)
+def gain(before: Mode, after: Mode, criteria: Criteria = DEFAULT) -> Change:
+    """Return the gain in cross-validated log predictive density of one model over another."""
+    fold = folds(after, criteria)
     return Change.of(leave_out(after, fold).density - leave_out(before, fold).density)
 
 
 def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) -> Array:
-    """Sum of squared errors of forecasts of each fold, by what was fitted without it.
+    """Return sums of squared forecast errors of each fold, from the fit without it.
 
     Parameters
     ----------
     mode : Mode
-        Of whole trajectories.
+        Fitted to whole trajectories.
     fold : ndarray of int
         Fold of each transition.
     left_out : LeftOut
-        Of these folds.
+        Fits without these folds.
     intervals : int
         Length of the forecasts.
 
@@ -191,17 +190,17 @@ def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) 
     cells = len(mode.problem.trajectory_noise.cells.places)
     squares = np.full((len(left_out.phi), cells), np.nan)
     for f, (phi, sigma) in enumerate(zip(left_out.phi, left_out.sigma, strict=True)):
-        told = forecast(mode.problem, phi, sigma, intervals, within=fold == f)
-        seen = np.isfinite(told.error)
-        total = np.where(seen, told.error, 0.0) ** 2
+        error = forecast(mode.problem, phi, sigma, intervals, within=fold == f).error
+        seen = np.isfinite(error)
+        total = np.where(seen, error, 0.0) ** 2
         squares[f] = np.where(seen.any(axis=0), total.sum(axis=0), np.nan)
     return squares
 
 
 def relative_fall(before: Array, after: Array) -> Change:
-    """Share by which errors fall, from sums of squares of folds and cells, shape (fold, cell).
+    """Return the share by which errors fall, from sums of squares, shape (fold, coordinate).
 
-    A fold or cell without forecasts is NaN. To first order, half of what the squares fall by.
+    A fold or coordinate without forecasts is NaN. To first order, half of the fall of squares.
     """
     some = np.isfinite(before).any(axis=1)
     before, after = before[some], after[some]
@@ -216,9 +215,9 @@ def relative_fall(before: Array, after: Array) -> Change:
 def _linearised(
     mode: Mode, residual: Array, scale: Array
 ) -> Callable[[NDArray[np.bool_]], tuple[Array, Array, Array]]:
-    """Noise parameters, whitened residual and Jacobian of all rows, fitted without some of them.
+    """Return a function that fits noise, whitened residual and Jacobian without some rows.
 
-    The latter have the shapes (transition, cell) and (transition, cell, p), the Jacobian by the
+    The last two have the shapes (transition, cell) and (transition, cell, p), the Jacobian by the
     parameters in units of ``scale``. Under Eq. 11 the noise stays.
     """
     problem, phi, p = mode.problem, mode.phi, len(mode.phi)
@@ -244,7 +243,7 @@ def _linearised(
 
 
 def _residual_slopes(mode: Mode, scale: Array) -> Array:
-    """Derivative of the cells' residuals by parameters in units of ``scale``.
+    """Return the derivative of residuals by parameters in units of ``scale``.
 
     Shape (p, transition, cell).
     """
@@ -258,7 +257,7 @@ def _residual_slopes(mode: Mode, scale: Array) -> Array:
     def residual(points: Array) -> Array:
         return np.nan_to_num(cells.of_residual(problem.residual(points)))
 
-    # of what the data do not inform a long step would cross thresholds that nothing else does
+    # a long step of a parameter that the data do not inform would cross thresholds
     steps = np.where(informed, scale, 1e-3 * np.minimum(scale, 1.0))
     steps[list(problem.tails)] = 0.0  # they change the density, not the residual
     slopes = differentiate(residual, mode.phi, steps, lower, upper) * scale
@@ -268,7 +267,7 @@ def _residual_slopes(mode: Mode, scale: Array) -> Array:
 def _to_top(
     mode: Mode, precision: Array, gradient: Array, scale: Array
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Step from a mode to the top of its Gaussian, and which parameters no bound stops there.
+    """Return the step from a mode to the top of its Gaussian, and which parameters are free there.
 
     Precision, gradient and step are in units of ``scale``, shape (p,).
     """

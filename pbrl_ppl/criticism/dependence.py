@@ -1,4 +1,4 @@
-"""Permutation test, by kernel regression, of whether innovations depend on what was recorded."""
+"""Permutation test, by kernel regression, of innovations against recorded quantities."""
 
 from __future__ import annotations
 
@@ -19,19 +19,12 @@ from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 
-#: Chance of calling clean data unexplained.
-FALSE_ALARM = 0.01
-#: Less than this share of the residual's variance does not matter.
-SMALLEST_SHARE = 0.02
-#: Permutations a body: the smallest p-value is a fifth of what is significant.
+#: Permutations a body: the smallest p-value is a fifth of the significance.
 _PERMUTATIONS = 500
-#: Fewer transitions than this tell nothing.
-_FEWEST = 20
 _FOLDS = 5
 _RIDGE = 1.0
-#: More transitions than this say the same more slowly.
+#: Transitions of the test, at most: more take long and change nothing.
 _MOST = 1500
-
 #: Recorded quantities that a residual may depend on, with their units.
 FEATURES = {
     "position x": "m",
@@ -54,8 +47,8 @@ FEATURES = {
     "torque commanded before": "N m",
     "time": "s",
 }
-#: What depends on two quantities together has no smooth term in either: a spinning body's lift,
-#: a force that fades with speed, an actuator that remembers, a floor that is rough in places.
+#: Forces that depend on two quantities together: a spinning body's lift, a force that fades with
+#: speed, an actuator with memory, a floor that is rough in places.
 PRODUCTS = {
     " × ".join(pair): pair
     for pair in (
@@ -82,9 +75,9 @@ class Dependence:
     Parameters
     ----------
     tested : bool
-        Whether there were enough transitions for it.
+        Whether there were enough transitions.
     found : Unexplained or None
-        Where the structure is strongest; None if none is significant.
+        The strongest dependence; None if none is significant.
     """
 
     tested: bool
@@ -92,7 +85,7 @@ class Dependence:
 
 
 def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Dependence:
-    """Test whether the innovations of a fitted model still depend on state, action or time.
+    """Test whether the innovations of a fitted model depend on state, action or time.
 
     A kernel ridge regression with one smooth term a quantity, or product of two, predicts the
     residual of trajectories that it was not trained on, or of runs within few trajectories; the
@@ -103,26 +96,26 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
     mode : Mode
         A fitted model.
     criteria : Criteria
-        What is negligible.
+        Thresholds of significant and of negligible.
     seed : int
-        Of the shuffling and the folds.
+        Seed of the permutations and the folds.
 
     Returns
     -------
     Dependence
-        Where the structure is strongest.
+        The strongest dependence.
     """
     rng = np.random.default_rng(seed)
     problem = mode.problem
-    n = problem.segments.n
-    if n < _FEWEST:
+    n, limits = problem.segments.n, criteria.residual
+    if n < limits.least_transitions:
         return Dependence(tested=False)
     tests = len(problem.scene.dynamic)
     permutations = _PERMUTATIONS * tests - 1
     chosen = np.sort(rng.permutation(n)[:_MOST])
     places = mode.problem.trajectory_noise.cells.places
     innovations = mode.whitened_residual[chosen]
-    groups = folds(mode)[chosen]
+    groups = folds(mode, criteria)[chosen]
     relative = innovations_over_steps(mode)
     best: Unexplained | None = None
     for i, body in enumerate(problem.scene.moving):
@@ -140,8 +133,8 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
         at = int(np.argmax(shares))
         size = np.sqrt(max(float(shares[at]), 0.0)) * relative[own[of[at]]]
         p_value = float((1 + (null >= shares[at]).sum()) / (1 + permutations)) * tests
-        small = shares[at] < SMALLEST_SHARE or size < criteria.negligible
-        if p_value > FALSE_ALARM or small:
+        small = shares[at] < limits.dependence_share or size < criteria.negligible
+        if p_value > limits.dependence_p or small:
             continue
         if best is None or shares[at] > best.share:
             best = _describe(body.name, names[at], features, y[:, at], shares[at], p_value)
@@ -151,7 +144,7 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
 def _in_both_frames(
     y: Array, dimension: NDArray[np.intp], features: Array
 ) -> tuple[Array, list[str], list[int]]:
-    """Innovations in the world's frame, then velocities' in the body's; their names and columns."""
+    """Return innovations in the world frame and velocities' in the body's, names and columns."""
     names, of = [STATE[d] for d in dimension], list(range(len(dimension)))
     velocities = [names.index(name) for name in ("vx", "vy") if name in names]
     if len(velocities) < 2:
@@ -185,7 +178,7 @@ def recorded_quantities(problem: Problem, body: int) -> Array:
 
 
 def _kernels(features: Array) -> Iterator[Array]:
-    """One Gaussian kernel a quantity, on ranks scaled to unit range, shape (n, n) each."""
+    """Yield a Gaussian kernel of each quantity's ranks, scaled to unit range, shape (n, n)."""
     ranks = (rankdata(features, axis=0) - 1) / max(len(features) - 1, 1)  # equal ones share theirs
     varies = np.ptp(features, axis=0) > 1e-9
     for rank, moves in zip(ranks.T, varies, strict=True):
@@ -194,7 +187,7 @@ def _kernels(features: Array) -> Iterator[Array]:
 
 
 def _summed(features: Array) -> Array:
-    """Kernel of all quantities together, shape (n, n)."""
+    """Return the kernel of all quantities together, shape (n, n)."""
     kernel = np.zeros((len(features), len(features)))
     for term in _kernels(features):
         kernel += term
@@ -202,7 +195,7 @@ def _summed(features: Array) -> Array:
 
 
 def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
-    """Matrix that predicts each transition from those of other groups."""
+    """Return the matrix that predicts each transition from those of other groups."""
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))
     for held in np.array_split(names, min(_FOLDS, len(names))):
@@ -213,7 +206,7 @@ def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Ge
 
 
 def _explained(smoother: Array, y: Array) -> Array:
-    """Share of variance predicted, per column."""
+    """Return the share of variance predicted, per column."""
     size = np.maximum((y**2).sum(axis=0), 1e-300)
     return np.asarray(1.0 - ((y - smoother @ y) ** 2).sum(axis=0) / size)
 
@@ -221,6 +214,7 @@ def _explained(smoother: Array, y: Array) -> Array:
 def _describe(
     body: str, dimension: str, features: Array, y: Array, share: float, p_value: float
 ) -> Unexplained:
+    """Return the dependence with the quantity that contributes most to the regression."""
     weights = np.linalg.solve(_summed(features) + _RIDGE * np.eye(len(y)), y)
     parts = [np.var(kernel @ weights) for kernel in _kernels(features)]
     name = list(QUANTITIES)[int(np.argmax(parts))]

@@ -13,20 +13,20 @@ from pbrl_ppl.state import STATE
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-#: Rows after which a filter knows a state about as well as it ever will.
+#: Rows after which a filter's covariance has settled.
 _SETTLED = 5
 
 
 @dataclass(frozen=True, eq=False)
 class Forecast:
-    """Errors at the end of forecasts, and what noise alone would make of them.
+    """Errors at the end of forecasts, and their size under noise alone.
 
     Parameters
     ----------
     error : ndarray
         Measured minus predicted, shape (start, cell), SI units; NaN where not measured.
     variance : ndarray
-        Expected square of it from the noise of measurements, shape (start, cell).
+        Expected square of the error under measurement noise, shape (start, cell).
     dimension : ndarray of int
         State dimension of each cell, shape (cell,).
     """
@@ -36,14 +36,15 @@ class Forecast:
     dimension: Ints
 
     def rmse(self) -> dict[str, float]:
-        """Root mean square error of each measured state dimension, in its unit."""
+        """Return the root mean square error of each measured state dimension, in its unit."""
         return self._by_dimension(self.error**2)
 
     def floor(self) -> dict[str, float]:
-        """The same of the noise alone."""
+        """Return the same for the noise alone."""
         return self._by_dimension(np.where(np.isfinite(self.error), self.variance, np.nan))
 
     def _by_dimension(self, square: Array) -> dict[str, float]:
+        """Return root mean squares by state dimension."""
         result = {}
         for d in np.unique(self.dimension):
             own = square[:, self.dimension == d]
@@ -53,13 +54,13 @@ class Forecast:
 
 
 def longest_forecast(problem: Problem) -> int:
-    """Intervals of the longest forecasts that all trajectories have, from settled states."""
+    """Return the length of the longest forecasts that all trajectories have, in intervals."""
     shortest = int(problem.data.history.dataset["n_rows"].min()) - 1
     return max(1, shortest - min(_SETTLED, shortest // 2))
 
 
 def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
-    """States given what was measured up to them, shape (trajectory, time, body, 6), SI units."""
+    """Return the filtered states, shape (trajectory, time, body, 6), SI units."""
     noise = problem.trajectory_noise
     cells, segments = noise.cells, problem.segments
     residual = cells.of_residual(problem.residual(phi))
@@ -67,7 +68,7 @@ def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
     states = problem.data.smoothed_states.copy()
     flat = states.reshape(*states.shape[:2], -1)
     flat[segments.trajectory[:, None], segments.step[:, None] + 1, cells.places] += deviation
-    # nothing comes before a trajectory's first row: it is as measured, or as the next rows have it
+    # the first row has no earlier one: it is as measured, or as smoothed over the next rows
     few = replace(noise, seen=noise.seen & (segments.step < _SETTLED)[:, None])
     hidden = (noise.wide > 0).any(axis=1, keepdims=True)
     first = np.where(hidden, few.smoothed(residual, sigma)[0], noise.begin)[noise.first]
@@ -89,16 +90,16 @@ def forecast(
     Parameters
     ----------
     problem : Problem
-        Of whole trajectories.
+        A problem of whole trajectories.
     phi, sigma : ndarray
         Parameters and noise parameters, shapes (p,) and (parameter,).
     intervals : int
-        How far.
+        Length of a forecast.
     within : ndarray of bool, optional
         Transitions in which forecasts may begin, shape (transition,).
     allowed : ndarray, optional
-        A constant acceleration of each velocity whose errors the expected square contains, shape
-        (velocity,), m/s^2 and rad/s^2.
+        Constant accelerations that count as noise in the expected square, shape (velocity,),
+        m/s^2 and rad/s^2.
     """
     noise = problem.trajectory_noise
     cells, segments = noise.cells, problem.segments
@@ -109,8 +110,8 @@ def forecast(
         if length >= intervals:
             first = min(_SETTLED, length - intervals)
             rows = begin + np.arange(first, length - intervals + 1)
-            told = noise.seen[rows + intervals - 1].any(axis=1)
-            starts.append(rows[told][:: max(1, intervals // 2)])
+            measured = noise.seen[rows + intervals - 1].any(axis=1)
+            starts.append(rows[measured][:: max(1, intervals // 2)])
     at = np.concatenate(starts) if starts else np.zeros(0, dtype=np.intp)
     if within is not None:
         at = at[within[at]]
@@ -126,7 +127,7 @@ def forecast(
     error = cells.wrapped(cells.of(observed[trajectory, step + intervals]) - ends)
     covariance = _spread(noise, sigma, at, step)
     free, touching = cells.steps(sigma)
-    jolt = touching - free  # how bodies part is known no better
+    contact = touching - free  # uncertainty of how bodies part
     pushes = np.zeros((len(cells.places), 0))
     if allowed is not None:
         rate = cells.pushed[cells.always] - len(cells.sensors)
@@ -135,14 +136,14 @@ def forecast(
     for i in range(intervals):
         slope = noise.slope[every[:, i]]
         covariance = slope @ covariance @ slope.transpose(0, 2, 1)
-        covariance = covariance + noise.touching[every[:, i], None, None] * jolt
+        covariance = covariance + noise.touching[every[:, i], None, None] * contact
         pushed = slope @ pushed + pushes
     variance = np.diagonal(covariance, axis1=1, axis2=2) + cells.errors(sigma) ** 2
     return Forecast(error, variance + (pushed**2).sum(axis=2), cells.places % len(STATE))
 
 
 def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array:
-    """Covariance of the filtered states before these transitions, shape (start, cell, cell)."""
+    """Return the covariance of filtered states before transitions, shape (start, cell, cell)."""
     after = noise.covariance(sigma)[at - 1]
     for i in np.flatnonzero(step == 0):
         after[i] = _first_spread(noise, sigma, int(at[i]))
@@ -150,12 +151,12 @@ def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array
 
 
 def _first_spread(noise: TrajectoryNoise, sigma: Array, first: int) -> Array:
-    """Covariance of a trajectory's first state as `filtered_states` has it, shape (cell, cell)."""
+    """Return the covariance of a trajectory's first filtered state, shape (cell, cell)."""
     error = noise.cells.errors(sigma)
     wide = noise.wide[first]
     if not wide.any():
         return np.diag(error**2)
-    # what the first rows tell of it, with no process noise between them
+    # the information of the first rows, with no process noise between them
     scale = np.where(wide > 0, np.sqrt(wide), error)
     information, way = np.eye(len(scale)), np.diag(scale)
     for k in range(first, min(first + _SETTLED, len(noise.first))):

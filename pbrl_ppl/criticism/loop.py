@@ -1,295 +1,314 @@
-"""Closing the loop: fit, criticise, add an effect, confirm on held-out data, go round again."""
+"""Result of a closed loop, and the files that it is saved in."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import replace
+import json
+import os
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
-from threadpoolctl import threadpool_limits
+from numpy.typing import NDArray
 
-from pbrl_ppl.criticism.assembly import Models, converged, put_together
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.drift import same_noise, with_correlated_errors
-from pbrl_ppl.criticism.findings import Findings
-from pbrl_ppl.criticism.held_out import HeldOut, rollout_horizon
-from pbrl_ppl.criticism.histories import checked_histories
-from pbrl_ppl.criticism.misfit import PRIOR, beside_names, find_misfit
-from pbrl_ppl.criticism.outliers import outliers
-from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
-from pbrl_ppl.criticism.ranking import declared_mode
-from pbrl_ppl.criticism.results import ResidualTest
-from pbrl_ppl.criticism.score import Signature, rank_candidates
-from pbrl_ppl.criticism.selection import Selection, Step
-from pbrl_ppl.criticism.stages import Stage
-from pbrl_ppl.criticism.unexplained import (
-    Left,
-    unexplained_acceleration,
-    without_acceleration,
+from pbrl_ppl.criticism.remainder import learn_remainder, remainder_in_words
+from pbrl_ppl.criticism.results import (
+    Acceleration,
+    Added,
+    Candidate,
+    Correlations,
+    Errors,
+    Growth,
+    Numerical,
+    ResidualTest,
+    Rollout,
+    Unexplained,
 )
-from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import ConvergenceWarning, PriorWarning
-from pbrl_ppl.history import History, without_measurements
-from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import build_model
-from pbrl_ppl.modes import Mode
-from pbrl_ppl.physics import try_effect
-from pbrl_ppl.sampling import fit
+from pbrl_ppl.errors import FitError, OutputError
+from pbrl_ppl.files import json_values
+from pbrl_ppl.history import History, UnusedVelocity
+from pbrl_ppl.posterior import Comparison, Identifiability, save_posterior
 from pbrl_ppl.scene import Scene
 
-#: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
-DRAWS, INDEPENDENT, LEAST_TUNE = (300, 1000), (125,), 100
-#: Times that the noise is mended and the search for effects begun again, at most.
-_NOISES = 4
-#: Draws from the prior, of which some must reach what was measured.
-PRIOR_DRAWS = 100
+Array = NDArray[np.float64]
+
+#: The verdicts; the last one means that there is none, for the chains do not agree.
+ADEQUATE, EFFECTS_ADDED, UNEXPLAINED = "adequate", "effects-added", "unexplained"
+NOT_CONVERGED = "not-converged"
+#: Files of a saved loop and its report; beside them, the posterior with a learned remainder.
+FILES = ("report.html", "report.json", "before.nc", "after.nc")
+REMAINDER = "remainder.nc"
 
 
-def revise(
-    scene: Scene,
-    train: History,
-    test: History | None = None,
-    *,
-    catalogue: Iterable[Effect] = full_catalogue,
-    seed: int = 0,
-    substeps: int | None = None,
-    draws: int | None = None,
-    method: str = "metropolis",
-    criteria: Criteria = DEFAULT,
-    progress: Callable[[str], None] | None = None,
-) -> Findings:
-    """Fit a declared model, trace its residual to missing effects, add them, and compare.
+@dataclass(frozen=True, eq=False, repr=False)
+class Loop:
+    """Result of :func:`pbrl_ppl.close_loop`: verdict, added effects, errors and both posteriors.
 
     Parameters
     ----------
     scene : Scene
-        The declared model.
-    train, test : History
-        Measured transitions to fit and to judge by; without ``test``, a quarter of the whole
-        trajectories of ``train`` is held out.
-    catalogue : iterable of Effect
-        Effects to consider; add your own to the package's.
-    seed : int
-        The same seed gives the same findings.
-    substeps : int, optional
-        Engine steps an interval to begin with; the scene's by default.
-    draws : int, optional
-        Posterior draws of each chain; by default 300, or 1000 where chains have not converged.
-    method : str
-        Of :func:`pbrl_ppl.fit`, for the posteriors; with ``laplace`` the verdict stands on modes.
+        The declared scene.
+    verdict : str
+        ``adequate``, ``effects-added``, ``unexplained``, or ``not-converged``.
+    numerical : Numerical
+        Engine substeps, and the numerical error that is left.
+    candidates : tuple of Candidate
+        All candidates of the first round, best first.
+    added : tuple of Added
+        Effects added, in order.
+    unexplained : Unexplained or None
+        Structure that no effect in the catalogue explains.
+    before, after, noise_floor : Errors
+        Held-out errors of the declared model, of the revised one, and of the noise alone.
+    posterior_before, posterior_after : InferenceData or DataTree
+        Posteriors of both models; the same object twice if nothing was added.
+    residuals_before, residuals_after : dict of str to ndarray
+        Held-out residuals in units of noise per state dimension, 1-d arrays.
+    rollout : Rollout
+        One held-out trajectory.
+    rollout_horizon : int
+        Intervals of ``rollout_rmse``.
+    provenance : dict
+        Seed, versions, hash of the data, number of transitions, horizons.
+    tests : tuple of ResidualTest
+        Tests of the revised model's residual.
+    acceleration : Acceleration
+        Unexplained acceleration of both models.
+    correlations : Correlations
+        Correlations of the revised model's innovations.
+    growth : Growth
+        Growth of the revised model's forecast errors.
+    small : tuple of Candidate
+        Effects that are significant and negligible; they were not added.
+    identifiability : Identifiability or None
+        Which parameters of the revised model the data inform.
+    loo : Comparison or None
+        Leave-one-out cross-validation of both models on the data they were fitted to.
+    velocities_not_used : tuple of UnusedVelocity
+        Velocity columns that were computed from positions or lag them.
+    bad_frames : tuple of str
+        A sentence for each single bad frame that was left out, of either history.
     criteria : Criteria
         Thresholds of the decisions.
-    progress : callable, optional
-        Told the name of each stage.
+    held_out : History, optional
+        The held-out trajectories; reports animate them.
+    catalogue : tuple of Effect
+        Where the names of effects are looked up.
+    remainder : InferenceData or DataTree, optional
+        A posterior that :meth:`learn_remainder` gave: reports name it, and ``save`` writes it.
+    """
 
-    Returns
-    -------
-    Findings
-        Verdict, effects, errors before and after, and both posteriors.
+    scene: Scene
+    verdict: str
+    numerical: Numerical
+    candidates: tuple[Candidate, ...]
+    added: tuple[Added, ...]
+    unexplained: Unexplained | None
+    before: Errors
+    after: Errors
+    noise_floor: Errors
+    posterior_before: Any
+    posterior_after: Any
+    residuals_before: Mapping[str, Array]
+    residuals_after: Mapping[str, Array]
+    rollout: Rollout
+    rollout_horizon: int
+    provenance: Mapping[str, Any]
+    tests: tuple[ResidualTest, ...]
+    acceleration: Acceleration
+    correlations: Correlations
+    growth: Growth
+    small: tuple[Candidate, ...] = ()
+    identifiability: Identifiability | None = None
+    loo: Comparison | None = None
+    velocities_not_used: tuple[UnusedVelocity, ...] = ()
+    bad_frames: tuple[str, ...] = ()
+    criteria: Criteria = DEFAULT
+    held_out: History | None = None
+    catalogue: tuple[Effect, ...] = tuple(full_catalogue)
+    remainder: Any = None
+
+    def __repr__(self) -> str:
+        added = [f"{one.effect} on {one.body}" for one in self.added]
+        return f"Loop(verdict={self.verdict!r}, added={added})"
+
+    @property
+    def remainder_words(self) -> str:
+        """Return in a sentence what the learned remainder does; empty without one."""
+        if self.remainder is None:
+            return ""
+        return remainder_in_words(self.posterior_after, self.remainder)
+
+    def learn_remainder(
+        self,
+        body: str | None = None,
+        *,
+        seed: int = 0,
+        progress: Callable[[str], None] | None = None,
+    ) -> Any:
+        """Learn a force for the unexplained residual; the verdict and the added effects stay.
+
+        Parameters
+        ----------
+        body : str, optional
+            The body that lacks a force; by default the one with the largest residual.
+        seed : int
+            The same seed gives the same posterior.
+        progress : callable, optional
+            Called with the name of each stage.
+
+        Returns
+        -------
+        InferenceData or DataTree
+            The posterior with the effect ``learned_remainder``, to save, plan with and update; see
+            :func:`pbrl_ppl.criticism.learn_remainder`.
+
+        Raises
+        ------
+        FitError
+            If nothing is unexplained, or the residual does not depend on the body's velocity.
+
+        Examples
+        --------
+        ::
+
+            loop.verdict  # 'unexplained'
+            pp.save_posterior(loop.learn_remainder(seed=1), "remainder.nc")
+        """
+        if self.verdict != UNEXPLAINED:
+            raise FitError(f"nothing to learn: the verdict is {self.verdict}")
+        found = self.unexplained.body if self.unexplained is not None else ""
+        bodies = [moving.name for moving in self.scene.dynamic]
+        body = body or found or (bodies[0] if len(bodies) == 1 else "")
+        if not body:
+            raise FitError(f"remainder: no body stands out; give body=, one of {bodies}")
+        return learn_remainder(
+            self.posterior_after, body, catalogue=self.catalogue, seed=seed,
+            criteria=self.criteria, progress=progress,
+        )  # fmt: skip
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the contents of ``report.json``; numbers that are not finite become null."""
+        contents: dict[str, Any] = json_values(
+            {
+                "verdict": self.verdict,
+                "numerical": self.numerical,
+                "added": [_fields(added, "sentence") for added in self.added],
+                "candidates": [_fields(each, "sentence", "units") for each in self.candidates],
+                "small": [[candidate.effect, candidate.body] for candidate in self.small],
+                "tests": self.tests,
+                "unexplained_acceleration": self.acceleration,
+                "unexplained": self.unexplained,
+                "error": {
+                    "before": self.before,
+                    "after": self.after,
+                    "noise_floor": self.noise_floor,
+                },
+                "identifiability": self.identifiability and self.identifiability.to_dict(),
+                "loo": self.loo and self.loo.to_dict(),
+                "velocities_not_used": self.velocities_not_used,
+                "bad_frames": self.bad_frames,
+                "provenance": self.provenance,
+            }
+        )
+        if self.remainder is not None:
+            contents["learned_remainder"] = self.remainder_words
+        return contents
+
+    def save(self, folder: str | Path, overwrite: bool = False, *, page: str = "") -> Path:
+        """Write report.json, before.nc, after.nc (and remainder.nc), all or nothing.
+
+        Parameters
+        ----------
+        folder : str or pathlib.Path
+            Made if missing; other files in it are left alone.
+        overwrite : bool
+            Whether a folder that has content may be written to.
+        page : str
+            HTML of the report, written as report.html with the other files; none if empty.
+
+        Returns
+        -------
+        pathlib.Path
+            The folder.
+
+        Raises
+        ------
+        OutputError
+            If the folder cannot be written, or has content and ``overwrite`` is false.
+
+        Examples
+        --------
+        ::
+
+            loop.save("out")
+            pp.report(loop, "out/report.html")
+        """
+        folder = Path(folder)
+        nearest = check_folder(folder, overwrite)
+        try:
+            # on the same file system as the folder, so that only a rename is left at the end
+            with tempfile.TemporaryDirectory(prefix=".pbrl-ppl-", dir=nearest) as temporary:
+                made = Path(temporary) / "result"
+                made.mkdir()
+                if page:
+                    (made / "report.html").write_text(page, encoding="utf-8")
+                save_posterior(self.posterior_before, made / "before.nc")
+                save_posterior(self.posterior_after, made / "after.nc")
+                if self.remainder is not None:
+                    save_posterior(self.remainder, made / REMAINDER)
+                text = json.dumps(self.to_dict(), indent=1, allow_nan=False)
+                (made / "report.json").write_text(text + "\n", encoding="utf-8")
+                if nearest == folder:
+                    # it may be a mount or a working directory: fill it, do not replace it
+                    for file in made.iterdir():
+                        file.replace(folder / file.name)
+                else:
+                    folder.parent.mkdir(parents=True, exist_ok=True)
+                    made.rename(folder)
+        except OutputError:
+            raise
+        except OSError as error:
+            raise OutputError(f"{folder}: cannot be written: {error}") from error
+        return folder
+
+
+def check_folder(folder: Path, overwrite: bool) -> Path:
+    """Check that results can be written to ``folder``, and return its nearest existing parent.
 
     Raises
     ------
-    HistoryError
-        If the histories do not fit each other or are too short.
-    EffectError
-        If the scene declares an unknown effect.
-
-    Warns
-    -----
-    PriorWarning
-        Before anything is fitted, if the declared prior could not have made ``train``.
+    OutputError
+        If they cannot, or if the folder has content and ``overwrite`` is false.
     """
-    # matrices are small: threads of linear algebra only get in each other's way
-    with threadpool_limits(1, "blas"):
-        return _revised(
-            scene, train, test, tuple(catalogue), seed, substeps, draws, method, criteria,
-            progress or (lambda stage: None),
-        )  # fmt: skip
-
-
-def _revised(
-    scene: Scene,
-    train: History,
-    test: History | None,
-    catalogue: tuple[Effect, ...],
-    seed: int,
-    substeps: int | None,
-    draws: int | None,
-    method: str,
-    criteria: Criteria,
-    say: Callable[[str], None],
-) -> Findings:
-    """Go through the stages of :func:`revise`."""
-    if test is None:
-        train, test = train.split(0.25, seed)
-    elif scene.test_is_later:  # what lasts from some trajectory on holds in it
-        test = test.numbered(float(train.dataset["number"].max()) + 1.0)
-    if substeps is not None:
-        scene.replace(substeps=substeps)  # it is checked there
-    train, test, unused, bad = checked_histories(scene, train, test)
-    for sentence in (*(velocity.sentence for velocity in unused), *bad):
-        say(sentence)
-    held_out = HeldOut(test, seed)
-    for effect in catalogue:
-        if effect not in full_catalogue:
-            try_effect(effect, scene, train)
-    selection = Selection(scene, catalogue, criteria, say)
-    effects = attach(scene, (), catalogue)
-    say(Stage.CHECK_PRIOR)
-    prior = _prior_test(scene, train, effects, seed)
-    if not prior.passed:  # of wrong units nobody wants the fit
-        hint = "the declared prior does not explain this recording, unless a missing effect is why"
-        warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
-    say(Stage.FIT)
-    declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
-    first, current, added = _with_effects(declared, selection, criteria, say, mendable=True)
-    # under the right noise effects may show that were hidden before
-    for again in reversed(range(_NOISES)):
-        train, frames = without_measurements(train, outliers(current))
-        if frames:
-            for sentence in map(str, frames):
-                say(sentence)
-            bad += tuple(map(str, frames))
-            declared = declared_mode(scene, train, effects, seed, substeps, say, criteria)
-        else:
-            tracked = with_correlated_errors(current, criteria)
-            if tracked is None:
-                break
-            say(Stage.REPEAT)
-            declared = same_noise(declared, tracked)
-        first, current, added = _with_effects(
-            declared, selection, criteria, say, mendable=again > 0
+    nearest = folder
+    # a dangling link counts as there: it cannot be made a folder
+    while not (nearest.exists() or nearest.is_symlink()) and nearest != nearest.parent:
+        nearest = nearest.parent
+    if not nearest.is_dir():
+        raise OutputError(
+            f"output folder {folder}: {nearest} is a file, expected a folder; choose another path"
         )
-    as_tested = replace(current, problem=held_out.problem(current))
-    test, frames = without_measurements(test, outliers(as_tested))
-    if frames:
-        held_out, bad = HeldOut(test, seed), (*bad, *(f"held out: {frame}" for frame in frames))
-    say(Stage.TEST)
-    before, left = (unexplained_acceleration(mode, criteria) for mode in (declared, current))
-    horizon = rollout_horizon(train, scene.time_step)
-    with_added = prior
-    if added and not prior.passed:  # what was missing may be why
-        own = dict(zip(current.problem.layout.labels, current.phi.tolist(), strict=True))
-        held = {label: own[label] for each in added for label in each.signature.attached.labels}
-        effects = current.problem.physics.effects
-        with_added = _prior_test(scene, train, effects, seed, held)
-    misfit = find_misfit(current, left, horizon=horizon, seed=seed).with_test(with_added)
-    remains = _remains(before, left) if added and misfit.unexplained is not None else 0.0
-    small = left.worst < criteria.negligible
-    large = remains > (criteria.large_if_small if small else criteria.large_remainder)
-    if large and not misfit.random:
-        without = find_misfit(declared, before, horizon=horizon, seed=seed)
-        followed = misfit.predictable < criteria.most_predictable * without.predictable
-        if remains > criteria.large_if_small or not followed:
-            # part of a misfit goes to whatever is there: no name is to be had from that
-            say(Stage.WITHDRAW)
-            selection.withdraw(added)
-            added, current, left = [], declared, before
-            misfit = without.with_test(prior)
-    if added:
-        misfit = beside_names(misfit, current, left)
-    say(Stage.SAMPLE_DECLARED)
-    posterior = _posterior(declared, method, seed, draws, criteria, say)
-    revised = posterior
-    if added:
-        say(Stage.SAMPLE_REVISED)
-        revised = _posterior(current, method, seed, draws, criteria, say)
-    say(Stage.COMPARE)
-    models = Models(declared, current, posterior, revised, before, left)
-    told = selection.explained(first), tuple(selection.small)
-    findings = put_together(train, held_out, models, *told, added, misfit, criteria, horizon)
-    return replace(findings, velocities_not_used=unused, bad_frames=bad)
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise OutputError(f"output folder {folder}: no permission to write in {nearest}")
+    if nearest != folder:
+        return nearest
+    if not overwrite and any(folder.iterdir()):
+        raise OutputError(
+            f"output folder {folder}: it has content already; choose another, or allow"
+            " overwriting: overwrite=True"
+        )
+    for name in (*FILES, REMAINDER):
+        if (folder / name).is_dir():
+            raise OutputError(f"output folder {folder}: {name} in it is a folder; remove it")
+    return folder
 
 
-def _with_effects(
-    declared: Mode,
-    selection: Selection,
-    criteria: Criteria,
-    say: Callable[[str], None],
-    *,
-    mendable: bool,
-) -> tuple[list[Signature], Mode, list[Step]]:
-    """The ranking of the declared model, the model with effects added one by one, and those.
-
-    If the noise is ``mendable`` it ends where outliers show, the last effect unconfirmed.
-    """
-    say(Stage.SCORE)
-    first = rank_candidates(declared, selection.missing(declared))
-    current, ranked = declared, first
-    added: list[Step] = []
-    while ranked and len(added) < criteria.most_added:
-        if mendable and np.isfinite(outliers(current)).any():
-            return first, current, added
-        step = selection.best_addition(current, ranked, provisional=mendable)
-        if step is None and unexplained_acceleration(current, criteria).remains.any():
-            alone = without_acceleration(current)
-            hidden = rank_candidates(alone, selection.missing(current))
-            step = selection.best_addition(current, hidden)
-        if step is None:
-            break
-        say(f"added {step.signature.candidate.effect} on {step.signature.candidate.body}")
-        added.append(step)
-        current = step.after
-        ranked = rank_candidates(current, selection.missing(current))
-    if len(added) > 1:
-        say(Stage.PRUNE)
-        current, added = selection.prune(current, added)
-    return first, current, added
-
-
-def _prior_test(
-    scene: Scene,
-    train: History,
-    effects: tuple[Attached, ...],
-    seed: int,
-    held: Mapping[str, float] | None = None,
-) -> ResidualTest:
-    """Whether the prior could have made the data, with some parameters held, as a test."""
-    problem = Problem.of(scene, train, effects, horizon=telling_horizon(train), threads=2)
-    model = build_model(problem)
-    checked = prior_predictive_check(model, draws=PRIOR_DRAWS, seed=seed, held=held)
-    share = float(checked.dataset["share_beyond"].max())
-    said, *more = checked.summary
-    if more:
-        said = f"{said}; so it is with {len(more)} more"
-    return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, said)
-
-
-def _remains(before: Left, after: Left) -> float:
-    """Share of what was missing, of its square, that remains."""
-    return after.square / before.square if before.square > 0 else 0.0
-
-
-def _posterior(
-    mode: Mode,
-    method: str,
-    seed: int,
-    draws: int | None,
-    criteria: Criteria,
-    say: Callable[[str], None],
-) -> Any:
-    """Sample a mode's model; the Laplace approximation to begin with needs little tuning."""
-    # a chain a processor: more threads would wait for each other
-    mode = replace(mode, problem=mode.problem.with_physics(threads=1))
-    model = build_model(mode.problem)
-    chains = method != "laplace"
-    for n in (DRAWS if chains else INDEPENDENT) if draws is None else (draws,):
-        tune = max(LEAST_TUNE, 5 * n // 8)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always")
-            fitted = fit(
-                model, method=method, seed=seed, draws=n, tune=tune, start=mode,
-                progress=False,
-            )  # fmt: skip
-        if "interrupted" in fitted.attrs:  # half a posterior is no ground for a verdict
-            raise KeyboardInterrupt
-        if converged(fitted, criteria):
-            break
-        say(f"the chains have not converged after {n} draws each")
-    for warning in caught:  # of the last; independent draws are no chains that converge
-        if chains or not issubclass(warning.category, ConvergenceWarning):
-            warnings.warn(warning.message, stacklevel=2)
-    return fitted
+def _fields(value: Any, *left_out: str) -> dict[str, Any]:
+    """Return the fields of a dataclass without those named."""
+    return {name: field for name, field in vars(value).items() if name not in left_out}

@@ -1,4 +1,4 @@
-"""Tests of what a model leaves: unexplained acceleration, whiteness, dependence, forecasts."""
+"""Tests of a model's residual: unexplained acceleration, whiteness, dependence, forecasts."""
 
 from __future__ import annotations
 
@@ -13,38 +13,35 @@ from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.dependence import Dependence, find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
-from pbrl_ppl.criticism.unexplained import Left, noise_alone
+from pbrl_ppl.criticism.unexplained import UnexplainedAcceleration, noise_alone
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE
 
 Array = NDArray[np.float64]
 
-#: Names of tests, of which all a model is good for depends.
+#: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
 _NOTHING_RECORDED = "nothing that was recorded"
-#: And of another.
 DEPENDENCE = "dependence on state, command and time"
-#: An error of a forecast counts for no more than this many times what is expected.
-_FAR_OFF = 3.0
 #: Lengths of forecasts that a picture shows, at most.
 _LENGTHS = 6
 
 
 @dataclass(frozen=True, eq=False)
 class Misfit:
-    """Tests of what a model leaves, and where structure is that no effect explains.
+    """Tests of a model's residual, and where it has structure that no effect explains.
 
     Parameters
     ----------
     tests : tuple of ResidualTest
         In the order of the report.
     unexplained : Unexplained or None
-        Where it is strongest; None where all tests are passed.
+        Where the structure is strongest; None where all tests are passed.
     correlations : Correlations
-        Of innovations.
+        Correlations of the innovations.
     growth : Growth
-        Of forecasts' errors.
+        Growth of the forecasts' errors.
     """
 
     tests: tuple[ResidualTest, ...]
@@ -54,84 +51,69 @@ class Misfit:
 
     @property
     def predicts(self) -> bool:
-        """Whether steps and forecasts are as good as noise lets them be, and the prior could be."""
+        """Return whether the tests of acceleration, forecasts and prior are passed."""
         needed = (ACCELERATION, FORECASTS, PRIOR)
         return all(test.passed for test in self.tests if test.name in needed)
 
     @property
     def random(self) -> bool:
-        """Whether nothing predicts what is left, however large: a random force, and no law."""
+        """Return whether no quantity predicts the residual: it is a random force, and no law."""
         return all(test.passed for test in self.tests if test.name != ACCELERATION)
 
     @property
     def predictable(self) -> float:
-        """Share of the errors that recorded quantities predict; 0 where none is sure."""
+        """Return the share of the residual's variance that recorded quantities predict."""
         return next(test.size for test in self.tests if test.name == DEPENDENCE)
 
     def with_test(self, test: ResidualTest) -> Misfit:
-        """The same with one test more; what it says is where the structure is if no other fails."""
+        """Return the misfit with one more test, which is the unexplained one if no other fails."""
         unexplained = self.unexplained
         if unexplained is None and not test.passed:
             unexplained = Unexplained("", "", _NOTHING_RECORDED, 0.0, 0.0, test.sentence)
         return replace(self, tests=(*self.tests, test), unexplained=unexplained)
 
 
-def beside_names(misfit: Misfit, mode: Mode, left: Left) -> Misfit:
-    """The misfit of a revised model, with an acceleration that remains, though negligible.
+def with_negligible_acceleration(
+    misfit: Misfit, mode: Mode, excess: UnexplainedAcceleration
+) -> Misfit:
+    """Return a revised model's misfit, with a negligible acceleration as unexplained if it has one.
 
-    A law that is only near to the right one leaves as little as two engines differ by.
+    A law that is only near the right one may leave as little as two engines differ by.
     """
-    if misfit.unexplained is not None or not left.remains.any():
+    if misfit.unexplained is not None or not excess.remains.any():
         return misfit
-    told = _acceleration(left)
-    body, dimension = _where(mode, left, mode.problem.trajectory_noise.cells.places)
-    rest = Unexplained(body, dimension, _NOTHING_RECORDED, told.size, told.p_value, told.sentence)
-    return replace(misfit, unexplained=rest)
+    return replace(misfit, unexplained=_located(_acceleration(excess), mode, excess))
 
 
-def find_misfit(mode: Mode, left: Left, *, horizon: int, seed: int = 0) -> Misfit:
-    """Test what a fitted model leaves of the data that it was fitted to.
+def find_misfit(
+    mode: Mode, excess: UnexplainedAcceleration, *, horizon: int, seed: int = 0
+) -> Misfit:
+    """Test the residual of a fitted model on the data that it was fitted to.
 
     Parameters
     ----------
     mode : Mode
-        Of whole trajectories.
-    left : Left
-        Its unexplained acceleration.
+        Fitted to whole trajectories.
+    excess : UnexplainedAcceleration
+        Its unexplained acceleration, with the criteria.
     horizon : int
         Intervals of the forecasts.
     seed : int
-        Of permutations.
+        Seed of the permutations.
     """
-    dependence = find_dependence(mode, left.criteria, seed=seed)
-    of_correlation, correlations = correlation_tests(mode, left.criteria)
-    of_forecasts, growth = _forecasts(mode, noise_alone(mode, left), horizon, left.criteria)
-    tests = (
-        _acceleration(left),
-        *of_correlation,
-        of_forecasts,
-        _dependence(dependence),
-    )
+    dependence = find_dependence(mode, excess.criteria, seed=seed)
+    of_correlation, correlations = correlation_tests(mode, excess.criteria)
+    of_forecasts, growth = _forecasts(mode, noise_alone(mode, excess), horizon, excess.criteria)
+    tests = (_acceleration(excess), *of_correlation, of_forecasts, _dependence(dependence))
     failed = [test for test in tests if not test.passed]
-    if not failed:
-        return Misfit(tests, None, correlations, growth)
-    where = dependence.found
-    if where is None:
-        first = failed[0]
-        noise = mode.problem.trajectory_noise
-        body, dimension = _where(mode, left, noise.cells.places)
-        where = Unexplained(
-            body=body,
-            dimension=dimension,
-            depends_on=_NOTHING_RECORDED,
-            share=first.size,
-            p_value=first.p_value,
-            sentence=first.sentence,
-        )
-    return Misfit(tests, where, correlations, growth)
+    unexplained = None
+    if failed:
+        unexplained = dependence.found or _located(failed[0], mode, excess)
+    return Misfit(tests, unexplained, correlations, growth)
 
 
 def _dependence(dependence: Dependence) -> ResidualTest:
+    """Return the test of dependence on state, command and time."""
     if not dependence.tested:
         return ResidualTest.untested(DEPENDENCE, "too few transitions")
     found = dependence.found
@@ -141,61 +123,58 @@ def _dependence(dependence: Dependence) -> ResidualTest:
     return ResidualTest(DEPENDENCE, found.p_value, found.share, False, found.sentence)
 
 
-def _where(mode: Mode, left: Left, places: NDArray[np.intp]) -> tuple[str, str]:
-    """Body and state dimension whose innovations are largest where most is unexplained."""
-    worst = int(np.argmax(left.relative))
-    d = STATE.index(left.names[worst])
-    own = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
-    size = (mode.whitened_residual[:, own] ** 2).mean(axis=0)
-    body = int(places[own[int(np.argmax(size))]] // len(STATE))
-    return mode.problem.scene.moving[body].name, left.names[worst]
+def _located(test: ResidualTest, mode: Mode, excess: UnexplainedAcceleration) -> Unexplained:
+    """Return a failed test with the body and dimension whose acceleration is unexplained most."""
+    places = mode.problem.trajectory_noise.cells.places
+    name = excess.names[int(np.argmax(excess.relative))]
+    d = STATE.index(name)
+    columns = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
+    size = (mode.whitened_residual[:, columns] ** 2).mean(axis=0)
+    body = mode.problem.scene.moving[int(places[columns[int(np.argmax(size))]] // len(STATE))].name
+    return Unexplained(body, name, _NOTHING_RECORDED, test.size, test.p_value, test.sentence)
 
 
-def _acceleration(left: Left) -> ResidualTest:
-    """Whether a step adds more than the model says."""
-    passed = not left.matters.any()
-    worst = int(np.argmax(np.where(left.certain if passed else left.matters, left.relative, -1.0)))
-    unit = "rad/s²" if left.names[worst] == "omega" else "m/s²"
-    some = bool(left.certain.any())
+def _acceleration(excess: UnexplainedAcceleration) -> ResidualTest:
+    """Return the test of unexplained accelerations against none."""
+    passed = not excess.matters.any()
+    chosen = excess.certain if passed else excess.matters
+    worst = int(np.argmax(np.where(chosen, excess.relative, -1.0)))
+    unit = "rad/s²" if excess.names[worst] == "omega" else "m/s²"
     sentence = "no unexplained acceleration is significant"
-    if some:
+    if excess.certain.any():
         sentence = (
-            f"an acceleration of {left.size[worst]:.2g} {unit} in {left.names[worst]} is"
-            f" unexplained in each interval, {100 * left.relative[worst]:.2g} % of the bodies'"
+            f"an acceleration of {excess.size[worst]:.2g} {unit} in {excess.names[worst]} is"
+            f" unexplained in each interval, {100 * excess.relative[worst]:.2g} % of the bodies'"
             " acceleration"
         )
-        if not left.beyond_engine[worst]:
+        if not excess.beyond_engine[worst]:
             sentence += ": engines differ by as much in their steps"
         elif passed:
             sentence += ", which is negligible"
-    p_value = float(min(1.0, left.p_value[worst] * len(left.names)))
-    return ResidualTest(ACCELERATION, p_value, float(left.relative[worst]), passed, sentence)
+    p_value = float(min(1.0, excess.p_value[worst] * len(excess.names)))
+    return ResidualTest(ACCELERATION, p_value, float(excess.relative[worst]), passed, sentence)
 
 
 def _forecasts(
     mode: Mode, sigma: Array, horizon: int, criteria: Criteria
 ) -> tuple[ResidualTest, Growth]:
-    """Whether errors grow with the length of a forecast as noise, sigma, makes them.
-
-    What a negligible acceleration that lasts adds to that is no misfit.
-    """
+    """Return the test of forecasts' errors against those of noise and a negligible acceleration."""
     noise = mode.problem.trajectory_noise
     lengths = np.diff(np.append(np.flatnonzero(noise.first), len(noise.first)))
     longest = min(horizon, int(lengths.max()))
     steps = np.unique(np.geomspace(1, longest, min(longest, _LENGTHS)).round().astype(int))
     every = [forecast(mode.problem, mode.phi, sigma, int(n)) for n in steps]
     allowed = criteria.negligible * bodies_acceleration(mode.problem)
-    told = forecast(mode.problem, mode.phi, sigma, longest, allowed=allowed)
+    last = forecast(mode.problem, mode.phi, sigma, longest, allowed=allowed)
     worst, p_value, name = 0.0, 1.0, ""
-    dimensions = np.unique(told.dimension)
+    dimensions = np.unique(last.dimension)
     for d in dimensions:
-        own = told.dimension == d
-        z = (told.error[:, own] ** 2 / told.variance[:, own])[np.isfinite(told.error[:, own])]
+        error = last.error[:, last.dimension == d]
+        z = (error**2 / last.variance[:, last.dimension == d])[np.isfinite(error)]
         if not z.size:
             continue
-        # forecasts overlap by half, so that half of them count; a single one that a bad frame or a
-        # grazing contact spoils is no misfit
-        total = np.minimum(z, _FAR_OFF**2).sum() / 2
+        # forecasts overlap by half, so half of them count
+        total = np.minimum(z, criteria.residual.most_error**2).sum() / 2
         chance = len(dimensions) * float(chi2.sf(total, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]

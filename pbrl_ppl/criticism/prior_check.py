@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 from scipy.stats import binom
 
+from pbrl_ppl.criticism.criteria import DEFAULT, PriorCriteria
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History, longest_gap, measurement_noise
 from pbrl_ppl.likelihood import Problem
@@ -21,25 +22,11 @@ from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, wrapped
 
 Array = NDArray[np.float64]
 
-#: Where the quantiles are taken: the ends and middle of the interval, and its half.
+#: Quantiles: the ends of the interval, its quartiles and the median.
 QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
-#: More than this share of cells beyond all draws, and the prior cannot have made the data. Measured
-#: with 200 draws: at most 0.08 on sound problems, at least 0.14 with a mass 100 times too large.
-#: The share inside the interval tells less: all cells share one phi, which may be in a tail.
-MOST_BEYOND = 0.11
-#: And that so many do must be less likely than this: of few cells one lies beyond soon enough.
-_BY_CHANCE = 1e-3
-#: Where velocities were not measured, those that predictions start from have errors: a position is
-#: reached that is off by this share of the usual change.
-_SLACK = 0.25
-_FEWEST = 50
-#: Changes so many times the errors of measuring say something of the parameters.
-_WELL_BEYOND = 5.0
 _CHUNK = 16
 #: Factors of wrong units: m and mm or N and mN; degrees; kg for the weight of a kg.
 _UNITS = {1000.0: "1000", 180 / np.pi: "57.3", 9.81: "9.81"}
-#: How far beyond the range of the prior's factors one of these may be.
-_NEAR = 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,31 +51,34 @@ class PriorCheck:
     seconds : float
         Length of a segment (s).
     draws, diverged : int
-        Draws from the prior, and those that the engine could not follow and that were left out.
+        Draws from the prior, and those on which the engine diverged, which were left out.
+    criteria : PriorCriteria
+        When the prior could not have made the data.
     """
 
     dataset: xr.Dataset
     seconds: float
     draws: int
     diverged: int
+    criteria: PriorCriteria = DEFAULT.prior
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """Where the data are outside of what the prior can produce; none where they are inside."""
-        found = []
+        """Return where the prior could not have made the data; empty where it could."""
+        limits, found = self.criteria, []
         for body in self.dataset["body"].values:
             for state in self.dataset["state"].values:
                 changes = self.dataset.sel(body=body, state=state)
                 unit = STATE_UNITS[STATE.index(str(state))]
                 share, cells = float(changes["share_beyond"]), int(changes["cells"])
-                if not share > MOST_BEYOND:  # or not measured
+                if not share > limits.most_beyond:  # or not measured
                     continue
-                # either end of a cell's own draws is as likely as any place between two of them
+                # beyond either end of the draws is as likely as between any two of them
                 chance = binom.sf(round(share * cells) - 1, cells, 2 / (self.draws + 1))
-                if chance > _BY_CHANCE:
+                if chance > limits.chance:
                     continue
                 # a position changes mostly by the velocity before, which is in the same units
-                factor = "" if str(state) in POSE else _unit(changes["factor"])
+                factor = "" if str(state) in POSE else _unit(changes["factor"], limits)
                 found.append(
                     f"{state} of {body} changes by up to {float(changes['measured_largest']):.3g}"
                     f" {unit} in {self.seconds:g} s; under the prior 94 % of changes are within"
@@ -105,7 +95,7 @@ class PriorCheck:
 
     @property
     def summary(self) -> tuple[str, ...]:
-        """The sentences, or one that says that nothing is wrong."""
+        """Return the sentences, or one that says that nothing is wrong."""
         return self.sentences or ("the declared priors could have made data like these",)
 
 
@@ -115,23 +105,26 @@ def prior_predictive_check(
     draws: int = 200,
     seed: int = 0,
     held: Mapping[str, float] | None = None,
+    criteria: PriorCriteria = DEFAULT.prior,
 ) -> PriorCheck:
-    """Compare measured changes over a segment with what the prior predicts for them.
+    """Compare measured changes over a segment with predictions under the prior.
 
-    The noise added to the predictions is the median of sigma's prior, or what positions and
-    velocities show of it by themselves, if that is more. All of that prior would not do: it is
-    scaled by the data and so wide that noise could explain any change.
+    The noise added to the predictions is the median of sigma's prior, or the noise estimated from
+    the measurements alone, if that is larger. Draws from sigma's prior would not do: it is scaled
+    by the data, and so wide that noise could explain any change.
 
     Parameters
     ----------
     model : pymc.Model
         As made by :func:`pbrl_ppl.physics_model`.
     draws : int
-        Draws from the prior, at least 50: what none of them reaches counts against the prior.
+        Draws from the prior, at least 50; measurements beyond all of them count against the prior.
     seed : int
         The same seed gives the same answer.
     held : mapping of str to float, optional
         Parameters that have these values in every draw, by their labels.
+    criteria : PriorCriteria
+        When the prior could not have made the data.
 
     Returns
     -------
@@ -156,14 +149,14 @@ def prior_predictive_check(
     problem = getattr(model, "problem", None)
     if not isinstance(problem, Problem):
         raise FitError("prior check: this pm.Model was not made by physics_model; make it so")
-    if draws < _FEWEST:
-        raise ValueError(f"draws is {draws}, expected at least {_FEWEST}")
+    if draws < criteria.least_draws:
+        raise ValueError(f"draws is {draws}, expected at least {criteria.least_draws}")
     rng = np.random.default_rng(seed)
     observations, segments = problem.observations, problem.segments
     columns = list(observations.columns)
     noise = problem.noise_prior[0]
     first = segments.start[..., columns]
-    # where bodies are seen now and then, the last row that shows one is what tells of it
+    # of bodies that are seen now and then, the last measured row counts
     steps = np.arange(1, observations.values.shape[1] + 1)[:, None, None]
     last = np.maximum((steps * observations.measured).max(axis=1), 1) - 1
     measured = _at(observations.values, last)
@@ -186,7 +179,7 @@ def prior_predictive_check(
             " from the prior; narrow the prior's hyper-parameters, or use more substeps"
         )
     exact = observations.wrapped(ends[good] - first)
-    # where sensors are worse than the prior's median, of which both ends of a change have an error
+    # sensors may be worse than the prior's median; both ends of a change have an error
     known = measurement_noise(problem.data.history)
     noisy = np.sqrt(2.0) * known
     seconds = problem.data.horizon * problem.scene.time_step
@@ -197,7 +190,7 @@ def prior_predictive_check(
         rate = d if d >= len(POSE) else d + len(POSE)
         seen = np.isfinite(problem.data.history.dataset["observed"].to_numpy()[..., rate])
         derived[:, i] = ~seen.any(axis=(0, 1))
-    dataset = _compare(observations.wrapped(predicted - first), measured, _SLACK * derived)
+    dataset = _compare(observations.wrapped(predicted - first), measured, criteria.slack * derived)
     dataset = dataset.merge(_factors(exact, measured))
     coords = {
         "body": [body.name for body in problem.scene.moving],
@@ -209,11 +202,12 @@ def prior_predictive_check(
         problem.data.horizon * problem.scene.time_step,
         draws,
         int(draws - good.sum()),
+        criteria,
     )
 
 
 def _factors(exact: Array, measured: Array) -> xr.Dataset:
-    """How many times as large measured changes (transition, body, state) are as each draw's."""
+    """Return quantiles over draws of the ratio of measured (transition, body, state) changes."""
     seen = np.where(np.isfinite(measured), exact, 0.0)
     square = (seen**2).sum(axis=1)
     product = (seen * np.nan_to_num(measured)).sum(axis=1)
@@ -224,16 +218,17 @@ def _factors(exact: Array, measured: Array) -> xr.Dataset:
     return xr.Dataset({"factor": (("quantile", "body", "state"), quantiles)})
 
 
-def _unit(factor: xr.DataArray) -> str:
-    """What a factor between measured and predicted changes suggests, if it is near a unit's."""
+def _unit(factor: xr.DataArray, criteria: PriorCriteria) -> str:
+    """Return a hint if measured changes are a factor of wrong units larger or smaller."""
     low, middle, high = (float(factor[i]) for i in (0, len(QUANTILES) // 2, -1))
     if not low > 0:  # nothing was predicted, or motion the other way
         return ""
     over, size = ("", middle) if middle > 1 else ("1/", 1 / middle)
     if middle <= 1:
         low, high = 1 / high, 1 / low
-    near = [each for each in _UNITS if low / _NEAR < each < high * _NEAR]
-    if low / _NEAR < 1 or not near:
+    low, high = low / criteria.unit_factor, high * criteria.unit_factor
+    near = [each for each in _UNITS if low < each < high]
+    if low < 1 or not near:
         return ""
     best = min(near, key=lambda each: abs(np.log(each / size)))
     return (
@@ -243,24 +238,26 @@ def _unit(factor: xr.DataArray) -> str:
 
 
 def _at(states: Array, step: NDArray[np.intp]) -> Array:
-    """States (..., transition, H, body, state) at each cell's step: (..., transition, body, state).
+    """Return states (..., transition, H, body, state) at one step for each coordinate.
 
-    ``step`` has the shape (transition, body, state).
+    ``step`` has the shape (transition, body, state), the result (..., transition, body, state).
     """
     picked = np.broadcast_to(step[:, None], (*states.shape[:-3], 1, *states.shape[-2:]))
     return np.asarray(np.take_along_axis(states, picked, axis=-3)[..., 0, :, :])
 
 
-def telling_horizon(history: History) -> int:
-    """Intervals in which bodies move well beyond the errors of measuring: often one.
+def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -> int:
+    """Return the intervals in which bodies move well beyond the measurement noise: often one.
 
-    Where a recording is fast, an interval shows hardly more than noise, of which a prior of the
-    parameters says nothing. The noise is judged by third differences.
+    In a fast recording an interval shows hardly more than noise, which does not depend on the
+    prior of the parameters. The noise is estimated by third differences of positions.
 
     Parameters
     ----------
     history : History
-        Its places are looked at, as far as they were measured.
+        The recording.
+    criteria : PriorCriteria
+        How far beyond the noise.
     """
     observed = history.dataset["observed"].to_numpy()[..., : len(POSE)]
     places = observed.transpose(0, 2, 3, 1).reshape(-1, observed.shape[1])
@@ -278,23 +275,23 @@ def telling_horizon(history: History) -> int:
 
     horizon = longest_gap(history)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of means of nothing
+        warnings.simplefilter("ignore", RuntimeWarning)  # means of no measurements
         noise = size(1, 3) / 20.0
-        while horizon < longest and (size(horizon, 1) < _WELL_BEYOND**2 * noise).any():
+        while horizon < longest and (size(horizon, 1) < criteria.signal**2 * noise).any():
             horizon = min(2 * horizon, longest)
     return horizon
 
 
 def _compare(predicted: Array, measured: Array, slack: Array) -> xr.Dataset:
-    """Summaries of changes: (draw, transition, body, state), and (transition, body, state).
+    """Return summaries of changes (draw, transition, body, state), and (transition, body, state).
 
-    Draws reach what is off by no more than ``slack``, a share of the usual change, (body, state).
+    Draws reach measurements within ``slack``, a share of the usual change, shape (body, state).
     """
     seen = np.isfinite(measured)
     low, high = np.quantile(predicted, [QUANTILES[0], QUANTILES[-1]], axis=0)
     inside = (measured >= low) & (measured <= high)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # of what was never measured
+        warnings.simplefilter("ignore", RuntimeWarning)  # means of no measurements
         slack = slack * np.sqrt(np.nanmean(measured**2, axis=0))
     low_end, high_end = predicted.min(axis=0) - slack, predicted.max(axis=0) + slack
     beyond = (measured < low_end) | (measured > high_end)

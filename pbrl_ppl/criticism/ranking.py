@@ -1,4 +1,4 @@
-"""The score test of every candidate at the mode of the declared model, and nothing after it."""
+"""Ranking of all candidates by their score tests at the mode of the declared model."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
-from pbrl_ppl.criticism.histories import checked_histories
-from pbrl_ppl.criticism.resolution import with_enough_substeps
+from pbrl_ppl.criticism.recordings import checked_histories
+from pbrl_ppl.criticism.refinement import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.stages import Stage
@@ -24,7 +24,7 @@ from pbrl_ppl.scene import Scene
 
 @dataclass(frozen=True)
 class Ranking:
-    """Candidate effects by their score, at the mode of the declared model.
+    """Score tests of all candidate effects, at the mode of the declared model.
 
     Parameters
     ----------
@@ -33,7 +33,7 @@ class Ranking:
     mode : dict of str to float
         The declared model's parameters there, by label, SI units.
     unexplained_acceleration : dict of str to float
-        What a step adds beyond the declared model, m/s^2 and rad/s^2.
+        Standard deviation of the declared model's process noise, m/s^2 and rad/s^2.
     substeps : int
         Engine steps an interval that were needed.
     """
@@ -54,7 +54,7 @@ def criticise(
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Ranking:
-    """Rank what a declared model might lack by the score test, without a refit.
+    """Rank the effects that a declared model might lack by their score tests, without a refit.
 
     A statistic says that the residual looks like the effect's signature; whether the effect
     explains it, and helps on other data, :func:`pbrl_ppl.close_loop` finds out.
@@ -68,7 +68,7 @@ def criticise(
     catalogue : iterable of Effect
         Effects to consider.
     seed : int
-        Of the search for the mode.
+        Seed of the search for the mode.
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     criteria : Criteria
@@ -101,12 +101,12 @@ def criticise(
         say(Stage.FIT)
         mode = declared_mode(scene, history, effects, seed, substeps, say, criteria)
         say(Stage.SCORE)
-        ranked = rank_candidates(mode, candidates(scene, effects, catalogue))
-        left = unexplained_acceleration(mode)
+        ranked = rank_candidates(mode, candidates(scene, effects, catalogue), criteria)
+        excess = unexplained_acceleration(mode, criteria)
     return Ranking(
         tuple(signature.candidate for signature in ranked),
         dict(zip(mode.problem.layout.labels, mode.phi.tolist(), strict=True)),
-        dict(zip(left.names, left.size.tolist(), strict=True)),
+        dict(zip(excess.names, excess.size.tolist(), strict=True)),
         mode.problem.physics.substeps,
     )
 
@@ -120,7 +120,7 @@ def declared_mode(
     say: Callable[[str], None],
     criteria: Criteria = DEFAULT,
 ) -> Mode:
-    """Mode of the declared model along trajectories, the engine's error small."""
+    """Return the declared model's mode on whole trajectories, with enough substeps."""
     problem = Problem.of(scene, history, effects, substeps=substeps, threads=2)
     if substeps is None:
         physics = problem.physics

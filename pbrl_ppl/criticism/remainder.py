@@ -1,4 +1,4 @@
-"""A learned remainder: a Gaussian process for the force that no effect explains."""
+"""Learned remainder: a Gaussian process for a force that no effect explains."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
-from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.cross_validation import gain
 from pbrl_ppl.criticism.rivals import likeliest_mode
 from pbrl_ppl.criticism.stages import Stage
@@ -20,9 +20,11 @@ from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learned_remainder
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import ACCELERATION
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, trajectory_mode
+from pbrl_ppl.posterior import draws as posterior_draws
+from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.state import STATE
 
@@ -30,15 +32,13 @@ Array = NDArray[np.float64]
 
 #: Transitions that the process is fitted to, at most.
 _MOST = 400
-#: Log marginal likelihood that a force must gain over noise alone, in nats.
-_GAIN = 6.0
-#: Length scales, as shares of the range of the speeds that were seen; a longer one is a constant.
+#: Length scales, as shares of the range of recorded speeds; a longer one is a constant.
 _SHORTEST, _LONGEST = 0.15, 10.0
-#: How far beyond that range the process goes on, as a share of it; there it returns to nothing.
+#: How far beyond that range the process extends, as a share of it; there it returns to zero.
 _BEYOND = 0.3
-#: Bumps of each force; forms that have this share of its variance, and at most so many.
+#: Kernel centres of each force; eigenvectors with this share of its variance, and at most so many.
 _BUMPS, _SHARE, _FORMS = 48, 0.9995, 24
-#: Of each chain; they are independent.
+#: Draws of each chain; they are independent.
 DRAWS = 250
 
 
@@ -49,35 +49,38 @@ def learn_remainder(
     catalogue: Iterable[Effect] = full_catalogue,
     seed: int = 0,
     draws: int = DRAWS,
+    criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Any:
     """Learn a residual force on a body, with its uncertainty, and refit the model with it.
 
-    What steps add to the velocities beyond the model is, times mass and moment, a force and a
+    The residual acceleration of each step, times mass and moment of inertia, is a force and a
     torque in the body's frame. A Gaussian process of the velocity in that frame (forward, sideways,
-    angular) is fitted to each; its kernel's leading forms, with standard normal weights, go into
-    the model, which is then fitted anew to whole trajectories with all parameters and both noises.
-    So the weights vary from draw to draw as far as the data leave them open; at speeds that were
-    not seen the force goes back to nothing in the mean, and its spread to that of the process at
-    large, up to a third of the seen range beyond it. Further off it is zero, and says nothing.
+    angular) is fitted to each. The leading eigenvectors of its kernel, with standard normal
+    weights, go into the model, which is then fitted anew to whole trajectories with all parameters
+    and both noises. So the weights vary from draw to draw as far as the data leave them open. At
+    speeds that were not recorded the mean force returns to zero and its spread to that of the
+    process, up to a third of the recorded range beyond it; further off it is zero.
 
-    An update by a few new transitions is as quick as any; by many, whose draws have to be moved in
-    as many dimensions as there are forms, it takes long: learn the remainder anew from all data.
+    An update by a few new transitions is quick. One by many moves the draws in as many dimensions
+    as there are weights, and takes long: learn the remainder anew from all data.
 
     Parameters
     ----------
     posterior : InferenceData or DataTree
-        Of whole trajectories.
+        A posterior of whole trajectories.
     body : str
-        Which body lacks a force.
+        The body that lacks a force.
     catalogue : iterable of Effect
         Where the names of the posterior's effects are looked up.
     seed : int
         The same seed gives the same posterior.
     draws : int
-        Of each of four chains, from the Gaussian at the mode.
+        Draws of each of four chains, from the Gaussian at the mode.
+    criteria : Criteria
+        The gain that a force needs.
     progress : callable, optional
-        Told the name of each stage.
+        Called with the name of each stage.
 
     Returns
     -------
@@ -87,8 +90,8 @@ def learn_remainder(
     Raises
     ------
     FitError
-        If there is nothing to learn: no force that depends on the velocity, or none that helps on
-        trajectories that were left out; if it has one already, or scikit-learn is missing.
+        If no force depends on the velocity, or none improves cross-validated predictions; if the
+        posterior has a learned remainder already, or scikit-learn is missing.
     PosteriorError
         If the posterior is of single transitions.
     """
@@ -99,11 +102,11 @@ def learn_remainder(
         if LEARNED_REMAINDER in present:
             raise FitError("posterior: it has a learned remainder already; take one without")
         say(Stage.LEARN)
-        effect = _learned(mode, body, seed)
+        effect = _learned(mode, body, seed, criteria)
         say(Stage.REFIT)
         refitted = _refitted(mode, effect, body)
-        gained = gain(mode, refitted)
-        if gained.total < DEFAULT.min_elpd or not gained.certain(DEFAULT.min_elpd_se):
+        gained = gain(mode, refitted, criteria)
+        if gained.total < criteria.min_elpd or not gained.certain(criteria.min_elpd_se):
             raise FitError(
                 f"nothing to learn: a force on {body} that follows its velocity does not help on"
                 " trajectories that were left out"
@@ -112,7 +115,21 @@ def learn_remainder(
         return fit(model, method="laplace", seed=seed, draws=draws, start=refitted, progress=False)
 
 
+def remainder_in_words(before: Any, after: Any) -> str:
+    """Return a sentence on what a learned remainder does, from both posteriors."""
+    sizes = [posterior_draws(each)[ACCELERATION].mean(axis=0) for each in (before, after)]
+    names = group(after, "posterior")[ACCELERATION]
+    worst = int(np.argmax(sizes[0] - sizes[1]))
+    name = str(names[names.dims[-1]].values[worst])
+    unit = "rad/s²" if name == "omega" else "m/s²"
+    return (
+        f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
+        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {unit}"
+    )
+
+
 def _refitted(mode: Mode, effect: LearnedRemainder, body: str) -> Mode:
+    """Return the mode with the learned force, fitted from its zero on."""
     effects = (*mode.problem.physics.effects, effect.on(body))
     problem = mode.problem.with_physics(effects=effects)
     phi = problem.layout.from_layout(mode.problem.layout, mode.phi)
@@ -120,8 +137,8 @@ def _refitted(mode: Mode, effect: LearnedRemainder, body: str) -> Mode:
     return trajectory_mode(problem, phi, mode.sigma)
 
 
-def _learned(mode: Mode, body: str, seed: int) -> LearnedRemainder:
-    """The forms of the processes of those forces that are there."""
+def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRemainder:
+    """Return the effect with the eigenvectors of each significant force's process."""
     x, forces = residual_forces(mode, body)
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.permutation(len(x))[:_MOST])
@@ -129,11 +146,12 @@ def _learned(mode: Mode, body: str, seed: int) -> LearnedRemainder:
     size = np.maximum(high - low, 1e-9)
     table: dict[str, list[Any]] = {"centre": [], "width": [], "output": []}
     blocks = []
-    matters = _matters(mode)
+    excess = unexplained_acceleration(mode, criteria)
+    missing = {name for name, matters in zip(excess.names, excess.matters, strict=True) if matters}
     for output, y in forces.items():
-        if not matters[output]:
+        if missing.isdisjoint({"omega"} if output == 2 else {"vx", "vy"}):
             continue
-        found = _process((x[chosen] - low) / size, y[chosen], seed)
+        found = _process((x[chosen] - low) / size, y[chosen], seed, criteria.min_remainder)
         if found is None:
             continue
         sd, lengths = found
@@ -149,22 +167,14 @@ def _learned(mode: Mode, body: str, seed: int) -> LearnedRemainder:
         table["output"] += [output] * _BUMPS
     if not blocks:
         raise FitError(
-            f"nothing to learn: what the model leaves of the forces on {body} is too little to"
-            " matter, or does not depend on its velocity"
+            f"nothing to learn: the unexplained force on {body} is negligible, or does not depend"
+            " on its velocity"
         )
     return learned_remainder(json.dumps(table | {"forms": block_diag(*blocks).tolist()}))
 
 
-def _matters(mode: Mode) -> tuple[bool, bool, bool]:
-    """Whether an acceleration is left that matters, for a force forward, sideways and a torque."""
-    left = unexplained_acceleration(mode)
-    own = dict(zip(left.names, left.matters.tolist(), strict=True))
-    force = own.get("vx", False) or own.get("vy", False)
-    return force, force, own.get("omega", False)
-
-
-def _process(x: Array, y: Array, seed: int) -> tuple[float, Array] | None:
-    """Standard deviation of a force, and its length scales; None if it is noise."""
+def _process(x: Array, y: Array, seed: int, needed: float) -> tuple[float, Array] | None:
+    """Return the standard deviation of a force and its length scales; None if it is noise."""
     try:
         from sklearn.exceptions import ConvergenceWarning
         from sklearn.gaussian_process import GaussianProcessRegressor
@@ -183,23 +193,23 @@ def _process(x: Array, y: Array, seed: int) -> tuple[float, Array] | None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a length at its bound is no matter
         process.fit(x, y / scale)
-    # of noise alone, its variance fitted: that of y is 1
+    # noise alone with its variance fitted, which is 1 here
     alone = -0.5 * len(y) * (np.log(2 * np.pi) + 1.0)
-    if process.log_marginal_likelihood_value_ - alone < _GAIN:
+    if process.log_marginal_likelihood_value_ - alone < needed:
         return None
     fitted = process.kernel_.k1
     return scale * float(np.sqrt(fitted.k1.constant_value)), np.atleast_1d(fitted.k2.length_scale)
 
 
 def residual_forces(mode: Mode, body: str) -> tuple[Array, dict[int, Array]]:
-    """What steps add beyond a model, as forces in a body's frame.
+    """Return the residual accelerations of steps as forces in a body's frame.
 
     Returns
     -------
     velocity : ndarray
         In the body's frame, shape (transition, 3), m/s, m/s, rad/s.
     forces : dict of int to ndarray
-        Forward and sideways force (N) and torque (N m), by 0, 1 and 2, as far as they are seen.
+        Forward and sideways force (N) and torque (N m), by 0, 1 and 2, where observed.
 
     Raises
     ------
@@ -218,20 +228,17 @@ def residual_forces(mode: Mode, body: str) -> tuple[Array, dict[int, Array]]:
     theta, vx, vy, omega = problem.segments.start[:, index, 2:].T
     c, s = np.cos(theta), np.sin(theta)
     velocity = np.stack([c * vx + s * vy, c * vy - s * vx, omega], axis=1)
-    mass = _mass(problem, mode.phi, body)
+    declared = problem.scene.body(body)
+    known = dict(declared.known)
+    mass = (
+        known["mass"] if "mass" in known else mode.phi[problem.layout.index("mass", declared.owner)]
+    )
+    mass = float(mass)
     forces: dict[int, Array] = {}
     if places[0] is not None and places[1] is not None:
         ax, ay = added[:, places[0]], added[:, places[1]]
         forces |= {0: mass * (c * ax + s * ay), 1: mass * (c * ay - s * ax)}
     if places[2] is not None:
-        moment = mass * problem.scene.body(body).shape.unit_moment
+        moment = mass * declared.shape.unit_moment
         forces[2] = moment * added[:, places[2]]
     return velocity, forces
-
-
-def _mass(problem: Problem, phi: Array, body: str) -> float:
-    own = problem.scene.body(body)
-    known = dict(own.known)
-    if "mass" in known:
-        return float(known["mass"])
-    return float(phi[problem.layout.index("mass", own.owner)])

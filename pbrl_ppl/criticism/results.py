@@ -1,4 +1,4 @@
-"""What the loop finds, as plain results: candidates, effects added, tests, errors."""
+"""Parts of the result of a closed loop: candidates, added effects, tests, errors."""
 
 from __future__ import annotations
 
@@ -13,22 +13,21 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Candidate:
-    """An effect that the model lacks, and how strongly the residual asks for it.
+    """An effect that the model lacks, and its score test.
 
     Parameters
     ----------
     effect, body : str
-        What, and on which body.
+        Names of the effect and of the body.
     sentence : str
-        What it means in words.
+        The effect in words.
     statistic : float
         Score statistic S; chi-squared with ``dof`` degrees of freedom if the effect is absent.
     dof : int
         Number of the signature's columns: the effect's parameters, less those that are scanned, and
         one where all are.
     p_value : float
-        Probability of a statistic at least as large by chance, corrected for the number of
-        candidates.
+        P-value of the statistic, corrected for the number of candidates.
     estimate : dict of str to float
         First estimate of each parameter, from the signature alone.
     units : dict of str to str
@@ -36,15 +35,15 @@ class Candidate:
     identifiable : float
         Share of the signature (0 to 1) that the declared parameters cannot absorb.
     looks : int
-        At how many places, thresholds or times it was tried; the p-value pays for them.
+        Number of grid points (places, thresholds or times); the p-value is corrected for them.
     detectable : dict of str to float
-        Smallest size of each parameter that these data would show (nine times of ten, at a p-value
-        of 0.01), the others being nothing; infinite where they would not show any. Of a scan, where
-        it shows best; empty where there is no size without a place.
+        Detection limit of each parameter, the others at their null values: the smallest size that
+        reaches a p-value of 0.01 with probability 0.9; infinite where none does. For a scan, at the
+        best grid point; empty where there is no size without a place.
     caps : bool
-        Whether smaller is stronger, as of a limit: larger ones than ``detectable`` are not seen.
+        Whether smaller is stronger, as for a limit: larger ones than ``detectable`` are not seen.
     why : str
-        Why the loop added it or did not; empty where nothing was decided.
+        Why the loop added it or did not; empty if it did not decide.
     """
 
     effect: str
@@ -64,18 +63,18 @@ class Candidate:
 
 @dataclass(frozen=True)
 class ResidualTest:
-    """Test of what a model leaves, for a reader.
+    """Result of a test of a model's residual.
 
     Parameters
     ----------
     name : str
-        What was tested.
+        Name of the test.
     p_value : float
-        Probability of a result as large by chance, if nothing is missing.
+        P-value of the result if nothing is missing.
     size : float
-        How much there is, as ``sentence`` says.
+        Size of the misfit, as in ``sentence``.
     passed : bool
-        Whether there is nothing, or too little to matter.
+        Whether there is no misfit, or a negligible one.
     sentence : str
         The result in words.
     tested : bool
@@ -91,26 +90,26 @@ class ResidualTest:
 
     @classmethod
     def untested(cls, name: str, why: str) -> ResidualTest:
-        """Result of a test that the data cannot fail."""
+        """Return the result of a test that the data cannot fail."""
         return cls(name, float("nan"), 0.0, True, f"not tested: {why}", tested=False)
 
 
 @dataclass(frozen=True, eq=False)
 class Correlations:
-    """Correlations of innovations, for a picture.
+    """Correlations of innovations, for a plot.
 
     Parameters
     ----------
     cells : tuple of str
-        What was measured: state dimension and body.
+        Observed coordinates: state dimension and body.
     own : ndarray
-        With those 1, 2, ... intervals before, shape (lag, cell).
+        Correlation with innovations 1, 2, ... intervals before, shape (lag, cell).
     pairs : ndarray
-        Pairs that each was taken over, shape (lag, cell).
+        Number of pairs of each, shape (lag, cell).
     commands : tuple of str
         Commands that vary.
     driven : ndarray
-        With commands 0, 1, ... intervals before, shape (lag, command, cell).
+        Correlation with commands 0, 1, ... intervals before, shape (lag, command, cell).
     """
 
     cells: tuple[str, ...]
@@ -122,7 +121,7 @@ class Correlations:
 
 @dataclass(frozen=True, eq=False)
 class Growth:
-    """Growth of forecasts' errors with their length, for a picture.
+    """Growth of forecasts' errors with their length, for a plot.
 
     Parameters
     ----------
@@ -139,7 +138,7 @@ class Growth:
 
 @dataclass(frozen=True)
 class Acceleration:
-    """Unexplained acceleration of each velocity: what a step adds beyond the model.
+    """Unexplained acceleration of each velocity: standard deviation of the process noise.
 
     Parameters
     ----------
@@ -148,7 +147,7 @@ class Acceleration:
     relative_before, relative_after : dict of str to float
         The same over the root mean square acceleration of the bodies.
     certain_after : dict of str to bool
-        Whether what the revised model leaves is not nothing.
+        Whether that of the revised model is significant.
     """
 
     before: Mapping[str, float]
@@ -170,14 +169,14 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Added:
-    """An effect that was added to the model, with its posterior and what it gained.
+    """An effect that was added to the model, with its posterior and its gain.
 
     Parameters
     ----------
     effect, body, sentence : str
-        What, on which body, and what it means in words.
+        Names of the effect and of the body, and the effect in words.
     statistic, p_value : float
-        Of the round in which it was found.
+        Score test in the round in which it was found.
     parameters : dict of str to Estimate
         Posterior of each of its parameters.
     not_separable_from : tuple of str
@@ -199,7 +198,7 @@ class Added:
 
 @dataclass(frozen=True)
 class Numerical:
-    """Engine substeps declared and used, and how far doubling the declared ones moves results."""
+    """Engine substeps declared and used, and the shift of results if those used are doubled."""
 
     substeps_declared: int
     substeps_used: int
@@ -217,7 +216,7 @@ class Errors:
     rollout_rmse : dict of str to float
         The same at the end of a rollout of several intervals.
     normalised_rmse : float
-        Root mean square of the residual in units of the noise: 1 is as good as can be.
+        Root mean square of the residual in units of the noise: 1 if the model is perfect.
     elpd : float
         Log predictive density, summed over held-out transitions.
     """
@@ -255,7 +254,7 @@ class Rollout:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """Structure that remains in the residual after all that the catalogue explains.
+    """Structure of the residual that no effect in the catalogue explains.
 
     Parameters
     ----------
@@ -266,9 +265,9 @@ class Unexplained:
     share : float
         Share of that residual's variance that a flexible regression predicts (0 to 1).
     p_value : float
-        Of a permutation test.
+        P-value of the test that found it.
     sentence : str
-        The same in words.
+        The structure in words.
     """
 
     body: str

@@ -1,4 +1,4 @@
-"""Rival models: each has one of several effects that a recording cannot tell apart."""
+"""Rival models, each with one of several effects that a recording cannot separate."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: The attribute of a posterior that names its inseparable effects.
+#: Attribute of a posterior with its groups of inseparable effects.
 _GROUPS = "not_separable"
 _ON = " on "
 
@@ -37,11 +37,11 @@ class Rival:
     attached : Attached
         The effect.
     mode : Mode
-        Of whole trajectories, of the model with this effect and without the others.
+        Of the model with this effect and without the others, fitted to whole trajectories.
     draws : ndarray
-        Of its posterior, shape (draw, p).
+        Draws from its posterior, shape (draw, p).
     sigma : ndarray
-        Noise parameters of the posterior that all rivals are from, shape (parameter,).
+        Noise parameters of the posterior that all rivals come from, shape (parameter,).
     """
 
     attached: Attached
@@ -51,14 +51,17 @@ class Rival:
 
     @property
     def name(self) -> str:
-        """Name of the effect and of its body."""
+        """Return the names of the effect and of its body."""
         return f"{self.attached.effect.name}{_ON}{self.attached.body}"
 
 
 def keep_groups(posterior: Any, added: Iterable[Added]) -> None:
-    """Note in a posterior's attributes which effects its recording cannot tell apart."""
+    """Record in a posterior's attributes which effects its recording cannot separate."""
     groups = [
-        [_whole(name, one.body) for name in (one.effect, *one.not_separable_from)]
+        [
+            name if _ON in name else f"{name}{_ON}{one.body}"
+            for name in (one.effect, *one.not_separable_from)
+        ]
         for one in added
         if one.not_separable_from
     ]
@@ -66,24 +69,20 @@ def keep_groups(posterior: Any, added: Iterable[Added]) -> None:
 
 
 def kept_groups(posterior: Any) -> list[tuple[str, ...]]:
-    """Groups of effects that a posterior's recording cannot tell apart, as ``effect on body``."""
+    """Return the groups of effects that a posterior's recording cannot separate."""
     return [tuple(names) for names in json.loads(str(posterior.attrs.get(_GROUPS, "[]")))]
-
-
-def _whole(name: str, body: str) -> str:
-    return name if _ON in name else f"{name}{_ON}{body}"
 
 
 def named_effects(
     names: Sequence[str], scene: Scene, catalogue: Iterable[Effect]
 ) -> list[Attached]:
-    """Effects on bodies by names such as ``spring``, or ``spring on cart``.
+    """Return effects on bodies by names such as ``spring``, or ``spring on cart``.
 
     Raises
     ------
     EffectError
-        If there are fewer than two, one is unknown, does not apply, or is of the noise; or where
-        the body is left out and there are several.
+        If there are fewer than two, one is unknown, does not apply, or is an effect of the noise;
+        or if the body is left out and there are several.
     """
     by_name = {effect.name: effect for effect in catalogue}
     found: list[Attached] = []
@@ -100,19 +99,21 @@ def named_effects(
         if not body and len(bodies) != 1:
             raise EffectError(f"effect {name} may act on {bodies}; say which: '{name} on BODY'")
         if isinstance(effect.stage, Noise):
-            raise EffectError(f"effect {name} is of the noise, which no action makes clearer")
+            raise EffectError(
+                f"effect {name} is of the noise: experiments cannot identify noise effects"
+            )
         if effect.on(body or bodies[0]) not in found:
             found.append(effect.on(body or bodies[0]))
     if len(found) < 2:
         raise EffectError(
-            f"effects: got {list(names)}, expected two or more that are to be told apart, such as"
+            f"effects: got {list(names)}, expected two or more to separate, such as"
             " linear_drag and quadratic_drag"
         )
     return found
 
 
 def likeliest_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
-    """The mode of a posterior's model, from its likeliest draw on.
+    """Return the mode of a posterior's model, found from its draw of the highest density.
 
     Raises
     ------
@@ -122,8 +123,8 @@ def likeliest_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
     problem = problem_of(posterior, catalogue).with_physics(threads=2)
     if isinstance(problem.likelihood, TransitionLikelihood):
         raise PosteriorError(
-            "posterior: it is of single transitions, which do not tell errors of measuring from"
-            " unexplained motion; take after.nc of close_loop, or fit with trajectories=True"
+            "posterior: it is of single transitions, which do not separate measurement noise from"
+            " process noise; take after.nc of close_loop, or fit with trajectories=True"
         )
     phi, sigma = parameter_draws(problem, posterior)
     best = likeliest_draw(posterior)
@@ -135,21 +136,20 @@ def fit_rivals(
 ) -> list[Rival]:
     """Fit a model with each of several effects to the recording that a posterior holds.
 
-    The posterior's own draws are those of the model that it is of; of the others, draws are from
-    the Gaussian at the mode.
+    The posterior's own model keeps its draws; the others are drawn from the Gaussian at the mode.
 
     Parameters
     ----------
     posterior : InferenceData or DataTree
-        Of whole trajectories.
+        A posterior of whole trajectories.
     effects : sequence of Attached
-        Of which each model has one.
+        The effects; each model has one.
     catalogue : iterable of Effect
         Where the names of the posterior's effects are looked up.
     draws : int
-        Of each model.
+        Number of draws from each model.
     seed : int
-        Of the draws.
+        Seed of the draws.
 
     Raises
     ------
@@ -169,14 +169,14 @@ def fit_rivals(
         without = problem.with_physics(effects=others)
         begin = without.layout.from_layout(problem.layout, own.phi)
         base = trajectory_mode(without, begin, own.sigma)
-    usual = np.median(sigma, axis=0)
+    noise = np.median(sigma, axis=0)
     found = []
     for attached in effects:
         if present == [attached]:
             chosen = phi[rng.choice(len(phi), draws, replace=False)]
-            found.append(Rival(attached, own, chosen, usual))
+            found.append(Rival(attached, own, chosen, noise))
             continue
         (signature,) = rank_candidates(base, [attached])
         mode = refitted(base, signature)
-        found.append(Rival(attached, mode, mode.draws(rng, draws), usual))
+        found.append(Rival(attached, mode, mode.draws(rng, draws), noise))
     return found

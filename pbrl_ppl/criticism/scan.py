@@ -1,34 +1,37 @@
-"""Grid scan of effects with a place, a threshold or a time, corrected for the looks."""
+"""Grid scan of effects with a place, a threshold or a time, and detection limits."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
-from pbrl_ppl.effects import Attached
+from pbrl_ppl.criticism.criteria import ScoreCriteria
+from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.modes import Mode
 
 Array = NDArray[np.float64]
 
-#: Looks that are simulated in one call.
+#: Grid points that are simulated in one call.
 _AT_ONCE = 8
 
 
 @dataclass(frozen=True, eq=False)
 class Look:
-    """An effect tried at one value of what is scanned.
+    """An effect at one grid point of its scan.
 
     Parameters
     ----------
     values : ndarray
         The effect's parameters, shape (q,), those that are not scanned at their null value.
     signature : ndarray
-        What it does to the whitened prediction, shape (n, columns): the derivative by each
-        parameter that is not scanned, or the whole change where all are.
+        Change of the whitened prediction, shape (n, columns): the derivative by each parameter that
+        is not scanned, or the whole change where all are.
     columns : tuple of int
-        The parameter of each column; empty where it is the whole change.
+        The parameter of each column; empty for a whole change.
     """
 
     values: Array
@@ -37,19 +40,19 @@ class Look:
 
 
 def looks(mode: Mode, candidate: Attached) -> list[Look]:
-    """Try a candidate at every value that its scan proposes.
+    """Simulate a candidate at every grid point that its scan proposes.
 
     Parameters
     ----------
     mode : Mode
-        Mode of the model that lacks it.
+        Mode of the model that lacks the effect.
     candidate : Attached
         An effect with a ``scan``.
 
     Returns
     -------
     list of Look
-        Those that change a prediction.
+        The grid points that change a prediction.
     """
     effect, problem = candidate.effect, mode.problem
     if effect.scan is None:
@@ -94,7 +97,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
 def _points(
     proposed: Array, free: Array, null: Array, steps: tuple[Array, Array]
 ) -> tuple[Array, list[tuple[Array, tuple[int, ...], list[int]]]]:
-    """Points to simulate, and each look's values, free columns and rows of the points."""
+    """Return points to simulate, and each grid point's values, free columns and rows of points."""
     points: list[Array] = []
     plan = []
     for row, unknown in zip(proposed, free, strict=True):
@@ -110,3 +113,83 @@ def _points(
             points.append(values)
         plan.append((values, columns, list(range(begin, len(points)))))
     return np.array(points), plan
+
+
+def detection_limits(
+    effect: Effect, unit: Array, tried: int, criteria: ScoreCriteria
+) -> dict[str, float]:
+    """Return the smallest detectable size of each parameter, the others at their null values.
+
+    Parameters
+    ----------
+    effect : Effect
+        The effect.
+    unit : ndarray
+        Change of the prediction by one unit of each parameter, in units of noise, shape (q,).
+    tried : int
+        Number of tests that the p-value is corrected for.
+    criteria : ScoreCriteria
+        P-value and power of the limit.
+    """
+    sizes = _sizes(unit, tried, criteria)
+    return dict(zip((p.name for p in effect.parameters), sizes, strict=True))
+
+
+def detection_limits_of_scan(
+    effect: Effect,
+    looks: Sequence[Look],
+    units: Sequence[Array],
+    candidates: int,
+    criteria: ScoreCriteria,
+) -> dict[str, float]:
+    """Return the smallest detectable sizes of a scanned effect, each at its best grid point.
+
+    For a whole change by a single parameter, as by a threshold, it is the detectable value nearest
+    to the null value; a whole change by several, such as an obstacle's place, has no size.
+
+    Parameters
+    ----------
+    effect : Effect
+        The effect.
+    looks : sequence of Look
+        Its grid points.
+    units : sequence of ndarray
+        Change of the prediction by one unit of each column of a grid point, or all of a whole
+        change, in units of noise.
+    candidates : int
+        Number of tests that the p-value is corrected for, beside the grid points.
+    criteria : ScoreCriteria
+        P-value and power of the limit.
+    """
+    tried = candidates * len(looks)
+    names = [parameter.name for parameter in effect.parameters]
+    found: dict[str, float] = {}
+    whole = [
+        (look.values, unit) for look, unit in zip(looks, units, strict=True) if not look.columns
+    ]
+    if whole and len(names) == 1:
+        null = effect.null[0]
+        seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
+        found[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
+    for look, unit in zip(looks, units, strict=True):
+        for column, size in zip(look.columns, _sizes(unit, tried, criteria), strict=False):
+            found[names[column]] = min(found.get(names[column], np.inf), size)
+    return found
+
+
+def caps(effect: Effect, looks: Sequence[Look]) -> bool:
+    """Return whether smaller is stronger, as for a limit: grid points below the null value."""
+    return bool(looks) and all(
+        not look.columns and look.values[0] < effect.null[0] for look in looks
+    )
+
+
+def _needed(tried: int, criteria: ScoreCriteria) -> float:
+    """Return the detectable change in units of noise, for a two-sided test."""
+    return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
+
+
+def _sizes(unit: Array, tried: int, criteria: ScoreCriteria) -> list[float]:
+    """Return the detectable size of each column."""
+    with np.errstate(divide="ignore"):
+        return [float(size) for size in _needed(tried, criteria) / unit]

@@ -10,44 +10,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
-from pbrl_ppl.criticism.detectable import caps, smallest, smallest_of_looks
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.scan import Look, looks
+from pbrl_ppl.criticism.scan import caps, detection_limits, detection_limits_of_scan, looks
 from pbrl_ppl.effects import Attached, Noise
-from pbrl_ppl.likelihood import TrajectoryLikelihood
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-#: Signatures whose directions agree more than this cannot be told apart.
-PARALLEL = 0.95
-#: ... and more than this, they are the same.
-SAME = 0.9999
-#: A difference of score statistics beyond this tells even nearly parallel signatures apart.
-DECISIVE = 10.0
-#: Less than this share of a signature left means that the declared parameters absorb it.
-ABSORBED = 1e-3
-#: A direction in which a size as the prior has it does less than this, in units of noise, is of the
-#: engine's rounding.
-_SHOWS = 1e-3
-#: Decimals of a p-value's logarithm; effects that are the same physics differ by rounding alone.
+#: Decimals of a p-value's logarithm: effects that are the same physics differ by rounding.
 _EQUAL = 3
 
 
 @dataclass(frozen=True, eq=False)
 class Signature:
-    """Signature of a candidate effect in the residual, and how much of it is seen there.
+    """Signature of a candidate effect, and its score test.
 
     Parameters
     ----------
     attached : Attached
         The candidate.
     candidate : Candidate
-        Its statistic, for the report.
+        Its test, for the report.
     log_p : float
-        Natural logarithm of the uncorrected p-value: the ranking.
+        Natural logarithm of the p-value before the correction for the number of candidates.
     basis : ndarray
         Orthonormal basis of the projected signature, shape (n, q).
     direction : ndarray
@@ -61,7 +49,9 @@ class Signature:
     direction: Array
 
 
-def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signature]:
+def rank_candidates(
+    mode: Mode, candidates: Sequence[Attached], criteria: Criteria = DEFAULT
+) -> list[Signature]:
     """Score every candidate effect at the mode of the model that lacks it, best first.
 
     With whitened residual r, Jacobian J of the declared parameters and signature D of a candidate
@@ -75,6 +65,8 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
         Mode of the declared model.
     candidates : sequence of Attached
         Effects that it lacks.
+    criteria : Criteria
+        Which signatures are absorbed.
 
     Returns
     -------
@@ -84,28 +76,24 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
     """
     if not candidates:
         return []
-    smooth = [
-        attached
-        for attached in candidates
-        if attached.effect.scan is None and not _of_noise(attached)
-    ]
+    smooth = [one for one in candidates if one.effect.scan is None and not _of_noise(one)]
     residual, jacobian, signatures = _signatures(mode, smooth)
     q, r = np.linalg.qr(jacobian)
-    # a parameter that the data and the prior say nothing about has no direction
+    # a parameter that neither the data nor the prior inform has no direction
     q = q[:, np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)]
-    left = residual - q @ (q.T @ residual)
+    test = _Test(q, residual - q @ (q.T @ residual), len(candidates), criteria)
     derived = dict(zip(smooth, signatures, strict=True))
 
     def score(attached: Attached) -> Signature:
         if _of_noise(attached):
-            return _tail_score(mode, attached, left, len(candidates))
+            return _tail_score(mode, attached, test)
         if attached in derived:
-            evidence = _evidence(derived[attached], q, left, _sides(attached), _scales(attached))
+            evidence = test.evidence(derived[attached], _sides(attached), _scales(attached))
             values = np.array(attached.effect.null) + evidence.size
-            return _signature(attached, evidence, values, 1, len(candidates))
-        return _best_look(attached, looks(mode, attached), q, left, len(candidates))
+            return _signature(attached, evidence, values, 1, test)
+        return _best_look(mode, attached, test)
 
-    # the noise's shape is never what is missing as long as an effect might be
+    # the noise's shape comes last: any missing effect makes tails heavy
     def order(signature: Signature) -> tuple[bool, float]:
         return _of_noise(signature.attached), round(signature.log_p, _EQUAL)
 
@@ -113,7 +101,7 @@ def rank_candidates(mode: Mode, candidates: Sequence[Attached]) -> list[Signatur
 
 
 def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Array, list[Array]]:
-    """Residual, Jacobian and every candidate's signature, with the prior as further rows.
+    """Return residual, Jacobian and every candidate's signature, with the prior as further rows.
 
     Returns
     -------
@@ -157,7 +145,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
 
 @dataclass(frozen=True, eq=False)
 class _Evidence:
-    """Score test of a signature's columns."""
+    """Result of the score test of a signature's columns."""
 
     statistic: float
     log_p: float
@@ -169,71 +157,92 @@ class _Evidence:
 
 
 def _none(n: int) -> _Evidence:
-    """No evidence of one column, over n whitened residuals."""
+    """Return no evidence for one column, over n whitened residuals."""
     return _Evidence(0.0, 0.0, 0.0, np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1))
 
 
-def _evidence(signature: Array, q: Array, residual: Array, sides: Ints, scales: Array) -> _Evidence:
-    """The score statistic of a signature, projected off the declared parameters' directions ``q``.
+@dataclass(frozen=True, eq=False)
+class _Test:
+    """Score tests of candidates at one mode.
 
     Parameters
     ----------
-    signature : ndarray
-        Shape (n, columns).
     q : ndarray
-        Orthonormal, shape (n, p).
+        Orthonormal directions that the declared parameters absorb, shape (n, p).
     residual : ndarray
-        Projected already, shape (n,).
-    sides : ndarray of int
-        1 (or -1) where a column can only have a positive (or negative) size, shape (columns,).
-    scales : ndarray
-        Sizes that columns might have, shape (columns,): what those do not show is not seen.
+        Whitened residual without these directions, shape (n,).
+    candidates : int
+        Number of candidates, which p-values are corrected for.
+    criteria : Criteria
+        Which signatures are absorbed.
     """
-    signature = signature * scales
-    projected = signature - q @ (q.T @ signature)
-    total = (signature**2).sum()
-    share = float((projected**2).sum() / total) if total > 0 else 0.0
-    n, columns = signature.shape
-    size, statistic, log_p = np.zeros(columns), 0.0, 0.0
-    unit = np.zeros(columns)
-    basis, direction = np.zeros((n, 0)), np.zeros(n)
-    if share > ABSORBED:
-        u, s, vt = np.linalg.svd(projected, full_matrices=False)
-        whole = np.linalg.norm(signature @ vt.T, axis=0)  # before the projection
-        keep = (s > 1e-6 * s.max()) & (s >= min(_SHOWS, s.max())) & (s**2 > ABSORBED * whole**2)
-        basis = u[:, keep]
-        unit = np.sqrt((projected**2).sum(axis=0)) / scales
-        coordinates = basis.T @ residual
-        size = scales * (vt[keep].T @ (coordinates / s[keep]))
-        statistic = float(coordinates @ coordinates)
-        log_p = float(chi2.logsf(statistic, max(1, int(keep.sum()))))
-        seen = int(np.argmax(np.abs(vt[0])))
-        if sides[seen] and keep.sum() == 1 and np.abs(vt[0, seen]) > 1 - 1e-6:
-            # it can only be on one side of nothing: half the chance, and none on the other side
-            allowed = sides[seen] * size[seen] > 0
-            statistic = statistic if allowed else 0.0
-            log_p = log_p + np.log(0.5) if allowed else 0.0
-        if statistic > 0:
-            direction = basis @ coordinates / np.sqrt(statistic)
-    return _Evidence(statistic, log_p, share, size, basis, direction, unit)
+
+    q: Array
+    residual: Array
+    candidates: int
+    criteria: Criteria
+
+    def evidence(self, signature: Array, sides: Ints, scales: Array) -> _Evidence:
+        """Return the score test of a signature.
+
+        Parameters
+        ----------
+        signature : ndarray
+            Shape (n, columns).
+        sides : ndarray of int
+            1 (or -1) where a column's size can only be positive (or negative), shape (columns,).
+        scales : ndarray
+            Typical sizes, shape (columns,): directions that are invisible at these are left out.
+        """
+        signature = signature * scales
+        projected = signature - self.q @ (self.q.T @ signature)
+        total = (signature**2).sum()
+        share = float((projected**2).sum() / total) if total > 0 else 0.0
+        n, columns = signature.shape
+        limits = self.criteria.score
+        size, statistic, log_p = np.zeros(columns), 0.0, 0.0
+        unit = np.zeros(columns)
+        basis, direction = np.zeros((n, 0)), np.zeros(n)
+        if share > limits.absorbed:
+            u, s, vt = np.linalg.svd(projected, full_matrices=False)
+            whole = np.linalg.norm(signature @ vt.T, axis=0)  # before the projection
+            keep = (s > 1e-6 * s.max()) & (s >= min(limits.visible, s.max()))
+            keep &= s**2 > limits.absorbed * whole**2
+            basis = u[:, keep]
+            unit = np.sqrt((projected**2).sum(axis=0)) / scales
+            coordinates = basis.T @ self.residual
+            size = scales * (vt[keep].T @ (coordinates / s[keep]))
+            statistic = float(coordinates @ coordinates)
+            log_p = float(chi2.logsf(statistic, max(1, int(keep.sum()))))
+            seen = int(np.argmax(np.abs(vt[0])))
+            if sides[seen] and keep.sum() == 1 and np.abs(vt[0, seen]) > 1 - 1e-6:
+                # it can only have one sign: half the p-value, and no evidence for the other sign
+                allowed = sides[seen] * size[seen] > 0
+                statistic = statistic if allowed else 0.0
+                log_p = log_p + np.log(0.5) if allowed else 0.0
+            if statistic > 0:
+                direction = basis @ coordinates / np.sqrt(statistic)
+        return _Evidence(statistic, log_p, share, size, basis, direction, unit)
 
 
 def _sides(attached: Attached) -> Ints:
-    """On which side of its null value each parameter must be; 0 if on any."""
+    """Return the side of its null value on which each parameter must be; 0 if on any."""
     supports = [(p.null, *p.prior.support) for p in attached.effect.parameters]
     return np.array([int(null == low) - int(null == high) for null, low, high in supports])
 
 
 def _scales(attached: Attached) -> Array:
-    """Sizes that an effect's parameters have under their priors."""
+    """Return the typical sizes of an effect's parameters under their priors."""
     return np.array([parameter.prior.sigma for parameter in attached.effect.parameters])
 
 
 def _signature(
-    attached: Attached, evidence: _Evidence, values: Array, n_looks: int, n_candidates: int
+    attached: Attached, evidence: _Evidence, values: Array, n_looks: int, test: _Test
 ) -> Signature:
-    """A candidate's signature, its p-value corrected for the looks and for the candidates."""
-    effect = attached.effect
+    """Return a candidate's signature, its p-value corrected for grid points and candidates."""
+    effect, limits = attached.effect, {}
+    if effect.scan is None:
+        limits = detection_limits(effect, evidence.unit, test.candidates, test.criteria.score)
     log_p = min(0.0, evidence.log_p + np.log(max(1, n_looks)))
     names = [parameter.name for parameter in effect.parameters]
     candidate = Candidate(
@@ -242,66 +251,66 @@ def _signature(
         sentence=effect.sentence,
         statistic=evidence.statistic,
         dof=evidence.basis.shape[1] or evidence.size.size,  # directions that are seen
-        p_value=float(min(1.0, np.exp(log_p) * n_candidates)),
+        p_value=float(min(1.0, np.exp(log_p) * test.candidates)),
         estimate=dict(zip(names, values.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
         identifiable=evidence.share,
         looks=n_looks,
-        detectable=smallest(effect, evidence.unit, n_candidates) if effect.scan is None else {},
+        detectable=limits,
     )
     return Signature(attached, candidate, log_p, evidence.basis, evidence.direction)
 
 
-def _best_look(
-    attached: Attached, tried: Sequence[Look], q: Array, residual: Array, n_candidates: int
-) -> Signature:
-    """The look of a scan that explains most; of a whole change, only its own sign counts."""
-    effect, best, units = attached.effect, _none(len(residual)), []
+def _best_look(mode: Mode, attached: Attached, test: _Test) -> Signature:
+    """Return the signature of the grid point that explains most; a whole change has one sign."""
+    effect, n, units = attached.effect, len(test.residual), []
+    tried, best = looks(mode, attached), _none(n)
     values = np.array(effect.null)
     for look in tried:
-        rows = np.pad(look.signature, ((0, len(residual) - len(look.signature)), (0, 0)))
+        rows = np.pad(look.signature, ((0, n - len(look.signature)), (0, 0)))
         columns = list(look.columns)
         sides = _sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
         scales = _scales(attached)[columns] if columns else np.ones(1)
-        found = _evidence(rows, q, residual, sides, scales)
+        found = test.evidence(rows, sides, scales)
         units.append(found.unit)
         if found.log_p < best.log_p:
             best, values = found, look.values.copy()
             for column, size in zip(look.columns, found.size, strict=False):
                 values[column] += size
-    signature = _signature(attached, best, values, len(tried), n_candidates)
+    signature = _signature(attached, best, values, len(tried), test)
     candidate = replace(
         signature.candidate,
-        detectable=smallest_of_looks(effect, tried, units, n_candidates),
+        detectable=detection_limits_of_scan(
+            effect, tried, units, test.candidates, test.criteria.score
+        ),
         caps=caps(effect, tried),
     )
     return replace(signature, candidate=candidate)
 
 
 def _of_noise(attached: Attached) -> bool:
+    """Return whether an effect is of the noise's shape."""
     return isinstance(attached.effect.stage, Noise)
 
 
-def _tail_score(mode: Mode, attached: Attached, left: Array, n_candidates: int) -> Signature:
-    """Score of the noise's tail: the kurtosis, with what sigma can absorb projected out.
+def _tail_score(mode: Mode, attached: Attached, test: _Test) -> Signature:
+    """Return the score test of the noise's tail: the kurtosis, with sigma's score projected out.
 
     The derivative of Student-t's log-density by the reciprocal of its degrees of freedom at zero is
     (z^4 - 2 z^2 - 1) / 4; without its projection on sigma's score it is the fourth Hermite
     polynomial over 4, of variance 3/2.
     """
-    likelihood = mode.problem.likelihood
-    seen = mode.problem.observations.measured
-    if isinstance(likelihood, TrajectoryLikelihood):
-        seen = likelihood.noise.seen
-    whitened = left[: seen.size].reshape(seen.shape)
-    # what never moves has no noise, and would make that of all others look heavy
-    loud = seen & (np.abs(whitened).max(axis=0) > _SHOWS)
+    noise = mode.problem.trajectory_noise
+    seen = mode.problem.observations.measured if noise is None else noise.seen
+    whitened = test.residual[: seen.size].reshape(seen.shape)
+    # coordinates that never move have no noise, and would make all others look heavy-tailed
+    loud = seen & (np.abs(whitened).max(axis=0) > test.criteria.score.visible)
     z = whitened[loud] if mode.problem.nu(mode.phi) is None else np.zeros(0)
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0
     evidence = replace(
-        _none(len(left)),
+        _none(len(test.residual)),
         statistic=score**2 / variance if heavier else 0.0,
         log_p=float(norm.logsf(score / np.sqrt(variance))) if heavier else 0.0,
         share=1.0,
@@ -310,19 +319,21 @@ def _tail_score(mode: Mode, attached: Attached, left: Array, n_candidates: int) 
     values = np.array(attached.effect.null)
     if heavier and len(values) == 1:
         values = values + score / variance
-    return _signature(attached, evidence, values, 1, n_candidates)
+    return _signature(attached, evidence, values, 1, test)
 
 
-def twins(first: Signature, second: Signature) -> bool:
-    """Whether two candidates are the same physics here, such as drags on a single pendulum."""
+def twins(first: Signature, second: Signature, criteria: Criteria = DEFAULT) -> bool:
+    """Return whether two candidates are the same physics here, as two drags on one pendulum."""
     if first.basis.shape != second.basis.shape or first.candidate.dof != second.candidate.dof:
         return False
     overlap = np.linalg.svd(first.basis.T @ second.basis, compute_uv=False)
-    return bool(overlap.size and overlap.min() > SAME)
+    return bool(overlap.size and overlap.min() > criteria.score.same)
 
 
-def inseparable(leader: Signature, others: Sequence[Signature]) -> tuple[str, ...]:
-    """Names of effects that explain the residual as the leader does, as far as the data can tell.
+def inseparable(
+    leader: Signature, others: Sequence[Signature], criteria: Criteria = DEFAULT
+) -> tuple[str, ...]:
+    """Return the effects that the data cannot separate from the leader, by name.
 
     Parameters
     ----------
@@ -330,14 +341,16 @@ def inseparable(leader: Signature, others: Sequence[Signature]) -> tuple[str, ..
         The effect to be added.
     others : sequence of Signature
         All ranked candidates.
+    criteria : Criteria
+        Which signatures are separable.
     """
-    names = []
+    limits, names = criteria.score, []
     for signature in others:
         if signature is leader or signature.basis.shape[1] == 0:
             continue
         cosine = float(np.linalg.norm(signature.basis.T @ leader.direction))
         behind = leader.candidate.statistic - signature.candidate.statistic
-        if cosine > PARALLEL and behind < DECISIVE:
+        if cosine > limits.parallel and behind < limits.decisive:
             same_body = signature.attached.body == leader.attached.body
             name = signature.attached.effect.name
             names.append(name if same_body else f"{name} on {signature.attached.body}")

@@ -12,17 +12,17 @@ from scipy.stats import chi2
 from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.cross_validation import (
     Change,
-    few_trajectories,
     folds,
     forecast_squares,
     leave_out,
     relative_fall,
+    trajectory_count,
 )
 from pbrl_ppl.criticism.forecast import longest_forecast
-from pbrl_ppl.criticism.outliers import outliers
-from pbrl_ppl.criticism.resolution import with_enough_substeps
+from pbrl_ppl.criticism.recordings import outliers
+from pbrl_ppl.criticism.refinement import with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.score import Signature, inseparable, twins
+from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, trajectory_evidence, trajectory_mode
@@ -31,19 +31,10 @@ from pbrl_ppl.scene import Scene
 
 Array = NDArray[np.float64]
 
-#: Candidates that are refitted in a round.
-TRIED = 4
-#: A candidate with less than this share of the leader's statistic waits until that has failed.
-WORTH_A_REFIT = 0.5
-#: A parameter whose posterior is narrower than this share of its prior has been fitted.
-TOLD = 0.7
-#: Likelihoods that differ by less do not choose between effects: the catalogue's order does.
-TIE = 1.0
-
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """One effect added: its signature, the new mode and what it gained."""
+    """An added effect: its signature, the new mode and the gain in log predictive density."""
 
     signature: Signature
     not_separable_from: tuple[str, ...]
@@ -52,24 +43,27 @@ class Step:
     elpd_difference_se: float
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Selection:
-    """The data and the catalogue that effects are chosen by, and what became of each effect.
+    """Stepwise selection of effects, which records its decision on each candidate.
 
     Parameters
     ----------
     scene : Scene
-        The declared one.
+        The declared scene.
     catalogue : tuple of Effect
         Effects to consider.
     criteria : Criteria
-        When an effect is accepted.
+        Thresholds of the decisions.
     say : callable
-        Told what takes long.
+        Called with the name of what takes long.
+
+    Attributes
+    ----------
     why : dict of (str, str) to str
-        Why an effect on a body was added or not, as the last round that it was tried in has it.
+        Why an effect on a body was added or not, from the last round that tried it.
     small : list of Candidate
-        Of the last round, the best that is certain and does not matter, if there is one.
+        The best candidate of the last round that is significant and negligible, if there is one.
     """
 
     scene: Scene
@@ -80,89 +74,91 @@ class Selection:
     small: list[Candidate] = field(default_factory=list, init=False)
 
     def missing(self, mode: Mode) -> tuple[Attached, ...]:
-        """Candidate effects for a model."""
+        """Return the candidate effects for a model."""
         return candidates(self.scene, mode.problem.physics.effects, self.catalogue)
+
+    def rank(self, mode: Mode, at: Mode | None = None) -> list[Signature]:
+        """Return the scores of a model's candidates, at its mode or with other noise parameters."""
+        return rank_candidates(at or mode, self.missing(mode), self.criteria)
 
     def best_addition(
         self, mode: Mode, ranked: list[Signature], *, provisional: bool = False
     ) -> Step | None:
-        """Refit with the leading candidates; the best that held-out data confirm, or None.
+        """Refit with the leading candidates and return the best that is confirmed, or None.
 
         If ``provisional``, one whose fit shows outliers is returned without being confirmed.
         """
         order = [attached.effect.name for attached in self.missing(mode)]
+        limits = self.criteria.selection
         self.small.clear()
 
-        def rank(item: tuple[Signature, Mode]) -> float:
-            signature, fitted = item
-            fitting = _told(fitted, signature.attached)
+        def score(signature: Signature, fitted: Mode) -> float:
             shown = fitted.problem.trajectory_noise.seen.any(axis=1).sum()
-            penalty = 0.5 * fitting * np.log(shown)
+            penalty = 0.5 * _informed(fitted, signature.attached, limits.informed) * np.log(shown)
             return float(_log_likelihood(fitted) - penalty)
 
         waiting = self._worth_a_refit(ranked, order)
         while waiting:
-            # those far behind the first wait until it has failed
-            enough = WORTH_A_REFIT * waiting[0].candidate.statistic
-            leading = [
-                signature for signature in waiting if signature.candidate.statistic >= enough
-            ]
-            waiting = [signature for signature in waiting if signature.candidate.statistic < enough]
-            fits = [(signature, refitted(mode, signature)) for signature in leading]
-            ranks = {item: rank(item) for item in fits}
-            ranks = {item: value for item, value in ranks.items() if np.isfinite(value)}
-            while ranks:
-                best = max(ranks.values())
-                tied = [item for item, value in ranks.items() if value > best - TIE]
-                item = min(tied, key=lambda pair: order.index(pair[0].attached.effect.name))
-                own = ranks.pop(item)
-                if provisional and np.isfinite(outliers(item[1])).any():
-                    return Step(item[0], (), item[1], np.nan, np.nan)
-                step = self._confirm(mode, *item, ranked)
+            # those far behind the first are tried only once it has failed
+            enough = limits.worth_a_refit * waiting[0].candidate.statistic
+            leading = [each for each in waiting if each.candidate.statistic >= enough]
+            waiting = [each for each in waiting if each.candidate.statistic < enough]
+            fits = {signature: refitted(mode, signature) for signature in leading}
+            scores = {signature: score(signature, fitted) for signature, fitted in fits.items()}
+            scores = {signature: value for signature, value in scores.items() if np.isfinite(value)}
+            while scores:
+                best = max(scores.values())
+                tied = [each for each, value in scores.items() if value > best - limits.tie]
+                signature = min(tied, key=lambda each: order.index(each.attached.effect.name))
+                height, fitted = scores.pop(signature), fits[signature]
+                if provisional and np.isfinite(outliers(fitted, self.criteria)).any():
+                    return Step(signature, (), fitted, np.nan, np.nan)
+                step = self._confirm(mode, signature, fitted, ranked)
                 if step is None:
                     continue
-                for (other, _), value in ranks.items():
-                    self._note(other, _behind(own - value, step.signature, other))
+                for other, value in scores.items():
+                    self._note(other, _behind(height - value, limits.tie, signature, other))
                 for other in waiting:
-                    self._note(other, f"too far behind {_named(item[0], other)} to be refitted")
+                    self._note(other, f"too far behind {_named(signature, other)} to be refitted")
                 return step
         return None
 
     def _worth_a_refit(self, ranked: list[Signature], order: list[str]) -> list[Signature]:
-        """Significant candidates, best first; of twins, the one that the catalogue names first.
+        """Return the significant candidates, best first; of twins, the first in the catalogue.
 
-        The noise's shape is scored and never added: misfit would pass for noise. A scene declares
-        it.
+        The noise's shape is scored and never added, for it would take up any misfit.
         """
         kept: list[Signature] = []
         for signature in sorted(ranked, key=lambda entry: order.index(entry.attached.effect.name)):
-            same = [earlier for earlier in kept if twins(signature, earlier)]
+            same = [earlier for earlier in kept if twins(signature, earlier, self.criteria)]
             if isinstance(signature.attached.effect.stage, Noise):
                 self._note(signature, "the noise's shape is scored and never added: declare it")
             elif signature.candidate.p_value >= self.criteria.try_p:
-                # of one that came close before, what it was is better known by that round
+                # an earlier round that tried it says more
                 if _key(signature) not in self.why:
-                    chance = f"p = {signature.candidate.p_value:.2g}"
-                    self._note(signature, f"not significant ({chance})")
+                    self._note(
+                        signature, f"not significant (p = {signature.candidate.p_value:.2g})"
+                    )
             elif same:
                 self._note(signature, f"the same as {_named(same[0], signature)} in these data")
             else:
                 kept.append(signature)
         kept.sort(key=lambda entry: entry.log_p)
-        for signature in kept[TRIED:]:
-            self._note(signature, f"behind the {TRIED} that are refitted in a round")
-        return kept[:TRIED]
+        most = self.criteria.selection.refits
+        for signature in kept[most:]:
+            self._note(signature, f"behind the {most} that are refitted in a round")
+        return kept[:most]
 
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
-        """Accept an improvement that cross-validation is sure of and that is not negligible."""
+        """Return the step if its gain is significant in cross-validation and not negligible."""
         fitted = with_enough_substeps(fitted, self.say, self.criteria)
         if why := self._implausible(fitted, signature):
             self._note(signature, why)
             return None
-        density, forecasts = gains = _gains(mode, fitted)
-        if why := self._unsure(mode, fitted, *gains):
+        density, forecasts = _gains(mode, fitted, self.criteria)
+        if why := self._uncertain(mode, fitted, density, forecasts):
             self._note(signature, why)
             return None
         share, negligible = _share(mode, fitted), self.criteria.negligible
@@ -171,17 +167,17 @@ class Selection:
         if share < negligible:
             size = f"changes predictions by {100 * share:.2g} %"
             self._note(signature, f"{size}: less than {100 * negligible:g} % is negligible")
-            if not self.small:  # of others it is not known whether they are there beside it
+            if not self.small:  # others may be significant only without it
                 self.small.append(signature.candidate)
             return None
         self._note(signature, "added")
-        step = density.total, density.error
-        return Step(signature, inseparable(signature, ranked), fitted, *step)
+        others = inseparable(signature, ranked, self.criteria)
+        return Step(signature, others, fitted, density.total, density.error)
 
     def _implausible(self, mode: Mode, signature: Signature) -> str:
-        """Why the fitted size of an effect is not accepted; empty if it is."""
+        """Return why the fitted size of an effect is not accepted; empty if it is."""
         attached = signature.attached
-        if not _told(mode, attached):
+        if not _informed(mode, attached, self.criteria.selection.informed):
             return "the data do not inform its size"
         layout = mode.problem.layout
         places = [layout.labels.index(label) for label in attached.labels]
@@ -196,16 +192,16 @@ class Selection:
             " the effect would allow it"
         )
 
-    def _unsure(self, before: Mode, after: Mode, density: Change, forecasts: Change) -> str:
-        """Why a gain in density, and a fall of forecasts' errors, do not do; empty if they do.
+    def _uncertain(self, before: Mode, after: Mode, density: Change, forecasts: Change) -> str:
+        """Return why gains in density and forecasts are not enough; empty if they are.
 
-        Runs of a few trajectories are too few and too much alike for a standard error: there the
+        Runs of a few trajectories are too few and too similar for a standard error: there the
         evidence decides.
         """
         criteria = self.criteria
         if -forecasts.total > max(criteria.negligible, forecasts.needed(criteria.min_elpd_se)):
             return f"errors of cross-validated forecasts rise by {-100 * forecasts.total:.2g} %"
-        if few_trajectories(after):
+        if trajectory_count(after) < criteria.selection.least_trajectories:
             return self._without_evidence(before, after)
         needed = max(criteria.min_elpd, density.needed(criteria.min_elpd_se))
         either = any(each.certain(criteria.min_elpd_se) for each in (density, forecasts))
@@ -215,9 +211,9 @@ class Selection:
         return f"cross-validation gains {gained}, {needed:.1f} are needed"
 
     def _without_evidence(self, before: Mode, after: Mode) -> str:
-        """Why neither evidence nor likelihood says that an effect is there; empty if both do.
+        """Return why evidence and likelihood do not support an effect; empty if both do.
 
-        The likelihood must rise, too: a declared prior that fits badly is no ground for a name.
+        The likelihood must rise, too: a declared prior that fits badly does not support an effect.
         """
         likelihood = _log_likelihood(after) - _log_likelihood(before)
         more = len(after.phi) - len(before.phi)
@@ -225,37 +221,43 @@ class Selection:
         if chance > self.criteria.try_p:
             return f"the likelihood rises by {likelihood:.1f} nats (p = {chance:.2g})"
         labels = before.problem.layout.labels
-        added = [i for i, label in enumerate(after.problem.layout.labels) if label not in labels]
-        told = [i for i in added if _left_of_prior(after)[i] < TOLD]
-        gained = trajectory_evidence(after, told) - trajectory_evidence(before)
+        narrow = _width_over_prior(after) < self.criteria.selection.informed
+        informed = [
+            i for i, label in enumerate(after.problem.layout.labels)
+            if label not in labels and narrow[i]
+        ]  # fmt: skip
+        gained = trajectory_evidence(after, informed) - trajectory_evidence(before)
         if gained >= self.criteria.min_evidence:
             return ""
         return f"the evidence rises by {gained:.1f} nats, {self.criteria.min_evidence:g} are needed"
 
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
-        """Drop effects that later ones have made unnecessary; what gained most comes first."""
+        """Drop effects that later ones have made unnecessary; sort the rest by their gain."""
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
             without = self._without(mode, step.signature.attached)
-            if why := self._unsure(without, mode, *_gains(without, mode)):
+            gains = _gains(without, mode, self.criteria)
+            if why := self._uncertain(without, mode, *gains):
                 self._note(step.signature, f"needless beside later ones: {why}")
                 mode = without
                 steps = [addition for addition in steps if addition is not step]
         return mode, sorted(steps, key=lambda addition: -addition.elpd_difference)
 
     def withdraw(self, steps: list[Step]) -> None:
-        """Take back what was added: most of what was missing remains with it."""
+        """Withdraw added effects, with which most of the residual remains."""
         for step in steps:
             self._note(step.signature, "withdrawn: most of what is missing remains with it")
-        self.small.clear()  # beside what is no longer there
+        self.small.clear()  # it was found beside the effects that are withdrawn
 
     def explained(self, ranked: list[Signature]) -> tuple[Candidate, ...]:
-        """Candidates that say what became of them."""
-        return tuple(replace(own.candidate, why=self.why.get(_key(own), "")) for own in ranked)
+        """Return candidates with the decision on each."""
+        return tuple(replace(one.candidate, why=self.why.get(_key(one), "")) for one in ranked)
 
     def _note(self, signature: Signature, why: str) -> None:
+        """Record the decision on a candidate."""
         self.why[_key(signature)] = why
 
     def _without(self, mode: Mode, effect: Attached) -> Mode:
+        """Return the mode refitted without an effect."""
         kept = tuple(attached for attached in mode.problem.physics.effects if attached != effect)
         problem = mode.problem.with_physics(effects=kept)
         phi = problem.layout.from_layout(mode.problem.layout, mode.phi)
@@ -263,11 +265,11 @@ class Selection:
 
 
 def refitted(mode: Mode, signature: Signature) -> Mode:
-    """Mode with the candidate in the model, under the same noise structure."""
+    """Return the mode with a candidate in the model, under the same noise structure."""
     attached = signature.attached
     estimate = np.array(list(signature.candidate.estimate.values()))
     stage = attached.effect.stage
-    if isinstance(stage, Structure) and stage.rod is None:  # something to run into
+    if isinstance(stage, Structure) and stage.rod is None:  # bodies collide with it
         return structure_mode(mode, attached, estimate)
     effects = (*mode.problem.physics.effects, attached)
     problem = mode.problem.with_physics(effects=effects)
@@ -278,29 +280,30 @@ def refitted(mode: Mode, signature: Signature) -> Mode:
 
 
 def _key(signature: Signature) -> tuple[str, str]:
+    """Return effect and body."""
     return signature.candidate.effect, signature.candidate.body
 
 
 def _named(signature: Signature, beside: Signature) -> str:
-    """An effect in words, with its body where the other one's is another."""
+    """Return an effect's name, with its body if the other effect acts on another."""
     name, body = signature.attached.effect.name.replace("_", " "), signature.attached.body
     return name if body == beside.attached.body else f"{name} on {body}"
 
 
-def _behind(nats: float, best: Signature, own: Signature) -> str:
-    """Why one that was refitted was not taken, but another that fits so much better."""
-    if nats < TIE:
-        return f"fits no better than {_named(best, own)}, which is simpler"
-    return f"fits less well than {_named(best, own)}, by {nats:.1f} nats"
+def _behind(nats: float, tie: float, best: Signature, other: Signature) -> str:
+    """Return why a refitted candidate was not taken but another that fits better."""
+    if nats < tie:
+        return f"fits no better than {_named(best, other)}, which is simpler"
+    return f"fits less well than {_named(best, other)}, by {nats:.1f} nats"
 
 
-def _gains(before: Mode, after: Mode) -> tuple[Change, Change]:
-    """Gain in cross-validated log predictive density, and relative fall of forecasts' errors.
+def _gains(before: Mode, after: Mode, criteria: Criteria) -> tuple[Change, Change]:
+    """Return the gain in cross-validated density, and the fall of forecast errors.
 
-    The forecasts are as long as the recording lets them be; the mean is taken over what was
-    measured, each in units of the errors before.
+    The forecasts are as long as the recording allows; the fall is a mean over observed coordinates,
+    each in units of the errors before.
     """
-    fold = folds(after)
+    fold = folds(after, criteria)
     models = [leave_out(mode, fold) for mode in (before, after)]
     intervals = longest_forecast(after.problem)
     worse, better = (
@@ -311,37 +314,38 @@ def _gains(before: Mode, after: Mode) -> tuple[Change, Change]:
 
 
 def _share(before: Mode, after: Mode) -> float:
-    """Share by which one model's innovations exceed another's, in units of the latter's noise."""
+    """Return the share by which a model's innovations exceed another's, in the latter's noise."""
     physics = before.problem.physics
     model = after.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
     worse, better = model.whitened(before.phi, after.sigma), after.whitened_residual
     return 1.0 - float(np.sqrt((better**2).sum() / (worse**2).sum()))
 
 
-def _told(mode: Mode, attached: Attached) -> int:
-    """How many of an effect's parameters the data say something of: others fit nothing.
+def _informed(mode: Mode, attached: Attached, informed: float) -> int:
+    """Return the number of an effect's parameters that the data inform.
 
-    Where the derivative vanishes, as at a threshold, the posterior cannot tell: what is scanned
-    counts.
+    Where the derivative vanishes, as at a threshold, the posterior's width says nothing: scanned
+    parameters always count.
     """
     problem = mode.problem
     labels = problem.layout.labels
     places = [labels.index(label) for label in attached.labels]
-    told = _left_of_prior(mode)[places] < TOLD
+    narrow = _width_over_prior(mode)[places] < informed
     if attached.effect.scan is not None:
         body = problem.scene.body(attached.body)
         looks = np.nan_to_num(attached.effect.scan(problem.scene, problem.data.history, body))
-        told |= np.ptp(looks, axis=0) > 0
-    return int(told.sum())
+        narrow |= np.ptp(looks, axis=0) > 0
+    return int(narrow.sum())
 
 
-def _left_of_prior(mode: Mode) -> Array:
-    """Posterior standard deviations in units of the prior's, shape (p,)."""
+def _width_over_prior(mode: Mode) -> Array:
+    """Return posterior standard deviations in units of the prior's, shape (p,)."""
     slopes = prior_slopes(mode.problem.layout.priors, mode.phi)
     return np.asarray(np.sqrt(np.diag(mode.covariance)) * np.abs(slopes))
 
 
 def _log_likelihood(mode: Mode) -> float:
+    """Return the log-likelihood of the mode."""
     problem = mode.problem
     residual = problem.residual(mode.phi)
     return float(problem.log_density(residual, mode.sigma, mode.phi).sum())

@@ -1,4 +1,4 @@
-"""Mode of a model with an effect that bodies run into: its place is sought without derivatives."""
+"""Mode of a model with a structure that bodies collide with, found without derivatives."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Array = NDArray[np.float64]
 _SUBSTEPS = 40
 #: Degrees of freedom of the loss: a transition that a guess does not explain pulls little.
 _NU = 4.0
-#: What a step adds, as a share of its prior's median: the engine's own error at contact, and more.
+#: Process noise as a share of its prior's median: more than the engine's error at contact.
 _ADDED = 0.3
 #: Guesses that are improved, runs of the engine for each, and how far the first ones go (prior sd).
 _GUESSES, _RUNS, _SIDE = 6, 200, 0.05
-#: Places whose losses differ by less are the same.
+#: Places with losses that differ by less are the same.
 _SAME = 1.0
 #: Places from which the other parameters and the noise are fitted, and rounds after the first.
 _PLACES, _ROUNDS = 4, 3
@@ -30,21 +30,21 @@ _BETTER = 2.0
 
 
 def structure_mode(mode: Mode, candidate: Attached, estimate: Array) -> Mode:
-    """Fit a model with a structure that bodies run into.
+    """Fit a model with a structure that bodies collide with.
 
-    Derivatives that straddle a collision mislead a climb, and the noise that is needed without the
-    structure hides which hits a place explains. So guesses of the place are improved first, by
-    Nelder and Mead's simplex under Student's loss with little noise; the best are fitted with all
-    parameters, place and fit in turn.
+    Derivatives across a collision mislead an optimiser, and the noise that fits without the
+    structure hides which collisions a place explains. So guesses of the place are improved first,
+    by Nelder and Mead's simplex under Student's loss with little noise; the best are fitted with
+    all parameters, place and fit in turn.
 
     Parameters
     ----------
     mode : Mode
-        Of whole trajectories, of the model that lacks the structure.
+        Of the model that lacks the structure, fitted to whole trajectories.
     candidate : Attached
         The effect; its scan makes the guesses.
     estimate : ndarray
-        One guess more, shape (q,).
+        A further guess, shape (q,).
 
     Returns
     -------
@@ -85,7 +85,7 @@ def structure_mode(mode: Mode, candidate: Attached, estimate: Array) -> Mode:
 def _places(
     problem: Problem, phi: Array, sigma: Array, own: list[int], guesses: Array
 ) -> list[Array]:
-    """Improve guesses of some parameters, the others held; distinct ones, best first."""
+    """Improve guesses of some parameters, the others held; return distinct ones, best first."""
     lower, upper = (bound[own] for bound in problem.layout.bounds)
 
     def loss(values: Array) -> float:

@@ -1,7 +1,8 @@
-"""Unexplained acceleration: what a step adds beyond the model, beside what the bodies do."""
+"""Unexplained acceleration: process noise of a fitted model, beside the bodies' motion."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,23 +18,24 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Left:
+class UnexplainedAcceleration:
     """Unexplained acceleration of a model, shape (velocity,) each.
 
     Parameters
     ----------
     names : tuple of str
-        Velocities.
+        Names of the velocities.
     size : ndarray
         Standard deviation, m/s^2 and rad/s^2.
     relative : ndarray
         The same over the root mean square acceleration of the bodies.
     p_value : ndarray
-        Of the likelihood ratio against none.
+        P-value of the likelihood ratio against none.
     numerical : ndarray
-        Change of the bodies' accelerations if the substeps are doubled, root mean square, as size.
+        Root mean square change of the bodies' accelerations if the substeps are doubled, in the
+        units of size.
     criteria : Criteria
-        What is significant, and what negligible.
+        Thresholds of significant and of negligible.
     """
 
     names: tuple[str, ...]
@@ -45,74 +47,76 @@ class Left:
 
     @property
     def certain(self) -> NDArray[np.bool_]:
-        """Which are significant."""
+        """Return which are significant."""
         return np.asarray(self.p_value * len(self.names) < self.criteria.false_alarm)
 
     @property
     def beyond_engine(self) -> NDArray[np.bool_]:
-        """Which are larger than what engines make of the same model."""
-        return np.asarray(self.size > self.criteria.engines * self.numerical)
+        """Return which are larger than the engine's numerical error."""
+        return np.asarray(self.size > self.criteria.engine.error_factor * self.numerical)
 
     @property
     def matters(self) -> NDArray[np.bool_]:
-        """Which are significant, beyond the engine's error, and not negligible."""
+        """Return which are significant, beyond the engine's error, and not negligible."""
         large = self.relative >= self.criteria.negligible
         return np.asarray(self.remains & large)
 
     @property
     def remains(self) -> NDArray[np.bool_]:
-        """Which are significant and beyond the engine's error, negligible or not."""
+        """Return which are significant and beyond the engine's error, negligible or not."""
         return np.asarray(self.certain & self.beyond_engine)
 
     @property
     def worst(self) -> float:
-        """Largest relative one among those that are certain; 0 without any."""
+        """Return the largest relative one among those that are significant; 0 without any."""
         return float(np.where(self.certain, self.relative, 0.0).max(initial=0.0))
 
     @property
     def square(self) -> float:
-        """Sum of squares of the relative ones that are certain."""
+        """Return the sum of squares of the relative ones that are significant."""
         return float((np.where(self.certain, self.relative, 0.0) ** 2).sum())
 
 
-def unexplained_acceleration(mode: Mode, criteria: Criteria = DEFAULT) -> Left:
-    """Size of the acceleration that the model of a mode leaves unexplained."""
+def unexplained_acceleration(mode: Mode, criteria: Criteria = DEFAULT) -> UnexplainedAcceleration:
+    """Return the acceleration that a fitted model leaves unexplained."""
     noise = mode.problem.trajectory_noise
     cells = noise.cells
     size = mode.sigma[cells.accelerations]
     relative = size / np.maximum(bodies_acceleration(mode.problem), 1e-300)
     names = tuple(STATE[d] for d in cells.rates)
-    return Left(names, size, relative, _p_values(mode), _numerical(mode), criteria)
+    return UnexplainedAcceleration(
+        names, size, relative, _p_values(mode), _numerical(mode), criteria
+    )
 
 
-def noise_alone(mode: Mode, left: Left) -> Array:
-    """Noise parameters as they are if what is not certain is nothing, shape (parameter,).
+def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Array:
+    """Return noise parameters without accelerations that are not significant, shape (parameter,).
 
-    Few data do not tell an error of measuring from what a step adds: the mode gives all to one.
+    Few data do not tell measurement noise from process noise: the mode gives all to one of them.
     """
-    problem, places = mode.problem, mode.problem.trajectory_noise.cells.accelerations
-    held = {
-        place: NOTHING * problem.noise_prior[0][place]
-        for place, certain in zip(places, left.certain, strict=True)
-        if not certain
-    }
-    return profile_sigma(problem, problem.residual(mode.phi), mode.phi, held)
+    places = mode.problem.trajectory_noise.cells.accelerations
+    pairs = zip(places, excess.certain, strict=True)
+    negligible = [place for place, certain in pairs if not certain]
+    return _without(mode, negligible, mode.problem.residual(mode.phi))
 
 
 def without_acceleration(mode: Mode) -> Mode:
-    """The mode with the noise parameters that it has without any unexplained acceleration.
+    """Return the mode with the noise parameters that it has without unexplained acceleration.
 
-    That is a random force, and follows what is smooth: scores of such effects are small beside it.
+    A random force follows smooth effects: their scores are small beside it.
     """
-    problem = mode.problem
-    places = problem.trajectory_noise.cells.accelerations
-    held = {place: NOTHING * problem.noise_prior[0][place] for place in places}
-    sigma = profile_sigma(problem, problem.residual(mode.phi), mode.phi, held)
-    return replace(mode, sigma=sigma)
+    places = mode.problem.trajectory_noise.cells.accelerations
+    return replace(mode, sigma=_without(mode, places, mode.problem.residual(mode.phi)))
+
+
+def _without(mode: Mode, places: Iterable[int], residual: Array) -> Array:
+    """Return the noise parameters that are best if those at some places are next to nothing."""
+    held = {place: NOTHING * mode.problem.noise_prior[0][place] for place in places}
+    return profile_sigma(mode.problem, residual, mode.phi, held)
 
 
 def innovations_over_steps(mode: Mode) -> Array:
-    """Typical size of each cell's innovations as a share of what a step changes, shape (cell,)."""
+    """Return the typical innovations over the change in a step, shape (coordinate,)."""
     noise, segments = mode.problem.trajectory_noise, mode.problem.segments
     cells, dt = noise.cells, mode.problem.scene.time_step
     change = segments.observed[:, 0] - segments.start
@@ -124,7 +128,7 @@ def innovations_over_steps(mode: Mode) -> Array:
 
 
 def _numerical(mode: Mode) -> Array:
-    """Change of accelerations if the substeps are doubled, root mean square, shape (velocity,)."""
+    """Return the rms change of accelerations if the substeps are doubled, shape (velocity,)."""
     problem, cells = mode.problem, mode.problem.trajectory_noise.cells
     finer = problem.with_physics(substeps=2 * problem.physics.substeps)
     change = cells.of((finer.predict(mode.phi) - problem.predict(mode.phi))[:, 0])
@@ -134,21 +138,17 @@ def _numerical(mode: Mode) -> Array:
 
 
 def _p_values(mode: Mode) -> Array:
-    """Likelihood-ratio test of each acceleration against none, the other noises free.
+    """Return p-values of the likelihood ratio of each acceleration against none.
 
-    At the edge of what a variance may be: half a chi-squared with one degree of freedom.
+    The other noises are free. At the bound of a variance: half a chi-squared with one degree.
     """
     problem = mode.problem
     residual = problem.residual(mode.phi)
-    median = problem.noise_prior[0]
 
     def best(sigma: Array) -> float:
         return float(problem.log_density(residual, sigma, mode.phi).sum())
 
+    here = best(mode.sigma)
     places = problem.trajectory_noise.cells.accelerations
-    here, p_values = best(mode.sigma), np.empty(len(places))
-    for i, place in enumerate(places):
-        held = {place: NOTHING * median[place]}
-        without = profile_sigma(problem, residual, mode.phi, held)
-        p_values[i] = 0.5 * chi2.sf(max(2 * (here - best(without)), 0.0), 1)
-    return p_values
+    gains = [here - best(_without(mode, [place], residual)) for place in places]
+    return np.asarray([0.5 * chi2.sf(max(2 * gain, 0.0), 1) for gain in gains])

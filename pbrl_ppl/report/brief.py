@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Added, Findings
+from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Added, Loop
 from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import (
     accepted,
@@ -22,12 +22,12 @@ from pbrl_ppl.report.words import (
 )
 
 
-def in_brief(findings: Findings, folder: str | Path, remainder: str = "") -> list[str]:
+def in_brief(findings: Loop, folder: str | Path, remainder: str = "") -> list[str]:
     """Summarise findings in about ten lines.
 
     Parameters
     ----------
-    findings : Findings
+    findings : Loop
         What was found.
     folder : str or pathlib.Path
         Where the results are, to name in commands.
@@ -63,7 +63,7 @@ def _effect(added: Added) -> str:
     return text
 
 
-def _errors(findings: Findings) -> list[str]:
+def _errors(findings: Loop) -> list[str]:
     """Write the held-out errors, before and after if something was added."""
     before, after, floor = findings.before, findings.after, findings.noise_floor
 
@@ -87,7 +87,7 @@ def _errors(findings: Findings) -> list[str]:
     return [f"{text}.", *([f"  {note}"] if note else [])]
 
 
-def _next(findings: Findings, folder: Path, tried: bool) -> str:
+def _next(findings: Loop, folder: Path, tried: bool) -> str:
     """Return what to do next."""
     left = findings.unexplained
     if findings.verdict == NOT_CONVERGED:

@@ -13,7 +13,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.stats import chi2, gaussian_kde
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import scalars
 from pbrl_ppl.report.evidence import Evidence, Law, bin_means
@@ -28,7 +28,7 @@ HARDLY = 0.01
 MOST_CANDIDATES, MOST_ADDED = 20, 12
 
 
-def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
+def plot_candidates(findings: Loop, width: float = WIDE) -> Figure:
     """Plot the score statistic of the candidates, best on top, with the threshold of each."""
     added = {(addition.effect, addition.body) for addition in findings.added}
     shown = [
@@ -85,7 +85,7 @@ def plot_candidates(findings: Findings, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_added(findings: Findings, width: float = WIDE) -> Figure:
+def plot_added(findings: Loop, width: float = WIDE) -> Figure:
     """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
     shown = [
         (added, name, estimate)

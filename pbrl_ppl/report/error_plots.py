@@ -12,14 +12,14 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, UNITS, WIDE, blank_figure, legend
 
 Array = NDArray[np.float64]
 
 
-def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
+def plot_residuals(findings: Loop, width: float = WIDE) -> Figure:
     """Plot held-out residuals of each state dimension in units of noise, before and after."""
     names = list(findings.residuals_before)
     figure, (axes,) = blank_figure(width, 3.6, 1, 1)
@@ -59,7 +59,7 @@ def plot_residuals(findings: Findings, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
+def plot_errors(findings: Loop, width: float = WIDE) -> Figure:
     """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
     kinds = [
         ("one_step_rmse", "one step ahead"),
@@ -106,7 +106,7 @@ def plot_errors(findings: Findings, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_rollout(findings: Findings, width: float = WIDE) -> Figure:
+def plot_rollout(findings: Loop, width: float = WIDE) -> Figure:
     """Plot one held-out trajectory: measured, and predicted before and after."""
     rollout = findings.rollout
     count = len(rollout.names)
@@ -163,7 +163,7 @@ _CHANCE = 0.01
 _NAMED = 4
 
 
-def plot_correlations(findings: Findings, width: float = WIDE) -> Figure:
+def plot_correlations(findings: Loop, width: float = WIDE) -> Figure:
     """Plot correlations of errors with earlier errors and with commands."""
     found = findings.correlations
     figure, axes = blank_figure(width, 3.2, 1, 2 if found.commands else 1)
@@ -206,7 +206,7 @@ def _plot_correlations(
     axes.set_xticks(lags)
 
 
-def plot_growth(findings: Findings, width: float = WIDE) -> Figure:
+def plot_growth(findings: Loop, width: float = WIDE) -> Figure:
     """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
     growth = findings.growth
     names = [name for name in growth.floor[-1] if growth.floor[-1][name] > 0]

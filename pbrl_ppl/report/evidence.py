@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import QUANTITIES, Findings, recorded_quantities
+from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import group, problem_of
@@ -105,7 +105,7 @@ class Evidence:
         return order[: int(np.searchsorted(total, share * total[-1])) + 1]
 
 
-def find_evidence(findings: Findings, effects: Iterable[Effect]) -> Evidence | None:
+def find_evidence(findings: Loop, effects: Iterable[Effect]) -> Evidence | None:
     """Return the gain of the revised model by measured number.
 
     None where nothing was added, or a posterior does not hold its recording.
@@ -250,7 +250,7 @@ class Law:
     curve: Curve
 
 
-def find_laws(findings: Findings, effects: Iterable[Effect], most: int = 3) -> list[Law]:
+def find_laws(findings: Loop, effects: Iterable[Effect], most: int = 3) -> list[Law]:
     """Return residual forces against the quantity that they depend on, and others like it.
 
     The residual force is what each step adds to the smoothed states beyond the model, over the time

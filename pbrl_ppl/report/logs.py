@@ -19,12 +19,14 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from pbrl_ppl.criticism import Loop, close_loop
+from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ManifestError, PbrlError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.history import History
-from pbrl_ppl.report.loop import FILES, Loop, close_loop
+from pbrl_ppl.report.write import loop_page
 from pbrl_ppl.scene import Scene, nearest
 
 _NEEDED, _OPTIONAL = ("name", "scene", "train"), ("test", "kind")
@@ -179,7 +181,18 @@ class Settings:
 Run = Callable[[Log, Settings], Any]
 
 
-def close_log(log: Log, settings: Settings) -> Loop:
+@dataclass(frozen=True, eq=False)
+class LoopWithPage:
+    """A closed loop, saved together with its page."""
+
+    loop: Loop
+
+    def save(self, folder: Path) -> None:
+        """Write the loop's files and its report."""
+        self.loop.save(folder, page=loop_page(self.loop))
+
+
+def close_log(log: Log, settings: Settings) -> LoopWithPage:
     """Read a log's files and close the loop."""
     scene = Scene.load(log.scene)
     scene = scene.replace(
@@ -193,9 +206,11 @@ def close_log(log: Log, settings: Settings) -> Loop:
     )  # fmt: skip
     train, test = read(log.train), None if log.test is None else read(log.test)
     catalogue = full_catalogue if settings.catalogue is None else settings.catalogue
-    return close_loop(
-        scene, train, test, catalogue=catalogue, seed=settings.seed, draws=settings.draws,
-        method=settings.method,
+    return LoopWithPage(
+        close_loop(
+            scene, train, test, catalogue=catalogue, seed=settings.seed, draws=settings.draws,
+            method=settings.method,
+        )
     )  # fmt: skip
 
 
@@ -238,7 +253,7 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
     Returns
     -------
     dict
-        As of :func:`row_of`.
+        Row of the log, see :func:`row_of`.
     """
     with _ONE:
         # on a cluster, a result that was lost with its worker is asked for again
@@ -262,7 +277,7 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
         except Exception as error:
             return failed(log, folder, error)
     row = row_of(log, folder, inputs)
-    return row or failed(log, folder, OSError(f"{place / DONE}: it was not there once written"))
+    return row or failed(log, folder, OSError(f"{place / DONE}: missing after it was written"))
 
 
 def _keep(loop: Any, place: Path, about: dict[str, Any]) -> None:

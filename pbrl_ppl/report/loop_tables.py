@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import Candidate, Findings
+from pbrl_ppl.criticism import Candidate, Loop
 from pbrl_ppl.effects import Effect, Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison
@@ -25,7 +25,7 @@ _DRAWS = 20_000
 
 
 def measured_parameters(
-    candidate: Candidate, findings: Findings, effects: Iterable[Effect]
+    candidate: Candidate, findings: Loop, effects: Iterable[Effect]
 ) -> tuple[str, ...]:
     """Return a candidate's parameters without those of state dimensions that were not measured.
 
@@ -33,7 +33,7 @@ def measured_parameters(
     ----------
     candidate : Candidate
         Of the findings.
-    findings : Findings
+    findings : Loop
         Their residuals name the state dimensions that were measured.
     effects : iterable of Effect
         Where the candidate's name is looked up.
@@ -45,7 +45,7 @@ def measured_parameters(
     return tuple(name for name in names if name not in STATE or name in findings.residuals_after)
 
 
-def limits_in_words(candidate: Candidate, findings: Findings, effects: Iterable[Effect]) -> str:
+def limits_in_words(candidate: Candidate, findings: Loop, effects: Iterable[Effect]) -> str:
     """Return the detection limit of each parameter as text; empty where there is none.
 
     A limit beyond what the effect's prior allows is left out: no plausible size would be found.
@@ -95,7 +95,7 @@ def _draws(prior: Prior) -> NDArray[np.float64]:
 _CARRIERS = 8
 
 
-def error_tables(findings: Findings) -> list[Table]:
+def error_tables(findings: Loop) -> list[Table]:
     """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
     tables = []
     seconds = findings.rollout_horizon * findings.scene.time_step
@@ -130,19 +130,19 @@ def error_tables(findings: Findings) -> list[Table]:
 
 
 def _row(
-    findings: Findings, name: str, before: Any, after: Any, floor: Any, *unit: str, digits: int = 3
+    findings: Loop, name: str, before: Any, after: Any, floor: Any, *unit: str, digits: int = 3
 ) -> tuple[str, ...]:
     both = [before, after] if findings.added else [before]
     return (name, *(number(value, digits) for value in (*both, floor)), *unit)
 
 
-def models_of(findings: Findings) -> tuple[str, ...]:
+def models_of(findings: Loop) -> tuple[str, ...]:
     """Return the heads of the columns of one model, or of two."""
     return ("Before", "After") if findings.added else ("Declared model",)
 
 
 def _before_after(
-    findings: Findings, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
+    findings: Loop, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
 ) -> Table:
     columns = (name, *models_of(findings), "Noise floor", *last)
     return Table(caption, columns, rows, words=(len(columns) - 1,) if last else ())
@@ -171,7 +171,7 @@ def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
     return Table(f"{loo.method} (az.loo)", ("Measure", *columns), rows)
 
 
-def acceleration_table(findings: Findings) -> Table:
+def acceleration_table(findings: Loop) -> Table:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
     left = findings.acceleration
     rows = []
@@ -199,7 +199,7 @@ def acceleration_table(findings: Findings) -> Table:
     )
 
 
-def residual_test_table(findings: Findings) -> Table:
+def residual_test_table(findings: Loop) -> Table:
     """Tabulate the tests of the model's residual."""
     which = "revised" if findings.added else "declared"
     return Table(
@@ -219,7 +219,7 @@ def residual_test_table(findings: Findings) -> Table:
     )
 
 
-def candidate_table(findings: Findings, effects: Iterable[Effect]) -> Table:
+def candidate_table(findings: Loop, effects: Iterable[Effect]) -> Table:
     """Tabulate the candidates of the first round."""
     effects = tuple(effects)
     added = {(each.effect, each.body) for each in findings.added}

@@ -13,7 +13,7 @@ from typing import Any
 
 import pandas as pd
 
-from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED
+from pbrl_ppl.criticism import NOT_CONVERGED, UNEXPLAINED, check_folder
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.errors import OutputError, PbrlError
 from pbrl_ppl.files import write_text
@@ -30,7 +30,6 @@ from pbrl_ppl.report.logs import (
     row_of,
     settle,
 )
-from pbrl_ppl.report.loop import check_folder
 from pbrl_ppl.report.many_page import effect_table, in_words, page, summary_table
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.sampling import Pooled, pool

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem
@@ -53,13 +53,13 @@ def likeliest(problem: Problem, posterior: Any) -> tuple[Array, Array]:
 
 
 def held_out_motions(
-    findings: Findings, held_out: History | None, effects: Iterable[Effect]
+    findings: Loop, held_out: History | None, effects: Iterable[Effect]
 ) -> list[Motion]:
     """Play held-out trajectories under the likeliest draws before and after, worst before first.
 
     Parameters
     ----------
-    findings : Findings
+    findings : Loop
         With posteriors as files have them.
     held_out : History or None
         Without it, the findings' one trajectory of one body, if its whole pose was measured.
@@ -122,7 +122,7 @@ def _played(
     return dict(zip(keys, states, strict=True))
 
 
-def _of_rollout(findings: Findings) -> list[Motion]:
+def _of_rollout(findings: Loop) -> list[Motion]:
     """Return the one trajectory that the findings hold."""
     rollout = findings.rollout
     if not {"x", "y", "theta"} <= set(rollout.names):
@@ -134,7 +134,7 @@ def _of_rollout(findings: Findings) -> list[Motion]:
     return [Motion("held out", rollout.time, measured, before, after)]
 
 
-def animation(findings: Findings, motions: Sequence[Motion]) -> dict[str, Any] | None:
+def animation(findings: Loop, motions: Sequence[Motion]) -> dict[str, Any] | None:
     """Return what the page's script draws, as JSON values; None where there is no motion.
 
     Lengths are in m with five digits, angles in rad.

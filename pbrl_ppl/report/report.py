@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from pbrl_ppl.criticism import Findings
+from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
@@ -66,7 +66,7 @@ Array = NDArray[np.float64]
 
 
 def render(
-    findings: Findings,
+    findings: Loop,
     held_out: History | None = None,
     effects: Iterable[Effect] = full_catalogue,
     source: Source | None = None,
@@ -76,7 +76,7 @@ def render(
 
     Parameters
     ----------
-    findings : Findings
+    findings : Loop
         What was found.
     held_out : History, optional
         What errors were measured on, for the moving picture; without it, the findings' own

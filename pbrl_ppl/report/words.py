@@ -1,24 +1,19 @@
-"""Findings in words: the verdict, and numbers as a reader wants them."""
+"""A loop in words: the verdict, and numbers as a reader wants them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any
 
 import numpy as np
 
 from pbrl_ppl.criticism import (
     ADEQUATE,
-    DEFAULT,
     NOT_CONVERGED,
     TRIED,
     UNEXPLAINED,
     Added,
-    Findings,
+    Loop,
 )
-from pbrl_ppl.likelihood import ACCELERATION
-from pbrl_ppl.posterior import draws, group
-from pbrl_ppl.report.style import acceleration_unit
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
@@ -28,19 +23,7 @@ _SMALLEST_P = 1e-16
 _TOO_LARGE = 1.5
 
 
-def remainder_in_words(before: Any, after: Any) -> str:
-    """Return what a learned remainder does, from the posteriors without and with it."""
-    sizes = [draws(each)[ACCELERATION].mean(axis=0) for each in (before, after)]
-    names = group(after, "posterior")[ACCELERATION]
-    worst = int(np.argmax(sizes[0] - sizes[1]))
-    name = str(names[names.dims[-1]].values[worst])
-    return (
-        f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
-        f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {acceleration_unit(name)}"
-    )
-
-
-def verdict_in_words(findings: Findings) -> str:
+def verdict_in_words(findings: Loop) -> str:
     """Return the verdict in a sentence or two, for a reader who knows no statistics."""
     found = joined(
         f"{added.sentence.rstrip('.')} ({plain(added.effect)}) on the {plain(added.body)}"
@@ -69,7 +52,7 @@ def verdict_in_words(findings: Findings) -> str:
     return f"Something was missing: {found}."
 
 
-def _adequate(findings: Findings) -> str:
+def _adequate(findings: Loop) -> str:
     """Return how adequate the model is: what passed, and which negligible misfit is significant."""
     tested = sum(test.tested for test in findings.tests)
     passed = f"the declared model passes all {tested} tests of its residual"
@@ -78,7 +61,7 @@ def _adequate(findings: Findings) -> str:
     # beside what was added the table of candidates has them
     small = "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
-        " less than 1 %."
+        f" less than {100 * findings.criteria.negligible:g} %."
         for one in findings.small
     )
     remains = significant_acceleration(findings)
@@ -92,26 +75,26 @@ def _adequate(findings: Findings) -> str:
     return f"{missing} found missing: {passed}.{small}"
 
 
-def significant_acceleration(findings: Findings) -> float:
+def significant_acceleration(findings: Loop) -> float:
     """Return the largest significant unexplained acceleration over that of the bodies, or 0."""
     left = findings.acceleration
     sizes = (left.relative_after[name] for name, sure in left.certain_after.items() if sure)
     return max(sizes, default=0.0)
 
 
-def accepted(findings: Findings) -> tuple[Added, ...]:
+def accepted(findings: Loop) -> tuple[Added, ...]:
     """Return the added effects that the verdict stands for: none where it is another."""
     stands = findings.verdict not in (UNEXPLAINED, NOT_CONVERGED)
     return findings.added if stands else ()
 
 
-def depends_on_records(findings: Findings) -> bool:
+def depends_on_records(findings: Loop) -> bool:
     """Return whether the residual depends on a recorded quantity: the dependence test failed."""
     left = findings.unexplained
     return left is not None and not left.depends_on.startswith("nothing")
 
 
-def error_in_words(findings: Findings) -> str:
+def error_in_words(findings: Loop) -> str:
     """Return what a held-out error means, where it alone would contradict the verdict."""
     model, after = "revised" if findings.added else "declared", findings.after.normalised_rmse
     if findings.unexplained is not None or significant_acceleration(findings):
@@ -127,18 +110,20 @@ def error_in_words(findings: Findings) -> str:
     return ""
 
 
-def rejected_in_words(findings: Findings) -> str:
+def rejected_in_words(findings: Loop) -> str:
     """Return why the leading significant candidates were not added."""
     present = {(added.effect, added.body) for added in findings.added}
     reasons = [
         f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
         for one in findings.candidates
-        if one.why and one.p_value < DEFAULT.try_p and (one.effect, one.body) not in present
+        if one.why
+        and one.p_value < findings.criteria.try_p
+        and (one.effect, one.body) not in present
     ]
     return f"Not added: {'; '.join(reasons[:TRIED])}." if reasons else ""
 
 
-def left_out_in_words(findings: Findings) -> str:
+def left_out_in_words(findings: Loop) -> str:
     """Return which bad frames were left out of the histories, the first few one by one."""
     first, more = findings.bad_frames[:TRIED], len(findings.bad_frames) - TRIED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""

@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from pbrl_ppl import report
+from pbrl_ppl import criticism
 from pbrl_ppl.cli import main, terminal
+from pbrl_ppl.criticism.loop import FILES, Loop
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
-from pbrl_ppl.report import loop as loop_module
-from pbrl_ppl.report.loop import FILES, Loop
+from pbrl_ppl.report import write as loop_module
 from tests.helpers.made_up import made_up
 from tests.helpers.places import ROOT
 
@@ -56,9 +56,9 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any, Any, dict[str
     def close_loop(scene: Any, train: Any, test: Any = None, **options: Any) -> Loop:
         options.pop("progress")("fitting [all] of it")
         seen.append((scene, train, test, options))
-        return Loop(made_up())
+        return made_up()
 
-    monkeypatch.setattr(report, "close_loop", close_loop)
+    monkeypatch.setattr(criticism, "close_loop", close_loop)
     monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
     return seen
 
@@ -149,8 +149,8 @@ def test_close_loop_states_the_noise(calls: list[Any], capsys: pytest.CaptureFix
 def test_close_loop_without_a_verdict_exits_with_3(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    stuck = Loop(made_up("not-converged"))
-    monkeypatch.setattr(report, "close_loop", lambda *args, **options: stuck)
+    stuck = made_up("not-converged")
+    monkeypatch.setattr(criticism, "close_loop", lambda *args, **options: stuck)
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 3
     assert "No verdict" in capsys.readouterr().out
     assert Path("out/report.html").exists()  # what there is may be looked at
@@ -236,7 +236,7 @@ def test_trouble_in_the_long_work(
     def close_loop(*args: Any, **options: Any) -> Loop:
         raise problem
 
-    monkeypatch.setattr(report, "close_loop", close_loop)
+    monkeypatch.setattr(criticism, "close_loop", close_loop)
     code = main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"])
     interrupted = isinstance(problem, KeyboardInterrupt)
     assert code == (130 if interrupted else 2)
@@ -253,9 +253,9 @@ def test_warnings_are_one_line(
         with warnings.catch_warnings():
             warnings.simplefilter("always")  # the test run makes errors of them
             warnings.warn("w_y did\nnot converge", ConvergenceWarning, stacklevel=2)
-        return Loop(made_up())
+        return made_up()
 
-    monkeypatch.setattr(report, "close_loop", close_loop)
+    monkeypatch.setattr(criticism, "close_loop", close_loop)
     monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 0
     assert capsys.readouterr().err.strip() == "warning: w_y did not converge"

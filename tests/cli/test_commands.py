@@ -17,7 +17,7 @@ import pandas as pd
 import pytest
 import typer
 
-from pbrl_ppl import criticism, report, sampling
+from pbrl_ppl import criticism, sampling
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.app import COMMANDS, _options_of, app
 from pbrl_ppl.cli.scene_text import _HEAD
@@ -180,7 +180,7 @@ def test_a_position_in_other_units_than_its_velocity_is_named(
     def long_work(*args: Any, **options: Any) -> Any:
         raise FitError("the long work")
 
-    for module, name in ((sampling, "fit"), (report, "close_loop"), (criticism, "criticise")):
+    for module, name in ((sampling, "fit"), (criticism, "close_loop"), (criticism, "criticise")):
         monkeypatch.setattr(module, name, long_work)
     name, *options = command
     output = [] if name in ("check", "criticise") else ["-o", "out.nc"]
@@ -517,7 +517,7 @@ def test_calibrate_takes_the_likelihood_of_fit(
 def test_a_folder_that_cannot_be_made_is_refused_at_once(
     name: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(report, "close_loop", lambda *args, **options: pytest.fail("too late"))
+    monkeypatch.setattr(criticism, "close_loop", lambda *args, **options: pytest.fail("too late"))
     Path("logs.csv").write_text("name,scene,train\na,scene.toml,train.csv\n")
     for argv in (
         ["close-loop", "scene.toml", "train.csv"],

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pbrl_ppl import report
+from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
 from pbrl_ppl.cli.close_loop import OneProcessEach
 from pbrl_ppl.report import many
@@ -127,7 +127,7 @@ def test_own_tables_of_one_log(
         seen.append((scene, train))
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(report, "close_loop", stop)
+    monkeypatch.setattr(criticism, "close_loop", stop)
     argv = ["close-loop", "scene.toml", "capture.csv", "-o", "out", "--estimate-velocities"]
     own = ["--columns", "time=t,x=px,y=py,theta=yaw,force_x=0,force_y=0,torque=0"]
     own += ["--units", "time=ms,x=mm,theta=deg"]

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from pbrl_ppl import report
+from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
-from pbrl_ppl.report import loop as loop_module
-from pbrl_ppl.report.loop import Loop
+from pbrl_ppl.criticism import Loop
+from pbrl_ppl.report import write as loop_module
 from pbrl_ppl.scene import Scene
 from tests.helpers.made_up import made_up
 from tests.helpers.places import MODELS, ROOT
@@ -60,9 +60,9 @@ def test_three_commands_from_a_raw_table_to_a_verdict(
 
     def close_loop(scene: Any, train: Any, *rest: Any, **options: Any) -> Loop:
         seen.append((scene, train))
-        return Loop(made_up())
+        return made_up()
 
-    monkeypatch.setattr(report, "close_loop", close_loop)
+    monkeypatch.setattr(criticism, "close_loop", close_loop)
     monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
     known = "--known arm.mass=0.5 --declare arm=inertia_scale"
     assert run(f"new --history swing.csv {COLUMNS} {UNITS} {PENDULUM} {known}") == 0

@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pbrl_ppl.criticism.histories import checked_histories
 from pbrl_ppl.criticism.ranking import criticise
+from pbrl_ppl.criticism.recordings import checked_histories
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History, without_bad_frames
 from pbrl_ppl.posterior import recorded, recording

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.special import logsumexp
 
-from pbrl_ppl.criticism.cross_validation import LEAST_FOLDS, Change, folds, leave_out
+from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.cross_validation import Change, folds, leave_out
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories, log_prior
@@ -104,7 +105,7 @@ def test_trajectories_are_folds_and_few_of_them_are_cut() -> None:
     np.testing.assert_array_equal(fold, mode(DISC).problem.segments.trajectory)
     short = mode(DISC, 3)
     runs, segments = folds(short), short.problem.segments
-    assert len(np.unique(runs)) >= LEAST_FOLDS
+    assert len(np.unique(runs)) >= DEFAULT.selection.least_trajectories
     for run in np.unique(runs):  # of neighbours in one trajectory
         own = runs == run
         assert len(np.unique(segments.trajectory[own])) == 1

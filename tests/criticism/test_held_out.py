@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pbrl_ppl.criticism import revise
+from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.effects import catalogue
@@ -41,7 +41,7 @@ def loops(frames, make_history):
     train = history(frames[0])
     _, other = box2d(make_history, 6, linear_drag=0.3)
     options = {"catalogue": CATALOGUE, "seed": 1, "method": "laplace"}
-    return tuple(revise(BOX, train, history(test), **options) for test in (frames[1], other))
+    return tuple(close_loop(BOX, train, history(test), **options) for test in (frames[1], other))
 
 
 @pytest.mark.slow
@@ -105,7 +105,7 @@ def test_the_floor_is_of_the_noise_of_measuring_and_grows_with_the_length() -> N
 
 def test_a_mode_is_judged_by_other_data_at_the_same_noise(frames) -> None:
     mode = fitted(BOX, frames[0])
-    problem = HeldOut(history(frames[1]), 1).problem(mode)
+    problem = HeldOut.of(mode, history(frames[1])).problem
     assert problem.data.history.n_trajectories == 4
     assert problem.trajectory_noise.cells is mode.problem.trajectory_noise.cells
     np.testing.assert_array_equal(problem.noise_prior[0], mode.problem.noise_prior[0])
@@ -122,13 +122,13 @@ def begin(stage: str) -> None:
 def refused(scene: Scene, train: History, test: History) -> str:
     """The message with which they are, before the loop says that it does anything."""
     with pytest.raises(HistoryError) as caught:
-        revise(scene, train, test, progress=begin)
+        close_loop(scene, train, test, progress=begin)
     return str(caught.value)
 
 
 def test_histories_that_fit_are_not_refused(frames) -> None:
     with pytest.raises(Begun):
-        revise(BOX, *map(history, frames), progress=begin)
+        close_loop(BOX, *map(history, frames), progress=begin)
 
 
 def test_other_bodies_are_refused_at_once(frames) -> None:
@@ -156,7 +156,7 @@ def test_other_dimensions_are_refused_at_once(frames) -> None:
 def test_a_test_history_may_measure_less(frames) -> None:
     blind = History.from_dataframe(frames[1].drop(columns="omega"), BOX, estimate_velocities=True)
     with pytest.raises(Begun):
-        revise(BOX, history(frames[0]), blind, progress=begin)
+        close_loop(BOX, history(frames[0]), blind, progress=begin)
     mode = fitted(BOX, frames[0])
-    told = HeldOut(blind, 1).noise_floor(mode, mode.sigma, 5)
+    told = HeldOut.of(mode, blind).noise_floor(mode.sigma, 5)
     assert set(told.one_step_rmse) == set(STATE) - {"omega"}

@@ -10,12 +10,12 @@ import pandas as pd
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import revise
+from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.cross_validation import Change, relative_fall
 from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.misfit import ACCELERATION, find_misfit
-from pbrl_ppl.criticism.resolution import with_enough_substeps
+from pbrl_ppl.criticism.refinement import with_enough_substeps
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
@@ -133,7 +133,7 @@ def falls(seed: int, drag: float, trajectories: int = 1) -> pp.History:
 def test_drag_of_a_fall_that_positions_show_is_named(trajectories) -> None:
     """A random force could follow the drag, which is smooth; its prior says that it does not."""
     train, test = falls(1, 0.0209, trajectories), falls(2, 0.0209)
-    found = revise(AIR, train, test, seed=1, method="laplace")
+    found = close_loop(AIR, train, test, seed=1, method="laplace")
     assert found.verdict == "effects-added"
     assert [one.effect for one in found.added] == ["linear_drag"]
     estimate = found.added[0].parameters["coefficient"]
@@ -143,7 +143,7 @@ def test_drag_of_a_fall_that_positions_show_is_named(trajectories) -> None:
 
 @pytest.mark.slow
 def test_a_fall_in_a_vacuum_is_adequate() -> None:
-    found = revise(AIR, falls(1, 0.0), falls(2, 0.0), seed=1, method="laplace")
+    found = close_loop(AIR, falls(1, 0.0), falls(2, 0.0), seed=1, method="laplace")
     assert found.verdict == "adequate"
 
 
@@ -207,7 +207,7 @@ def test_a_revision_that_forecasts_worse_is_unexplained() -> None:
     train = Disc(8, 15, FINE, drag=0.3).frame(np.random.default_rng(1))
     test = Disc(4, 15, FINE, seed=12).frame(np.random.default_rng(2))
     histories = (pp.History.from_dataframe(frame, FINE) for frame in (train, test))
-    found = revise(FINE, *histories, catalogue=QUICK, seed=1, method="laplace")
+    found = close_loop(FINE, *histories, catalogue=QUICK, seed=1, method="laplace")
     assert [one.effect for one in found.added] == ["linear_drag"]
     assert found.after.normalised_rmse > found.before.normalised_rmse
     assert found.verdict == "unexplained"
@@ -230,7 +230,7 @@ def test_a_load_that_lasts_holds_in_a_later_recording() -> None:
 
     def loop(scene: pp.Scene):
         train, test = (pp.History.from_dataframe(frame, scene) for frame in frames)
-        return revise(scene, train, test, catalogue=load_alone, seed=1, method="laplace")
+        return close_loop(scene, train, test, catalogue=load_alone, seed=1, method="laplace")
 
     later = loop(FINE)
     assert later.verdict == "effects-added"

@@ -12,7 +12,11 @@ from scipy.stats import binom
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.dependence import _kernels
 from pbrl_ppl.criticism.misfit import ACCELERATION, DEPENDENCE, FORECASTS, find_misfit
-from pbrl_ppl.criticism.unexplained import Left, noise_alone, unexplained_acceleration
+from pbrl_ppl.criticism.unexplained import (
+    UnexplainedAcceleration,
+    noise_alone,
+    unexplained_acceleration,
+)
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
 from tests.helpers.histories import NOISE
 
@@ -92,7 +96,9 @@ def test_a_disturbance_without_memory_is_an_acceleration() -> None:
 def test_what_engines_differ_by_is_no_misfit() -> None:
     """Half of the engine's error is certain in enough data, and left alone; ten times is not."""
     sizes = np.array([0.02, 0.02, 0.02])
-    left = Left(("vx", "vy", "omega"), sizes, sizes / 2.0, np.full(3, 1e-9), 0.5 * sizes)
+    left = UnexplainedAcceleration(
+        ("vx", "vy", "omega"), sizes, sizes / 2.0, np.full(3, 1e-9), 0.5 * sizes
+    )
     assert left.certain.all()
     assert not left.matters.any()
     coarse = replace(left, numerical=np.array([0.5, 0.1, 0.5]) * sizes)

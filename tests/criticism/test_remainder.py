@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl import report
+from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
 from pbrl_ppl.criticism import learn_remainder
 from pbrl_ppl.criticism.results import Unexplained
@@ -38,11 +38,10 @@ def posterior_of(frame):
 def unexplained(posterior) -> pp.Loop:
     """A loop that found no name for what is missing, without the search."""
     left = Unexplained("puck", "vx", "speed", 0.5, 0.001, "vx of puck depends on its speed")
-    findings = replace(
+    return replace(
         made_up("unexplained"), scene=BOX, unexplained=left, posterior_before=posterior,
         posterior_after=posterior,
     )  # fmt: skip
-    return pp.Loop(findings)
 
 
 def force(idata, speeds, draws=60) -> np.ndarray:
@@ -87,7 +86,7 @@ def test_held_out_motion_is_foreseen_and_nothing_is_named(frames, loop, learned)
     assert (after < 0.2 * before).all()
     assert loop.verdict == "unexplained"
     assert loop.added == ()
-    assert LEARNED_REMAINDER not in json.dumps(loop.findings.to_dict())
+    assert LEARNED_REMAINDER not in json.dumps(loop.to_dict())
     assert json.loads(learned.attrs["effects"]) == [[LEARNED_REMAINDER, "puck"]]
     # the mass is that of the pushes, and the rest is as good as without noise of its own
     left = group(learned, "posterior")["unexplained_acceleration"].mean(("chain", "draw")).values
@@ -142,14 +141,8 @@ def test_an_update_keeps_it(frames, learned) -> None:
 
 @pytest.mark.slow
 def test_the_command_writes_it_beside_the_report(loop, learned, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(report, "close_loop", lambda *given, **options: loop)
+    monkeypatch.setattr(criticism, "close_loop", lambda *given, **options: loop)
     monkeypatch.setattr(pp.Loop, "learn_remainder", lambda self, **options: learned)
-    page = pp.Loop.page  # the one of the first round, without it, takes as long, and is replaced
-    monkeypatch.setattr(
-        pp.Loop,
-        "page",
-        lambda self, source: "a page" if self.remainder is None else page(self, source),
-    )
     (tmp_path / "scene.toml").write_text(BOX.to_toml())
     train = tmp_path / "train.csv"
     train.write_text(
@@ -180,7 +173,7 @@ def test_clean_data_have_nothing_to_learn(make_history) -> None:
 
 def test_a_verdict_with_names_is_left_alone() -> None:
     with pytest.raises(FitError, match="nothing to learn: the verdict is adequate"):
-        pp.Loop(made_up("adequate")).learn_remainder()
+        made_up("adequate").learn_remainder()
 
 
 def test_without_the_library_it_says_what_to_install(loop, monkeypatch) -> None:

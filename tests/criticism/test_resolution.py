@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pbrl_ppl.criticism.resolution import SMALL_SHIFT, shift, with_enough_substeps
+from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.refinement import shift, with_enough_substeps
 from tests.helpers.free_puck import DISC, Disc
 
 pytestmark = pytest.mark.one_stack
@@ -21,10 +22,10 @@ def quiet(stage: str) -> None:
 def test_substeps_are_doubled_until_they_change_nothing() -> None:
     disc = Disc(8, 15, DRAGGED.replace(substeps=1), drag=0.9)
     mode = disc.mode(np.random.default_rng(3))
-    assert shift(mode) > SMALL_SHIFT
+    assert shift(mode) > DEFAULT.engine.small_shift
     said = []
     found = with_enough_substeps(mode, said.append)
-    assert shift(found) <= SMALL_SHIFT
+    assert shift(found) <= DEFAULT.engine.small_shift
     assert found.problem.physics.substeps > 1
     assert said[-1] == f"using {found.problem.physics.substeps} engine steps an interval"
 

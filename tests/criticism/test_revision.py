@@ -14,10 +14,10 @@ import pytest
 from scipy.stats import norm
 
 import pbrl_ppl as pp
-from pbrl_ppl.criticism import loop as loop_module
-from pbrl_ppl.criticism import revise
+from pbrl_ppl.criticism import close_loop
+from pbrl_ppl.criticism import closing as loop_module
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.histories import checked_histories
+from pbrl_ppl.criticism.recordings import checked_histories
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
 from pbrl_ppl.errors import (
@@ -53,7 +53,7 @@ def histories(frames, scene=BOX):
 
 
 def loop(frames, scene=BOX, method=GAUSSIAN, **options):
-    return revise(scene, *histories(frames, scene), seed=1, method=method, **options)
+    return close_loop(scene, *histories(frames, scene), seed=1, method=method, **options)
 
 
 @pytest.fixture(scope="module")
@@ -326,7 +326,7 @@ def test_a_carts_drag_is_chosen_and_known_to_a_hundredth(shared_data) -> None:
 
 @pytest.mark.long
 def test_the_loop_finds_a_carts_drag(shared_data) -> None:
-    found = revise(*load(shared_data / "cart-linear-drag"), seed=1)
+    found = close_loop(*load(shared_data / "cart-linear-drag"), seed=1)
     assert found.verdict == "effects-added"
     assert [one.effect for one in found.added] == ["linear_drag"]
     low, high = found.added[0].parameters["coefficient"].hdi
@@ -347,7 +347,7 @@ NAMES = {
 @pytest.mark.long
 @pytest.mark.parametrize("case", NAMES)
 def test_other_effects_on_carts_are_found(case, shared_data) -> None:
-    found = revise(*load(shared_data / case), seed=1)
+    found = close_loop(*load(shared_data / case), seed=1)
     ((_, value),) = json.loads((shared_data / case / "truth.json").read_text())[
         "undeclared"
     ].items()
@@ -361,7 +361,7 @@ def test_other_effects_on_carts_are_found(case, shared_data) -> None:
 
 @pytest.mark.long
 def test_a_clean_cart_is_adequate(shared_data) -> None:
-    found = revise(*load(shared_data / "cart-null"), seed=1)
+    found = close_loop(*load(shared_data / "cart-null"), seed=1)
     assert found.verdict == "adequate"
     truth = json.loads((shared_data / "cart-null" / "truth.json").read_text())["truth"]
     body = truth["bodies"][0]

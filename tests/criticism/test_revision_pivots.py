@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pbrl_ppl.criticism import revise
+from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
@@ -35,7 +35,7 @@ def test_friction_of_a_pivot_of_another_engine_is_chosen() -> None:
 
 @pytest.mark.long
 def test_the_loop_names_it() -> None:
-    found = revise(*load(FOLDER, FOLDER / "recorded"), seed=1, draws=100)
+    found = close_loop(*load(FOLDER, FOLDER / "recorded"), seed=1, draws=100)
     assert [one.effect for one in found.added] == ["pivot_friction"]
     low, high = found.added[0].parameters["torque"].hdi
     assert low <= 0.015 <= high
@@ -44,7 +44,7 @@ def test_the_loop_names_it() -> None:
 @pytest.mark.long
 def test_a_real_pivot_rubs(shared_data) -> None:
     """It is not all of what is missing; what is added is known, and predicts."""
-    found = revise(*load(shared_data / "real" / "pendulum-swing"), seed=1)
+    found = close_loop(*load(shared_data / "real" / "pendulum-swing"), seed=1)
     assert {"pivot_damping", "pivot_friction"} & {one.effect for one in found.added}
     assert found.verdict in ("effects-added", "unexplained")
     assert found.posterior_after.attrs["max_rhat"] <= 1.02

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import binom, chi2, norm
 
-from pbrl_ppl.criticism.detectable import caps, smallest_of_looks
-from pbrl_ppl.criticism.scan import Look, looks
+from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.scan import Look, caps, detection_limits_of_scan, looks
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.state import STATE
@@ -65,16 +65,23 @@ def test_the_smallest_size_is_of_the_look_that_shows_it_best() -> None:
     signature = np.zeros((3, 1))
     free = [Look(np.array([1.0, begin, 0.0]), signature, (0,)) for begin in (0.5, 1.5)]
     units = [np.array([2.0]), np.array([5.0])]
-    sizes = smallest_of_looks(EFFECTS["mass_change"], free, units, 2)
+    sizes = detection_limits_of_scan(EFFECTS["mass_change"], free, units, 2, DEFAULT.score)
     assert sizes == {"factor": pytest.approx(needed / 5.0)}
     whole = [Look(np.array([value]), signature, ()) for value in (1.0, 2.0, 3.0)]
     units = [np.array([change]) for change in (1.0, 9.0, 12.0)]
-    assert smallest_of_looks(EFFECTS["force_cutoff"], whole, units, 2) == {"threshold": 2.0}
-    assert smallest_of_looks(EFFECTS["saturation"], whole, units, 2) == {"limit": 3.0}
-    none = smallest_of_looks(EFFECTS["force_cutoff"], whole[:1], units[:1], 2)
+    assert detection_limits_of_scan(EFFECTS["force_cutoff"], whole, units, 2, DEFAULT.score) == {
+        "threshold": 2.0
+    }
+    assert detection_limits_of_scan(EFFECTS["saturation"], whole, units, 2, DEFAULT.score) == {
+        "limit": 3.0
+    }
+    none = detection_limits_of_scan(EFFECTS["force_cutoff"], whole[:1], units[:1], 2, DEFAULT.score)
     assert none == {"threshold": np.inf}
     there = [Look(np.zeros(3), signature, ())]
-    assert smallest_of_looks(EFFECTS["hidden_obstacle"], there, units[1:2], 2) == {}
+    assert (
+        detection_limits_of_scan(EFFECTS["hidden_obstacle"], there, units[1:2], 2, DEFAULT.score)
+        == {}
+    )
     assert caps(EFFECTS["saturation"], whole)
     assert not caps(EFFECTS["force_cutoff"], whole)
     assert not caps(EFFECTS["mass_change"], free)

@@ -1,10 +1,12 @@
 """Selection says what became of each candidate, and which is there without mattering."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from pbrl_ppl.criticism import selection as module
-from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.cross_validation import Change
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import Selection
@@ -18,9 +20,9 @@ TRIED = ("linear_drag", "quadratic_drag", "torque_gain", "inertia_scale", "const
          "heavy_tails")  # fmt: skip
 
 
-def selection(*names: str) -> Selection:
+def selection(*names: str, criteria: Criteria = DEFAULT) -> Selection:
     chosen = tuple(effect for effect in catalogue if effect.name in names)
-    return Selection(FINE, chosen, DEFAULT, lambda stage: None)
+    return Selection(FINE, chosen, criteria, lambda stage: None)
 
 
 @pytest.fixture(scope="module")
@@ -53,11 +55,11 @@ def test_each_candidate_says_what_became_of_it(weak) -> None:
 
 
 def test_a_gain_that_is_not_sure_is_told(weak, monkeypatch) -> None:
-    chosen = selection("linear_drag")
+    few = replace(DEFAULT, selection=replace(DEFAULT.selection, least_trajectories=1))
+    chosen = selection("linear_drag", criteria=few)
     ranked = rank_candidates(weak, chosen.missing(weak))
     gains = Change(3.1, 2.4, 100_000), Change(0.0, np.inf, 0)
-    monkeypatch.setattr(module, "_gains", lambda before, after: gains)
-    monkeypatch.setattr(module, "few_trajectories", lambda mode: False)
+    monkeypatch.setattr(module, "_gains", lambda before, after, criteria: gains)
     assert chosen.best_addition(weak, ranked) is None
     (only,) = chosen.explained(ranked)
     assert only.why == "cross-validation gains 3.1 ± 2.4 nats, 4.8 are needed"

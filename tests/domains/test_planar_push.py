@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pbrl_ppl.criticism import revise
+from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.history import History
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.physics import Transition
@@ -73,7 +73,7 @@ def test_the_loop_names_the_friction(recorded) -> None:
     """Nothing of the table is declared; 3.2 mm and 2.1 degrees without it, fitted."""
     declared, train, test = recorded
     scene = declared.replace(bodies=tuple(replace(each, effects=()) for each in declared.bodies))
-    found = revise(scene, train, test, seed=1, method="laplace")
+    found = close_loop(scene, train, test, seed=1, method="laplace")
     assert (found.verdict, [added.effect for added in found.added]) == (
         "effects-added",
         ["sliding_friction"],

@@ -6,7 +6,7 @@ from typing import Any
 import arviz as az
 import numpy as np
 
-from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import (
     Acceleration,
     Added,
@@ -56,7 +56,7 @@ def made_up_errors(times: float) -> Errors:
     return Errors(grown, far, normalised_rmse=times, elpd=3000.0 - 300.0 * times)
 
 
-def made_up(verdict: str = "effects-added", stuck: bool = False) -> Findings:
+def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
     """Small findings of each verdict, without a fit."""
     rng = np.random.default_rng(0)
     scene = Scene(time_step=0.1, bodies=(Body("cart", Shape.box(1.0, 0.6)),))
@@ -150,7 +150,7 @@ def made_up(verdict: str = "effects-added", stuck: bool = False) -> Findings:
     )
     posterior = made_up_posterior(stuck)
     before = made_up_errors(2.4 if verdict != "adequate" else 1.01)
-    return Findings(
+    return Loop(
         scene=scene,
         verdict=verdict,
         numerical=Numerical(10, 40, 0.83) if found else Numerical(10, 10, 0.012),

@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 
-from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
@@ -26,8 +26,8 @@ def recordings() -> tuple[History, History]:
 
 
 @cache
-def revised() -> Findings:
-    """Return findings with the posteriors of a puck without drag and with it."""
+def revised() -> Loop:
+    """Findings as made up, with the posteriors of a puck without drag and with it."""
     train, _ = recordings()
     drag = [effect for effect in catalogue if effect.name == "linear_drag"]
     models = (physics_model(DISC, train, e, trajectories=True) for e in ((), drag))
@@ -39,8 +39,8 @@ def revised() -> Findings:
     )
 
 
-def unexplained() -> Findings:
-    """Return the same without a named effect."""
+def unexplained() -> Loop:
+    """The same where no effect has a name."""
     left = Unexplained("puck", "vx", "velocity x", 0.5, 0.001, "vx of puck depends on velocity x")
     before = revised().posterior_before
     return replace(

@@ -8,7 +8,7 @@ import pytest
 import xarray as xr
 
 from pbrl_ppl.criticism import prior_predictive_check
-from pbrl_ppl.criticism.held_out import HeldOut
+from pbrl_ppl.criticism.held_out import HeldOut, example_rollout
 from pbrl_ppl.errors import MeetingWarning
 from pbrl_ppl.history import from_segments
 from pbrl_ppl.likelihood import ACCELERATION, Problem, TrajectoryLikelihood, along_trajectories
@@ -128,13 +128,13 @@ def test_held_out_errors_are_of_one_world(model) -> None:
     whole = along_trajectories(model.problem, np.array([TRUE]))
     sigma = np.full(len(whole.trajectory_noise.sigma), 0.002)
     mode = Mode(whole, phi, sigma, np.zeros((0, 1)), np.eye(1), log_posterior=0.0)
-    held = HeldOut(model.problem.data.history, seed=1)
+    held = HeldOut.of(mode, model.problem.data.history)
     expected = of_one_world(model.problem, phi)
-    shown = held.rollout(mode, mode)
+    shown = example_rollout(held, held)
     assert shown.body == "a"  # which the other stops
     np.testing.assert_allclose(shown.before[1], expected[0, 0, A], atol=1e-9)
     off = model.problem.observations.residual(expected)[:, -1]
-    errors = held.errors(mode, mode, posterior_of(build_model(whole), phi), rollout=1)
+    errors = held.errors(held, posterior_of(build_model(whole), phi), rollout=1, seed=1)
     for i, name in enumerate(STATE):
         found = errors.one_step_rmse[name]
         assert found == pytest.approx(np.sqrt((off[..., i] ** 2).mean()), rel=1e-6), name

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
+from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.errors import ManifestError, OutputError
 from pbrl_ppl.report import close_loop_many, read_manifest
-from pbrl_ppl.report.loop import FILES
 from tests.helpers.fleet import BEGUN, KEPT, cluster, lines, made_logs, pretend
 
 

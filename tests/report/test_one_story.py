@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from pbrl_ppl.criticism.findings import Findings
+from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Acceleration, Candidate, Unexplained
 from pbrl_ppl.effects import Effect, EffectParameter, catalogue
 from pbrl_ppl.parameters import Prior
@@ -32,11 +32,11 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(page_module, "_picture", lambda draw: {"wide": nothing, "narrow": nothing})
 
 
-def text_of(findings: Findings) -> str:
+def text_of(findings: Loop) -> str:
     return Page(render(findings)).text
 
 
-def nearest() -> Findings:
+def nearest() -> Loop:
     """Unexplained, with the nearest effect in the model."""
     left = made_up("unexplained")
     return replace(
@@ -48,7 +48,7 @@ def nearest() -> Findings:
     )
 
 
-def with_acceleration(findings: Findings, **sizes: tuple[float, bool]) -> Findings:
+def with_acceleration(findings: Loop, **sizes: tuple[float, bool]) -> Loop:
     """Findings with these relative accelerations left, each significant or not."""
     shares = {name: share for name, (share, _) in sizes.items()}
     sure = {name: certain for name, (_, certain) in sizes.items()}

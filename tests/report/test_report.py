@@ -1,8 +1,8 @@
 """The report: the right words and numbers, a page that needs nothing else, files all or none."""
 
 import copy
-import inspect
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,21 +10,24 @@ from typing import Any
 import numpy as np
 import pytest
 
+import pbrl_ppl as pp
+from pbrl_ppl.criticism import loop as loop_module
+from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.criticism.results import Errors
 from pbrl_ppl.errors import OutputError
 from pbrl_ppl.history import UnusedVelocity
 from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.posterior.cross_validation import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
-from pbrl_ppl.report import loop as loop_module
 from pbrl_ppl.report import page as page_module
+from pbrl_ppl.report import write as write_module
 from pbrl_ppl.report.error_plots import plot_rollout, unwrap
-from pbrl_ppl.report.loop import FILES, Loop, close_loop
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.posterior_tables import PARAMETERS
 from pbrl_ppl.report.report import render
 from pbrl_ppl.report.words import number, rejected_in_words, verdict_in_words
+from pbrl_ppl.report.write import loop_page
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 
@@ -322,38 +325,19 @@ def test_a_parameter_that_never_moved() -> None:
     assert "mass[cart]: R-hat –" in Page(render(findings)).text
 
 
-def test_loop_stands_for_its_findings() -> None:
-    loop = Loop(made_up())
-    assert loop.verdict == "effects-added"
-    for name in ("added", "candidates", "unexplained", "before", "after"):
-        assert getattr(loop, name) is getattr(loop.findings, name)
-    assert loop.posterior_before is loop.findings.posterior_before
-    assert loop.posterior_after is loop.findings.posterior_after
-    assert "Something was missing" in repr(loop)
+def test_loop_says_what_it_found() -> None:
+    loop = made_up()
+    assert "effects-added" in repr(loop) and "linear_drag on cart" in repr(loop)
     assert copy.copy(loop).verdict == "effects-added"
     with pytest.raises(AttributeError, match="vredict"):
         _ = loop.vredict
 
 
-def test_close_loop_hands_over_what_it_got(monkeypatch: pytest.MonkeyPatch) -> None:
-    calls = []
-    revise = loop_module.revise
-    monkeypatch.setattr(
-        loop_module, "revise", lambda *args, **kw: calls.append((args, kw)) or made_up()
-    )
-    loop = close_loop("scene", "train", "test", seed=3, substeps=20)  # type: ignore[arg-type]
-    assert loop.verdict == "effects-added"
-    ((args, options),) = calls
-    assert args == ("scene", "train", "test")
-    assert (options["seed"], options["substeps"], options["draws"]) == (3, 20, None)
-    ours, theirs = (inspect.signature(each).parameters for each in (close_loop, revise))
-    assert list(ours.values()) == list(theirs.values())
-
-
 @pytest.mark.usefixtures("undrawn")
 def test_save_writes_the_contract(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "out"
-    assert Loop(made_up()).save(folder) == folder
+    loop = made_up()
+    assert loop.save(folder, page=loop_page(loop)) == folder
     assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
     assert [p.name for p in tmp_path.iterdir()] == ["new"]
     got = json.loads((folder / "report.json").read_text())
@@ -417,13 +401,12 @@ def broken(monkeypatch: pytest.MonkeyPatch) -> None:
             raise KeyboardInterrupt
 
     monkeypatch.setattr(loop_module, "save_posterior", fail)
-    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
 
 
 @pytest.mark.usefixtures("broken")
 def test_failure_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
-        Loop(made_up()).save(tmp_path / "new" / "out")
+        made_up().save(tmp_path / "new" / "out", page="a page")
     assert not list(tmp_path.iterdir())
 
 
@@ -431,7 +414,7 @@ def test_failure_leaves_nothing(tmp_path: Path) -> None:
 def test_failure_leaves_what_was_there(tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text("old")
     with pytest.raises(KeyboardInterrupt):
-        Loop(made_up()).save(tmp_path, overwrite=True)
+        made_up().save(tmp_path, overwrite=True, page="a page")
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
     assert (tmp_path / "report.html").read_text() == "old"
 
@@ -440,14 +423,13 @@ def test_overwrite(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         loop_module, "save_posterior", lambda posterior, path: path.write_bytes(b"nc")
     )
-    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
-    loop = Loop(made_up())
+    loop = made_up()
     (tmp_path / "notes.txt").write_text("mine")
     with pytest.raises(OutputError, match=r"has content already.*overwrite=True"):
         loop.save(tmp_path)
     assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
-    loop.save(tmp_path, overwrite=True)
-    loop.save(tmp_path, overwrite=True)
+    loop.save(tmp_path, overwrite=True, page="a page")
+    loop.save(tmp_path, overwrite=True, page="a page")
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted([*FILES, "notes.txt"])
 
 
@@ -455,23 +437,29 @@ def test_folder_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     (tmp_path / "file").write_text("")
     for place in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(OutputError, match="is a file, expected a folder"):
-            Loop(made_up()).save(place, overwrite=True)
+            made_up().save(place, overwrite=True)
     (tmp_path / "out" / "after.nc").mkdir(parents=True)
     with pytest.raises(OutputError, match=r"after\.nc in it is a folder"):
-        Loop(made_up()).save(tmp_path / "out", overwrite=True)
+        made_up().save(tmp_path / "out", overwrite=True)
     monkeypatch.setattr("os.access", lambda path, mode: False)
     with pytest.raises(OutputError, match="no permission to write"):
-        Loop(made_up()).save(tmp_path / "new")
+        made_up().save(tmp_path / "new")
 
 
 def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
-    path = Loop(made_up()).report(tmp_path / "report.html")
+    monkeypatch.setattr(write_module, "render", lambda *args, **options: "a page")
+    path = pp.report(made_up(), tmp_path / "report.html")
     assert path.read_text() == "a page"
     for place in (tmp_path, tmp_path / "none" / "report.html"):
         with pytest.raises(OutputError, match="cannot be written"):
-            Loop(made_up()).report(place)
+            pp.report(made_up(), place)
     assert [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_report_is_function_and_subpackage() -> None:
+    """Whichever was imported first."""
+    assert callable(pp.report)
+    assert pp.report is sys.modules["pbrl_ppl.report"] is pp.report.report
 
 
 def test_velocities_that_are_not_used_are_named() -> None:

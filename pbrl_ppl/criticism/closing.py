@@ -1,0 +1,464 @@
+"""The closed loop: fit, score, add effects, test the residual, compare on held-out data."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.held_out import HeldOut, example_rollout, longest_rollout, rollout_horizon
+from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
+from pbrl_ppl.criticism.misfit import PRIOR, Misfit, find_misfit, with_negligible_acceleration
+from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
+from pbrl_ppl.criticism.ranking import declared_mode
+from pbrl_ppl.criticism.recordings import checked_histories, outliers
+from pbrl_ppl.criticism.refinement import same_noise, shift, with_correlated_errors
+from pbrl_ppl.criticism.results import (
+    Acceleration,
+    Added,
+    Errors,
+    Estimate,
+    Numerical,
+    ResidualTest,
+    Unexplained,
+)
+from pbrl_ppl.criticism.rivals import keep_groups
+from pbrl_ppl.criticism.score import Signature
+from pbrl_ppl.criticism.selection import Selection, Step
+from pbrl_ppl.criticism.stages import Stage
+from pbrl_ppl.criticism.unexplained import (
+    UnexplainedAcceleration,
+    noise_alone,
+    unexplained_acceleration,
+    without_acceleration,
+)
+from pbrl_ppl.effects import Attached, Effect, attach
+from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.errors import ConvergenceWarning, PriorWarning
+from pbrl_ppl.history import History, without_measurements
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.model import build_model
+from pbrl_ppl.modes import Mode
+from pbrl_ppl.physics import try_effect
+from pbrl_ppl.posterior import compare, identify, interval, versions
+from pbrl_ppl.posterior import draws as posterior_draws
+from pbrl_ppl.sampling import fit
+from pbrl_ppl.scene import Scene
+
+#: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
+DRAWS, INDEPENDENT, LEAST_TUNE = (300, 1000), (125,), 100
+#: Draws from the prior, some of which must reach the measurements.
+PRIOR_DRAWS = 100
+
+
+def close_loop(
+    scene: Scene,
+    train: History,
+    test: History | None = None,
+    *,
+    catalogue: Iterable[Effect] = full_catalogue,
+    seed: int = 0,
+    substeps: int | None = None,
+    draws: int | None = None,
+    method: str = "metropolis",
+    criteria: Criteria = DEFAULT,
+    progress: Callable[[str], None] | None = None,
+) -> Loop:
+    """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene.
+    train : History
+        Measured transitions that the model is fitted to.
+    test : History, optional
+        Held-out trajectories that errors are measured on; by default a seeded quarter of the
+        trajectories of ``train``.
+    catalogue : iterable of Effect
+        Effects to consider; add your own to the package's.
+    seed : int
+        The same seed gives the same result.
+    substeps : int, optional
+        Engine steps an interval to begin with; the scene's by default.
+    draws : int, optional
+        Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
+    method : str
+        Sampler of :func:`pbrl_ppl.fit`; with ``laplace`` the verdict relies on modes.
+    criteria : Criteria
+        Thresholds of the decisions.
+    progress : callable, optional
+        Called with the name of each stage.
+
+    Returns
+    -------
+    Loop
+        Verdict, effects, errors before and after, and both posteriors.
+
+    Raises
+    ------
+    HistoryError
+        If the histories do not fit each other or are too short.
+    EffectError
+        If the scene declares an unknown effect.
+
+    Warns
+    -----
+    PriorWarning
+        Before anything is fitted, if the declared prior could not have made ``train``.
+
+    Examples
+    --------
+    ::
+
+        loop = pp.close_loop(scene, train, test, seed=1)
+        loop.verdict  # 'effects-added'
+        pp.report(loop, "report.html")
+    """
+    say = progress or (lambda stage: None)
+    task = _Task(scene, tuple(catalogue), seed, substeps, draws, method, criteria, say)
+    if test is None:
+        train, test = train.split(0.25, seed)
+        given = test
+    else:
+        given = test
+        if scene.test_is_later:  # an effect from some trajectory on still acts in the test
+            test = test.numbered(float(train.dataset["number"].max()) + 1.0)
+    # matrices are small: threads of linear algebra only get in each other's way
+    with threadpool_limits(1, "blas"):
+        return replace(_closed(task, train, test), held_out=given, catalogue=task.catalogue)
+
+
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """Arguments of :func:`close_loop`."""
+
+    scene: Scene
+    catalogue: tuple[Effect, ...]
+    seed: int
+    substeps: int | None
+    draws: int | None
+    method: str
+    criteria: Criteria
+    say: Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class _Model:
+    """A fitted model: mode, unexplained acceleration, posterior, and held-out trajectories."""
+
+    mode: Mode
+    excess: UnexplainedAcceleration
+    posterior: Any
+    held_out: HeldOut
+
+
+class _Search(NamedTuple):
+    """Result of a search for effects: the declared model's ranking, the mode, the added effects."""
+
+    first: list[Signature]
+    mode: Mode
+    steps: list[Step]
+
+
+def _closed(task: _Task, train: History, test: History) -> Loop:
+    """Go through the stages of :func:`close_loop`."""
+    scene, seed, criteria, say = task.scene, task.seed, task.criteria, task.say
+    if task.substeps is not None:
+        scene.replace(substeps=task.substeps)  # it is checked there
+    train, test, unused, bad = checked_histories(scene, train, test)
+    for sentence in (*(velocity.sentence for velocity in unused), *bad):
+        say(sentence)
+    for effect in task.catalogue:
+        if effect not in full_catalogue:
+            try_effect(effect, scene, train)
+    selection = Selection(scene, task.catalogue, criteria, say)
+    effects = attach(scene, (), task.catalogue)
+    say(Stage.CHECK_PRIOR)
+    prior = _prior_test(task, train, effects)
+    if not prior.passed:  # nobody wants the fit of wrong units
+        hint = "the declared prior does not explain this recording, unless a missing effect is why"
+        warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
+    say(Stage.FIT)
+    declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
+    search = _add_effects(declared, selection, provisional=True)
+    # with the right noise model effects may show that were hidden before
+    for again in reversed(range(criteria.noise_rounds)):
+        train, frames = without_measurements(train, outliers(search.mode, criteria))
+        if frames:
+            for sentence in map(str, frames):
+                say(sentence)
+            bad += tuple(map(str, frames))
+            declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
+        else:
+            correlated = with_correlated_errors(search.mode, criteria)
+            if correlated is None:
+                break
+            say(Stage.REPEAT)
+            declared = same_noise(declared, correlated)
+        search = _add_effects(declared, selection, provisional=again > 0)
+    revised, steps = search.mode, search.steps
+    tested = replace(revised, problem=HeldOut.of(revised, test).problem)
+    test, frames = without_measurements(test, outliers(tested, criteria))
+    bad += tuple(f"held out: {frame}" for frame in frames)
+    say(Stage.TEST)
+    before, after = (unexplained_acceleration(mode, criteria) for mode in (declared, revised))
+    horizon = rollout_horizon(train, scene.time_step)
+    with_added = prior
+    if steps and not prior.passed:  # the missing effect may be why
+        values = dict(zip(revised.problem.layout.labels, revised.phi.tolist(), strict=True))
+        held = {label: values[label] for step in steps for label in step.signature.attached.labels}
+        with_added = _prior_test(task, train, revised.problem.physics.effects, held)
+    misfit = find_misfit(revised, after, horizon=horizon, seed=seed).with_test(with_added)
+    if steps and _too_much_remains(misfit, before, after):
+        without = find_misfit(declared, before, horizon=horizon, seed=seed)
+        share = after.square / before.square
+        followed = misfit.predictable < criteria.most_predictable * without.predictable
+        if share > criteria.large_if_small or not followed:
+            # any effect takes up a part of a misfit, so no name follows from that
+            say(Stage.WITHDRAW)
+            selection.withdraw(steps)
+            steps, revised, after = [], declared, before
+            misfit = without.with_test(prior)
+    if steps:
+        misfit = with_negligible_acceleration(misfit, revised, after)
+    say(Stage.SAMPLE_DECLARED)
+    posterior = _posterior(task, declared)
+    first = last = _Model(declared, before, posterior, HeldOut.of(declared, test))
+    if steps:
+        say(Stage.SAMPLE_REVISED)
+        posterior = _posterior(task, revised)
+    if revised is not declared:
+        last = _Model(revised, after, posterior, HeldOut.of(revised, test))
+    say(Stage.COMPARE)
+    rollout = longest_rollout(test, horizon)
+    return replace(
+        _put_together(task, train, first, last, steps, misfit, rollout),
+        candidates=selection.explained(search.first),
+        small=tuple(selection.small),
+        velocities_not_used=unused,
+        bad_frames=bad,
+        criteria=criteria,
+    )
+
+
+def _add_effects(declared: Mode, selection: Selection, *, provisional: bool) -> _Search:
+    """Rank candidates and add effects one by one, each ranked beside those before.
+
+    If ``provisional``, the search ends where outliers show, the last effect unconfirmed.
+    """
+    criteria, say = selection.criteria, selection.say
+    say(Stage.SCORE)
+    first = selection.rank(declared)
+    mode, ranked = declared, first
+    steps: list[Step] = []
+    while ranked and len(steps) < criteria.most_added:
+        if provisional and np.isfinite(outliers(mode, criteria)).any():
+            return _Search(first, mode, steps)
+        step = selection.best_addition(mode, ranked, provisional=provisional)
+        if step is None and unexplained_acceleration(mode, criteria).remains.any():
+            # a random force follows smooth effects, whose scores are small beside it
+            step = selection.best_addition(mode, selection.rank(mode, without_acceleration(mode)))
+        if step is None:
+            break
+        say(f"added {step.signature.candidate.effect} on {step.signature.candidate.body}")
+        steps.append(step)
+        mode = step.after
+        ranked = selection.rank(mode)
+    if len(steps) > 1:
+        say(Stage.PRUNE)
+        mode, steps = selection.prune(mode, steps)
+    return _Search(first, mode, steps)
+
+
+def _prior_test(
+    task: _Task,
+    train: History,
+    effects: tuple[Attached, ...],
+    held: Mapping[str, float] | None = None,
+) -> ResidualTest:
+    """Test whether the prior, with some parameters held, could have made the data."""
+    horizon = telling_horizon(train, task.criteria.prior)
+    problem = Problem.of(task.scene, train, effects, horizon=horizon, threads=2)
+    checked = prior_predictive_check(
+        build_model(problem), draws=PRIOR_DRAWS, seed=task.seed, held=held,
+        criteria=task.criteria.prior,
+    )  # fmt: skip
+    share = float(checked.dataset["share_beyond"].max())
+    sentence, *more = checked.summary
+    if more:
+        sentence = f"{sentence}; so it is with {len(more)} more"
+    return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, sentence)
+
+
+def _too_much_remains(
+    misfit: Misfit, before: UnexplainedAcceleration, after: UnexplainedAcceleration
+) -> bool:
+    """Return whether too much of the unexplained acceleration remains, and is not random."""
+    if misfit.unexplained is None or misfit.random or not before.square > 0:
+        return False
+    criteria = after.criteria
+    small = after.worst < criteria.negligible
+    limit = criteria.large_if_small if small else criteria.large_remainder
+    return after.square / before.square > limit
+
+
+def _posterior(task: _Task, mode: Mode) -> Any:
+    """Sample a mode's model, with more draws if the chains have not converged."""
+    # one thread a chain: more would wait for each other
+    mode = replace(mode, problem=mode.problem.with_physics(threads=1))
+    model = build_model(mode.problem)
+    chains = task.method != "laplace"
+    for n in (DRAWS if chains else INDEPENDENT) if task.draws is None else (task.draws,):
+        tune = max(LEAST_TUNE, 5 * n // 8)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            fitted = fit(
+                model, method=task.method, seed=task.seed, draws=n, tune=tune, start=mode,
+                progress=False,
+            )  # fmt: skip
+        if "interrupted" in fitted.attrs:  # half a posterior gives no verdict
+            raise KeyboardInterrupt
+        if _converged(fitted, task.criteria):
+            break
+        task.say(f"the chains have not converged after {n} draws each")
+    for warning in caught:  # of the last fit; independent draws are no chains that converge
+        if chains or not issubclass(warning.category, ConvergenceWarning):
+            warnings.warn(warning.message, stacklevel=2)
+    return fitted
+
+
+def _converged(posterior: Any, criteria: Criteria) -> bool:
+    """Return whether chains agree well enough for a verdict; warnings begin earlier."""
+    r_hat, ess = posterior.attrs.get("max_rhat", np.inf), posterior.attrs.get("min_ess", 0.0)
+    return bool(r_hat <= criteria.worst_rhat and ess >= criteria.least_ess)
+
+
+def _put_together(
+    task: _Task,
+    train: History,
+    declared: _Model,
+    revised: _Model,
+    steps: list[Step],
+    misfit: Misfit,
+    rollout: int,
+) -> Loop:
+    """Return the result of the stages; errors are forecasts of ``rollout`` intervals."""
+    scene, held_out, criteria = task.scene, revised.held_out, task.criteria
+    test = held_out.problem.data.history
+    before = declared.held_out.errors(held_out, declared.posterior, rollout, task.seed)
+    after = before
+    if revised is not declared:
+        after = held_out.errors(held_out, revised.posterior, rollout, task.seed)
+    verdict = EFFECTS_ADDED if steps else ADEQUATE
+    unexplained = misfit.unexplained
+    # added effects that leave an acceleration unexplained are at best near the right ones
+    if unexplained is not None and not (steps and misfit.predicts):
+        verdict = UNEXPLAINED
+    if steps and after.normalised_rmse > (1.0 + criteria.negligible) * before.normalised_rmse:
+        verdict, unexplained = UNEXPLAINED, unexplained or _worse(before, after)
+    if not all(_converged(model.posterior, criteria) for model in (declared, revised)):
+        verdict = NOT_CONVERGED
+    added = tuple(_added(step, revised) for step in steps)
+    keep_groups(revised.posterior, added)
+    noise = noise_alone(revised.mode, revised.excess)
+    return Loop(
+        scene=scene,
+        verdict=verdict,
+        numerical=Numerical(
+            scene.substeps, revised.mode.problem.physics.substeps, shift(revised.mode)
+        ),
+        candidates=(),
+        added=added,
+        unexplained=unexplained,
+        before=before,
+        after=after,
+        noise_floor=held_out.noise_floor(noise, rollout),
+        posterior_before=declared.posterior,
+        posterior_after=revised.posterior,
+        residuals_before=declared.held_out.residuals(held_out),
+        residuals_after=held_out.residuals(held_out),
+        rollout=example_rollout(declared.held_out, held_out),
+        rollout_horizon=rollout,
+        provenance={
+            "seed": task.seed,
+            "versions": versions(),
+            "data_sha256": train.data_sha256,
+            "test_sha256": test.data_sha256,
+            "transitions": train.n_transitions,
+            "test_transitions": test.n_transitions,
+            "rollout_horizon": rollout,
+            "rollout_seconds": rollout * scene.time_step,
+        },
+        tests=misfit.tests,
+        acceleration=_acceleration(declared.excess, revised.excess),
+        correlations=misfit.correlations,
+        growth=misfit.growth,
+        identifiability=identify(revised.posterior, mode=revised.mode),
+        loo=compare(declared.posterior, revised.posterior),
+    )
+
+
+def _acceleration(before: UnexplainedAcceleration, after: UnexplainedAcceleration) -> Acceleration:
+    """Return the unexplained accelerations of both models by name."""
+
+    def named(excess: UnexplainedAcceleration, values: Any) -> dict[str, Any]:
+        return dict(zip(excess.names, values.tolist(), strict=True))
+
+    return Acceleration(
+        named(before, before.size),
+        named(after, after.size),
+        named(before, before.relative),
+        named(after, after.relative),
+        named(after, after.certain),
+    )
+
+
+def _worse(before: Errors, after: Errors) -> Unexplained:
+    """Return what is unexplained where the revised model's held-out error is the larger one."""
+    rise = after.normalised_rmse / before.normalised_rmse - 1.0
+    return Unexplained(
+        body="",
+        dimension="",
+        depends_on="nothing that was recorded",
+        share=0.0,
+        p_value=float("nan"),
+        sentence=(
+            "the revised model forecasts the held-out trajectories worse than the declared one: its"
+            f" error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
+            f" {before.normalised_rmse:.3g} times the noise"
+        ),
+    )
+
+
+def _added(step: Step, revised: _Model) -> Added:
+    """Return an added effect with its posterior."""
+    candidate, effect = step.signature.candidate, step.signature.attached.effect
+    drawn = posterior_draws(revised.posterior)
+    bodies = [
+        attached.body
+        for attached in revised.mode.problem.physics.effects
+        if attached.effect.name == effect.name
+    ]
+    estimates = {}
+    for parameter in effect.parameters:
+        values = drawn[effect.variable(parameter)][:, bodies.index(candidate.body)]
+        estimates[parameter.name] = Estimate(
+            float(values.mean()), float(values.std()), interval(values), parameter.unit
+        )
+    return Added(
+        effect=candidate.effect,
+        body=candidate.body,
+        sentence=candidate.sentence,
+        statistic=candidate.statistic,
+        p_value=candidate.p_value,
+        parameters=estimates,
+        not_separable_from=step.not_separable_from,
+        elpd_difference=step.elpd_difference,
+        elpd_difference_se=step.elpd_difference_se,
+    )

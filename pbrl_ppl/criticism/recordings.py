@@ -1,0 +1,149 @@
+"""Checks of recordings: histories before a fit, and outliers after it."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.unexplained import without_acceleration
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import (
+    History,
+    UnusedVelocity,
+    bad_frames,
+    measured_alone,
+    unused_velocities,
+    without_bad_frames,
+)
+from pbrl_ppl.likelihood import cells_of, check_moves
+from pbrl_ppl.modes import Mode
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import STATE
+
+Array = NDArray[np.float64]
+
+
+def checked_histories(
+    scene: Scene, train: History, test: History
+) -> tuple[History, History, tuple[UnusedVelocity, ...], tuple[str, ...]]:
+    """Return both histories without unused velocities and single bad frames, and name those.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared scene.
+    train, test : History
+        The training and the test history.
+
+    Returns
+    -------
+    train, test : History
+        Without them.
+    unused : tuple of UnusedVelocity
+        Velocity columns of the training history that are not used, in either.
+    bad : tuple of str
+        A sentence for each single bad frame that is left out.
+
+    Raises
+    ------
+    HistoryError
+        If they have other bodies, another time step or other measured dimensions, or nothing
+        moves in the training history.
+    """
+    names = [body.name for body in scene.moving]
+    for which, history in (("training", train), ("test", test)):
+        if list(history.bodies) != names:
+            raise HistoryError(
+                f"{which} history: it is of {', '.join(history.bodies)}, the scene has"
+                f" {', '.join(names)}; load it with this scene"
+            )
+        step = float(history.dataset.attrs["time_step"])
+        if not np.isclose(step, scene.time_step):
+            raise HistoryError(
+                f"{which} history: it has a row each {step:g} s, the scene each"
+                f" {scene.time_step:g} s; load it with this scene"
+            )
+    same, unused = test is train, _unused(train)
+    train, test = measured_alone(train, unused), measured_alone(test, unused)
+    train, bad = without_bad_frames(train)
+    test, more = without_bad_frames(test)
+    check_moves(cells_of(scene, train), scene)
+    known, asked = (
+        np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
+        for history in (train, test)
+    )
+    if (asked & ~known).any():
+        missing = ", ".join(
+            f"{STATE[d]} of {scene.moving[body].name}" for body, d in np.argwhere(asked & ~known)
+        )
+        raise HistoryError(
+            f"test history measures {missing}, which the training history does"
+            " not; leave those columns empty, or measure them in both"
+        )
+    held_out = [] if same else [f"held out: {frame}" for frame in more]
+    return train, test, unused, (*map(str, bad), *held_out)
+
+
+def _unused(history: History) -> tuple[UnusedVelocity, ...]:
+    """Return the velocities that are not used, judged without bad trajectories if few are bad.
+
+    A bad frame makes positions look noisy, and a measured velocity as if they predicted it.
+    """
+    clear = np.flatnonzero(~bad_frames(history).any(axis=(1, 2, 3)))
+    most = 2 * len(clear) >= history.n_trajectories
+    return unused_velocities(history.select(clear) if most else history)
+
+
+def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Array:
+    """Return errors of single measurements that a fitted model and all others contradict.
+
+    They are judged by the residual given all other measurements (auxiliary residuals), without any
+    unexplained acceleration, which would follow them, and in units of the median residual: where
+    physics is missing most residuals are large, and none is far off.
+
+    Parameters
+    ----------
+    mode : Mode
+        Fitted to whole trajectories.
+    criteria : Criteria
+        When a measurement is left out.
+
+    Returns
+    -------
+    ndarray
+        Measured minus smoothed, shape (trajectory, time, body, 6), SI units; NaN elsewhere.
+    """
+    problem, limits = mode.problem, criteria.outliers
+    noise, segments = problem.trajectory_noise, problem.segments
+    residual = noise.cells.of_residual(problem.residual(mode.phi))
+    sigma = without_acceleration(mode).sigma
+    both, error = noise.auxiliary(residual, sigma), noise.cells.white(sigma)
+    size = np.abs(np.concatenate(both))  # of rows that transitions end at, then of first rows
+    size[size == 0.0] = np.nan
+    off = np.concatenate([noise.measured, noise.begin])
+    trajectory = np.tile(segments.trajectory, 2)
+    row = np.concatenate([segments.step + 1, segments.step])
+    observed = problem.data.history.dataset["observed"]
+    found = np.full(observed.shape, np.nan)
+    flat = found.reshape(*found.shape[:2], -1)
+    for cell, place in enumerate(noise.cells.places):
+        own = size[:, cell]
+        count = np.isfinite(own).sum()
+        if noise.cells.sensor[cell] < 0 or count < limits.least_measurements:
+            continue
+        far = own > limits.deviations * np.nanmedian(own) / norm.isf(0.25)
+        far &= np.abs(off[:, cell]) > limits.errors * error[cell]
+        far &= own > limits.neighbours * np.nan_to_num(_beside(own, trajectory, row))
+        if 0 < far.sum() <= max(limits.most * count, 1):
+            flat[trajectory[far], row[far], place] = off[far, cell]
+    return found
+
+
+def _beside(size: Array, trajectory: NDArray[np.intp], row: NDArray[np.intp]) -> Array:
+    """Return the larger residual of the rows before and after, shape of ``size``; NaN if none."""
+    table = np.full((trajectory.max() + 1, row.max() + 3), np.nan)
+    some = np.isfinite(size)
+    table[trajectory[some], row[some] + 1] = size[some]
+    return np.fmax(table[trajectory, row], table[trajectory, row + 2])
