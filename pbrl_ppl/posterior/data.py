@@ -222,7 +222,7 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
         origin, before = given[_ORIGIN].to_numpy(), given[_SENSITIVITY].to_numpy()
         follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
         noise = replace(noise, sensitivity=follow)
-    return problem.on(data).along(noise, scalar=False)
+    return problem.on(data).along(noise)
 
 
 def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:
