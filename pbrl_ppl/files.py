@@ -6,6 +6,7 @@ import contextlib
 import math
 import secrets
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import is_dataclass
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +41,12 @@ def write_text(path: Path, text: str) -> None:
 
 
 def json_values(value: Any) -> Any:
-    """Return a value as JSON has it: arrays as lists, paths as text, non-finite numbers as null."""
+    """Return plain values for JSON: arrays as lists, paths as text, non-finite numbers as null.
+
+    A dataclass becomes an object of its fields.
+    """
+    if is_dataclass(value):
+        value = vars(value)
     if isinstance(value, Mapping):
         return {str(key): json_values(item) for key, item in value.items()}
     if isinstance(value, Path):

@@ -26,10 +26,11 @@ SOURCES = sources_digest(Path(__file__).parent)
 
 
 def disk_cache(function: Callable[..., Any], digest: str) -> FunctionCache:
-    """Return numba's cache of a function, whose entries are valid for one digest of the sources.
+    """Return numba's cache of a function, in files that are named by a digest of the sources.
 
     Numba itself compares the time and size of the file that defines the function, and misses
-    changes of the functions and constants that it uses from other files.
+    changes of the functions and constants that it uses from other files. Files of other digests
+    are deleted: numba would fail to read one that mentions a module which is gone.
 
     Raises
     ------
@@ -37,7 +38,13 @@ def disk_cache(function: Callable[..., Any], digest: str) -> FunctionCache:
         If neither the package's folder nor the user's cache folder can be written to.
     """
     cache = FunctionCache(function)
-    cache._cache_file = IndexDataCacheFile(cache.cache_path, cache._impl.filename_base, digest)
+    base = cache._impl.filename_base
+    named = f"{base}.{digest[:16]}"
+    for path in Path(cache.cache_path).glob(f"{base}.*"):
+        if not path.name.startswith(named):
+            with suppress(OSError):
+                path.unlink()
+    cache._cache_file = IndexDataCacheFile(cache.cache_path, named, digest)
     return cache
 
 

@@ -186,9 +186,9 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
 
 def recording(problem: Problem) -> xr.Dataset:
     """Return the recording and linearisation of whole trajectories; empty for other problems."""
-    noise = problem.trajectory_noise
-    if noise is None:
+    if isinstance(problem.likelihood, TransitionLikelihood):
         return xr.Dataset()
+    noise = problem.trajectory_noise
     dataset = problem.data.history.dataset
     kept = dataset.rename(
         {name: f"{_PREFIX}{name}" for name in (*dataset.dims, *dataset.data_vars)}

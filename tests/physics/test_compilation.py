@@ -1,6 +1,7 @@
 """The cache of machine code on disk, and the private pymunk symbols that compiled code calls."""
 
 import importlib.util
+from pathlib import Path
 
 import numba
 import pymunk
@@ -94,6 +95,23 @@ def test_another_digest_compiles_anew(tmp_path) -> None:
         return sum(dispatcher.stats.cache_hits.values())
 
     assert [hits(digest) for digest in ("a", "a", "b", "b", "a")] == [0, 1, 0, 1, 0]
+
+
+def test_an_older_cache_that_cannot_be_read_is_deleted(tmp_path) -> None:
+    """It may mention modules that are gone."""
+    path = tmp_path / "loop.py"
+    path.write_text("def double(x):\n    return 2.0 * x\n")
+    spec = importlib.util.spec_from_file_location("loop", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    older = disk_cache(module.double, "a")
+    index = Path(older._cache_file._index_path)
+    index.parent.mkdir(exist_ok=True)
+    index.write_bytes(b"not an index")
+    dispatcher = numba.njit(module.double)
+    dispatcher._cache = disk_cache(module.double, "b")
+    assert dispatcher(1.5) == 3.0
+    assert not index.exists()
 
 
 @pytest.mark.parametrize("rollout", [compiled.rollout, lockstep.rollout, lockstep_chain.rollout])
