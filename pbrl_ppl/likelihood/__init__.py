@@ -1,7 +1,7 @@
 """Likelihoods in numpy: data, noise, Eq. 11, whole trajectories and the log-posterior."""
 
-from pbrl_ppl.likelihood.cells import ACCELERATION, DRIFT, JOLT, Cells, check_moves
-from pbrl_ppl.likelihood.data import Data
+from pbrl_ppl.likelihood.cells import ACCELERATION, DRIFT, JOLT, Cells, cells_of, check_moves
+from pbrl_ppl.likelihood.data import Data, Observations, estimate_sigma, sigma_prior
 from pbrl_ppl.likelihood.declared import declared_problem
 from pbrl_ppl.likelihood.likelihood import (
     GAUSSIAN,
@@ -21,9 +21,7 @@ from pbrl_ppl.likelihood.log_posterior import (
     noise_prior_slope,
 )
 from pbrl_ppl.likelihood.noise_scales import bodies_acceleration, noise_medians, ranges
-from pbrl_ppl.likelihood.observations import Observations, estimate_sigma, sigma_prior
 from pbrl_ppl.likelihood.problem import Problem
-from pbrl_ppl.likelihood.recorded_cells import cells_of
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.likelihood.simulation import simulated_trajectories, with_measurements
 from pbrl_ppl.likelihood.smoothing import (

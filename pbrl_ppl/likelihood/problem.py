@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments
-from pbrl_ppl.likelihood.data import Data
+from pbrl_ppl.likelihood.data import Data, Observations, sigma_prior
 from pbrl_ppl.likelihood.likelihood import (
     Likelihood,
     TrajectoryLikelihood,
     TransitionLikelihood,
 )
-from pbrl_ppl.likelihood.observations import Observations, sigma_prior
 from pbrl_ppl.likelihood.tails import degrees_of_freedom, tail_places
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.parameters import Layout, ParameterLibrary

@@ -11,10 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.history import longest_gap, unseen
-from pbrl_ppl.likelihood.cells import Cells, check_moves
+from pbrl_ppl.likelihood.cells import Cells, cells_of, check_moves, first_states
 from pbrl_ppl.likelihood.noise_scales import SPREAD, noise_medians
 from pbrl_ppl.likelihood.problem import Problem
-from pbrl_ppl.likelihood.recorded_cells import cells_of, first_states
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.physics import touching

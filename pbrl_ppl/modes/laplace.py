@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, log_posterior
-from pbrl_ppl.modes.noise import FAR_OFF, noise_gaussian, profile_sigma
-from pbrl_ppl.modes.tails import best_tails, tail_precision
+from pbrl_ppl.modes.noise import FAR_OFF, best_tails, noise_gaussian, profile_sigma, tail_precision
 from pbrl_ppl.parameters import box, differentiate, inside, likeliest, prior_residual
 from pbrl_ppl.physics import PartedSimulator
 

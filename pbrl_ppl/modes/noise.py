@@ -1,8 +1,8 @@
-"""Maximum a posteriori sigma at given residuals."""
+"""Most probable noise parameters and tails at given residuals."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
@@ -19,6 +19,7 @@ from pbrl_ppl.likelihood import (
     noise_law,
     noise_prior_slope,
 )
+from pbrl_ppl.parameters import box
 
 Array = NDArray[np.float64]
 
@@ -197,3 +198,50 @@ def noise_gaussian(
             hessian[i, j] = hessian[j, i] = mixed / (4 * h**2)
     values, vectors = np.linalg.eigh(hessian)
     return at, np.asarray((vectors / np.maximum(values, spread**-2)) @ vectors.T)
+
+
+#: Step of a second difference in the tails, and the least curvature.
+_STEP, _LEAST = 0.02, 1.0
+
+
+def _tail_cost(problem: Problem, phi: Array, sigma: Array) -> Callable[[Array], float]:
+    """Negative log-posterior as a function of the noise's tails alone."""
+    residual, tails = np.nan_to_num(problem.residual(phi), nan=FAR_OFF), list(problem.tails)
+
+    def cost(values: Array) -> float:
+        point = phi.copy()
+        point[tails] = values
+        likelihood = problem.log_density(residual, sigma, point).sum()
+        return -float(likelihood + problem.layout.log_prior(point)[tails].sum())
+
+    return cost
+
+
+def best_tails(problem: Problem, phi: Array, sigma: Array) -> Array:
+    """Phi with the maximum a posteriori tails, all else fixed."""
+    if not problem.tails:
+        return phi
+    tails = list(problem.tails)
+    lower, upper = (end[tails] for end in box(problem.layout.priors))
+    bounds = list(zip(lower, upper, strict=True))
+    found = minimize(_tail_cost(problem, phi, sigma), phi[tails], method="L-BFGS-B", bounds=bounds)
+    result = phi.copy()
+    result[tails] = found.x
+    return result
+
+
+def tail_precision(problem: Problem, phi: Array, sigma: Array) -> Array:
+    """Curvature of the negative log-posterior in each of the noise's tails."""
+    tails = list(problem.tails)
+    lower, upper = (end[tails] for end in box(problem.layout.priors))
+    cost = _tail_cost(problem, phi, sigma)
+    curvature = np.empty(len(tails))
+    for i, step in enumerate(np.minimum(_STEP, 0.25 * (upper - lower))):
+        middle = phi[tails].copy()
+        middle[i] = np.clip(middle[i], lower[i] + step, upper[i] - step)
+        ends = [middle.copy(), middle, middle.copy()]
+        ends[0][i] -= step
+        ends[2][i] += step
+        below, at, above = (cost(end) for end in ends)
+        curvature[i] = max((below - 2 * at + above) / step**2, _LEAST)
+    return curvature
