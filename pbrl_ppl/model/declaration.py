@@ -1,4 +1,4 @@
-"""(scene, history, effects) -> pm.Model: Table 1 prior, Eq. 11 likelihood, named coordinates."""
+"""The pm.Model of a problem: Table 1 prior, Eq. 11 likelihood, named coordinates."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
 from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
 from pbrl_ppl.state import INPUT, STATE
 
-#: Dimensions of the noises along trajectories.
+#: Dimensions of the noise variables along trajectories.
 _NOISE_DIMS = {
     "sigma": "sensor", ACCELERATION: "velocity", JOLT: "velocity", DRIFT: "position",
 }  # fmt: skip
@@ -72,7 +72,7 @@ def build_model(problem: Problem) -> PhysicsModel:
         # Eq. 7: s' = f(s, a; Phi) + eps, and Eq. 11
         columns = list(observations.columns)
         predicted = SimulatorOp(physics, sensitivity)(phi, start, actions)[..., columns]
-        # the likelihood takes bodies apart that were apart in the data; in draws they may meet
+        # bodies of independent parts never meet in the likelihood; in draws they may
         whole = predicted
         if len(problem.simulator.parts) > 1:
             whole = OneWorldOp(physics, sensitivity)(phi, start, actions)[..., columns]
@@ -96,18 +96,18 @@ def build_model(problem: Problem) -> PhysicsModel:
 def prior_predictive_draws(
     model: pm.Model, names: Sequence[str], draws: int, seed: int
 ) -> dict[str, NDArray[Any]]:
-    """Draws from the prior of a model, by PyMC.
+    """Draw from the prior of a model with PyMC.
 
     Parameters
     ----------
     model : pymc.Model
-        As made by :func:`pbrl_ppl.physics_model`.
+        Returned by :func:`pbrl_ppl.physics_model`.
     names : sequence of str
         Variables to draw, ``next_state`` among them if wanted (Eq. 13).
     draws : int
-        How many; the first of more are the same.
+        Number of draws; a larger number begins with the same draws.
     seed : int
-        Of the draws.
+        Seed of the draws.
 
     Returns
     -------
@@ -123,7 +123,7 @@ def prior_predictive_draws(
 
 
 def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
-    """Which parameter set each body or class has, and the parameters that follow from that."""
+    """Declare the parameter set of each body or class, and the parameters that follow from it."""
     names = tuple(problem.scene.owners)
     table = library.table(problem.layout, problem.scene)
     p = np.stack([library.prior(name) for name in names])
@@ -137,7 +137,7 @@ def _chosen(problem: Problem, library: ParameterLibrary) -> dict[str, Any]:
 
 
 def _noise(problem: Problem) -> Any:
-    """The noise parameters, shape (parameter,)."""
+    """Declare the noise parameters, shape (parameter,)."""
     median, spread = problem.noise_prior
     if problem.scalar_sigma:
         scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
@@ -157,7 +157,7 @@ def _noise(problem: Problem) -> Any:
 
 
 def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
-    """Index variable that selects each anchor's prior; 0 where the body is given."""
+    """Return the index that selects each anchor's prior; 0 where the body is given."""
     name = f"i_{block.name[0]}"
     if not block.conditional or name not in variables:
         return None
@@ -167,7 +167,7 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
 
 
 def _signature(problem: Problem) -> str:
-    """Core dimensions: of one transition, or of all where they depend on each other."""
+    """Return core dimensions: of one transition, or of all where they are correlated."""
     tail = ",(k)" * bool(problem.tails)
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         return f"(n,h,k,d),(n,h,k,d),(m){tail}->(n,h,k,d)"
@@ -183,7 +183,7 @@ def _log_density(
     sigma: Any,
     tail: Any = None,
 ) -> Any:
-    """Log-density of the measurements about the predictions in parts; ``whole`` is for draws."""
+    """Return the log-density of measurements about predictions in parts; ``whole`` is for draws."""
     nu = likelihood.nu
     if not isinstance(likelihood, TrajectoryLikelihood):
         return next_state_logp(value, predicted, sigma, observations, nu, tail)
@@ -215,7 +215,7 @@ def _random(
 
 
 def _coords(problem: Problem) -> dict[str, Any]:
-    """Coordinates of the model's dimensions, by name."""
+    """Return the coordinates of the model's dimensions by name."""
     segments = problem.segments
     coords: dict[str, Any] = {
         "body": [body.name for body in problem.scene.moving],
@@ -240,14 +240,14 @@ def _noise_coords(problem: Problem) -> dict[str, Any]:
 
 
 def _dim(problem: Problem, block: Block) -> str:
-    """Dimension of a parameter: of joints, or of the bodies or classes that have it."""
+    """Return the dimension of a parameter: joints, or the bodies or classes that have it."""
     if block.of == "joint":
         return "joint" if not block.name.startswith("i_") else "free_joint"
     return _owner_dim(problem, block.owners, block.effect or block.name)
 
 
 def _owner_dim(problem: Problem, owners: tuple[str, ...], name: str) -> str:
-    """``body`` for all moving bodies, ``owner`` for all that own parameters, else one by name."""
+    """Return ``body`` for all moving bodies, ``owner`` for all owners, or a name of its own."""
     if set(owners) == {body.name for body in problem.scene.moving}:
         return "body"
     return "owner" if owners == tuple(problem.scene.owners) else f"{name}_body"

@@ -15,14 +15,14 @@ from pbrl_ppl.state import THETA
 
 
 def difference(value: Any, predicted: Any, observations: Observations) -> Any:
-    """Difference of states as a pytensor expression, angles wrapped to (-pi, pi].
+    """Return the difference of states as a pytensor expression, angles wrapped.
 
     Parameters
     ----------
     value, predicted : tensor
         Shape (transition, H, body, state).
     observations : Observations
-        Says which states they are.
+        Names the states.
     """
     residual = value - predicted  # s' - f(s, a; Phi)
     if THETA in observations.columns:
@@ -40,7 +40,7 @@ def next_state_logp(
     nu: float | None = None,
     tail: Any = None,
 ) -> Any:
-    """Eq. 11 as a pytensor expression, one log-density a transition.
+    """Return Eq. 11 as a pytensor expression, one log-density a transition.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def next_state_logp(
     sigma : tensor
         Noise of each state dimension, shape (state,).
     observations : Observations
-        Says which cells were measured.
+        Masks missing measurements.
     nu : float, optional
         Degrees of freedom of a Student-t distribution; without it, Gaussian.
     tail : tensor, optional
@@ -76,7 +76,7 @@ def next_state_logp(
 
 
 def tail_tensor(physics: Physics, variables: Mapping[str, Any], nu: float | None) -> Any:
-    """Reciprocal degrees of freedom of each body's noise, a tensor of shape (body,)."""
+    """Return the reciprocal degrees of freedom of each body's noise, a tensor (body,)."""
     owners = {block.name: block.owners for block in physics.layout.blocks}
 
     def value(attached: Attached, variable: str) -> Any:

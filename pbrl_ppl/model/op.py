@@ -1,4 +1,4 @@
-"""SimulatorOp: the engine as a black-box pytensor Op, its derivative, and numba dispatch."""
+"""The engine as a black-box pytensor Op, with its derivative and numba dispatch."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 class _EngineOp(Op):
-    """Base of the prediction and of its derivative: inputs, and the answer to impossible ones."""
+    """Base class of the prediction and its derivative: checks inputs and dispatches."""
 
     __props__ = ("physics", "sensitivity")
 
@@ -42,13 +42,13 @@ class _EngineOp(Op):
     def _following(
         self, engine: Callable[..., Array], phi: Array, start: Array, actions: Array
     ) -> Array:
-        """What an engine predicts, from start states that follow phi."""
+        """Return predictions of an engine from start states that follow phi."""
         if self.sensitivity is None:
             return engine(phi, start, actions)
         return self.sensitivity.predicted(engine, phi, start, actions)
 
     def make_node(self, phi: Any, start: Any, actions: Any) -> Apply:
-        """Check what can be checked before values are there.
+        """Check the dimensions and static shapes of the inputs.
 
         Raises
         ------
@@ -78,7 +78,7 @@ class _EngineOp(Op):
         return Apply(self, inputs, [pt.tensor(dtype="float64", shape=(None, None, *self._last))])
 
     def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
-        """(transition, H) from the shape of the actions."""
+        """Return (transition, H) from the shape of the actions."""
         actions = arguments[-1][2]  # older stacks pass (fgraph, node, shapes), newer (node, shapes)
         return [(actions[0], actions[1], *self._last)]
 
@@ -87,10 +87,10 @@ class _EngineOp(Op):
         outputs[0][0] = self.predict(*inputs)
 
     def predict(self, phi: Array, start: Array, actions: Array) -> Array:
-        """Run the engine."""
+        """Run the engine; NaN where phi is impossible."""
         try:
             return self._compute(phi, start, actions)
-        except ParameterError:  # a sampler may look there; nothing can be observed of it
+        except ParameterError:  # samplers try such points: their likelihood is zero
             return np.full((*actions.shape[:2], *self._last), np.nan)
 
 
@@ -130,7 +130,7 @@ class SimulatorOp(_EngineOp):
         if self.sensitivity is None:
             return self.physics.simulator.recall(phi, start, actions)
         follow = partial(self._following, self.physics.simulator.recall)
-        # a copy: what is remembered must not be written into
+        # a copy: a graph may write into its arrays
         return self._memory.recall((phi, start, actions), follow).copy()
 
     @cached_property
@@ -140,7 +140,7 @@ class SimulatorOp(_EngineOp):
     def pullback(
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
     ) -> list[Any]:
-        """Vector-Jacobian product; start states and actions are data and have no derivative."""
+        """Return the vector-Jacobian product by phi; start states and actions are data."""
         jacobian = JacobianOp(self.physics, self.sensitivity)(*inputs)
         return [
             (cotangents[0][..., None] * jacobian).sum(axis=(0, 1, 2, 3)),
@@ -170,7 +170,7 @@ class OneWorldOp(_EngineOp):
 class JacobianOp(_EngineOp):
     """Derivative of :class:`SimulatorOp` by phi, shape (transition, H, body, 6, p).
 
-    That start states follow phi is no part of it: what they add, the way back takes off.
+    It leaves out that start states follow phi: the correction to the smoothed starts cancels that.
     """
 
     @property
@@ -185,7 +185,7 @@ class JacobianOp(_EngineOp):
 
 @numba_funcify.register(_EngineOp)
 def _numba_engine(op: _EngineOp, node: Any = None, **kwargs: Any) -> Any:
-    """Numba dispatch of the Op: a call of the rollout in object mode."""
+    """Dispatch the Op in numba: a call in object mode."""
     kind = numba.types.Array(numba.float64, 2 + len(op._last), "C")
 
     @numba.njit

@@ -79,7 +79,7 @@ def random_variable(
 
 
 def _von_mises(name: str, mu: Array, kappa: Array, dims: str) -> Any:
-    """PyMC's von Mises, or the same density written so that a sharp one does not overflow."""
+    """Declare PyMC's von Mises, or an equal density that does not overflow if it is sharp."""
     kappa = np.maximum(kappa, _LEVEL)
     if kappa.max() <= _SHARP:
         return pm.VonMises(name, mu=mu, kappa=kappa, dims=dims)

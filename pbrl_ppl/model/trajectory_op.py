@@ -23,7 +23,7 @@ _STEP = 1e-5
 
 
 class _DensityOp(Op):
-    """Base of the density and of its derivative.
+    """Base class of the density and its derivative.
 
     Inputs are measured minus linearised next states, linearised minus predicted ones, both of shape
     (transition, 1, body, state), noise parameters (parameter,) and reciprocal degrees of freedom,
@@ -45,7 +45,7 @@ class _DensityOp(Op):
         return self._given
 
     def density(self, deviation: Array, residual: Array, sigma: Array, tail: Array) -> Array:
-        """Log-density of each transition given those before it, shape (transition,)."""
+        """Return the log-density of each transition given those before, shape (transition,)."""
         if not (np.isfinite(sigma).all() and (sigma > 0).all()):
             return np.full(len(residual), -np.inf)
         nu = None
@@ -66,13 +66,13 @@ class TrajectoryDensityOp(_DensityOp):
     """
 
     def make_node(self, deviation: Any, residual: Any, sigma: Any, tail: Any) -> Apply:
-        """Take tensors of the shapes named in the base class."""
+        """Cast the inputs; shapes as in the base class."""
         given = (deviation, residual, sigma, tail)
         inputs = [pt.cast(pt.as_tensor(value), "float64") for value in given]
         return Apply(self, inputs, [pt.vector(dtype="float64")])
 
     def infer_shape(self, *arguments: Any) -> list[tuple[Any, ...]]:
-        """(transition,) from the residuals' shape."""
+        """Return (transition,) from the residuals' shape."""
         return [(arguments[-1][0][0],)]
 
     def perform(self, node: Apply, inputs: Any, outputs: Any) -> None:
@@ -82,7 +82,7 @@ class TrajectoryDensityOp(_DensityOp):
     def pullback(
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
     ) -> list[Any]:
-        """Vector-Jacobian product: by the filter's adjoint, and by differences for the noise."""
+        """Return the vector-Jacobian product: the filter's adjoint, differences for the noise."""
         return list(_DerivativeOp(self.likelihood)(*inputs, cotangents[0], return_list=True))
 
     L_op = pullback  # its name in pytensor 2
@@ -107,7 +107,7 @@ class _DerivativeOp(_DensityOp):
     def derivatives(
         self, deviation: Array, residual: Array, sigma: Array, tail: Array, weights: Array
     ) -> tuple[Array, Array, Array, Array]:
-        """Derivatives by the inputs, in their order."""
+        """Return the derivatives by the inputs, in their order."""
         noise = self.given(deviation).noise
         white = noise.filtered(noise.cells.of_residual(residual)[None], sigma)[0][0]
         pull = white
@@ -149,7 +149,7 @@ class _DerivativeOp(_DensityOp):
 
 @numba_funcify.register(TrajectoryDensityOp)
 def _numba_density(op: TrajectoryDensityOp, node: Any = None, **kwargs: Any) -> Any:
-    """Numba dispatch: a call of the filter in object mode."""
+    """Dispatch the density in numba: a call in object mode."""
     kind = numba.types.Array(numba.float64, 1, "C")
 
     @numba.njit
@@ -163,7 +163,7 @@ def _numba_density(op: TrajectoryDensityOp, node: Any = None, **kwargs: Any) -> 
 
 @numba_funcify.register(_DerivativeOp)
 def _numba_derivative(op: _DerivativeOp, node: Any = None, **kwargs: Any) -> Any:
-    """Numba dispatch: a call of the adjoint in object mode."""
+    """Dispatch the derivative in numba: a call in object mode."""
     wide = numba.types.Array(numba.float64, 4, "C")
     flat = numba.types.Array(numba.float64, 1, "C")
 

@@ -1,4 +1,4 @@
-"""Peaks of the posterior: the climb, the search, their evidence, joints of unknown bodies."""
+"""Modes of the posterior: climb, search, evidence, and joints of unknown bodies."""
 
 from pbrl_ppl.modes.configurations import (
     ATTRIBUTE,

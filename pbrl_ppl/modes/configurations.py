@@ -1,4 +1,4 @@
-"""Configurations of joints of unknown bodies, and the problem that each one leaves."""
+"""Configurations of joints of unknown bodies, and the problem of each."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class Configuration:
         return all(pair is None for _, pair in self.pairs)
 
     def scene(self, scene: Scene) -> Scene:
-        """The scene with these joints' bodies named, and without those that join nothing."""
+        """The scene with named bodies of these joints, without joints of nothing."""
         chosen = dict(self.pairs)
         joints = [
             replace(joint, name=name, bodies=joint.bodies or chosen[name], prior=())
@@ -117,7 +117,7 @@ class Alike:
 
 
 def alike(scene: Scene) -> tuple[Alike, ...]:
-    """Groups of exchangeable joints, of those whose bodies the scene does not name."""
+    """Return groups of exchangeable joints of unknown bodies."""
     groups: dict[tuple[str, Prior, Prior], list[str]] = {}
     for name, joint in zip(scene.joint_names, scene.joints, strict=True):
         if joint.bodies is None:
@@ -164,7 +164,7 @@ def index_law(pair: Pair, scene: Scene, p_a: Array, p_b: Array) -> Array:
 
 
 def number(scene: Scene) -> int:
-    """Number of configurations."""
+    """Return the number of configurations."""
     return math.prod(
         math.comb(len(group.weights) + len(group.names) - 1, len(group.names))
         for group in alike(scene)
@@ -172,7 +172,7 @@ def number(scene: Scene) -> int:
 
 
 def configurations(scene: Scene) -> tuple[Configuration, ...]:
-    """Every choice for the joints whose bodies the scene does not name, no joint at all first.
+    """Yield all configurations of the joints of unknown bodies, no joint at all first.
 
     Joints that are alike are exchangeable: of the ways to share pairs out among them, the one in
     order counts for all.
@@ -205,13 +205,13 @@ def configurations(scene: Scene) -> tuple[Configuration, ...]:
 
 
 def nothing(scene: Scene) -> Configuration:
-    """The configuration in which nothing is joined, whether or not the prior allows it."""
+    """Return the configuration without joints, whether or not the prior allows it."""
     groups = alike(scene)
     return _configuration(groups, [[None] * len(own.names) for own in groups])
 
 
 def one_more(scene: Scene, configuration: Configuration) -> tuple[Configuration, ...]:
-    """The configurations with one more joint than this one has."""
+    """Yield the configurations with one more joint."""
     groups, chosen, found = alike(scene), dict(configuration.pairs), []
     for i, own in enumerate(groups):
         order = [pair for pair, _ in own.weights]
@@ -226,7 +226,7 @@ def one_more(scene: Scene, configuration: Configuration) -> tuple[Configuration,
 
 
 def _configuration(groups: Sequence[Alike], held: Sequence[Sequence[Pair]]) -> Configuration:
-    """What the joints of each group join, in the group's order, and its prior."""
+    """Return a configuration from the pairs of each group, with its prior."""
     chosen: dict[str, Pair] = {}
     weight = 1.0
     for own, pairs in zip(groups, held, strict=True):
@@ -240,7 +240,7 @@ def _configuration(groups: Sequence[Alike], held: Sequence[Sequence[Pair]]) -> C
 
 
 def stored(found: Sequence[Weighed]) -> str:
-    """Configurations as a posterior's attribute, the most probable first."""
+    """Return configurations as a posterior's attribute, most probable first."""
     rows = [
         {
             "joints": dict(weighed.configuration.pairs),
@@ -255,7 +255,7 @@ def stored(found: Sequence[Weighed]) -> str:
 
 
 def joint_probabilities(idata: Any) -> dict[str, dict[str, float]]:
-    """Posterior probabilities of what each joint of unknown bodies joins.
+    """Return the posterior probabilities of the pairs that each joint connects.
 
     Parameters
     ----------
@@ -298,7 +298,7 @@ def joint_probabilities(idata: Any) -> dict[str, dict[str, float]]:
 
 
 def doubts(idata: Any) -> str | None:
-    """Warning of evidences too rough for their probabilities; None where they are not."""
+    """Return a warning if evidences are too uncertain for their probabilities, or None."""
     for row in json.loads(str(idata.attrs.get(ATTRIBUTE, "[]"))):
         probability, error, ess = row["probability"], row["error"], row["ess"]
         if error is None:

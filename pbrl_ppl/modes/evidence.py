@@ -1,4 +1,4 @@
-"""The evidence of a problem: the prior's mean of the likelihood, about one mode."""
+"""Evidence (marginal likelihood) of a problem about one mode."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _CHUNK = 128
 
 @dataclass(frozen=True)
 class Evidence:
-    """Logarithm of the evidence, and how well it is known.
+    """Log-evidence with its standard error.
 
     Parameters
     ----------
@@ -49,8 +49,7 @@ class Evidence:
 class Coordinates:
     """Parameters and noise in coordinates in which their prior is a standard normal.
 
-    What the data do not inform then has a posterior known beforehand, and the evidence is a mean
-    over a normal distribution, without any density's constant.
+    The evidence is then the mean of the likelihood over a standard normal distribution.
 
     Parameters
     ----------
@@ -71,7 +70,7 @@ class Coordinates:
         self.origin = np.concatenate([z, (sigma - self._centre) / self._spread])
 
     def values(self, z: Array) -> tuple[Array, Array]:
-        """Phi, shape (n, p), and sigma, shape (n, state), at z, shape (n, d)."""
+        """Return phi (n, p) and sigma (n, parameter) at z (n, d)."""
         p = len(self._laws)
         columns = [law.value(z[:, i]) for i, law in enumerate(self._laws)]
         phi = np.stack(columns, axis=1) if columns else np.zeros((len(z), 0))
@@ -80,7 +79,7 @@ class Coordinates:
         return phi, np.broadcast_to(sigma, (len(z), states))
 
     def log_density(self, z: Array) -> Array:
-        """Log-posterior with the coordinates' volume, normalised by the prior, shape (n,)."""
+        """Return the log-posterior density of z, normalised by the prior, shape (n,)."""
         phi, sigma = self.values(z)
         problem = self.problem
         parts = [
@@ -91,7 +90,7 @@ class Coordinates:
         return np.asarray(np.concatenate(parts).sum(axis=-1) + _log_normal(z) + even)
 
     def gauss_newton(self, mode: Mode) -> tuple[Array, Array]:
-        """The mode in these coordinates, shape (d,), and the Laplace covariance, shape (d, d)."""
+        """Return the mode (d,) and the Laplace covariance (d, d) in these coordinates."""
         p, step = len(self._laws), 1e-4
         slope = np.array(
             [
@@ -115,7 +114,7 @@ class Coordinates:
 
 
 class _Law:
-    """A prior's distribution, and its standard normal coordinate."""
+    """Map between a prior's values and a standard normal coordinate."""
 
     def __init__(self, prior: Prior, near: float) -> None:
         self._prior = prior
@@ -129,7 +128,7 @@ class _Law:
             self._law = truncnorm(*ends, prior.mu, prior.sigma)
 
     def standard(self, x: float) -> Array:
-        """The coordinate of a value."""
+        """Return the coordinate of a value."""
         prior = self._prior
         if prior.family in ("log_normal", "normal"):
             natural = np.log(x) if prior.family == "log_normal" else x
@@ -140,7 +139,7 @@ class _Law:
         return np.asarray(np.where(below < above, ndtri(below), -ndtri(above)))
 
     def value(self, z: Array) -> Array:
-        """The values at coordinates, same shape."""
+        """Return the values at coordinates, same shape."""
         prior = self._prior
         if prior.family == "log_normal":
             return np.asarray(np.exp(prior.mu + prior.sigma * z))
@@ -153,7 +152,7 @@ class _Law:
 
 
 def laplace(mode: Mode) -> Evidence:
-    """The Laplace approximation of the evidence, with a Gauss-Newton curvature.
+    """Return the Laplace approximation of the evidence, with a Gauss-Newton curvature.
 
     Parameters
     ----------
@@ -167,7 +166,7 @@ def laplace(mode: Mode) -> Evidence:
 
 
 def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
-    """The Laplace approximation of the log-evidence of whole trajectories.
+    """Return the Laplace approximation of the log-evidence of whole trajectories.
 
     States are integrated out by the filter; of the noise parameters the logarithm is normal, as an
     unexplained acceleration may well be nothing.
@@ -194,7 +193,7 @@ def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
 
 
 def importance(mode: Mode, rng: np.random.Generator) -> Evidence:
-    """The evidence by importance sampling from a Student-t that adapts to the posterior.
+    """Return the evidence by adaptive importance sampling from a Student-t.
 
     It begins with the Laplace approximation; each round's proposal is made from the rounds before
     (Cappé et al., 2008), so that each round's estimate is unbiased by itself. It sees what is about
@@ -236,12 +235,12 @@ def importance(mode: Mode, rng: np.random.Generator) -> Evidence:
 
 
 def _log_normal(z: Array) -> Array:
-    """Log-density of a standard normal, shape (n,), at (n, d)."""
+    """Return the log-density of a standard normal, shape (n,), at (n, d)."""
     return np.asarray(-0.5 * (z**2).sum(axis=1) - 0.5 * z.shape[1] * np.log(2 * np.pi))
 
 
 def _log_student(x: Array, factor: Array) -> Array:
-    """Log-density of the proposal about its centre, shape (n,), at (n, d)."""
+    """Return the log-density of the proposal about its centre, shape (n,), at (n, d)."""
     d = x.shape[1]
     square = (solve_triangular(factor, x.T, lower=True) ** 2).sum(axis=0)
     constant = gammaln((_NU + d) / 2) - gammaln(_NU / 2) - 0.5 * d * np.log(_NU * np.pi)

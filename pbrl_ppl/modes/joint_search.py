@@ -50,7 +50,7 @@ _ROWS = 500
 
 
 def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[Weighed, ...]:
-    """Probability of each configuration of the joints whose bodies are unknown.
+    """Return the probability of each configuration of the joints of unknown bodies.
 
     Each gets the mode of the continuous parameters that it leaves; the search for it begins where
     geometry puts the anchors. The evidence is Laplace's, and for those that it cannot rule out an
@@ -109,10 +109,7 @@ def weigh(problem: Problem, *, seed: int = 0, progress: bool = False) -> tuple[W
 def _tried(
     problem: Problem, seed: int, console: Console, progress: bool
 ) -> tuple[dict[Configuration, Mode], dict[Configuration, Evidence]]:
-    """Modes of all configurations, or of those that a search comes to; no joint at all first.
-
-    And their evidence by the Laplace method.
-    """
+    """Return modes and Laplace evidence of the configurations that a search reaches."""
     scene = problem.scene
     apart = nothing(scene)
     modes = {apart: _apart(apart.problem(problem), seed)}
@@ -164,7 +161,7 @@ def _too_many(scene: Scene, count: int) -> str:
 
 
 def _worth(modes: Mapping[Configuration, Mode]) -> float:
-    """Log-posterior below which a mode is hopeless."""
+    """Return the log-posterior below which a mode is given up."""
     return max(mode.log_posterior for mode in modes.values()) - _HOPELESS
 
 
@@ -175,7 +172,7 @@ def _score(configuration: Configuration, evidence: Evidence) -> float:
 def _leading(
     evidence: dict[Configuration, Evidence], within: float, at_least: int = 1
 ) -> list[Configuration]:
-    """Those whose posterior log-weight is near the best, or among the first."""
+    """Return configurations with a log-weight near the best, or among the first."""
     order = sorted(
         evidence, key=lambda configuration: -_score(configuration, evidence[configuration])
     )
@@ -184,12 +181,12 @@ def _leading(
 
 
 def _apart(problem: Problem, seed: int) -> Mode:
-    """The mode of a problem without joints of unknown bodies."""
+    """Return the mode of a problem without joints of unknown bodies."""
     return _best(problem, find_modes(problem.coarse, seed=seed), -np.inf)
 
 
 def _joint(problem: Problem, configuration: Configuration, fewer: Mode, worth: float) -> Mode:
-    """The mode, from where geometry puts the anchors, bodies as the prior or fewer joints have.
+    """Return the mode from anchors by geometry, and bodies of the prior or of fewer joints.
 
     The hills are told apart with few engine steps; the best is climbed with the exact engine.
     """
@@ -217,7 +214,7 @@ def _best(problem: Problem, rough: list[Mode], worth: float) -> Mode:
 
 
 def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed: int) -> Mode:
-    """Look for a better mode with the anchors where they are, and the bodies anywhere."""
+    """Return a better mode with the same anchors and any bodies' parameters."""
     problem = mode.problem
     priors = problem.layout.priors
     rng = np.random.default_rng(seed)
@@ -231,14 +228,14 @@ def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed
 
 
 def _carried(base: Mode, problem: Problem, default: Array) -> Array:
-    """Parameters of a problem at a base mode's values, the default where the base has none."""
+    """Return a problem's parameters at a base mode's values, or defaults."""
     values = dict(zip(base.problem.layout.labels, base.phi, strict=True))
     labels = problem.layout.labels
     return np.array([values.get(label, x) for label, x in zip(labels, default, strict=True)])
 
 
 def _joined(problem: Problem, configuration: Configuration) -> Iterator[tuple[str, Joint]]:
-    """Name and joint of what the configuration joins, as its scene has it."""
+    """Yield the names and joints of a configuration, as in its scene."""
     chosen = {name for name, pair in configuration.pairs if pair is not None}
     scene = problem.scene
     for name, joint in zip(scene.joint_names, scene.joints, strict=True):
@@ -247,7 +244,7 @@ def _joined(problem: Problem, configuration: Configuration) -> Iterator[tuple[st
 
 
 def _anchor_places(problem: Problem, configuration: Configuration) -> list[int]:
-    """Where phi holds the anchors of the configuration's joints, four a joint."""
+    """Return the places in phi of the configuration's anchors, four a joint."""
     return [
         problem.layout.index(anchor, name)
         for name, _ in _joined(problem, configuration)
@@ -259,7 +256,7 @@ def _anchor_places(problem: Problem, configuration: Configuration) -> list[int]:
 
 
 def _placed(problem: Problem, configuration: Configuration) -> list[Array]:
-    """Likely anchors of all joints of a configuration, four a joint, best first."""
+    """Return likely anchors of a configuration's joints, four a joint, best first."""
     alternatives = [
         _anchors(problem, name, joint) for name, joint in _joined(problem, configuration)
     ]
@@ -268,7 +265,7 @@ def _placed(problem: Problem, configuration: Configuration) -> list[Array]:
 
 
 def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
-    """Anchors that keep their distance over the recording: none for a hinge.
+    """Return anchors that keep their distance over the recording: zero for a hinge.
 
     A hinge's are linear least squares; a rod's are not, and are sought from several starts.
     """
@@ -296,7 +293,7 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
 
 
 def _states(problem: Problem, body: str) -> Array:
-    """A body's recorded start states, shape (row, 6); the world's are zero."""
+    """Return a body's recorded start states, shape (row, 6); zero for the world."""
     start = problem.data.history.dataset["start"].to_numpy()
     rows = start[np.isfinite(start).all(axis=(-1, -2))]
     rows = rows[:: -(-len(rows) // _ROWS)]
@@ -307,11 +304,11 @@ def _states(problem: Problem, body: str) -> Array:
 
 
 def _reference(problem: Problem, body: str) -> Array:
-    """A body at rest in its reference pose, shape (1, 6)."""
+    """Return a body at rest in its reference pose, shape (1, 6)."""
     pose = None if body == WORLD else problem.scene.body(body).pose
     return np.array([[*(pose or (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0]])
 
 
 def _at(states: Array, anchor: Array) -> Array:
-    """An anchor of a body's frame in the world, shape (row, 2)."""
+    """Return an anchor's position in the world, shape (row, 2)."""
     return np.asarray(states[:, :2] + lever(states, (anchor[0], anchor[1]))[0])

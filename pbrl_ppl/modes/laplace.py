@@ -17,9 +17,9 @@ from pbrl_ppl.parameters import box, differentiate, inside, likeliest, prior_res
 from pbrl_ppl.physics import PartedSimulator
 
 Array = NDArray[np.float64]
-#: Gain in log-posterior that is not worth another round.
+#: Gain in log-posterior below which a climb ends.
 STALLED = 0.02
-#: Precision of an angle of which nothing is known, as if it were normal: 1 / variance (1/rad^2).
+#: Precision of a uniform angle: 1 / variance (1/rad^2).
 _CIRCLE = 3.0 / np.pi**2
 
 
@@ -48,9 +48,9 @@ class Mode:
     covariance : ndarray
         Laplace covariance of phi, shape (p, p).
     log_posterior : float
-        As of :func:`pbrl_ppl.likelihood.log_posterior`.
+        Value of :func:`pbrl_ppl.likelihood.log_posterior`.
     others : tuple of Mode
-        Lower ones, that may yet hold a share of the posterior.
+        Lower modes that may hold a share of the posterior.
     """
 
     problem: Problem
@@ -73,7 +73,7 @@ class Mode:
         return np.asarray(np.linalg.cholesky(self.covariance + jitter), dtype=float)
 
     def noise_gaussian(self) -> tuple[Array, Array]:
-        """Laplace approximation of the logarithm of sigma: mean and covariance.
+        """Return the Laplace approximation of log sigma: mean and covariance.
 
         Shapes (parameter,) and (parameter, parameter).
         """
@@ -85,7 +85,7 @@ class Mode:
         return np.log(self.sigma), np.diag(0.5 / np.maximum(counts, 1))
 
     def draws(self, rng: np.random.Generator, n: int) -> Array:
-        """Draws of phi from the Laplace approximation, cut at the supports, shape (n, p)."""
+        """Draw phi from the Laplace approximation, clipped to the supports, shape (n, p)."""
         moved = self.phi + rng.standard_normal((n, len(self.phi))) @ self.factor.T
         return inside(self.problem.layout.priors, moved)
 
@@ -100,7 +100,7 @@ class Mode:
 def posterior_steps(
     function: Callable[[Array], Array], phi: Array, lower: Array, upper: Array, begin: Array
 ) -> tuple[Array, Array]:
-    """Derivative with steps of about one posterior standard deviation, and those steps.
+    """Return the derivative with steps of one posterior standard deviation, and the steps.
 
     Friction makes kinks; a derivative over the posterior's own scale sees their average, one over a
     tiny step sees whichever side it is on.
@@ -116,7 +116,7 @@ def posterior_steps(
 def climb(
     problem: Problem, phi: Array, slope: PartedSimulator, rounds: int = 40, tries: int = 4
 ) -> Peak:
-    """Alternate between phi by least squares and the most probable sigma there.
+    """Return a mode by alternating least squares for phi with the most probable sigma.
 
     Derivatives are taken through the engine ``slope``.
     """
@@ -163,7 +163,7 @@ def climb(
 
 
 def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
-    """The most probable sigma at phi, and the log-posterior there."""
+    """Return the most probable sigma at phi, and the log-posterior there."""
     residual = problem.residual(phi)
     sigma = profile_sigma(problem, residual, phi)
     likelihood = problem.log_density(residual, sigma, phi).sum()

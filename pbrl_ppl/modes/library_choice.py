@@ -27,7 +27,7 @@ _NUMBERS = 4_000_000
 
 
 class _Combinations:
-    """Every combination of parameter sets of one part's bodies: its prior and its residuals."""
+    """All combinations of parameter sets of one part's bodies, with priors and residuals."""
 
     def __init__(self, problem: Problem, part: Part, table: Array) -> None:
         bodies = list(part.physics.scene.owners)
@@ -60,7 +60,7 @@ class _Combinations:
         self.residual = self.observations.residual(states)
 
     def log_joint(self, sigma: Array, nu: float | Array | None) -> Array:
-        """Log-density of data and combination given sigma (draw, state): (draw, combination)."""
+        """Return the log-density of data and combination given sigma, shape (draw, combination)."""
         seen = self.observations.measured
         result = np.empty((len(sigma), len(self.indices)))
         size = max(1, _NUMBERS // max(self.residual.size, 1))
@@ -165,7 +165,7 @@ def choose_from_library(
 
 
 def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> Array:
-    """Fixed-point estimate of sigma under each part's best combination, from a first guess."""
+    """Return a fixed-point estimate of sigma under each part's best combination."""
     observations = problem.observations
     residual = np.zeros_like(observations.values)
     for turn in range(3):

@@ -23,13 +23,13 @@ from pbrl_ppl.parameters import box
 
 Array = NDArray[np.float64]
 
-#: A residual beyond this many noise units says no more about where the mode is.
+#: Residuals are clipped at this many noise units.
 FAR_OFF = 1e3
-#: Sigma of a recording without noise still needs a scale.
+#: Least sigma, for recordings without noise.
 _LEAST = 1e-9
-#: How far the logarithm of a noise parameter may be from where trajectories were linearised.
+#: Bound of the change of a log noise parameter from the linearisation point.
 _FAR = 6.0
-#: What counts as no unexplained acceleration, as a share of its prior's median.
+#: Unexplained acceleration that counts as zero, as a share of its prior's median.
 NOTHING = 1e-3
 #: Step of second differences in the logarithm of a noise parameter.
 _SECOND = 0.05
@@ -41,12 +41,12 @@ def profile_sigma(
     phi: Array | None = None,
     held: Mapping[int, float] | None = None,
 ) -> Array:
-    """Sigma of highest posterior density at given residuals, shape (state,).
+    """Return sigma of highest posterior density at given residuals, shape (parameter,).
 
     Parameters
     ----------
     problem : Problem
-        Says which cells were measured, how residuals are correlated, and P(sigma).
+        Has the measurements, the likelihood and the prior of sigma.
     residual : ndarray
         Shape (transition, H, body, state).
     phi : ndarray, optional
@@ -76,7 +76,7 @@ def _of_trajectories(
     phi: Array | None,
     held: Mapping[int, float],
 ) -> Array:
-    """Noise parameters of highest posterior density along trajectories."""
+    """Return the noise parameters of highest posterior density along trajectories."""
     residual = np.nan_to_num(residual, nan=FAR_OFF)
     gaussian = problem.nu(phi) is None
     begin = np.log(noise.sigma)
@@ -98,7 +98,7 @@ def _of_trajectories(
 
 
 def _cost(problem: Problem, residual: Array, phi: Array | None, log_sigma: Array) -> float:
-    """Minus the log-density of data and the logarithm of noise parameters."""
+    """Return the negative log-density of data and log noise parameters."""
     sigma = np.exp(log_sigma) * np.ones(len(problem.noise_prior[0]))
     likelihood = problem.log_density(residual, sigma, phi).sum()
     return float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
@@ -107,14 +107,14 @@ def _cost(problem: Problem, residual: Array, phi: Array | None, log_sigma: Array
 def _cost_and_slope(
     problem: Problem, noise: TrajectoryNoise, residual: Array, log_sigma: Array
 ) -> tuple[float, Array]:
-    """Minus the log-density of Gaussian noise parameters, and its derivative by their logarithm."""
+    """Return the negative log-density for Gaussian noise, and its derivative by log sigma."""
     likelihood, slope = noise.score(residual, np.exp(log_sigma))
     cost = float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
     return cost, 1.0 - noise_prior_slope(problem, log_sigma) - slope
 
 
 def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
-    """Maximum a posteriori log sigma of independent Gaussian residuals, in closed form.
+    """Return the most probable log sigma of independent Gaussian residuals, in closed form.
 
     The density ``-(n + 1) t - S exp(-2 t) / 2 - (t - m)^2 / 2 s^2`` of t = log sigma has its only
     maximum where ``y exp(2 y) = s^2 S exp(2 (a - m))``, with ``a = s^2 (n + 1)`` and
@@ -123,7 +123,7 @@ def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
     Parameters
     ----------
     problem : Problem
-        Says how many cells were measured, and P(sigma).
+        Has the number of measurements and the prior of sigma.
     square : ndarray
         Sum of squared residuals of each state dimension, shape (..., state).
 
@@ -142,7 +142,7 @@ def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
 
 
 def gaussian_profile(problem: Problem, square: Array) -> Array:
-    """Profile log-density of data and sigma at that maximum, up to a constant, shape (...)."""
+    """Return the log-density of data and sigma at that maximum, up to a constant."""
     t = gaussian_log_sigma(problem, square)
     count = problem.observations.measured.sum((0, 1, 2))
     likelihood = -(count * t + 0.5 * square * np.exp(-2 * t)).sum(axis=-1)
@@ -152,10 +152,10 @@ def gaussian_profile(problem: Problem, square: Array) -> Array:
 def noise_gaussian(
     problem: Problem, residual: Array, sigma: Array, phi: Array
 ) -> tuple[Array, Array]:
-    """Laplace approximation of the logarithm of the noise parameters, by second differences.
+    """Return the Laplace approximation of log noise parameters by second differences.
 
-    Its mean is the mode of the density of the logarithm: that of the parameters themselves has
-    unexplained accelerations of nothing, about which no logarithm is normal.
+    It is taken at the mode of the density of the logarithm: at that of the parameters themselves,
+    unexplained accelerations may vanish, and their logarithm is not normal.
 
     Parameters
     ----------
@@ -205,7 +205,7 @@ _STEP, _LEAST = 0.02, 1.0
 
 
 def _tail_cost(problem: Problem, phi: Array, sigma: Array) -> Callable[[Array], float]:
-    """Negative log-posterior as a function of the noise's tails alone."""
+    """Return the negative log-posterior as a function of the tails alone."""
     residual, tails = np.nan_to_num(problem.residual(phi), nan=FAR_OFF), list(problem.tails)
 
     def cost(values: Array) -> float:
@@ -218,7 +218,7 @@ def _tail_cost(problem: Problem, phi: Array, sigma: Array) -> Callable[[Array], 
 
 
 def best_tails(problem: Problem, phi: Array, sigma: Array) -> Array:
-    """Phi with the maximum a posteriori tails, all else fixed."""
+    """Return phi with the most probable tails, all else fixed."""
     if not problem.tails:
         return phi
     tails = list(problem.tails)
@@ -231,7 +231,7 @@ def best_tails(problem: Problem, phi: Array, sigma: Array) -> Array:
 
 
 def tail_precision(problem: Problem, phi: Array, sigma: Array) -> Array:
-    """Curvature of the negative log-posterior in each of the noise's tails."""
+    """Return the curvature of the negative log-posterior in each tail parameter."""
     tails = list(problem.tails)
     lower, upper = (end[tails] for end in box(problem.layout.priors))
     cost = _tail_cost(problem, phi, sigma)

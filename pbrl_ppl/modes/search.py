@@ -1,4 +1,4 @@
-"""Search for the posterior's modes from many starts: the best, and those near it in height."""
+"""Search for modes of the posterior from many starts."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def find_modes(
     initial: Array | None = None,
     rounds: int | None = None,
 ) -> list[Mode]:
-    """Search for modes from several starts, best first.
+    """Return modes found from several starts, best first.
 
     Parameters
     ----------
@@ -117,10 +117,10 @@ def find_modes(
 
 
 def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
-    """The best that differential evolution finds, best first, shape (evolved, p).
+    """Return the best points of differential evolution, best first, shape (evolved, p).
 
-    Where few transitions slide, the top may be so narrow that no draw from the prior leads there.
-    It shows with the exact engine alone: one with fewer steps has its kinks elsewhere.
+    Where few transitions slide, the mode may be too narrow for draws from the prior to find. The
+    exact engine is needed: with fewer steps, friction's kinks are elsewhere.
     """
     priors = problem.layout.priors
     draws = prior_draws(priors, rng, _POPULATION)
@@ -145,10 +145,10 @@ def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
 
 
 def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
-    """Drop modes that predict the same as an earlier one and are on the same hill.
+    """Drop peaks that predict the same as an earlier one and are connected to it.
 
-    A wheel's other description is, and so is what differs where the data are silent. A mirror image
-    is not: it predicts the same, but what is linear in between would not.
+    Equivalent wheels and uninformed directions are connected; mirror images are not: they predict
+    the same, but points between them do not.
     """
     folded = likeliest(problem.layout, np.array([peak.phi for peak in found]))
     z = problem.whitened(folded, found[0].sigma)
@@ -162,7 +162,7 @@ def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
 
 
 def _part(problem: Problem, transitions: int) -> Problem:
-    """The coarse problem on evenly chosen trajectories of about so many transitions."""
+    """Return the coarse problem on evenly chosen trajectories of about this many transitions."""
     history = problem.data.history
     share = transitions / max(problem.segments.n, 1)
     count = max(2, math.ceil(share * history.n_trajectories))
@@ -181,14 +181,14 @@ def find_mode(
     initial: Array | None = None,
     rounds: int | None = None,
 ) -> Mode:
-    """Best mode, and those others that are not far below it; see :func:`find_modes`."""
+    """Return the best mode with others that are not far below it; see :func:`find_modes`."""
     best, *others = find_modes(problem, seed=seed, initial=initial, rounds=rounds)
     near = (mode for mode in others if mode.log_posterior > best.log_posterior - _LOWER)
     return replace(best, others=tuple(near))
 
 
 def _polish(problem: Problem, found: Peak) -> Peak:
-    """Refine a peak with the exact engine's derivative, while that raises the log-posterior."""
+    """Return a peak refined with the exact engine, if that raises the log-posterior."""
     if not problem.layout.size:
         return found
     found = described(problem, found)

@@ -1,4 +1,4 @@
-"""Linear algebra in one thread."""
+"""Limit of BLAS to one thread."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ R = TypeVar("R")
 
 
 def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
-    """Decorate a function of many small matrices, for which BLAS would start threads in vain.
+    """Decorate a function of many small matrices to run BLAS in one thread.
 
-    They wait for each other in a loop: beside other work on the same processors, such as a second
-    fit, most of the time goes there.
+    Threads would spin while they wait for each other, which costs most of the time beside other
+    work on the same processors.
     """
 
     @wraps(function)
@@ -29,5 +29,5 @@ def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
 
 @cache
 def _pools() -> Any:
-    """The libraries' thread pools, which it takes 2 ms to find."""
+    """Return the controller of the thread pools; finding them takes 2 ms."""
     return ThreadpoolController()

@@ -34,9 +34,9 @@ _STARTS, _WIDER = 5, 2.0
 
 @one_blas_thread
 def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
-    """The highest mode of whole trajectories that is found from several starts about one of Eq. 11.
+    """Return the best mode of whole trajectories, from several starts about one of Eq. 11.
 
-    Which side of a kink the states are smoothed on decides where a climb ends.
+    A climb's end depends on the side of a kink that the states are smoothed on.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
     Returns
     -------
     Mode
-        As of :func:`following`.
+        Result of :func:`following`.
     """
     near = find_mode(single_transitions(problem), seed=seed)
     off = near.draws(np.random.default_rng(seed), _STARTS - 1) - near.phi
@@ -58,9 +58,9 @@ def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
 
 
 def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) -> Mode:
-    """Mode with the transitions of a trajectory whitened together, linearised at smoothed states.
+    """Return the mode of whole trajectories, linearised at smoothed states.
 
-    The higher of two that begin with the given noise and with next to no unexplained acceleration.
+    The better of two, which start with the given noise and with near-zero process noise.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) ->
 
 
 def nearby_mode(problem: Problem, phi: Array, sigma: Array) -> Mode:
-    """Mode from states smoothed with these noise parameters, by climbs and smoothing in turn.
+    """Return the mode by alternating climbs with smoothing.
 
     Parameters
     ----------
@@ -111,12 +111,12 @@ def nearby_mode(problem: Problem, phi: Array, sigma: Array) -> Mode:
 
 
 def following(mode: Mode) -> Mode:
-    """A mode of whole trajectories whose smoothed states follow the parameters.
+    """Return a mode of whole trajectories whose smoothed states follow the parameters.
 
     Parameters
     ----------
     mode : Mode
-        As of :func:`trajectory_mode`.
+        Result of :func:`trajectory_mode`.
 
     Returns
     -------
@@ -140,7 +140,7 @@ def following(mode: Mode) -> Mode:
 
 
 def _change(mode: Mode, phi: Array) -> float:
-    """How far a mode is from where its search began, in standard deviations."""
+    """Return the distance of a mode from the start of its search, in standard deviations."""
     spread = np.sqrt(np.maximum(np.diag(mode.covariance), 1e-300))
     moved = change_from(mode.problem.layout, mode.phi, phi)
     return float((np.abs(moved) / spread).max(initial=0.0))
