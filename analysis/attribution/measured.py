@@ -20,9 +20,9 @@ from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
 from pbrl_ppl.criticism.recordings import checked_histories
-from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import trajectory_mode
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import draws
 from pbrl_ppl.report import plot_rollout, png
 from pbrl_ppl.report.words import verdict_in_words
@@ -292,7 +292,8 @@ def errors_ahead(
     fitted = []
     for posterior, effects in models:
         problem = Problem.of(
-            scene, train, attach(scene, effects), substeps=found.numerical.substeps_used, threads=2
+            Physics.declare(scene, effects, substeps=found.numerical.substeps_used, threads=2),
+            train,
         )
         vectors = problem.layout.to_vectors(draws(posterior), len(draws(posterior)["sigma"]))
         mode = trajectory_mode(problem, vectors.mean(axis=0))

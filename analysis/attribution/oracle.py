@@ -15,10 +15,11 @@ from attribution.sizes import STRONGEST
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.refinement import with_enough_substeps
-from pbrl_ppl.effects import Attached, attach
+from pbrl_ppl.effects import Attached
 from pbrl_ppl.likelihood import Problem, bodies_acceleration
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.parameters import inside
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
 
 #: Chance alone gives what the oracle calls detected less often than this.
@@ -95,7 +96,7 @@ def true_parameters(case: Case) -> dict[str, float]:
 def declared_mode(case: Case, train: pp.History, seed: int) -> Mode:
     """Fit the declared model to single transitions."""
     scene = case.body.scene
-    return find_mode(Problem.of(scene, train, attach(scene)), seed=seed)
+    return find_mode(Problem.of(Physics.declare(scene), train), seed=seed)
 
 
 def sized(case: Case, seed: int) -> Case:

@@ -258,7 +258,7 @@ def jacobian_rows() -> list[Row]:
     """Return rows of the demo's Jacobian: as for a mode's covariance, and as in the search."""
     scene = Scene.load(RECORDED / "scene.toml").with_effects("cart", *EFFECTS)
     history = History.load(RECORDED / "recorded" / "train.csv", scene)
-    problem = Problem.of(scene, history, attach(scene))
+    problem = Problem.of(Physics.declare(scene), history)
     layout, sigma = problem.layout, problem.noise_prior[0]
     phi = layout.to_vector(CART | SIZES)
     lower, upper = box(layout.priors)

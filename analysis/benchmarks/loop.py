@@ -22,9 +22,10 @@ from pathlib import Path
 
 import pbrl_ppl as pp
 from pbrl_ppl.criticism import closing, score
-from pbrl_ppl.effects import attach, candidates
+from pbrl_ppl.effects import candidates
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.report import loop_page
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -72,7 +73,7 @@ def measure_loop() -> Iterator[Row]:
     train, test = (
         pp.History.load(CART / "recorded" / f"{name}.csv", scene) for name in ("train", "test")
     )
-    problem = Problem.of(scene, train, attach(scene), threads=2)
+    problem = Problem.of(Physics.declare(scene, threads=2), train)
     mode = trajectory_mode(problem, find_mode(problem, seed=1).phi)
     lacking = candidates(scene, problem.physics.effects)
     score.rank_candidates(mode, lacking)  # laws are compiled by now, as they are in the loop

@@ -17,7 +17,7 @@ from pbrl_ppl.likelihood import Problem, TransitionLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import choose_from_library
 from pbrl_ppl.parameters import Layout, ParameterLibrary
-from pbrl_ppl.physics import build_layout, touching
+from pbrl_ppl.physics import Physics, build_layout, touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit
@@ -160,7 +160,7 @@ class LibraryAgent(PhysicsAgent):
         history = from_segments(scene, state, action[:, None], after[:, None])
         among = _restricted(self.library, scene, name)
         noise = TransitionLikelihood(scalar=True)
-        problem = Problem.of(scene, history, likelihood=noise, library=among)
+        problem = Problem.of(Physics(scene), history, likelihood=noise, library=among)
         if self.method == "paper":
             with warnings.catch_warnings():  # one chain, as in the paper
                 warnings.simplefilter("ignore", ConvergenceWarning)

@@ -10,6 +10,7 @@ from rich.table import Table
 
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.terminal import interruptible, print_json, print_table, stages
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
 
 if TYPE_CHECKING:
@@ -59,12 +60,11 @@ def check(
         if prior:
             progress("comparing with draws from the prior")
             from pbrl_ppl.criticism import prior_predictive_check, telling_horizon
-            from pbrl_ppl.effects import attach
             from pbrl_ppl.likelihood import Problem
             from pbrl_ppl.model import build_model
 
             horizon = telling_horizon(loaded)
-            model = build_model(Problem.of(declared, loaded, attach(declared, ()), horizon=horizon))
+            model = build_model(Problem.of(Physics.declare(declared), loaded, horizon=horizon))
             checked = prior_predictive_check(model, draws=draws, seed=seed)
             for sentence in checked.summary:
                 console.print(f"prior: {sentence}", soft_wrap=True)

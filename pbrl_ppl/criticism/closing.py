@@ -44,7 +44,7 @@ from pbrl_ppl.history import History, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.physics import try_effect
+from pbrl_ppl.physics import Physics, try_effect
 from pbrl_ppl.posterior import compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.sampling import fit
@@ -284,7 +284,7 @@ def _prior_test(
 ) -> ResidualTest:
     """Test whether the prior, with some parameters held, could have made the data."""
     horizon = telling_horizon(train, task.criteria.prior)
-    problem = Problem.of(task.scene, train, effects, horizon=horizon, threads=2)
+    problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
     checked = prior_predictive_check(
         build_model(problem), draws=PRIOR_DRAWS, seed=task.seed, held=held,
         criteria=task.criteria.prior,

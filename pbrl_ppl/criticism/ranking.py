@@ -19,6 +19,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, single_transitions
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene
 
 
@@ -121,7 +122,8 @@ def declared_mode(
     criteria: Criteria = DEFAULT,
 ) -> Mode:
     """Return the declared model's mode on whole trajectories, with enough substeps."""
-    problem = Problem.of(scene, history, effects, substeps=substeps, threads=2)
+    steps = scene.substeps if substeps is None else substeps
+    problem = Problem.of(Physics(scene, effects, steps, threads=2), history)
     if substeps is None:
         physics = problem.physics
         problem = problem.with_physics(substeps=max(physics.substeps, physics.fine_enough))

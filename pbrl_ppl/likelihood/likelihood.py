@@ -146,6 +146,23 @@ class TransitionLikelihood(Likelihood):
 
     scalar: bool = False
 
+    @classmethod
+    def declare(cls, sigma: str = "per_dimension", nu: float | None = None) -> TransitionLikelihood:
+        """Return the likelihood of options as users give them.
+
+        Raises
+        ------
+        ValueError
+            If sigma is neither ``per_dimension`` nor ``scalar``, or nu is not above 0.
+        """
+        if sigma not in ("per_dimension", "scalar"):
+            raise ValueError(f"sigma is {sigma!r}, expected 'per_dimension' or 'scalar'")
+        if nu is not None and not 0 < nu < np.inf:
+            raise ValueError(
+                f"nu is {nu}, expected degrees of freedom above 0, or None for a Gaussian"
+            )
+        return cls(scalar=sigma == "scalar", nu=nu)
+
     def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
         """Return ``sigma`` with the measured dimensions."""
         return {"sigma": observations.names}

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.likelihood.data import Data, Observations, sigma_prior
@@ -60,31 +59,20 @@ class Problem:
     @classmethod
     def of(
         cls,
-        scene: Scene,
+        physics: Physics,
         history: History,
-        effects: tuple[Attached, ...] = (),
         *,
         horizon: int = 1,
-        substeps: int | None = None,
-        threads: int = 1,
         columns: tuple[int, ...] | None = None,
         likelihood: Likelihood | None = None,
         library: ParameterLibrary | None = None,
-        together: tuple[str, ...] = (),
     ) -> Problem:
-        """Return the problem of a scene and a history; the defaults are the paper's.
+        """Return the problem of a history, with the parts that it shows; Eq. 11 by default.
 
-        Arguments are those of :class:`Data`, :class:`Physics` and of the problem itself;
-        ``substeps`` are the scene's by default.
+        ``horizon`` and ``columns`` are fields of :class:`Data`.
         """
-        steps = scene.substeps if substeps is None else substeps
-        physics = Physics(scene, effects, steps, threads, together=together)
-        return cls(
-            Data(scene, history, horizon, columns),
-            physics.in_parts(history),
-            likelihood or TransitionLikelihood(),
-            library,
-        )
+        data = Data(physics.scene, history, horizon, columns)
+        return cls(data, physics.in_parts(history), likelihood or TransitionLikelihood(), library)
 
     def with_data(self, **changes: Any) -> Problem:
         """Return the same problem of other data; arguments are fields of :class:`Data`."""

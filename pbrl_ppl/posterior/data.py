@@ -24,6 +24,7 @@ from pbrl_ppl.likelihood import (
     linearised,
     with_sensitivity,
 )
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, vectors
 from pbrl_ppl.posterior.store import from_groups, group, groups, likeliest_draw
 from pbrl_ppl.scene import Scene
@@ -122,17 +123,19 @@ def problem_of(
         # after a trajectory's end there is none: of the first interval alone
         history = history.numbered(float(actions[:, 0, :, INPUT.index("trajectory")].max()) + 1.0)
     problem = Problem.of(
-        record.scene,
+        Physics(
+            record.scene,
+            record.attached(effects),
+            substeps=record.substeps,
+            together=record.together,
+        ),
         history,
-        record.attached(effects),
         horizon=record.horizon,
-        substeps=record.substeps,
         columns=columns,
         likelihood=TransitionLikelihood(
             scalar=record.scalar_sigma, nu=record.nu, prior=record.sigma_prior
         ),
         library=record.library,
-        together=record.together,
     )
     stored = with_recording(problem, given, record.data_sha256)
     if not other or isinstance(stored.likelihood, TransitionLikelihood):

@@ -24,7 +24,13 @@ from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, declared_problem
+from pbrl_ppl.likelihood import (
+    Problem,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
+    declared_problem,
+)
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import versions
 from pbrl_ppl.sampling.ranks import Calibration
 from pbrl_ppl.sampling.replication import Record, draw_truths, labels, replicate
@@ -121,9 +127,12 @@ def calibrate(
     if replications < 2:
         raise ValueError(f"replications is {replications}, expected at least 2, better 200")
     design = declared_problem(
-        scene, history, effects, horizon=horizon, sigma=sigma, nu=nu, substeps=substeps,
+        Physics.declare(scene, effects, substeps=substeps),
+        history,
+        horizon=horizon,
+        likelihood=TransitionLikelihood.declare(sigma, nu),
         trajectories=trajectories,
-    )  # fmt: skip
+    )
     if design.layout.discrete.any():
         raise FitError(
             "calibrate: which bodies a joint joins is unknown, and ranks are for parameters that"

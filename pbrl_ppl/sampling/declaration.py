@@ -9,10 +9,11 @@ import pymc as pm
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import TrajectoryLikelihood, declared_problem
+from pbrl_ppl.likelihood import TrajectoryLikelihood, TransitionLikelihood, declared_problem
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_trajectory_mode, following, trajectory_mode
 from pbrl_ppl.parameters import ParameterLibrary
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import linearised_as
 from pbrl_ppl.scene import Scene
 
@@ -108,9 +109,13 @@ def physics_model(
     if around is not None and not trajectories:
         raise ValueError("around is given without trajectories, expected with trajectories=True")
     problem = declared_problem(
-        scene, history, effects, horizon=horizon, sigma=sigma, nu=nu, substeps=substeps,
-        threads=threads, library=library, trajectories=trajectories,
-    )  # fmt: skip
+        Physics.declare(scene, effects, substeps=substeps, threads=threads),
+        history,
+        horizon=horizon,
+        likelihood=TransitionLikelihood.declare(sigma, nu),
+        library=library,
+        trajectories=trajectories,
+    )
     mode = None
     if around is not None and not isinstance(around, Mode):
         problem = linearised_as(problem, around)

@@ -11,6 +11,7 @@ from pbrl_ppl.effects import attach, candidates, catalogue
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, single_transitions
 from pbrl_ppl.modes import find_mode
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE
 from tests.helpers.free_puck import BOX, DISC, Disc, box2d, fitted
@@ -162,7 +163,7 @@ def test_a_fifth_of_what_single_transitions_show_is_seen_along_trajectories() ->
         return found["linear_drag"]
 
     history = History.from_dataframe(Disc(8, 15, scene).frame(rng), scene)
-    problem = single_transitions(Problem.of(scene, history, attach(scene)))
+    problem = single_transitions(Problem.of(Physics.declare(scene), history))
     limit = score(find_mode(problem, seed=1)).detectable["coefficient"]
     pucks = (Disc(8, 15, scene, drag=limit / 5, seed=seed) for seed in range(20))
     found = [score(puck.mode(rng)).p_value < 0.01 for puck in pucks]

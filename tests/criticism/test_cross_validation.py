@@ -9,11 +9,11 @@ from scipy.special import logsumexp
 
 from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.cross_validation import Change, folds, leave_out
-from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories, log_prior
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.modes.laplace import finish
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene
 from tests.helpers.free_puck import DISC, Disc
 
@@ -28,7 +28,7 @@ FRAME = DATA.frame(np.random.default_rng(4))
 @cache
 def mode(scene: Scene, trajectories: int = 8) -> Mode:
     history = History.from_dataframe(FRAME[FRAME["trajectory"] < trajectories], scene)
-    problem = Problem.of(scene, history, attach(scene))
+    problem = Problem.of(Physics.declare(scene), history)
     return trajectory_mode(problem, find_mode(problem, seed=1).phi)
 
 
@@ -62,7 +62,7 @@ def by_refits(mode: Mode, scene: Scene, fold: np.ndarray) -> np.ndarray:
     result = []
     for f in range(fold.max() + 1):
         rest = history.select([t for t in range(fold.max() + 1) if t != f])
-        fitted = trajectory_mode(Problem.of(scene, rest, attach(scene)), mode.phi)
+        fitted = trajectory_mode(Problem.of(Physics.declare(scene), rest), mode.phi)
         held = fitted.problem.with_data(history=history.select([f]), states=None)
         held = along_trajectories(held, fitted.phi, fitted.sigma, cells)
         drawn = [
@@ -129,7 +129,7 @@ def test_a_parameter_at_its_bound_is_held_there() -> None:
     still = Disc(trajectories=8, intervals=6, drag=-0.1).frame(np.random.default_rng(6))
     modes = []
     for scene in (DISC, DRAGGED):
-        problem = Problem.of(scene, History.from_dataframe(still, scene), attach(scene))
+        problem = Problem.of(Physics.declare(scene), History.from_dataframe(still, scene))
         modes.append(trajectory_mode(problem, find_mode(problem, seed=1).phi))
     fold = folds(modes[0])
     gain = leave_out(modes[1], fold).density - leave_out(modes[0], fold).density

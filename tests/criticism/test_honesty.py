@@ -22,6 +22,7 @@ from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem, bodies_acceleration, smoothed
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.physics import Physics
 from tests.helpers.free_puck import BOX, DISC, MASS, Disc, box2d, fitted
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import MODELS, load
@@ -89,7 +90,7 @@ def test_substeps_are_refined_until_the_acceleration_test_is_still() -> None:
     scene, train, _ = load(MODELS / "shopping_cart", MODELS / "shopping_cart" / "recorded")
     few = train.select(range(6))
     effects = attach(scene, [e.on("cart") for e in pp.catalogue if e.name == "angular_drag"])
-    problem = Problem.of(scene, few, effects, threads=2)
+    problem = Problem.of(Physics(scene, effects, threads=2), few)
     mode = trajectory_mode(problem, find_mode(problem, seed=1).phi)
     found = with_enough_substeps(mode, quiet)
     assert not unexplained_acceleration(found).matters.any()
@@ -150,7 +151,7 @@ def test_a_fall_in_a_vacuum_is_adequate() -> None:
 def test_a_fit_leaves_the_hill_of_large_accelerations() -> None:
     """Drag is in the model, and the fit begins with a random force of 14 m/s^2."""
     drag = next(effect for effect in pp.catalogue if effect.name == "linear_drag")
-    problem = Problem.of(AIR, falls(1, 0.0209), attach(AIR, [drag.on("ball")]))
+    problem = Problem.of(Physics.declare(AIR, [drag.on("ball")]), falls(1, 0.0209))
     mode = trajectory_mode(problem, find_mode(problem, seed=1).phi)
     loud = mode.sigma.copy()
     loud[2:] = 14.0

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories, with_measurements
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import COLUMNS, NOISE
 
@@ -54,7 +54,7 @@ def fitted(scene: Scene, history: History | pd.DataFrame, effects: Any = ()) -> 
     """Mode of a model along trajectories, as the loop begins with."""
     if not isinstance(history, History):
         history = History.from_dataframe(history, scene)
-    problem = Problem.of(scene, history, attach(scene, effects), threads=2)
+    problem = Problem.of(Physics.declare(scene, effects, threads=2), history)
     return trajectory_mode(problem, find_mode(problem, seed=3).phi)
 
 
@@ -124,7 +124,7 @@ class Disc:
     def problem(self) -> Problem:
         """Of whole trajectories; data sets share its priors and commands."""
         history = History.from_dataframe(self.frame(np.random.default_rng(1)), self.scene)
-        problem = Problem.of(self.scene, history, attach(self.scene))
+        problem = Problem.of(Physics.declare(self.scene), history)
         return along_trajectories(problem, self.truth)
 
     @property

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories
 from pbrl_ppl.likelihood.log_posterior import log_posterior, log_prior
@@ -73,7 +72,7 @@ def test_likelihood_is_that_of_equal_masses(trajectories) -> None:
     problems = []
     for shared in (True, False):
         own = scene(shared)
-        problem = Problem.of(own, recorded())
+        problem = Problem.of(Physics(own), recorded())
         if trajectories:
             problem = along_trajectories(problem, np.full(problem.layout.size, MASS))
         problems.append(problem)
@@ -183,7 +182,7 @@ def test_pooled_and_emulated() -> None:
     first, second = (dict(body.prior) for body in pooled.scene.bodies)
     assert first["mass"] == second["mass"]
     assert "linear_drag_coefficient" in second and "linear_drag_coefficient" not in first
-    problem = Problem.of(own, recorded(), attach(own, ()))
+    problem = Problem.of(Physics.declare(own), recorded())
     problem = along_trajectories(problem, np.array([MASS, 0.1]))
     pieces = Pieces.of(problem).emulated
     assert [piece.places.tolist() for piece in pieces] == [[0], [0, 1]]

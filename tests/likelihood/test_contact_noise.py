@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import (
     Problem,
     along_trajectories,
@@ -13,6 +12,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import profile_sigma
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 
@@ -36,7 +36,7 @@ def pucks() -> Problem:
         PUCKS, {}, seed=2, trajectories=60, intervals=12, wrench_sd=(1.5, 1.5, 0.1),
         poses=[(0.0, 0.0, 0.0), (0.61, 0.0, 0.0)], substeps=8,
     )  # fmt: skip
-    return along_trajectories(Problem.of(PUCKS, history, attach(PUCKS)), PHI)
+    return along_trajectories(Problem.of(Physics.declare(PUCKS), history), PHI)
 
 
 def test_its_score_is_that_of_differences(pucks) -> None:
@@ -83,5 +83,5 @@ def test_the_model_names_it_where_bodies_touch_and_there_alone(pucks) -> None:
     )
     assert got == pytest.approx(density, rel=1e-10)
     apart = simulated_history(PUCKS, {}, seed=1, trajectories=2, intervals=4, substeps=4)
-    alone = along_trajectories(Problem.of(PUCKS, apart, attach(PUCKS)), PHI)
+    alone = along_trajectories(Problem.of(Physics.declare(PUCKS), apart), PHI)
     assert "contact_acceleration" not in alone.noise_variables

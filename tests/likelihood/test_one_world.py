@@ -174,7 +174,7 @@ def test_a_body_too_heavy_to_be_moved_is_joined_with_what_meets_it() -> None:
     """One world and the parts say the same of it, to a hundredth of the noise."""
     wall = Body("b", Shape.circle(0.2), known={"r": 0.0, "mu_c": 0.0, "mass": 1e4})
     scene = LIGHT.replace(bodies=(LIGHT.bodies[0], wall))
-    problem = Problem.of(scene, recorded(scene, TRUE))
+    problem = Problem.of(Physics(scene), recorded(scene, TRUE))
     joined = problem.joined(np.array([[TOO_LIGHT]]), np.full((1, 6), 0.05))
     assert joined.physics.parts == (("a", "b"),)
 

@@ -14,6 +14,7 @@ from pbrl_ppl.likelihood import (
     single_transitions,
 )
 from pbrl_ppl.likelihood import data as data_module
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 
@@ -38,7 +39,7 @@ def checks(monkeypatch) -> list[int]:
 
 @pytest.fixture
 def problem() -> Problem:
-    return Problem.of(PUCKS, simulated_history(PUCKS, TRUTH, seed=1), substeps=5)
+    return Problem.of(Physics(PUCKS, substeps=5), simulated_history(PUCKS, TRUTH, seed=1))
 
 
 def test_other_noise_keeps_the_engine_and_the_checked_data(problem, checks) -> None:

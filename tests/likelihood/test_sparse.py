@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
-from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
 from pbrl_ppl.modes import find_mode, trajectory_mode
-from pbrl_ppl.physics import Transition
+from pbrl_ppl.physics import Physics, Transition
 from pbrl_ppl.scene import Body, Scene, Shape
 
 FINGER = Body("finger", Shape.circle(0.02), kinematic=True, known={"r": 0.0, "mu_c": 1.0})
@@ -38,7 +37,7 @@ def recorded(trajectories: int = 16) -> History:
 
 @pytest.fixture(scope="module")
 def problem() -> Problem:
-    return Problem.of(SCENE, recorded(), attach(SCENE))
+    return Problem.of(Physics.declare(SCENE), recorded())
 
 
 def test_between_the_rows_it_is_linearised_where_the_model_leads(problem) -> None:

@@ -10,7 +10,6 @@ from pytensor import function
 from pytensor.graph.traversal import ancestors
 from scipy.stats import multivariate_normal
 
-from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import (
     Problem,
@@ -22,6 +21,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.model import build_model
 from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from pbrl_ppl.state import wrapped
@@ -45,7 +45,7 @@ NOISE = np.array([2e-3, 2e-3, 4e-3, 1e-2, 1e-2, 2e-2, 0.3, 0.3, 0.5])
 @pytest.fixture(scope="module")
 def problem() -> Problem:
     history = simulated_history(PUCK, TRUTH, seed=1, trajectories=3, intervals=4, substeps=2)
-    return along_trajectories(Problem.of(PUCK, history, attach(PUCK)), PHI, NOISE)
+    return along_trajectories(Problem.of(Physics.declare(PUCK), history), PHI, NOISE)
 
 
 def dense(noise, sigma) -> tuple[np.ndarray, np.ndarray]:
@@ -233,7 +233,7 @@ def test_the_model_is_the_problem_where_a_body_turns_by_more_than_half_a_turn() 
         values[..., 2] = wrapped(values[..., 2] + 4.0 * np.arange(values.shape[1])[:, None])
         values[..., 5] += 40.0
         dataset[name] = dataset[name].copy(data=values)
-    fast = along_trajectories(Problem.of(PUCK, History(dataset), attach(PUCK)), PHI, NOISE)
+    fast = along_trajectories(Problem.of(Physics.declare(PUCK), History(dataset)), PHI, NOISE)
     density = fast.log_density(fast.residual(PHI), NOISE).sum()
     assert density_of_the_model(fast) == pytest.approx(density, rel=1e-9)
     assert density > -1e4  # a turn more or less would cost a million
@@ -289,7 +289,7 @@ def test_a_stated_noise_is_not_inferred(problem, stated) -> None:
     truth = dict(zip(("x", "y", "theta", "vx", "vy", "omega"), NOISE, strict=False))
     scene = PUCK.replace(noise={name: truth[name] for name in stated})
     history = problem.data.history
-    known = along_trajectories(Problem.of(scene, history, attach(scene)), PHI)
+    known = along_trajectories(Problem.of(Physics.declare(scene), history), PHI)
     free = [name for name in truth if name not in stated]
     assert list(known.noise_variables.get("sigma", ())) == free
     sigma = np.array([*(truth[name] for name in free), *NOISE[6:]])
@@ -316,7 +316,7 @@ def test_computed_velocities_are_left_out_of_the_model() -> None:
             angles = np.unwrap(frame.loc[rows, position])
             frame.loc[rows, rate] = np.gradient(angles, PUCK.time_step)
     computed = History.from_dataframe(frame, PUCK)
-    problem = declared_problem(PUCK, computed, trajectories=True)
+    problem = declared_problem(Physics.declare(PUCK), computed, trajectories=True)
     assert problem.noise_variables["sigma"] == ("x", "y", "theta")
     eq_11 = physics_model(PUCK, computed).problem
     assert len(eq_11.noise_variables["sigma"]) == 6  # the paper's likelihood takes what it is given

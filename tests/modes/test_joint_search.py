@@ -7,6 +7,7 @@ from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import joint_search, weigh
 from pbrl_ppl.modes.configurations import MOST, configurations, number
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Joint, Scene, Shape
 from tests.helpers.histories import simulated_history
 from tests.helpers.joints import scene
@@ -53,7 +54,7 @@ def test_two_hinges_are_found_among_more_than_can_be_tried(
         truth, {}, seed=2, trajectories=3, intervals=2, noise=NOISE, poses=poses, substeps=4,
         wrench_sd=(5.0, 5.0, 0.1),
     )  # fmt: skip
-    found = weigh(Problem.of(free, history), seed=1)
+    found = weigh(Problem.of(Physics(free), history), seed=1)
     assert len(found) <= most
     best = max(found, key=lambda each: each.probability)
     assert {pair for _, pair in best.configuration.pairs} == set(HINGES)
@@ -112,7 +113,9 @@ def tried_of(free: Scene, monkeypatch, height):
         joint_search, "laplace", lambda mode: joint_search.Evidence(mode.log_posterior)
     )
     history = simulated_history(scene(), {}, seed=1, trajectories=1, intervals=2)
-    modes, _ = joint_search._tried(Problem.of(free, history), 1, joint_search.Console(), False)
+    modes, _ = joint_search._tried(
+        Problem.of(Physics(free), history), 1, joint_search.Console(), False
+    )
     first, *others = modes
     assert first.empty
     assert set(others) == tried

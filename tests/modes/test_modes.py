@@ -9,13 +9,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import search, trajectory_mode
 from pbrl_ppl.modes.laplace import climb
 from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import differentiate, fold_wheels
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history
@@ -33,7 +33,7 @@ def history() -> History:
 
 @pytest.fixture(scope="module")
 def problem(history):
-    return Problem.of(cart_scene(**KNOWN_CONTACT), history)
+    return Problem.of(Physics(cart_scene(**KNOWN_CONTACT)), history)
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +127,7 @@ def test_a_search_takes_one_thread_of_linear_algebra(problem, modes, monkeypatch
 
 def test_scalar_sigma(history) -> None:
     problem = Problem.of(
-        cart_scene(**KNOWN_CONTACT), history, likelihood=TransitionLikelihood(scalar=True)
+        Physics(cart_scene(**KNOWN_CONTACT)), history, likelihood=TransitionLikelihood(scalar=True)
     )
     mode = find_mode(problem, initial=problem.layout.to_vector(CART))
     assert np.ptp(mode.sigma) == 0.0
@@ -144,7 +144,7 @@ def test_recovers_what_another_engine_made(make_history) -> None:
     scene = cart_scene(**KNOWN_CONTACT)
     history = History.from_dataframe(train, scene)
     assert history.n_transitions == 360
-    problem = Problem.of(scene, history, substeps=20)
+    problem = Problem.of(Physics(scene, substeps=20), history)
     truth = dict(zip(WHEEL, vars(make_history.CART.wheel).values(), strict=True))
     truth["mass"] = make_history.CART.mass
     z = z_scores(find_mode(problem, seed=2), truth)
@@ -188,7 +188,7 @@ def test_four_descriptions_of_a_wheel_are_one(problem, x, y, angle, mu_x, mu_y) 
 
 
 def test_fold_leaves_a_body_without_wheel_alone(history) -> None:
-    problem = Problem.of(cart_scene(wheel=False), history)
+    problem = Problem.of(Physics(cart_scene(wheel=False)), history)
     phi = np.array([1.0, 0.2, 0.3])
     np.testing.assert_array_equal(fold_wheels(problem.layout, phi), phi)
 
@@ -196,7 +196,7 @@ def test_fold_leaves_a_body_without_wheel_alone(history) -> None:
 def test_a_partly_known_wheel_is_not_turned(history) -> None:
     """With w_theta given, the axes have names: mu_x may be the larger."""
     known = KNOWN_CONTACT["known"] | {"w_theta": 0.1}
-    problem = Problem.of(cart_scene(known=known), history)
+    problem = Problem.of(Physics(cart_scene(known=known)), history)
     phi = problem.layout.to_vector(CART | {"mu_x": 0.9, "mu_y": 0.1})
     np.testing.assert_array_equal(fold_wheels(problem.layout, phi), phi)
 
@@ -232,7 +232,7 @@ def test_prior_alone_where_data_say_nothing() -> None:
     """r and mu_c without contacts: the mode is the prior's, and so is the width."""
     history = simulated_history(cart_scene(), CART, seed=6, trajectories=2, intervals=6)
     wheel = {name: CART[name] for name in ("mass", *WHEEL)}
-    problem = Problem.of(cart_scene(known=wheel), history)
+    problem = Problem.of(Physics(cart_scene(known=wheel)), history)
     mode = find_mode(problem, seed=1)
     found = mode.values
     assert found["mu_c"] == pytest.approx(0.5, abs=1e-3)
@@ -278,6 +278,6 @@ def test_recovers_the_scene_s_effect() -> None:
     scene: Scene = cart_scene(effects=("linear_drag",), **KNOWN_CONTACT)
     truth = CART | {"linear_drag_coefficient": 3.0}
     history = simulated_history(scene, truth, seed=9, trajectories=6, intervals=10)
-    problem = Problem.of(scene, history, attach(scene))
+    problem = Problem.of(Physics.declare(scene), history)
     z = z_scores(find_mode(problem, seed=1), truth)
     assert max(np.abs(list(z.values()))) < 4, z

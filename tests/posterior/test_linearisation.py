@@ -9,6 +9,7 @@ import pytest
 import pbrl_ppl as pp
 from pbrl_ppl.errors import LinearisationWarning
 from pbrl_ppl.likelihood import declared_problem
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import from_groups, groups, parameter_draws
 from pbrl_ppl.posterior.completion import MOST, complete, linearisation, linearisation_errors
 from pbrl_ppl.scene import Body, Scene, Shape
@@ -42,7 +43,7 @@ def test_a_fit_says_where_it_does_not_hold() -> None:
     found = json.loads(idata.attrs["linearisation"])
     assert found["draws"] == 16 and found["sd"] <= MOST
     assert found["sd"] <= found["largest"] and 0 <= found["trajectory"] < 6
-    centre = declared_problem(scene, history, trajectories=True)
+    centre = declared_problem(Physics.declare(scene), history, trajectories=True)
     phi, sigma = parameter_draws(model.problem, idata)
     assert linearisation(centre, phi, sigma)["sd"] > 10 * MOST
     data = groups(idata)

@@ -16,6 +16,7 @@ from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TransitionLikelihood, declared_problem
 from pbrl_ppl.model import build_model
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.report import plot_calibration, png
 from pbrl_ppl.sampling import calibrate, calibration, physics_model, replication
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, Calibration, bins, holm, rank, uniformity
@@ -259,7 +260,9 @@ def test_sigma_s_prior_is_the_design_s(puck: tuple[Scene, History]) -> None:
     scene, history = puck
     design = design_of(history, scene)
     fixed = Problem.of(
-        scene, history, substeps=2, likelihood=TransitionLikelihood(prior=((0.5,) * 6, 1.5))
+        Physics(scene, substeps=2),
+        history,
+        likelihood=TransitionLikelihood(prior=((0.5,) * 6, 1.5)),
     )
     point = {"mass_log__": np.zeros(1), "sigma_log__": np.linspace(-1.0, 1.0, 6)}
     densities = []
@@ -559,7 +562,7 @@ def test_whole_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (truth[:, :-1] > 0).all()
     assert (truth[0] != truth[1]).all()
     # what was simulated is the design's, all but its numbers
-    problem = declared_problem(scene, history, trajectories=True)
+    problem = declared_problem(Physics.declare(scene), history, trajectories=True)
     (one,), _ = draw_truths(problem, 1, seed=1)
     again = simulated(problem, one.values)
     assert again.noise_prior[0] == pytest.approx(problem.noise_prior[0])

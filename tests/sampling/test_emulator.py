@@ -7,9 +7,9 @@ import numpy as np
 import pymc as pm
 import pytest
 
-from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
 from pbrl_ppl.modes import find_mode, trajectory_mode
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.store import group
 from pbrl_ppl.sampling import fit, fitting, physics_model, surrogate
 from pbrl_ppl.sampling.emulator import Emulator, Piece, Pieces
@@ -74,7 +74,7 @@ def test_bodies_that_meet_are_emulated_apart_and_the_engine_predicts_their_conta
         pair, {"mass": 1.0, "r": 0.5}, seed=2, trajectories=6, intervals=12,
         wrench_sd=(1.5, 1.5, 0.1), poses=[(0.0, 0.0, 0.0), (0.61, 0.0, 0.0)],
     )  # fmt: skip
-    problem = Problem.of(pair, history, attach(pair))
+    problem = Problem.of(Physics.declare(pair), history)
     truth = problem.layout.to_vector({"mass": 1.0, "r": 0.5})
     problem = along_trajectories(problem, truth)
     met = problem.trajectory_noise.touching

@@ -5,9 +5,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import find_mode
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.sampling import starts
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -49,7 +49,7 @@ def test_its_density_is_that_of_the_model_in_the_sampler_s_space() -> None:
     """But for a constant, which is that of the likelihood."""
     scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
     history = simulated_history(scene, CART, seed=7, trajectories=3, intervals=6)
-    problem = Problem.of(scene, history, attach(scene))
+    problem = Problem.of(Physics.declare(scene), history)
     mode = find_mode(problem, seed=1)
     pairs = [starts.unconstrain(p, x) for p, x in zip(problem.layout.priors, mode.phi, strict=True)]
     u = np.array(pairs)[:, 0] + 0.01 * np.random.default_rng(1).standard_normal((4, len(pairs)))
@@ -71,7 +71,7 @@ def test_its_density_is_that_of_the_model_in_the_sampler_s_space() -> None:
 def test_there_is_no_density_where_numbers_end() -> None:
     scene = cart_scene(known={"r": 0.2, "mu_c": 0.3})
     history = simulated_history(scene, CART, seed=7, trajectories=2, intervals=3)
-    problem = Problem.of(scene, history, attach(scene))
+    problem = Problem.of(Physics.declare(scene), history)
     far = np.full((2, problem.layout.size), [[1e4], [-1e4]])
     assert (starts._log_density(problem, far, np.ones(6)) == -np.inf).all()
     nothing = starts.widened(problem, MODE, np.zeros(0), np.zeros((0, 0)))
