@@ -7,13 +7,12 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, estimate_rates, fill_hinges, hung_bodies
 from pbrl_ppl.physics import touching
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, THETA, wrapped
+from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
 
 #: Variable of the process noise: the unexplained acceleration.
 ACCELERATION = "unexplained_acceleration"
@@ -21,10 +20,6 @@ ACCELERATION = "unexplained_acceleration"
 JOLT = "contact_acceleration"
 #: Variable of measurement noise that is correlated from row to row, as of a tracker.
 DRIFT = "correlated_error"
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,8 +51,8 @@ class Cells:
     places: Ints
     columns: tuple[int, ...]
     sensor: Ints
-    fixed: Array
-    push: Array
+    fixed: Floats
+    push: Floats
     pushed: Ints
     sensors: tuple[int, ...]
     rates: tuple[int, ...]
@@ -101,14 +96,14 @@ class Cells:
         """Mask of the rows that act in every step, not only in contact, shape (push,)."""
         return self.pushed < self.accelerations.stop
 
-    def steps(self, sigma: Array) -> Array:
+    def steps(self, sigma: Floats) -> Floats:
         """Return the process noise of a step without and with contact.
 
         Shape (2, cell, cell).
         """
         return step_covariances(self.push, sigma[self.pushed], self.always)
 
-    def pushes(self, sigma: Array, touching: Bools, rng: np.random.Generator) -> Array:
+    def pushes(self, sigma: Floats, touching: Bools, rng: np.random.Generator) -> Floats:
         """Draw process noise of the cells, shape (*touching.shape, cell).
 
         The leading axes of ``sigma``, shape (..., parameter), go with those.
@@ -116,22 +111,22 @@ class Cells:
         drawn = sigma[..., self.pushed] * rng.standard_normal((*touching.shape, len(self.pushed)))
         return np.where(self.always | touching[..., None], drawn, 0.0) @ self.push
 
-    def white(self, sigma: Array) -> Array:
+    def white(self, sigma: Floats) -> Floats:
         """Return the uncorrelated measurement noise of each cell, shape (cell,)."""
         return np.where(self.sensor >= 0, sigma[self.sensor], self.fixed)
 
-    def errors(self, sigma: Array) -> Array:
+    def errors(self, sigma: Floats) -> Floats:
         """Return the measurement noise of each cell, correlated and not, shape (cell,)."""
         square = self.white(sigma) ** 2
         cells, parameters = self.drifted
         square[cells] += sigma[parameters] ** 2
         return np.sqrt(square)
 
-    def of(self, values: Array) -> Array:
+    def of(self, values: Floats) -> Floats:
         """Return the cells of values (..., body, 6), shape (..., cell)."""
         return np.asarray(values.reshape(*values.shape[:-2], -1)[..., self.places])
 
-    def completed(self, scene: Scene, states: Array) -> Array:
+    def completed(self, scene: Scene, states: Floats) -> Floats:
         """Place hinged bodies of states (..., body, 6) by their hinges, in place."""
         if len(self.places) == 6 * len(scene.moving):  # none is hung
             return states
@@ -144,12 +139,12 @@ class Cells:
             fill_hinges(states.reshape(-1, 1, *states.shape[-2:]), scene)
         return states
 
-    def wrapped(self, difference: Array) -> Array:
+    def wrapped(self, difference: Floats) -> Floats:
         """Return differences of cells, shape (..., cell), angles wrapped to (-pi, pi]."""
         angle = self.places % 6 == THETA
         return np.where(angle, wrapped(difference), difference)
 
-    def of_residual(self, residual: Array) -> Array:
+    def of_residual(self, residual: Floats) -> Floats:
         """Return the cells of a residual (..., transition, 1, body, state)."""
         body, place = self.in_residual
         return np.ascontiguousarray(residual[..., 0, body, place])
@@ -161,7 +156,7 @@ class Cells:
         return body, np.searchsorted(self.columns, dimension)
 
 
-def step_covariances(push: Array, size: Array, always: Bools) -> Array:
+def step_covariances(push: Floats, size: Floats, always: Bools) -> Floats:
     """Return the process noise of a step without and with contact.
 
     Parameters
@@ -266,13 +261,13 @@ def _uncoupled(scene: Scene) -> bool:
     return not (scene.walls or scene.joints or len(scene.bodies) > 1 or scene.bodies[0].wheel)
 
 
-def first_states(history: History) -> Array:
+def first_states(history: History) -> Floats:
     """Return measured states, gaps interpolated, shape (trajectory, time, body, 6).
 
     Velocities that do not count as measured are estimated from measured positions.
     """
     dataset = history.dataset
-    states: Array = dataset["start"].to_numpy().copy()
+    states: Floats = dataset["start"].to_numpy().copy()
     seen = np.isfinite(dataset["observed"].to_numpy()).any(axis=(0, 1))
     free = ~dataset["kinematic"].to_numpy()[:, None]
     rates = np.hstack([np.zeros_like(seen[:, :_RATE]), free & seen[:, :_RATE] & ~seen[:, _RATE:]])

@@ -6,16 +6,12 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics import check_history
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, THETA, wrapped
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from pbrl_ppl.state import STATE, THETA, Bools, Floats, wrapped
 
 
 @dataclass(frozen=True)
@@ -30,7 +26,7 @@ class Observations:
         Which of the six state dimensions the last axis holds.
     """
 
-    values: Array
+    values: Floats
     columns: tuple[int, ...]
 
     @classmethod
@@ -65,14 +61,14 @@ class Observations:
         """Mask of measured values, shape as ``values``."""
         return np.isfinite(self.values)
 
-    def wrapped(self, difference: Array) -> Array:
+    def wrapped(self, difference: Floats) -> Floats:
         """Wrap the angles of state differences (..., state) to (-pi, pi], in place."""
         for i, d in enumerate(self.columns):
             if d == THETA:
                 difference[..., i] = wrapped(difference[..., i])
         return difference
 
-    def residual(self, predicted: Array) -> Array:
+    def residual(self, predicted: Floats) -> Floats:
         """Return measured minus predicted states, angles wrapped, 0 where missing.
 
         Parameters
@@ -90,7 +86,7 @@ class Observations:
         return np.asarray(difference)
 
 
-def sigma_prior(observations: Observations, segments: Segments) -> tuple[Array, float]:
+def sigma_prior(observations: Observations, segments: Segments) -> tuple[Floats, float]:
     """Return median and log-scale of a weak prior of sigma: a tenth of the states' change.
 
     Returns
@@ -107,7 +103,7 @@ def sigma_prior(observations: Observations, segments: Segments) -> tuple[Array, 
     return np.maximum(0.1 * typical, 1e-9) * np.ones(len(columns)), 2.0
 
 
-def estimate_sigma(residual: Array, measured: Bools) -> Array:
+def estimate_sigma(residual: Floats, measured: Bools) -> Floats:
     """Return the maximum-likelihood sigma of each dimension under Eq. 11, shape (state,).
 
     Parameters
@@ -145,7 +141,7 @@ class Data:
     history: History
     horizon: int = 1
     columns: tuple[int, ...] | None = None
-    states: Array | None = None
+    states: Floats | None = None
 
     def __getstate__(self) -> dict[str, object]:
         """Return the fields to pickle, without computed values."""
@@ -169,7 +165,7 @@ class Data:
         return segments
 
     @property
-    def smoothed_states(self) -> Array:
+    def smoothed_states(self) -> Floats:
         """Smoothed states, shape (trajectory, time, body, 6).
 
         Raises

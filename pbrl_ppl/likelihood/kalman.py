@@ -16,21 +16,21 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from pbrl_ppl.state import Bools, Floats
+
 Ints = NDArray[np.int64]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def gains(
-    slope: Array,
+    slope: Floats,
     first: Ints,
     seen: Bools,
-    begin: Array,
-    sensor: Array,
-    step: Array,
+    begin: Floats,
+    sensor: Floats,
+    step: Floats,
     kind: Ints,
-) -> tuple[Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats]:
     """Return the gain and standard deviation of every innovation.
 
     Parameters
@@ -101,15 +101,15 @@ def gains(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def innovations(
-    slope: Array,
+    slope: Floats,
     first: Ints,
     seen: Bools,
-    gain: Array,
-    scale: Array,
-    residual: Array,
-    begin: Array,
-    measured: Array,
-) -> tuple[Array, Array]:
+    gain: Floats,
+    scale: Floats,
+    residual: Floats,
+    begin: Floats,
+    measured: Floats,
+) -> tuple[Floats, Floats]:
     """Return the whitened innovations and filtered deviations.
 
     Parameters
@@ -153,8 +153,8 @@ def innovations(
 
 @numba.njit(cache=True, error_model="numpy")
 def adjoint(
-    slope: Array, last: Ints, seen: Bools, gain: Array, scale: Array, weighted: Array
-) -> tuple[Array, Array, Array]:
+    slope: Floats, last: Ints, seen: Bools, gain: Floats, scale: Floats, weighted: Floats
+) -> tuple[Floats, Floats, Floats]:
     """Return the adjoint of the filter: derivatives of a sum of innovations.
 
     With ``weighted = white``, it is Bierman's smoother: the smoothed deviation after a transition
@@ -200,14 +200,14 @@ def adjoint(
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def score(
-    slope: Array,
+    slope: Floats,
     last: Ints,
     seen: Bools,
-    gain: Array,
-    scale: Array,
-    white: Array,
+    gain: Floats,
+    scale: Floats,
+    white: Floats,
     kind: Ints,
-) -> tuple[Array, Array, Array, Array]:
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Return the derivative of the log-likelihood by the variances.
 
     Parameters

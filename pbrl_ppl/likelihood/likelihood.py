@@ -8,15 +8,13 @@ from dataclasses import dataclass, replace
 from typing import Any, Self, final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import gammaln
 
 from pbrl_ppl.likelihood.data import Observations
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
+from pbrl_ppl.state import Bools, Floats
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 #: Medians of the noise parameters' prior, and the standard deviation of their logarithm.
 NoisePrior = tuple[tuple[float, ...], float]
 
@@ -52,15 +50,15 @@ class Likelihood(ABC):
     def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
         """Return the noise variables with the state dimensions of each, in the order of sigma."""
 
-    def free(self, sigma: Array) -> Array:
+    def free(self, sigma: Floats) -> Floats:
         """Return the noise parameters that are inferred, shape (..., free)."""
         return sigma
 
-    def pooled(self, counts: Array) -> Array:
+    def pooled(self, counts: Floats) -> Floats:
         """Return sums over the dimensions that share a noise parameter, shape (..., free)."""
         return counts
 
-    def centre(self, medians: Array) -> Array:
+    def centre(self, medians: Floats) -> Floats:
         """Return the logarithm of the prior's medians, shape (free,)."""
         return np.asarray(np.log(medians))
 
@@ -77,7 +75,7 @@ class Likelihood(ABC):
         return self
 
     @abstractmethod
-    def whiten(self, residual: Array, sigma: Array) -> Array:
+    def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return residuals in units of their noise, independent if the model is right.
 
         Parameters
@@ -94,13 +92,13 @@ class Likelihood(ABC):
         """
 
     @abstractmethod
-    def robust(self, residual: Array, sigma: Array, nu: float | Array | None) -> Array:
+    def robust(self, residual: Floats, sigma: Floats, nu: float | Floats | None) -> Floats:
         """Return least-squares residuals, shape as of :meth:`whiten`; see :func:`robust`."""
 
     @abstractmethod
     def log_density(
-        self, residual: Array, sigma: Array, measured: Bools, nu: float | Array | None = None
-    ) -> Array:
+        self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
+    ) -> Floats:
         """Return the log-likelihood of each transition, shape (..., transition).
 
         Minus infinity where the engine diverged. ``measured`` has shape (transition, H, body,
@@ -110,12 +108,12 @@ class Likelihood(ABC):
     @abstractmethod
     def random(
         self,
-        predicted: Array,
-        linearised: Array,
-        sigma: Array,
+        predicted: Floats,
+        linearised: Floats,
+        sigma: Floats,
         rng: np.random.Generator,
-        nu: float | Array | None = None,
-    ) -> Array:
+        nu: float | Floats | None = None,
+    ) -> Floats:
         """Draw measured next states by Eq. 13, shape of ``predicted``.
 
         Parameters
@@ -167,15 +165,15 @@ class TransitionLikelihood(Likelihood):
         """Return ``sigma`` with the measured dimensions."""
         return {"sigma": observations.names}
 
-    def free(self, sigma: Array) -> Array:
+    def free(self, sigma: Floats) -> Floats:
         """Return the first of equal ones where sigma is a scalar."""
         return sigma[..., :1] if self.scalar else sigma
 
-    def pooled(self, counts: Array) -> Array:
+    def pooled(self, counts: Floats) -> Floats:
         """Return the sum over all dimensions where sigma is a scalar."""
         return counts.sum(axis=-1, keepdims=True) if self.scalar else counts
 
-    def centre(self, medians: Array) -> Array:
+    def centre(self, medians: Floats) -> Floats:
         """Return the mean logarithm where sigma is a scalar."""
         logs = np.log(medians)
         return np.asarray(logs.mean(keepdims=True) if self.scalar else logs)
@@ -184,20 +182,20 @@ class TransitionLikelihood(Likelihood):
         """Return the same."""
         return self
 
-    def whiten(self, residual: Array, sigma: Array) -> Array:
+    def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return residuals over sigma, shape (..., transition, H * body * state)."""
         scaled = residual / np.asarray(sigma)[..., None, None, None, :]
         return np.asarray(scaled.reshape(*scaled.shape[:-3], -1))
 
-    def robust(self, residual: Array, sigma: Array, nu: float | Array | None) -> Array:
+    def robust(self, residual: Floats, sigma: Floats, nu: float | Floats | None) -> Floats:
         """Return least-squares residuals."""
         if isinstance(nu, np.ndarray) and nu.ndim:
             nu = np.broadcast_to(nu, residual.shape).reshape(*residual.shape[:-3], -1)
         return robust(self.whiten(residual, sigma), nu)
 
     def log_density(
-        self, residual: Array, sigma: Array, measured: Bools, nu: float | Array | None = None
-    ) -> Array:
+        self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
+    ) -> Floats:
         """Return the log-likelihood of each transition (Eq. 11)."""
         axes = (-1, -2, -3)
         log_sigma = np.where(measured, np.log(sigma)[..., None, None, None, :], 0.0).sum(axes)
@@ -207,12 +205,12 @@ class TransitionLikelihood(Likelihood):
 
     def random(
         self,
-        predicted: Array,
-        linearised: Array,
-        sigma: Array,
+        predicted: Floats,
+        linearised: Floats,
+        sigma: Floats,
         rng: np.random.Generator,
-        nu: float | Array | None = None,
-    ) -> Array:
+        nu: float | Floats | None = None,
+    ) -> Floats:
         """Draw next states by Eq. 13."""
         return next_state_random(predicted, sigma, rng, nu=nu)
 
@@ -255,17 +253,17 @@ class TrajectoryLikelihood(Likelihood):
         """Return the same with smoothed states that do not follow the parameters."""
         return replace(self, noise=replace(self.noise, sensitivity=None))
 
-    def whiten(self, residual: Array, sigma: Array) -> Array:
+    def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return the innovations over their standard deviations."""
         return self.noise.whiten(residual, sigma)
 
-    def robust(self, residual: Array, sigma: Array, nu: float | Array | None) -> Array:
+    def robust(self, residual: Floats, sigma: Floats, nu: float | Floats | None) -> Floats:
         """Return least-squares residuals."""
         return robust(self.whiten(residual, sigma), self.noise.of_cells(nu, residual.shape))
 
     def log_density(
-        self, residual: Array, sigma: Array, measured: Bools, nu: float | Array | None = None
-    ) -> Array:
+        self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
+    ) -> Floats:
         """Return the log-density of each transition's measurements given those before."""
         z, log_scale = self.noise.whitened(residual, sigma)
         nu = self.noise.of_cells(nu, residual.shape)
@@ -274,22 +272,22 @@ class TrajectoryLikelihood(Likelihood):
 
     def random(
         self,
-        predicted: Array,
-        linearised: Array,
-        sigma: Array,
+        predicted: Floats,
+        linearised: Floats,
+        sigma: Floats,
         rng: np.random.Generator,
-        nu: float | Array | None = None,
-    ) -> Array:
+        nu: float | Floats | None = None,
+    ) -> Floats:
         """Draw measured next states, given those before."""
         return self.noise.random(predicted, linearised, sigma, rng)
 
 
-def _finite(log_density: Array) -> Array:
+def _finite(log_density: Floats) -> Floats:
     """Return log-densities with minus infinity where the engine diverged."""
     return np.where(np.isnan(log_density), -np.inf, log_density)
 
 
-def robust(z: Array, nu: float | Array | None) -> Array:
+def robust(z: Floats, nu: float | Floats | None) -> Floats:
     """Return residuals whose half squares are the negative log-density up to a constant.
 
     Parameters
@@ -311,7 +309,7 @@ def robust(z: Array, nu: float | Array | None) -> Array:
     return np.asarray(np.where(heavy, np.sign(z) * np.sqrt((nu + 1) * np.log1p(z**2 / nu)), z))
 
 
-def log_norm(nu: float | Array | None) -> Array:
+def log_norm(nu: float | Floats | None) -> Floats:
     """Return the logarithm of a standard Student-t density (or normal one) at zero."""
     normal = np.asarray(-0.5 * math.log(2 * math.pi))
     if nu is None:
@@ -327,8 +325,8 @@ def next_state_random(
     sigma: Any,
     rng: np.random.Generator,
     size: Any = None,
-    nu: float | Array | None = None,
-) -> Array:
+    nu: float | Floats | None = None,
+) -> Floats:
     """Draw next states by Eq. 13, shape as ``predicted``: (..., transition, H, body, state)."""
     predicted = np.asarray(predicted)
     shape = predicted.shape

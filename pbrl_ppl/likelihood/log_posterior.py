@@ -6,12 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood.problem import Problem
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Floats, Ints
 
 
-def noise_law(problem: Problem) -> tuple[Array, float]:
+def noise_law(problem: Problem) -> tuple[Floats, float]:
     """Return the prior of sigma: log medians, and the standard deviation of log sigma.
 
     Measurement noise is log-normal. Unexplained accelerations and correlated errors are
@@ -39,7 +37,7 @@ def exponential(problem: Problem) -> NDArray[np.bool_]:
     return problem.likelihood.exponential(len(problem.noise_prior[0]))
 
 
-def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
+def log_noise_prior(problem: Problem, log_sigma: Floats) -> Floats:
     """Return the log-density of log sigma, shape (...), at (..., free)."""
     centre, spread = noise_law(problem)
     normal = -0.5 * ((log_sigma - centre) / spread) ** 2 - np.log(spread) - 0.5 * np.log(2 * np.pi)
@@ -51,7 +49,7 @@ def log_noise_prior(problem: Problem, log_sigma: Array) -> Array:
     return np.asarray(normal.sum(axis=-1))
 
 
-def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
+def noise_prior_slope(problem: Problem, log_sigma: Floats) -> Floats:
     """Return the derivative of :func:`log_noise_prior` by log sigma, same shape."""
     centre, spread = noise_law(problem)
     normal = (centre - log_sigma) / spread**2
@@ -62,7 +60,7 @@ def noise_prior_slope(problem: Problem, log_sigma: Array) -> Array:
     return np.where(mask, 1.0 - np.exp(u), normal)
 
 
-def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = None) -> Array:
+def log_prior(problem: Problem, phi: Floats, sigma: Floats, choice: Ints | None = None) -> Floats:
     """Return the log-density of parameters and sigma under the declared prior.
 
     Parameters
@@ -96,12 +94,12 @@ def log_prior(problem: Problem, phi: Array, sigma: Array, choice: Ints | None = 
 
 def log_posterior(
     problem: Problem,
-    phi: Array,
-    sigma: Array,
+    phi: Floats,
+    sigma: Floats,
     choice: Ints | None = None,
     *,
-    log_likelihood: Array | None = None,
-) -> Array:
+    log_likelihood: Floats | None = None,
+) -> Floats:
     """Return the log-posterior up to the evidence, as PyMC's without transforms.
 
     Parameters

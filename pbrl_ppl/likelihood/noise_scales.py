@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.history import History, unseen
 from pbrl_ppl.likelihood.cells import Cells
 from pbrl_ppl.likelihood.problem import Problem
-from pbrl_ppl.state import STATE, THETA
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, THETA, Floats
 
 #: Medians of the log-normal priors of errors of measuring and of contact accelerations, as shares
 #: of what the states do in a step, and their log-scale.
@@ -27,7 +24,7 @@ _MEDIAN = np.log(2.0) / -np.log(ACCELERATION_CHANCE)
 _RATE = 3
 
 
-def noise_medians(cells: Cells, history: History, states: Array) -> Array:
+def noise_medians(cells: Cells, history: History, states: Floats) -> Floats:
     """Return the medians of the noise priors, shape (parameter,), from changes of the states."""
     real = np.isfinite(history.dataset["clock"].to_numpy())
     shown = real & ~unseen(history).any(axis=-1)
@@ -43,7 +40,7 @@ def noise_medians(cells: Cells, history: History, states: Array) -> Array:
     return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts, drifts]), 1e-9))
 
 
-def ranges(cells: Cells, history: History, states: Array) -> Array:
+def ranges(cells: Cells, history: History, states: Floats) -> Floats:
     """Return the range of each dimension with correlated errors, shape (drift,).
 
     Of x and y the larger one: a sensor of places is as far off in both.
@@ -66,7 +63,7 @@ def ranges(cells: Cells, history: History, states: Array) -> Array:
     return np.array([extent[place & (turns == (d == THETA))].max() for d in cells.drifts])
 
 
-def _typical(cells: Cells, changes: list[Array]) -> Array:
+def _typical(cells: Cells, changes: list[Floats]) -> Floats:
     """Return the root mean square change of each state dimension, shape (6,)."""
     square = np.concatenate([own.reshape(len(own), -1) for own in changes]) ** 2
     own = square.mean(axis=0)[cells.places]
@@ -74,14 +71,14 @@ def _typical(cells: Cells, changes: list[Array]) -> Array:
     return np.array([np.sqrt(own[of == d].mean()) if (of == d).any() else 0.0 for d in range(6)])
 
 
-def _vectors(each: Array, rates: tuple[int, ...]) -> Array:
+def _vectors(each: Floats, rates: tuple[int, ...]) -> Floats:
     """Return sizes of velocity changes, x and y as one vector, shape (rate,)."""
     plane = [d for d in rates if d % _RATE != THETA]
     size = float(np.sqrt((each[plane] ** 2).sum()))
     return np.array([each[d] if d % _RATE == THETA else size for d in rates])
 
 
-def bodies_acceleration(problem: Problem) -> Array:
+def bodies_acceleration(problem: Problem) -> Floats:
     """Return the root mean square acceleration along smoothed trajectories, shape (velocity,).
 
     Of x and y it is that of the vector, whatever the axes' directions (m/s^2); of omega in rad/s^2.

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.history import History, Segments
@@ -23,12 +22,10 @@ from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import OneWorld, PartedSimulator, Physics
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 #: Phi, start states and wrenches in, next states out.
-Engine = Callable[[Array, Array, Array], Array]
+Engine = Callable[[Floats, Floats, Floats], Floats]
 #: How far predictions may differ and be the same to the likelihood, in units of the noise.
 _SAME = 0.01
 
@@ -119,7 +116,7 @@ class Problem:
         """The same problem with fewer engine steps, for derivatives and changes."""
         return replace(self, physics=self.physics.rough)
 
-    def joined(self, phi: Array, sigma: Array) -> Problem:
+    def joined(self, phi: Floats, sigma: Floats) -> Problem:
         """Return the problem with bodies that meet at these draws in one part; itself if none do.
 
         Parameters
@@ -178,7 +175,7 @@ class Problem:
         return self.data.segments
 
     @property
-    def inputs(self) -> Array:
+    def inputs(self) -> Floats:
         """Inputs of the segments' intervals; see :meth:`Physics.inputs`.
 
         Shape (transition, H, body, 3), or (transition, H, body, 9) as in
@@ -192,7 +189,7 @@ class Problem:
         return self.data.observations
 
     @cached_property
-    def noise_prior(self) -> tuple[Array, float]:
+    def noise_prior(self) -> tuple[Floats, float]:
         """Medians of sigma's prior, shape (parameter,), and its log-scale."""
         if self.likelihood.prior is None:
             return sigma_prior(self.observations, self.segments)
@@ -212,7 +209,7 @@ class Problem:
             return self.likelihood.noise
         raise TypeError("the problem is one of single transitions, expected whole trajectories")
 
-    def quiet(self, sigma: Array, share: float) -> Array:
+    def quiet(self, sigma: Floats, share: float) -> Floats:
         """Return sigma with unexplained accelerations of at most a share of their prior median."""
         steps, sigma = self.trajectory_noise.cells.accelerations, sigma.copy()
         sigma[steps] = np.minimum(sigma[steps], share * self.noise_prior[0][steps])
@@ -223,7 +220,7 @@ class Problem:
         """Noise variables with their state dimensions, in the order of sigma."""
         return self.likelihood.variables(self.observations)
 
-    def named(self, phi: Array, sigma: Array) -> dict[str, Array]:
+    def named(self, phi: Floats, sigma: Floats) -> dict[str, Floats]:
         """Return the model's variables by name at phi (..., p) and sigma (..., parameter)."""
         if self.scalar_sigma:
             return self.layout.to_dict(phi) | {"sigma": sigma[..., 0]}
@@ -244,7 +241,7 @@ class Problem:
         return tuple(f"{name}[{of}]" for name, own in self.noise_variables.items() for of in own)
 
     @property
-    def measured(self) -> Array:
+    def measured(self) -> Floats:
         """Measured next states, shape (transition, H, body, state), NaN where missing."""
         if isinstance(self.likelihood, TransitionLikelihood):
             return self.observations.values
@@ -253,17 +250,17 @@ class Problem:
         raw = observed[segments.trajectory, segments.step + 1][:, None]
         return np.asarray(raw[..., self.observations.columns])
 
-    def predict(self, phi: Array, engine: Engine | None = None) -> Array:
+    def predict(self, phi: Floats, engine: Engine | None = None) -> Floats:
         """Return predicted states, shape (..., transition, H, body, 6), for phi (..., p)."""
         engine, given = engine or self.simulator, (phi, self.segments.start, self.inputs)
         sensitivity = self.likelihood.sensitivity
         return engine(*given) if sensitivity is None else sensitivity.predicted(engine, *given)
 
-    def residual(self, phi: Array, engine: Engine | None = None) -> Array:
+    def residual(self, phi: Floats, engine: Engine | None = None) -> Floats:
         """Return measured minus predicted states, shape (..., transition, H, body, state)."""
         return self.observations.residual(self.predict(phi, engine))
 
-    def whitened(self, phi: Array, sigma: Array, engine: Engine | None = None) -> Array:
+    def whitened(self, phi: Floats, sigma: Floats, engine: Engine | None = None) -> Floats:
         """Return the whitened residuals, shape (..., transition, coordinate)."""
         return self.likelihood.whiten(self.residual(phi, engine), sigma)
 
@@ -272,7 +269,7 @@ class Problem:
         """Places in phi of the parameters of the noise's tails."""
         return tuple(tail_places(self.physics))
 
-    def nu(self, phi: Array | None = None) -> float | Array | None:
+    def nu(self, phi: Floats | None = None) -> float | Floats | None:
         """Return the degrees of freedom of the noise at phi; None for a Gaussian.
 
         Shape (..., 1, 1, body, 1) where an effect of the noise stage says so.
@@ -288,14 +285,14 @@ class Problem:
             raise ParameterError("the noise's tails depend on the parameters; give phi")
         return degrees_of_freedom(self.physics, phi, self.likelihood.nu)
 
-    def robust(self, phi: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
+    def robust(self, phi: Floats, sigma: Floats, engine: PartedSimulator | None = None) -> Floats:
         """Return residuals whose half squares are the negative log-density up to a constant.
 
         Shape (..., transition, cell).
         """
         return self.likelihood.robust(self.residual(phi, engine), sigma, self.nu(phi))
 
-    def log_density(self, residual: Array, sigma: Array, phi: Array | None = None) -> Array:
+    def log_density(self, residual: Floats, sigma: Floats, phi: Floats | None = None) -> Floats:
         """Return the log-likelihood of each transition, shape (..., transition).
 
         Parameters
@@ -311,8 +308,8 @@ class Problem:
         return self.likelihood.log_density(residual, sigma, measured, self.nu(phi))
 
     def next_states(
-        self, states: Array, sigma: Array, rng: np.random.Generator, phi: Array | None = None
-    ) -> Array:
+        self, states: Floats, sigma: Floats, rng: np.random.Generator, phi: Floats | None = None
+    ) -> Floats:
         """Draw measured next states by Eq. 13 about predictions (..., transition, H, body, 6)."""
         predicted = states[..., self.observations.columns]
         values = self.observations.values

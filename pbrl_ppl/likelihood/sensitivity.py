@@ -20,13 +20,12 @@ from numpy.typing import NDArray
 from pbrl_ppl.likelihood.cells import Cells
 from pbrl_ppl.parameters import Layout, change_from
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import Bools, Floats
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 #: No state moves as far as this (SI units): a sampler may look at parameters that say so.
 _FAR = 1e6
 #: Predicts next states from phi, start states and inputs, as a simulator does.
-Engine = Callable[[Array, Array, Array], Array]
+Engine = Callable[[Floats, Floats, Floats], Floats]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -52,12 +51,12 @@ class Sensitivity:
     scene: Scene
     layout: Layout
     cells: Cells
-    slope: Array
-    phi: Array
-    before: Array
+    slope: Floats
+    phi: Floats
+    before: Floats
 
     @cached_property
-    def _sets(self) -> list[tuple[Array, Bools, Array]]:
+    def _sets(self) -> list[tuple[Floats, Bools, Floats]]:
         """Parameter sets of phi, the transitions of each, and their derivatives.
 
         The latter have the shape (transition * cell, p).
@@ -71,7 +70,7 @@ class Sensitivity:
         """Return the sensitivity of these transitions alone."""
         return replace(self, slope=self.slope[rows], phi=self.phi[rows], before=self.before[rows])
 
-    def moved(self, phi: Array) -> Array:
+    def moved(self, phi: Floats) -> Floats:
         """Return the change of the states with phi, shape (..., transition, cell)."""
         result = np.empty((*phi.shape[:-1], *self.before.shape[:2]))
         for own, rows, by_phi in self._sets:
@@ -79,12 +78,12 @@ class Sensitivity:
             result[..., rows, :] = change.reshape(*phi.shape[:-1], -1, result.shape[-1])
         return result
 
-    def begun(self, moved: Array, start: Array) -> Array:
+    def begun(self, moved: Floats, start: Floats) -> Floats:
         """Return moved start states, shape (..., transition, body, 6)."""
         states = np.broadcast_to(start, (*moved.shape[:-2], *start.shape))
         return self.cells.completed(self.scene, self._added(states, moved))
 
-    def predicted(self, engine: Engine, phi: Array, start: Array, inputs: Array) -> Array:
+    def predicted(self, engine: Engine, phi: Floats, start: Floats, inputs: Floats) -> Floats:
         """Return next states from the smoothed starts, shape (..., transition, 1, body, 6).
 
         Parameters
@@ -104,7 +103,7 @@ class Sensitivity:
         back = np.matmul(self.slope, moved[..., None])[..., 0]
         return self._added(states, -back[..., None, :])
 
-    def _added(self, states: Array, change: Array) -> Array:
+    def _added(self, states: Floats, change: Floats) -> Floats:
         """Return states (..., body, 6) with changed cells (..., cell)."""
         states = np.array(states, order="C")  # so that what is reshaped is a view of it
         flat = states.reshape(*states.shape[:-2], -1)

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.likelihood.smoothing import along_trajectories
 from pbrl_ppl.physics import touching
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 def simulated_trajectories(
-    problem: Problem, phi: Array, sigma: Array, rng: np.random.Generator
-) -> Array:
+    problem: Problem, phi: Floats, sigma: Floats, rng: np.random.Generator
+) -> Floats:
     """Return simulated measurements from the recorded first states and commands.
 
     Parameters
@@ -54,7 +52,7 @@ def simulated_trajectories(
     return np.where(np.isfinite(observed), measured, np.nan)
 
 
-def with_measurements(problem: Problem, observed: Array) -> Problem:
+def with_measurements(problem: Problem, observed: Floats) -> Problem:
     """Return the problem of whole trajectories with other measurements.
 
     Parameters

@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.history import longest_gap, unseen
 from pbrl_ppl.likelihood.cells import Cells, cells_of, check_moves, first_states
@@ -17,10 +16,7 @@ from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.physics import touching
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
+from pbrl_ppl.state import STATE, Bools, Floats
 
 #: Prior scale of an unmeasured state, as a multiple of the largest estimated one.
 _FAR = 10.0
@@ -35,7 +31,7 @@ _RATE = 3
 
 
 def along_trajectories(
-    problem: Problem, phi: Array, sigma: Array | None = None, cells: Cells | None = None
+    problem: Problem, phi: Floats, sigma: Floats | None = None, cells: Cells | None = None
 ) -> Problem:
     """Return the problem with the likelihood of whole trajectories, linearised at smoothed states.
 
@@ -96,7 +92,7 @@ def single_transitions(problem: Problem) -> Problem:
     return problem.on(data).with_likelihood(prior=None)
 
 
-def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
+def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     """Return the problem linearised about states smoothed at phi and sigma.
 
     Near-zero unexplained accelerations are raised to a small value: with stick and slip, smoothing
@@ -123,7 +119,7 @@ def smoothed(problem: Problem, phi: Array, sigma: Array) -> Problem:
     return problem
 
 
-def with_sensitivity(problem: Problem, phi: Array, sigma: Array) -> Problem:
+def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     """Return the problem with smoothed states that follow phi to first order.
 
     Parameters
@@ -152,7 +148,7 @@ def with_sensitivity(problem: Problem, phi: Array, sigma: Array) -> Problem:
     return problem.along(replace(noise, sensitivity=follow))
 
 
-def foreseen(problem: Problem, phi: Array) -> Array:
+def foreseen(problem: Problem, phi: Floats) -> Floats:
     """Return linearised states, with unobserved rows predicted from the row before.
 
     Interpolation between rows that are far apart would miss contacts.
@@ -183,7 +179,7 @@ def foreseen(problem: Problem, phi: Array) -> Array:
     return states
 
 
-def _steps(problem: Problem, cells: Cells, sigma: Array) -> Array:
+def _steps(problem: Problem, cells: Cells, sigma: Floats) -> Floats:
     """Return the steps of finite differences by the cells, shape (cell,)."""
     error = cells.errors(sigma)
     known = {place: error[i] / problem.scene.time_step for i, place in enumerate(cells.places)}
@@ -192,7 +188,7 @@ def _steps(problem: Problem, cells: Cells, sigma: Array) -> Array:
     return np.where(rate, np.maximum(error, below), error)
 
 
-def _between(begin: Array, end: Array, share: float, cells: Cells) -> Array:
+def _between(begin: Floats, end: Floats, share: float, cells: Cells) -> Floats:
     """Return noise parameters with accelerations between two sets, in the logarithm."""
     sigma, steps = end.copy(), list(cells.accelerations)
     larger = np.maximum(begin, end)[steps]
@@ -200,7 +196,7 @@ def _between(begin: Array, end: Array, share: float, cells: Cells) -> Array:
     return sigma
 
 
-def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
+def _guess(problem: Problem, cells: Cells, phi: Floats) -> Floats:
     """Return first noise parameters, from residuals of single steps."""
     residual = cells.of_residual(problem.residual(phi))
     size = np.sqrt(np.nanmedian(residual**2, axis=0)) / 0.67
@@ -214,7 +210,7 @@ def _guess(problem: Problem, cells: Cells, phi: Array) -> Array:
     return np.maximum(guess, problem.noise_prior[0] * 0.01)
 
 
-def _moved(problem: Problem, cells: Cells, first: Bools, before: Array, after: Array) -> Array:
+def _moved(problem: Problem, cells: Cells, first: Bools, before: Floats, after: Floats) -> Floats:
     """Return the states moved by the smoothed deviations."""
     segments = problem.segments
     states = problem.data.smoothed_states.copy()
@@ -227,7 +223,7 @@ def _moved(problem: Problem, cells: Cells, first: Bools, before: Array, after: A
 
 
 def _sloped(
-    problem: Problem, cells: Cells, phi: Array, sigma: Array, steps: Array
+    problem: Problem, cells: Cells, phi: Floats, sigma: Floats, steps: Floats
 ) -> TrajectoryNoise:
     """Linearise the transitions about the problem's states by central differences."""
     segments = problem.segments
@@ -245,7 +241,7 @@ def _sloped(
     return linearised(problem, cells, np.nan_to_num(slope), sigma)
 
 
-def linearised(problem: Problem, cells: Cells, slope: Array, sigma: Array) -> TrajectoryNoise:
+def linearised(problem: Problem, cells: Cells, slope: Floats, sigma: Floats) -> TrajectoryNoise:
     """Return the noise along a problem's trajectories from given slopes.
 
     Parameters

@@ -5,12 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Noise, at_stage
 from pbrl_ppl.physics import Physics
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 def tail_places(physics: Physics) -> list[int]:
@@ -23,7 +21,7 @@ def tail_places(physics: Physics) -> list[int]:
     ]
 
 
-def degrees_of_freedom(physics: Physics, phi: Array, nu: float | None) -> Array:
+def degrees_of_freedom(physics: Physics, phi: Floats, nu: float | None) -> Floats:
     """Return the degrees of freedom of each body's noise.
 
     Parameters
@@ -43,7 +41,7 @@ def degrees_of_freedom(physics: Physics, phi: Array, nu: float | None) -> Array:
     """
     labels = physics.layout.labels
 
-    def value(attached: Attached, variable: str) -> Array:
+    def value(attached: Attached, variable: str) -> Floats:
         return np.asarray(phi[..., labels.index(f"{variable}[{attached.body}]")])
 
     zero = np.full(phi.shape[:-1], 0.0 if nu is None else 1.0 / nu)

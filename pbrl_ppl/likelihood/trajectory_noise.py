@@ -6,16 +6,12 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood.cells import Cells, step_covariances
 from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.physics import Memory
-
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Bools, Floats, Ints
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -62,13 +58,13 @@ class TrajectoryNoise:
     """
 
     cells: Cells
-    slope: Array
+    slope: Floats
     first: Bools
     seen: Bools
-    measured: Array
-    begin: Array
-    wide: Array
-    sigma: Array
+    measured: Floats
+    begin: Floats
+    wide: Floats
+    sigma: Floats
     touching: Bools
     sensitivity: Sensitivity | None = None
     memory: Memory = field(default_factory=Memory, init=False, repr=False)
@@ -78,14 +74,14 @@ class TrajectoryNoise:
         """The filter's linear model."""
         return Extended.of(self.cells, self.slope, self.seen)
 
-    def _gains(self, sigma: Array) -> tuple[Array, Array, Array, Array]:
+    def _gains(self, sigma: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         """Gain, scale and covariance of the filter at noise parameters, and the log of the scale.
 
         The first three are as of :func:`kalman.gains`; the last is summed, shape (transition,).
         """
         return self.memory.recall((sigma,), self._filter_gains)
 
-    def _filter_gains(self, sigma: Array) -> tuple[Array, Array, Array, Array]:
+    def _filter_gains(self, sigma: Floats) -> tuple[Floats, Floats, Floats, Floats]:
         own = self._extended
         gain, scale, after = gains(
             own.slope, self.first, own.seen, self._begin(sigma),
@@ -93,11 +89,11 @@ class TrajectoryNoise:
         )  # fmt: skip
         return gain, scale, after, np.log(scale).sum(axis=1)
 
-    def scale(self, sigma: Array) -> Array:
+    def scale(self, sigma: Floats) -> Floats:
         """Standard deviation of each innovation, shape (transition, cell); 1 where not seen."""
         return self._gains(sigma)[1][:, : len(self.cells.places)]
 
-    def covariance(self, sigma: Array) -> Array:
+    def covariance(self, sigma: Floats) -> Floats:
         """Covariance of filtered states, shape (transition, cell, cell)."""
         return self._extended.covariance(self.cells, self._gains(sigma)[2])
 
@@ -111,7 +107,7 @@ class TrajectoryNoise:
         """1 where bodies touch in a transition and 0 elsewhere, shape (transition,)."""
         return self.touching.astype(np.int64)
 
-    def whiten(self, residual: Array, sigma: Array) -> Array:
+    def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return the whitened innovations.
 
         Parameters
@@ -128,7 +124,7 @@ class TrajectoryNoise:
         """
         return self.whitened(residual, sigma)[0]
 
-    def whitened(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+    def whitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return whitened innovations with the log of their standard deviations.
 
         The latter is summed over the cells, shape (..., transition) as that of sigma leads.
@@ -146,13 +142,13 @@ class TrajectoryNoise:
             white[mine], log_scale[mine] = self.filtered(rows[mine], row)[0], self._gains(row)[3]
         return white.reshape(cells.shape), log_scale.reshape(cells.shape[:-1])
 
-    def filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+    def filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return whitened innovations and filtered deviations of residuals."""
         white, state = self._filtered(residual, sigma)
         cells = self.cells
         return white[..., : len(cells.places)], self._extended.states(cells, state)
 
-    def _filtered(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+    def _filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return the same as :meth:`filtered` in the filter's extended state."""
         own, (gain, scale, *_) = self._extended, self._gains(sigma)
         rows = np.ascontiguousarray(own.padded(residual))  # another layout would be compiled, too
@@ -162,17 +158,17 @@ class TrajectoryNoise:
         )  # fmt: skip
         return white, state
 
-    def of_cells(self, nu: float | Array | None, shape: tuple[int, ...]) -> float | Array | None:
+    def of_cells(self, nu: float | Floats | None, shape: tuple[int, ...]) -> float | Floats | None:
         """Return the degrees of freedom of each innovation, from those of residuals."""
         if not isinstance(nu, np.ndarray) or nu.ndim == 0:
             return nu
         return self.cells.of_residual(np.broadcast_to(nu, shape))
 
-    def log_scale(self, sigma: Array) -> Array:
+    def log_scale(self, sigma: Floats) -> Floats:
         """Return the summed log standard deviations of innovations, shape (transition,)."""
         return self._gains(sigma)[3]
 
-    def smoothed(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+    def smoothed(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return smoothed deviations before and after transitions, (transition, cell) each."""
         own, cells = self._extended, self.cells
         white, filtered = self._filtered(residual[None], sigma)
@@ -181,20 +177,20 @@ class TrajectoryNoise:
         end = filtered[0] - np.einsum("kab,kb->ka", self._gains(sigma)[2], after)
         return own.states(cells, begin), own.states(cells, end)
 
-    def pulled(self, weighted: Array, sigma: Array) -> Array:
+    def pulled(self, weighted: Floats, sigma: Floats) -> Floats:
         """Return the derivative of weighted innovations by the predictions, (transition, cell)."""
         padded = self._extended.padded(weighted)
         return self._pulled(padded, sigma)[1][:, : weighted.shape[1]]
 
-    def _pulled(self, weighted: Array, sigma: Array) -> tuple[Array, Array, Array]:
+    def _pulled(self, weighted: Floats, sigma: Floats) -> tuple[Floats, Floats, Floats]:
         """Return :func:`kalman.adjoint` of weighted innovations."""
         own, (gain, scale, *_) = self._extended, self._gains(sigma)
-        pulled: tuple[Array, Array, Array] = adjoint(
+        pulled: tuple[Floats, Floats, Floats] = adjoint(
             own.slope, self.last, own.seen, gain, scale, weighted
         )
         return pulled
 
-    def score(self, residual: Array, sigma: Array) -> tuple[float, Array]:
+    def score(self, residual: Floats, sigma: Floats) -> tuple[float, Floats]:
         """Return the Gaussian log-likelihood and its derivative by the log noise parameters.
 
         Parameters
@@ -223,7 +219,7 @@ class TrajectoryNoise:
         value = norm - 0.5 * float((white**2).sum()) - float(log_scale.sum())
         return value, sigma**2 * slope
 
-    def auxiliary(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+    def auxiliary(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return standardised residuals of each measurement given all others.
 
         Parameters
@@ -245,7 +241,7 @@ class TrajectoryNoise:
         end, begin = every[..., : residual.shape[1]]
         return end, np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0)
 
-    def foreseen(self, residual: Array, sigma: Array) -> tuple[Array, Array]:
+    def foreseen(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return the one-step predictive mean and covariance of each measurement, as deviations.
 
         Parameters
@@ -272,8 +268,8 @@ class TrajectoryNoise:
         )
 
     def random(
-        self, predicted: Array, linearised: Array, sigma: Array, rng: np.random.Generator
-    ) -> Array:
+        self, predicted: Floats, linearised: Floats, sigma: Floats, rng: np.random.Generator
+    ) -> Floats:
         """Draw measured next states given those before (Eq. 13), shape of ``predicted``.
 
         Parameters
@@ -291,7 +287,7 @@ class TrajectoryNoise:
         result[:, 0, body, np.searchsorted(self.cells.columns, dimension)] += drawn
         return result
 
-    def _begin(self, sigma: Array) -> Array:
+    def _begin(self, sigma: Floats) -> Floats:
         """Return the variance of the filter's first state of each trajectory."""
         state = np.where(self.wide > 0, self.wide, self.cells.white(sigma) ** 2)
         error = np.broadcast_to(
@@ -323,14 +319,14 @@ class Extended:
         Which rows act in every step, shape (push,).
     """
 
-    slope: Array
+    slope: Floats
     seen: Bools
-    push: Array
+    push: Floats
     pushed: Ints
     always: Bools
 
     @classmethod
-    def of(cls, cells: Cells, slope: Array, seen: Bools) -> Extended:
+    def of(cls, cells: Cells, slope: Floats, seen: Bools) -> Extended:
         """Return the extended model of the cells; arguments as of `TrajectoryNoise`."""
         at, parameters = cells.drifted
         if not len(at):
@@ -352,19 +348,19 @@ class Extended:
             np.concatenate([cells.always, np.ones(k, dtype=bool)]),
         )
 
-    def steps(self, sigma: Array) -> Array:
+    def steps(self, sigma: Floats) -> Floats:
         """Return the process noise of a step without and with contact.
 
         Shape (2, coordinate, coordinate).
         """
         return step_covariances(self.push, sigma[self.pushed], self.always)
 
-    def padded(self, values: Array) -> Array:
+    def padded(self, values: Floats) -> Floats:
         """Return values of cells (..., cell), padded with zeros for the errors."""
         more = self.slope.shape[1] - values.shape[-1]
         return np.pad(values, (*[(0, 0)] * (values.ndim - 1), (0, more))) if more else values
 
-    def states(self, cells: Cells, coordinates: Array) -> Array:
+    def states(self, cells: Cells, coordinates: Floats) -> Floats:
         """Return cells without their errors, shape (..., cell)."""
         at, d = cells.drifted[0], len(cells.places)
         if not len(at):
@@ -373,7 +369,7 @@ class Extended:
         result[..., at] -= coordinates[..., d:]
         return result
 
-    def covariance(self, cells: Cells, whole: Array) -> Array:
+    def covariance(self, cells: Cells, whole: Floats) -> Floats:
         """Return the covariance of cells without errors, shape (transition, cell, cell)."""
         half = self.states(cells, whole)
         return self.states(cells, half.swapaxes(-1, -2))

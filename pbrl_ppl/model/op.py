@@ -9,7 +9,6 @@ from typing import Any
 import numba
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.gradient import grad_undefined
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
@@ -18,9 +17,7 @@ from pytensor.link.numba.dispatch.basic import numba_funcify
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.likelihood import Sensitivity
 from pbrl_ppl.physics import Memory, Physics
-from pbrl_ppl.state import INPUT, WRENCH
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import INPUT, WRENCH, Floats
 
 
 class _EngineOp(Op):
@@ -36,12 +33,12 @@ class _EngineOp(Op):
         """Last dimensions of the output, after (transition, H)."""
         raise NotImplementedError
 
-    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+    def _compute(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         raise NotImplementedError
 
     def _following(
-        self, engine: Callable[..., Array], phi: Array, start: Array, actions: Array
-    ) -> Array:
+        self, engine: Callable[..., Floats], phi: Floats, start: Floats, actions: Floats
+    ) -> Floats:
         """Return predictions of an engine from start states that follow phi."""
         if self.sensitivity is None:
             return engine(phi, start, actions)
@@ -86,7 +83,7 @@ class _EngineOp(Op):
         """Run the engine."""
         outputs[0][0] = self.predict(*inputs)
 
-    def predict(self, phi: Array, start: Array, actions: Array) -> Array:
+    def predict(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Run the engine; NaN where phi is impossible."""
         try:
             return self._compute(phi, start, actions)
@@ -126,7 +123,7 @@ class SimulatorOp(_EngineOp):
     def _last(self) -> tuple[int, ...]:
         return len(self.physics.scene.moving), 6
 
-    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+    def _compute(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         if self.sensitivity is None:
             return self.physics.simulator.recall(phi, start, actions)
         follow = partial(self._following, self.physics.simulator.recall)
@@ -163,7 +160,7 @@ class OneWorldOp(_EngineOp):
     def _last(self) -> tuple[int, ...]:
         return len(self.physics.scene.moving), 6
 
-    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+    def _compute(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         return self._following(self.physics.one_world, phi, start, actions)
 
 
@@ -177,7 +174,7 @@ class JacobianOp(_EngineOp):
     def _last(self) -> tuple[int, ...]:
         return len(self.physics.scene.moving), 6, self.physics.layout.size
 
-    def _compute(self, phi: Array, start: Array, actions: Array) -> Array:
+    def _compute(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         if self.sensitivity is not None:
             start = self.sensitivity.begun(self.sensitivity.moved(phi), start)
         return self.physics.jacobian(phi, start, actions)
@@ -186,7 +183,7 @@ class JacobianOp(_EngineOp):
 @numba_funcify.register(_EngineOp)
 def _numba_engine(op: _EngineOp, node: Any = None, **kwargs: Any) -> Any:
     """Dispatch the Op in numba: a call in object mode."""
-    kind = numba.types.Array(numba.float64, 2 + len(op._last), "C")
+    kind = numba.types.Floats(numba.float64, 2 + len(op._last), "C")
 
     @numba.njit
     def simulate(phi, start, actions):  # type: ignore[no-untyped-def]

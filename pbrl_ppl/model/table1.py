@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-from numpy.typing import NDArray
 from scipy.special import i0e
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import Prior
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Above this concentration the von Mises density of PyMC 5 overflows; PyMC wants a concentration
 #: above 0, and at this one the density is uniform to the last digit.
@@ -78,7 +76,7 @@ def random_variable(
     )
 
 
-def _von_mises(name: str, mu: Array, kappa: Array, dims: str) -> Any:
+def _von_mises(name: str, mu: Floats, kappa: Floats, dims: str) -> Any:
     """Declare PyMC's von Mises, or an equal density that does not overflow if it is sharp."""
     kappa = np.maximum(kappa, _LEVEL)
     if kappa.max() <= _SHARP:

@@ -9,14 +9,12 @@ from typing import Any
 import numba
 import numpy as np
 import pytensor.tensor as pt
-from numpy.typing import NDArray
 from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_funcify
 
 from pbrl_ppl.likelihood import TrajectoryLikelihood
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Step of a derivative by the logarithm of a noise parameter.
 _STEP = 1e-5
@@ -36,7 +34,7 @@ class _DensityOp(Op):
         self.likelihood = likelihood
         self._given = likelihood
 
-    def given(self, deviation: Array) -> TrajectoryLikelihood:
+    def given(self, deviation: Floats) -> TrajectoryLikelihood:
         """Return the likelihood of these measurements; the last one is kept with its gains."""
         noise = self.likelihood.noise
         measured = noise.cells.of_residual(deviation)
@@ -44,7 +42,7 @@ class _DensityOp(Op):
             self._given = replace(self.likelihood, noise=replace(noise, measured=measured))
         return self._given
 
-    def density(self, deviation: Array, residual: Array, sigma: Array, tail: Array) -> Array:
+    def density(self, deviation: Floats, residual: Floats, sigma: Floats, tail: Floats) -> Floats:
         """Return the log-density of each transition given those before, shape (transition,)."""
         if not (np.isfinite(sigma).all() and (sigma > 0).all()):
             return np.full(len(residual), -np.inf)
@@ -105,8 +103,8 @@ class _DerivativeOp(_DensityOp):
             place[0] = value
 
     def derivatives(
-        self, deviation: Array, residual: Array, sigma: Array, tail: Array, weights: Array
-    ) -> tuple[Array, Array, Array, Array]:
+        self, deviation: Floats, residual: Floats, sigma: Floats, tail: Floats, weights: Floats
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the derivatives by the inputs, in their order."""
         noise = self.given(deviation).noise
         white = noise.filtered(noise.cells.of_residual(residual)[None], sigma)[0][0]
@@ -128,7 +126,7 @@ class _DerivativeOp(_DensityOp):
         by_deviation = np.zeros_like(residual)
         by_deviation[:, 0, body, place] = by_cell - np.einsum("kab,ka->kb", slope, following)
 
-        def total(sigma: Array, tail: Array) -> float:
+        def total(sigma: Floats, tail: Floats) -> float:
             return float(self.density(deviation, residual, sigma, tail) @ weights)
 
         by_sigma = np.empty_like(sigma)
@@ -150,7 +148,7 @@ class _DerivativeOp(_DensityOp):
 @numba_funcify.register(TrajectoryDensityOp)
 def _numba_density(op: TrajectoryDensityOp, node: Any = None, **kwargs: Any) -> Any:
     """Dispatch the density in numba: a call in object mode."""
-    kind = numba.types.Array(numba.float64, 1, "C")
+    kind = numba.types.Floats(numba.float64, 1, "C")
 
     @numba.njit
     def density(deviation, residual, sigma, tail):  # type: ignore[no-untyped-def]
@@ -164,8 +162,8 @@ def _numba_density(op: TrajectoryDensityOp, node: Any = None, **kwargs: Any) -> 
 @numba_funcify.register(_DerivativeOp)
 def _numba_derivative(op: _DerivativeOp, node: Any = None, **kwargs: Any) -> Any:
     """Dispatch the derivative in numba: a call in object mode."""
-    wide = numba.types.Array(numba.float64, 4, "C")
-    flat = numba.types.Array(numba.float64, 1, "C")
+    wide = numba.types.Floats(numba.float64, 4, "C")
+    flat = numba.types.Floats(numba.float64, 1, "C")
 
     @numba.njit
     def derivative(deviation, residual, sigma, tail, weights):  # type: ignore[no-untyped-def]

@@ -11,7 +11,6 @@ from itertools import combinations, combinations_with_replacement, product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Problem
@@ -20,8 +19,8 @@ from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import Floats
 
-Array = NDArray[np.float64]
 #: Two names in the order of ``scene.joinable``, or None where there is no joint.
 Pair = tuple[str, str] | None
 
@@ -136,7 +135,7 @@ def alike(scene: Scene) -> tuple[Alike, ...]:
     return tuple(found)
 
 
-def index_law(pair: Pair, scene: Scene, p_a: Array, p_b: Array) -> Array:
+def index_law(pair: Pair, scene: Scene, p_a: Floats, p_b: Floats) -> Floats:
     """Probabilities of (i_a, i_b), shape (n, n), given what is joined.
 
     The two orders of a pair are the same joint. Where the indices have one prior, it is given in

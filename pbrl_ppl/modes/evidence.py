@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import gammaln, ndtr, ndtri
 from scipy.stats import truncnorm
@@ -14,8 +13,7 @@ from scipy.stats import truncnorm
 from pbrl_ppl.likelihood import log_posterior, noise_law
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior, evened
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Draws a round, rounds at most, and effective draws that are enough: the log-evidence is then
 #: known to within 0.07.
@@ -69,7 +67,7 @@ class Coordinates:
         #: The mode, shape (d,).
         self.origin = np.concatenate([z, (sigma - self._centre) / self._spread])
 
-    def values(self, z: Array) -> tuple[Array, Array]:
+    def values(self, z: Floats) -> tuple[Floats, Floats]:
         """Return phi (n, p) and sigma (n, parameter) at z (n, d)."""
         p = len(self._laws)
         columns = [law.value(z[:, i]) for i, law in enumerate(self._laws)]
@@ -78,7 +76,7 @@ class Coordinates:
         states = len(self.problem.observations.columns)
         return phi, np.broadcast_to(sigma, (len(z), states))
 
-    def log_density(self, z: Array) -> Array:
+    def log_density(self, z: Floats) -> Floats:
         """Return the log-posterior density of z, normalised by the prior, shape (n,)."""
         phi, sigma = self.values(z)
         problem = self.problem
@@ -89,7 +87,7 @@ class Coordinates:
         even = evened(problem.layout, phi).sum(axis=-1)  # it sees one description of a wheel
         return np.asarray(np.concatenate(parts).sum(axis=-1) + _log_normal(z) + even)
 
-    def gauss_newton(self, mode: Mode) -> tuple[Array, Array]:
+    def gauss_newton(self, mode: Mode) -> tuple[Floats, Floats]:
         """Return the mode (d,) and the Laplace covariance (d, d) in these coordinates."""
         p, step = len(self._laws), 1e-4
         slope = np.array(
@@ -127,7 +125,7 @@ class _Law:
             ends = (np.array(prior.support) - prior.mu) / prior.sigma
             self._law = truncnorm(*ends, prior.mu, prior.sigma)
 
-    def standard(self, x: float) -> Array:
+    def standard(self, x: float) -> Floats:
         """Return the coordinate of a value."""
         prior = self._prior
         if prior.family in ("log_normal", "normal"):
@@ -138,7 +136,7 @@ class _Law:
         below, above = self._law.cdf(x), self._law.sf(x)
         return np.asarray(np.where(below < above, ndtri(below), -ndtri(above)))
 
-    def value(self, z: Array) -> Array:
+    def value(self, z: Floats) -> Floats:
         """Return the values at coordinates, same shape."""
         prior = self._prior
         if prior.family == "log_normal":
@@ -212,7 +210,7 @@ def importance(mode: Mode, rng: np.random.Generator) -> Evidence:
     for _ in range(_ROUNDS):
         factor = np.asarray(np.linalg.cholesky(covariance), dtype=float)
         radius = np.sqrt(_NU / rng.chisquare(_NU, (_DRAWS, 1)))
-        moved: Array = radius * rng.standard_normal((_DRAWS, d)) @ factor.T
+        moved: Floats = radius * rng.standard_normal((_DRAWS, d)) @ factor.T
         z = centre + moved
         log_weight = coordinates.log_density(z) - _log_student(moved, factor)
         top = log_weight.max()
@@ -234,12 +232,12 @@ def importance(mode: Mode, rng: np.random.Generator) -> Evidence:
     return found
 
 
-def _log_normal(z: Array) -> Array:
+def _log_normal(z: Floats) -> Floats:
     """Return the log-density of a standard normal, shape (n,), at (n, d)."""
     return np.asarray(-0.5 * (z**2).sum(axis=1) - 0.5 * z.shape[1] * np.log(2 * np.pi))
 
 
-def _log_student(x: Array, factor: Array) -> Array:
+def _log_student(x: Floats, factor: Floats) -> Floats:
     """Return the log-density of the proposal about its centre, shape (n,), at (n, d)."""
     d = x.shape[1]
     square = (solve_triangular(factor, x.T, lower=True) ** 2).sum(axis=0)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from scipy.optimize import least_squares
@@ -28,8 +27,7 @@ from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import JOINT_ANCHORS, inside, prior_draws
 from pbrl_ppl.scene import WORLD, Joint, Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: A log-evidence this far below the best by the Laplace method is not looked at more closely: the
 #: approximation's error is a few units, and the same for all configurations in great part.
@@ -199,7 +197,7 @@ def _joint(problem: Problem, configuration: Configuration, fewer: Mode, worth: f
     return _best(problem, _climbed(problem, starts), worth)
 
 
-def _climbed(problem: Problem, starts: list[Array]) -> list[Mode]:
+def _climbed(problem: Problem, starts: list[Floats]) -> list[Mode]:
     return [find_mode(problem.coarse, initial=start, rounds=_ROUGH) for start in starts]
 
 
@@ -227,7 +225,7 @@ def _searched_again(mode: Mode, configuration: Configuration, worth: float, seed
     return _best(problem, _climbed(problem, [draws[i] for i in order]), worth)
 
 
-def _carried(base: Mode, problem: Problem, default: Array) -> Array:
+def _carried(base: Mode, problem: Problem, default: Floats) -> Floats:
     """Return a problem's parameters at a base mode's values, or defaults."""
     values = dict(zip(base.problem.layout.labels, base.phi, strict=True))
     labels = problem.layout.labels
@@ -255,7 +253,7 @@ def _anchor_places(problem: Problem, configuration: Configuration) -> list[int]:
 # -- where geometry puts the anchors ---------------------------------------------------------------
 
 
-def _placed(problem: Problem, configuration: Configuration) -> list[Array]:
+def _placed(problem: Problem, configuration: Configuration) -> list[Floats]:
     """Return likely anchors of a configuration's joints, four a joint, best first."""
     alternatives = [
         _anchors(problem, name, joint) for name, joint in _joined(problem, configuration)
@@ -264,7 +262,7 @@ def _placed(problem: Problem, configuration: Configuration) -> list[Array]:
     return [np.concatenate([anchors[i] for anchors in alternatives]) for i in range(count)]
 
 
-def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
+def _anchors(problem: Problem, name: str, joint: Joint) -> list[Floats]:
     """Return anchors that keep their distance over the recording: zero for a hinge.
 
     A hinge's are linear least squares; a rod's are not, and are sought from several starts.
@@ -273,7 +271,7 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
     a, b = (_states(problem, body) for body in joint.bodies or ())
     reference = [_reference(problem, body) for body in joint.bodies or ()]
 
-    def miss(anchors: Array) -> Array:
+    def miss(anchors: Floats) -> Floats:
         apart = _at(a, anchors[:2]) - _at(b, anchors[2:])
         if joint.kind == "hinge":
             return np.asarray(apart.ravel())
@@ -292,7 +290,7 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Array]:
     return [result.x for result in found[:_KEPT]]
 
 
-def _states(problem: Problem, body: str) -> Array:
+def _states(problem: Problem, body: str) -> Floats:
     """Return a body's recorded start states, shape (row, 6); zero for the world."""
     start = problem.data.history.dataset["start"].to_numpy()
     rows = start[np.isfinite(start).all(axis=(-1, -2))]
@@ -303,12 +301,12 @@ def _states(problem: Problem, body: str) -> Array:
     return np.asarray(rows[:, names.index(body)])
 
 
-def _reference(problem: Problem, body: str) -> Array:
+def _reference(problem: Problem, body: str) -> Floats:
     """Return a body at rest in its reference pose, shape (1, 6)."""
     pose = None if body == WORLD else problem.scene.body(body).pose
     return np.array([[*(pose or (0.0, 0.0, 0.0)), 0.0, 0.0, 0.0]])
 
 
-def _at(states: Array, anchor: Array) -> Array:
+def _at(states: Floats, anchor: Floats) -> Floats:
     """Return an anchor's position in the world, shape (row, 2)."""
     return np.asarray(states[:, :2] + lever(states, (anchor[0], anchor[1]))[0])

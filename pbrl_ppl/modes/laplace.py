@@ -8,15 +8,14 @@ from functools import cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, log_posterior
 from pbrl_ppl.modes.noise import FAR_OFF, best_tails, noise_gaussian, profile_sigma, tail_precision
 from pbrl_ppl.parameters import box, differentiate, inside, likeliest, prior_residual
 from pbrl_ppl.physics import PartedSimulator
+from pbrl_ppl.state import Floats
 
-Array = NDArray[np.float64]
 #: Gain in log-posterior below which a climb ends.
 STALLED = 0.02
 #: Precision of a uniform angle: 1 / variance (1/rad^2).
@@ -26,8 +25,8 @@ _CIRCLE = 3.0 / np.pi**2
 class Peak(NamedTuple):
     """The end of a climb."""
 
-    phi: Array
-    sigma: Array
+    phi: Floats
+    sigma: Floats
     log_posterior: float
 
 
@@ -54,25 +53,25 @@ class Mode:
     """
 
     problem: Problem
-    phi: Array
-    sigma: Array
-    jacobian: Array
-    covariance: Array
+    phi: Floats
+    sigma: Floats
+    jacobian: Floats
+    covariance: Floats
     log_posterior: float
     others: tuple[Mode, ...] = ()
 
     @property
-    def values(self) -> dict[str, Array]:
+    def values(self) -> dict[str, Floats]:
         """Parameters by name, shape (body,) each."""
         return self.problem.layout.to_dict(self.phi)
 
     @property
-    def factor(self) -> Array:
+    def factor(self) -> Floats:
         """Cholesky factor of the covariance, shape (p, p)."""
         jitter = 1e-15 * np.eye(len(self.phi))
         return np.asarray(np.linalg.cholesky(self.covariance + jitter), dtype=float)
 
-    def noise_gaussian(self) -> tuple[Array, Array]:
+    def noise_gaussian(self) -> tuple[Floats, Floats]:
         """Return the Laplace approximation of log sigma: mean and covariance.
 
         Shapes (parameter,) and (parameter, parameter).
@@ -84,13 +83,13 @@ class Mode:
         counts = self.problem.observations.measured.sum((0, 1, 2))
         return np.log(self.sigma), np.diag(0.5 / np.maximum(counts, 1))
 
-    def draws(self, rng: np.random.Generator, n: int) -> Array:
+    def draws(self, rng: np.random.Generator, n: int) -> Floats:
         """Draw phi from the Laplace approximation, clipped to the supports, shape (n, p)."""
         moved = self.phi + rng.standard_normal((n, len(self.phi))) @ self.factor.T
         return inside(self.problem.layout.priors, moved)
 
     @cached_property
-    def whitened_residual(self) -> Array:
+    def whitened_residual(self) -> Floats:
         """Residuals in units of noise, shape (transition, coordinate); read-only."""
         residual = self.problem.whitened(self.phi, self.sigma)
         residual.setflags(write=False)
@@ -98,8 +97,8 @@ class Mode:
 
 
 def posterior_steps(
-    function: Callable[[Array], Array], phi: Array, lower: Array, upper: Array, begin: Array
-) -> tuple[Array, Array]:
+    function: Callable[[Floats], Floats], phi: Floats, lower: Floats, upper: Floats, begin: Floats
+) -> tuple[Floats, Floats]:
     """Return the derivative with steps of one posterior standard deviation, and the steps.
 
     Friction makes kinks; a derivative over the posterior's own scale sees their average, one over a
@@ -114,7 +113,7 @@ def posterior_steps(
 
 
 def climb(
-    problem: Problem, phi: Array, slope: PartedSimulator, rounds: int = 40, tries: int = 4
+    problem: Problem, phi: Floats, slope: PartedSimulator, rounds: int = 40, tries: int = 4
 ) -> Peak:
     """Return a mode by alternating least squares for phi with the most probable sigma.
 
@@ -128,7 +127,7 @@ def climb(
     steps = 1e-3 * problem.layout.scale(phi)
     tails = list(problem.tails)
 
-    def whole(points: Array, sigma: Array, engine: PartedSimulator | None = None) -> Array:
+    def whole(points: Floats, sigma: Floats, engine: PartedSimulator | None = None) -> Floats:
         points = points.copy()
         points[..., tails] = phi[tails]  # no least squares: see `best_tails`
         z = problem.robust(points, sigma, engine).reshape(*points.shape[:-1], -1)
@@ -137,10 +136,10 @@ def climb(
 
     for _ in range(rounds):
 
-        def residual(point: Array, sigma: Array = sigma) -> Array:
+        def residual(point: Floats, sigma: Floats = sigma) -> Floats:
             return whole(point, sigma)
 
-        def jacobian(point: Array, sigma: Array = sigma, steps: Array = steps) -> Array:
+        def jacobian(point: Floats, sigma: Floats = sigma, steps: Floats = steps) -> Floats:
             size = np.minimum(steps, 0.1 * np.maximum(np.abs(point), steps))
             return differentiate(
                 lambda points: whole(points, sigma, slope), point, size, lower, upper
@@ -162,7 +161,7 @@ def climb(
     return Peak(phi, sigma, value)
 
 
-def _at(problem: Problem, phi: Array) -> tuple[Array, float]:
+def _at(problem: Problem, phi: Floats) -> tuple[Floats, float]:
     """Return the most probable sigma at phi, and the log-posterior there."""
     residual = problem.residual(phi)
     sigma = profile_sigma(problem, residual, phi)
@@ -187,7 +186,7 @@ def finish(problem: Problem, peak: Peak) -> Mode:
     lower, upper = box(priors)
     tails = list(problem.tails)
 
-    def residual(points: Array, engine: PartedSimulator | None = None) -> Array:
+    def residual(points: Floats, engine: PartedSimulator | None = None) -> Floats:
         points = points.copy()
         points[..., tails] = phi[tails]
         z = problem.robust(points, sigma, engine).reshape(len(points), -1)

@@ -6,7 +6,6 @@ from itertools import product
 from math import prod
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 from scipy.optimize import minimize
 from scipy.special import logsumexp, softmax
@@ -14,9 +13,7 @@ from scipy.special import logsumexp, softmax
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Observations, Problem, estimate_sigma, log_noise_prior
 from pbrl_ppl.physics import Part
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Floats, Ints
 
 #: A part's combinations times its measured numbers that are still summed over.
 _MOST = 50_000_000
@@ -29,7 +26,7 @@ _NUMBERS = 4_000_000
 class _Combinations:
     """All combinations of parameter sets of one part's bodies, with priors and residuals."""
 
-    def __init__(self, problem: Problem, part: Part, table: Array) -> None:
+    def __init__(self, problem: Problem, part: Part, table: Floats) -> None:
         bodies = list(part.physics.scene.owners)
         library = problem.library
         if library is None:
@@ -59,7 +56,7 @@ class _Combinations:
         )
         self.residual = self.observations.residual(states)
 
-    def log_joint(self, sigma: Array, nu: float | Array | None) -> Array:
+    def log_joint(self, sigma: Floats, nu: float | Floats | None) -> Floats:
         """Return the log-density of data and combination given sigma, shape (draw, combination)."""
         seen = self.observations.measured
         result = np.empty((len(sigma), len(self.indices)))
@@ -73,7 +70,7 @@ class _Combinations:
 
 def choose_from_library(
     problem: Problem, draws: int, chains: int, seed: int
-) -> tuple[Array, Array, Ints, Array, Ints]:
+) -> tuple[Floats, Floats, Ints, Floats, Ints]:
     """Draw sigma from its marginal posterior, and the parameter sets given sigma.
 
     Given sigma, bodies that have nothing to do with each other are independent, and the sum over
@@ -118,7 +115,7 @@ def choose_from_library(
     counts = problem.observations.measured.sum((0, 1, 2)).astype(float)
     counts, ones = problem.likelihood.pooled(counts), np.ones(len(median))
 
-    def density(log_sigma: Array) -> Array:
+    def density(log_sigma: Floats) -> Floats:
         sigma = np.exp(log_sigma) * ones
         log_sums = [logsumexp(part.log_joint(sigma, problem.nu()), axis=1) for part in parts]
         return np.asarray(np.sum(log_sums, axis=0) + log_noise_prior(problem, log_sigma))
@@ -164,7 +161,7 @@ def choose_from_library(
     return phi, np.stack(sigmas), indices, np.stack(accepted), best
 
 
-def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Array) -> Array:
+def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Floats) -> Floats:
     """Return a fixed-point estimate of sigma under each part's best combination."""
     observations = problem.observations
     residual = np.zeros_like(observations.values)

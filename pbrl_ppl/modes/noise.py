@@ -6,7 +6,6 @@ from collections.abc import Callable, Mapping
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import wrightomega
 
@@ -20,8 +19,7 @@ from pbrl_ppl.likelihood import (
     noise_prior_slope,
 )
 from pbrl_ppl.parameters import box
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Residuals are clipped at this many noise units.
 FAR_OFF = 1e3
@@ -37,10 +35,10 @@ _SECOND = 0.05
 
 def profile_sigma(
     problem: Problem,
-    residual: Array,
-    phi: Array | None = None,
+    residual: Floats,
+    phi: Floats | None = None,
     held: Mapping[int, float] | None = None,
-) -> Array:
+) -> Floats:
     """Return sigma of highest posterior density at given residuals, shape (parameter,).
 
     Parameters
@@ -72,10 +70,10 @@ def profile_sigma(
 def _of_trajectories(
     problem: Problem,
     noise: TrajectoryNoise,
-    residual: Array,
-    phi: Array | None,
+    residual: Floats,
+    phi: Floats | None,
     held: Mapping[int, float],
-) -> Array:
+) -> Floats:
     """Return the noise parameters of highest posterior density along trajectories."""
     residual = np.nan_to_num(residual, nan=FAR_OFF)
     gaussian = problem.nu(phi) is None
@@ -97,7 +95,7 @@ def _of_trajectories(
     return np.asarray(np.exp(found.x))
 
 
-def _cost(problem: Problem, residual: Array, phi: Array | None, log_sigma: Array) -> float:
+def _cost(problem: Problem, residual: Floats, phi: Floats | None, log_sigma: Floats) -> float:
     """Return the negative log-density of data and log noise parameters."""
     sigma = np.exp(log_sigma) * np.ones(len(problem.noise_prior[0]))
     likelihood = problem.log_density(residual, sigma, phi).sum()
@@ -105,15 +103,15 @@ def _cost(problem: Problem, residual: Array, phi: Array | None, log_sigma: Array
 
 
 def _cost_and_slope(
-    problem: Problem, noise: TrajectoryNoise, residual: Array, log_sigma: Array
-) -> tuple[float, Array]:
+    problem: Problem, noise: TrajectoryNoise, residual: Floats, log_sigma: Floats
+) -> tuple[float, Floats]:
     """Return the negative log-density for Gaussian noise, and its derivative by log sigma."""
     likelihood, slope = noise.score(residual, np.exp(log_sigma))
     cost = float(log_sigma.sum() - log_noise_prior(problem, log_sigma) - likelihood)
     return cost, 1.0 - noise_prior_slope(problem, log_sigma) - slope
 
 
-def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
+def gaussian_log_sigma(problem: Problem, square: Floats) -> Floats:
     """Return the most probable log sigma of independent Gaussian residuals, in closed form.
 
     The density ``-(n + 1) t - S exp(-2 t) / 2 - (t - m)^2 / 2 s^2`` of t = log sigma has its only
@@ -141,7 +139,7 @@ def gaussian_log_sigma(problem: Problem, square: Array) -> Array:
     return np.asarray(np.maximum(y - a + centre, np.log(_LEAST)))
 
 
-def gaussian_profile(problem: Problem, square: Array) -> Array:
+def gaussian_profile(problem: Problem, square: Floats) -> Floats:
     """Return the log-density of data and sigma at that maximum, up to a constant."""
     t = gaussian_log_sigma(problem, square)
     count = problem.observations.measured.sum((0, 1, 2))
@@ -150,8 +148,8 @@ def gaussian_profile(problem: Problem, square: Array) -> Array:
 
 
 def noise_gaussian(
-    problem: Problem, residual: Array, sigma: Array, phi: Array
-) -> tuple[Array, Array]:
+    problem: Problem, residual: Floats, sigma: Floats, phi: Floats
+) -> tuple[Floats, Floats]:
     """Return the Laplace approximation of log noise parameters by second differences.
 
     It is taken at the mode of the density of the logarithm: at that of the parameters themselves,
@@ -178,7 +176,7 @@ def noise_gaussian(
     floor = np.log(0.1 * problem.noise_prior[0])
     begin = np.where(exponential(problem), np.maximum(begin, floor), begin)
 
-    def cost(at: Array) -> float:
+    def cost(at: Floats) -> float:
         return _cost(problem, residual, phi, at) - float(at.sum())
 
     at = minimize(cost, begin, method="L-BFGS-B", bounds=[(b - _FAR, b + _FAR) for b in begin]).x
@@ -204,11 +202,11 @@ def noise_gaussian(
 _STEP, _LEAST = 0.02, 1.0
 
 
-def _tail_cost(problem: Problem, phi: Array, sigma: Array) -> Callable[[Array], float]:
+def _tail_cost(problem: Problem, phi: Floats, sigma: Floats) -> Callable[[Floats], float]:
     """Return the negative log-posterior as a function of the tails alone."""
     residual, tails = np.nan_to_num(problem.residual(phi), nan=FAR_OFF), list(problem.tails)
 
-    def cost(values: Array) -> float:
+    def cost(values: Floats) -> float:
         point = phi.copy()
         point[tails] = values
         likelihood = problem.log_density(residual, sigma, point).sum()
@@ -217,7 +215,7 @@ def _tail_cost(problem: Problem, phi: Array, sigma: Array) -> Callable[[Array], 
     return cost
 
 
-def best_tails(problem: Problem, phi: Array, sigma: Array) -> Array:
+def best_tails(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     """Return phi with the most probable tails, all else fixed."""
     if not problem.tails:
         return phi
@@ -230,7 +228,7 @@ def best_tails(problem: Problem, phi: Array, sigma: Array) -> Array:
     return result
 
 
-def tail_precision(problem: Problem, phi: Array, sigma: Array) -> Array:
+def tail_precision(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     """Return the curvature of the negative log-posterior in each tail parameter."""
     tails = list(problem.tails)
     lower, upper = (end[tails] for end in box(problem.layout.priors))

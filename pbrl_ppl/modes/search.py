@@ -6,7 +6,6 @@ import math
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import differential_evolution
 
 from pbrl_ppl.errors import FitError
@@ -15,8 +14,7 @@ from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, gaussian_profile
 from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import box, inside, likeliest, prior_draws
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Transitions used to tell basins apart, and how many of the best are searched with all data; with
 #: no more than so many transitions, all are.
@@ -43,7 +41,7 @@ def find_modes(
     seed: int | np.random.Generator = 0,
     starts: int | None = None,
     screened: int | None = None,
-    initial: Array | None = None,
+    initial: Floats | None = None,
     rounds: int | None = None,
 ) -> list[Mode]:
     """Return modes found from several starts, best first.
@@ -116,7 +114,7 @@ def find_modes(
     return [finish(problem, peak) for peak in (best, *found[1:])]
 
 
-def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
+def _evolve(problem: Problem, rng: np.random.Generator) -> Floats:
     """Return the best points of differential evolution, best first, shape (evolved, p).
 
     Where few transitions slide, the mode may be too narrow for draws from the prior to find. The
@@ -126,7 +124,7 @@ def _evolve(problem: Problem, rng: np.random.Generator) -> Array:
     draws = prior_draws(priors, rng, _POPULATION)
     measured = problem.observations.measured
 
-    def cost(points: Array) -> Array:
+    def cost(points: Floats) -> Floats:
         phi = inside(priors, points.T)
         residual = np.where(measured, np.nan_to_num(problem.residual(phi), nan=FAR_OFF), 0.0)
         fit = gaussian_profile(problem, (residual**2).sum((1, 2, 3)))
@@ -153,7 +151,7 @@ def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
     folded = likeliest(problem.layout, np.array([peak.phi for peak in found]))
     z = problem.whitened(folded, found[0].sigma)
     z = np.nan_to_num(z, nan=FAR_OFF)
-    kept: dict[int, Array] = {}
+    kept: dict[int, Floats] = {}
     for i in range(len(found)):
         same = [j for j in kept if ((z[i] - z[j]) ** 2).sum() < _SAME]
         if not any(((kept[j] @ (folded[i] - folded[j])) ** 2).sum() < _FAR for j in same):
@@ -178,7 +176,7 @@ def find_mode(
     problem: Problem,
     *,
     seed: int | np.random.Generator = 0,
-    initial: Array | None = None,
+    initial: Floats | None = None,
     rounds: int | None = None,
 ) -> Mode:
     """Return the best mode with others that are not far below it; see :func:`find_modes`."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import (
     Problem,
@@ -18,8 +17,7 @@ from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import change_from, inside
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Rounds at most; one that moves phi by less than this, in standard deviations, is the last.
 _ROUNDS, _SETTLED = 6, 0.2
@@ -57,7 +55,7 @@ def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
     return max(found, key=lambda mode: mode.log_posterior)
 
 
-def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) -> Mode:
+def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) -> Mode:
     """Return the mode of whole trajectories, linearised at smoothed states.
 
     The better of two, which start with the given noise and with near-zero process noise.
@@ -89,7 +87,7 @@ def trajectory_mode(problem: Problem, phi: Array, sigma: Array | None = None) ->
     return mode
 
 
-def nearby_mode(problem: Problem, phi: Array, sigma: Array) -> Mode:
+def nearby_mode(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
     """Return the mode by alternating climbs with smoothing.
 
     Parameters
@@ -139,7 +137,7 @@ def following(mode: Mode) -> Mode:
     return max(found, key=lambda own: own[0])[1]
 
 
-def _change(mode: Mode, phi: Array) -> float:
+def _change(mode: Mode, phi: Floats) -> float:
     """Return the distance of a mode from the start of its search, in standard deviations."""
     spread = np.sqrt(np.maximum(np.diag(mode.covariance), 1e-300))
     moved = change_from(mode.problem.layout, mode.phi, phi)

@@ -10,13 +10,13 @@ from scipy.sparse.csgraph import connected_components
 
 from pbrl_ppl.history import History
 from pbrl_ppl.scene import WORLD, Scene
+from pbrl_ppl.state import Floats
 
 #: Distance that bodies of different parts must keep: a share of their size plus the same share of
 #: their relative motion in an interval, since paths are not straight.
 SHARE = 0.25
 
 Parts = tuple[tuple[str, ...], ...]
-Array = NDArray[np.float64]
 
 
 def joined_parts(parts: Parts, together: Collection[str]) -> Parts:
@@ -103,7 +103,7 @@ def independent_parts(scene: Scene, history: History) -> Parts:
     return tuple(tuple(np.array(names)[part == label].tolist()) for label in np.unique(part))
 
 
-def come_near(begin: Array, end: Array, least: float) -> NDArray[np.bool_]:
+def come_near(begin: Floats, end: Floats, least: float) -> NDArray[np.bool_]:
     """Return whether two bodies come nearer than ``least`` (m), or may where places are missing.
 
     Parameters

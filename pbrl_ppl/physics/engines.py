@@ -17,8 +17,8 @@ from pbrl_ppl.physics.calls import pointers
 from pbrl_ppl.physics.lockstep import free_bodies
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.world import World
+from pbrl_ppl.state import Floats
 
-Array = NDArray[np.float64]
 Laws = tuple[NDArray[Any], ...]
 
 #: Items whose bodies' ways are kept at a time.
@@ -28,15 +28,15 @@ _BLOCK = 512
 class Batch(NamedTuple):
     """What the rollouts take: see `compiled.rollout`."""
 
-    given: tuple[Array, ...]
+    given: tuple[Floats, ...]
     commands: Laws
     forces: Laws
-    start: Array
-    inputs: Array
+    start: Floats
+    inputs: Floats
     time_step: float
     normal_gravity: float
     counts: NDArray[np.int64]
-    weights: Array
+    weights: Floats
 
     def alone(self) -> tuple[Batch, ...]:
         """What each body sees."""
@@ -65,7 +65,7 @@ class Batch(NamedTuple):
         )
 
 
-def _column(array: Array, i: int) -> Array:
+def _column(array: Floats, i: int) -> Floats:
     return np.ascontiguousarray(array[..., i : i + 1, :])
 
 
@@ -100,7 +100,7 @@ class Engine:
         self.slides = any(len(free.ring) for free in self.free)
 
     def rollout(
-        self, batch: Batch, alone: tuple[Batch, ...], first: int, last: int, out: Array
+        self, batch: Batch, alone: tuple[Batch, ...], first: int, last: int, out: Floats
     ) -> None:
         """Predict the items ``first`` to ``last`` into ``out``, NaN where the engine diverges.
 
@@ -135,7 +135,7 @@ class Engine:
             items = items[done + 1 :]
 
     def _apart(
-        self, alone: tuple[Batch, ...], first: int, last: int, out: Array
+        self, alone: tuple[Batch, ...], first: int, last: int, out: Floats
     ) -> NDArray[np.bool_]:
         """Predict each body as if alone, and say in which items it is not."""
         left = np.zeros(last - first, dtype=bool)
@@ -155,7 +155,7 @@ class Engine:
         return left
 
     def _joined(
-        self, chain: lockstep_chain.Chain, batch: Batch, items: NDArray[np.int64], out: Array
+        self, chain: lockstep_chain.Chain, batch: Batch, items: NDArray[np.int64], out: Floats
     ) -> NDArray[np.int64]:
         """Predict joined bodies where they come near nothing, and say which items are left."""
         mass = batch.given[0][:, 0, chain.chained, COLUMN.mass]

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
 from pbrl_ppl.scene import WORLD, Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Columns of a joint's numbers: its anchors and its length (m).
 JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
@@ -126,7 +125,7 @@ class SceneJoints:
             for joint, length in zip(scene.joints, lengths, strict=True)
         )
 
-    def _lengths(self, anchors: Array, held: NDArray[np.int64]) -> Array:
+    def _lengths(self, anchors: Floats, held: NDArray[np.int64]) -> Floats:
         """Return the distances of anchors (..., 4) in the reference poses, shape (...,)."""
         poses = self._poses[held]
         c, s = np.cos(poses[..., 2]), np.sin(poses[..., 2])
@@ -135,7 +134,7 @@ class SceneJoints:
         at_y = poses[..., 1] + s * x + c * y
         return np.asarray(np.hypot(at_x[..., 0] - at_x[..., 1], at_y[..., 0] - at_y[..., 1]))
 
-    def __call__(self, phi: Array) -> tuple[Array, NDArray[np.int64]]:
+    def __call__(self, phi: Floats) -> tuple[Floats, NDArray[np.int64]]:
         """Return anchors and lengths, and the bodies that joints of unknown bodies hold.
 
         Parameters
@@ -177,7 +176,7 @@ class SceneJoints:
         return joints, indices.astype(np.int64)
 
 
-def on_rod(states: Array, rod: Array, unit_moment: float) -> Array:
+def on_rod(states: Floats, rod: Floats, unit_moment: float) -> Floats:
     """Return start states that satisfy the rod of an effect, with the least correction.
 
     Measured states violate the rod by the noise. The engine would correct the whole drift in one
@@ -208,7 +207,7 @@ def on_rod(states: Array, rod: Array, unit_moment: float) -> Array:
         return states
     held, (a_x, a_y, b_x, b_y, length) = states[exists], rod[exists].T[..., None]
 
-    def geometry() -> tuple[Array, Array, Array, Array, Array]:
+    def geometry() -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """Return length, direction (x, y), lever arm, and the inverse mass along the rod."""
         c, s = np.cos(held[..., 2]), np.sin(held[..., 2])
         arm_x, arm_y = c * a_x - s * a_y, s * a_x + c * a_y
@@ -218,7 +217,7 @@ def on_rod(states: Array, rod: Array, unit_moment: float) -> Array:
         lever = arm_x * n_y - arm_y * n_x
         return distance, n_x, n_y, lever, 1.0 + lever**2 / unit_moment
 
-    def push(impulse: Array, first: int, n_x: Array, n_y: Array, lever: Array) -> None:
+    def push(impulse: Floats, first: int, n_x: Floats, n_y: Floats, lever: Floats) -> None:
         """Apply an impulse per unit of mass along the rod to poses (0) or velocities (3)."""
         held[..., first] += impulse * n_x
         held[..., first + 1] += impulse * n_y

@@ -13,15 +13,13 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.physics.coupling import SHARE, come_near
-from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.simulator import Simulator
+from pbrl_ppl.state import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from pbrl_ppl.physics.physics import Physics
 
-Bools = NDArray[np.bool_]
 R = TypeVar("R")
-Ints = NDArray[np.intp]
 #: Largest difference of one world's prediction from a part's that counts as rounding (SI units).
 _ROUNDING = 1e-6
 #: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
@@ -38,7 +36,7 @@ class Memory:
         """Nothing."""
         return {"_known": OrderedDict()}
 
-    def recall(self, arguments: tuple[Array, ...], compute: Callable[..., R]) -> R:
+    def recall(self, arguments: tuple[Floats, ...], compute: Callable[..., R]) -> R:
         """Return ``compute(*arguments)``, from memory for equal arguments.
 
         The first argument is compared as a whole, others by a hash.
@@ -115,7 +113,7 @@ class PartedSimulator:
         """Engine steps an interval, of all parts and all runs that are combined."""
         return int(sum(part.simulator.levels[0].sum() for part in self.parts))
 
-    def __call__(self, phi: Array, start: Array, actions: Array) -> Array:
+    def __call__(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Predict as :class:`Simulator` does: (transition, H, body, 6), or with proposals first."""
         if len(self.parts) == 1:
             return self.parts[0].simulator(phi, start, actions)
@@ -132,7 +130,7 @@ class PartedSimulator:
             out[..., part.bodies, :] = states[which.ravel()]
         return out if phi.ndim == 2 else out[0]
 
-    def recall(self, phi: Array, start: Array, actions: Array) -> Array:
+    def recall(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Return the prediction for one phi, from memory if it was just computed."""
         if phi.shape != (len(self._labels),):
             raise SimulationError(
@@ -145,7 +143,7 @@ class PartedSimulator:
             out[..., part.bodies, :] = part.memory.recall(asked, part.simulator)
         return out
 
-    def jacobian(self, phi: Array, start: Array, actions: Array) -> Array:
+    def jacobian(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Derivative by phi, shape (transition, H, body, 6, p); see :meth:`Simulator.jacobian`."""
         out = np.zeros((*actions.shape[:-1], 6, len(phi)))
         for part in self.parts:
@@ -154,7 +152,7 @@ class PartedSimulator:
         return out
 
 
-def _of(part: Part, start: Array, actions: Array) -> tuple[Array, Array]:
+def _of(part: Part, start: Floats, actions: Floats) -> tuple[Floats, Floats]:
     return start[..., part.bodies, :], actions[:, :, part.bodies]
 
 
@@ -177,11 +175,11 @@ class OneWorld:
         self._reach = [body.shape.bounding_radius for body in physics.scene.moving]
         self._whole = Simulator(physics.changed(extrapolate=False, parts=None))
 
-    def __call__(self, phi: Array, start: Array, actions: Array) -> Array:
+    def __call__(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Predict as :class:`Simulator` does: (transition, H, body, 6), or with proposals first."""
         return self.meetings(phi, start, actions)[0]
 
-    def meetings(self, phi: Array, start: Array, actions: Array) -> tuple[Array, Bools]:
+    def meetings(self, phi: Floats, start: Floats, actions: Floats) -> tuple[Floats, Bools]:
         """Predict, and return which bodies touch another part, shape (..., transition, body)."""
         states = self.parted(phi, start, actions)
         met = np.zeros((*states.shape[:-3], states.shape[-2]), dtype=bool)
@@ -202,7 +200,7 @@ class OneWorld:
             met[..., both] |= np.expand_dims(moved & near, -1)
         return np.where((met & differ)[..., None, :, None], whole, states), met
 
-    def _near(self, states: Array, start: Array, bodies_a: Ints, bodies_b: Ints) -> Bools:
+    def _near(self, states: Floats, start: Floats, bodies_a: Ints, bodies_b: Ints) -> Bools:
         """Whether a body of one part comes near one of another, shape (..., transition)."""
         begin = start[..., :, None, :, :2]
         first = np.broadcast_to(begin, (*states.shape[:-4], *begin.shape[-4:]))
@@ -215,6 +213,6 @@ class OneWorld:
         return found
 
 
-def _same(a: Array, b: Array) -> Bools:
+def _same(a: Floats, b: Floats) -> Bools:
     """Whether numbers are the same to rounding, or both are lost."""
     return np.asarray((abs(a - b) <= _ROUNDING) | (np.isnan(a) & np.isnan(b)))

@@ -13,10 +13,10 @@ from pbrl_ppl.history import History, Segments
 from pbrl_ppl.parameters import Layout
 from pbrl_ppl.physics.coupling import Parts, independent_parts, joined_parts
 from pbrl_ppl.physics.parts import OneWorld, PartedSimulator
-from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.simulator import check_engine
 from pbrl_ppl.physics.table1 import build_layout
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import Floats
 
 #: Engine steps of an interval for rough answers, and the longest of these steps (s).
 COARSE, LONGEST_COARSE = 4, 0.025
@@ -126,15 +126,15 @@ class Physics:
         """The engine of predictions, in which bodies of different parts may meet."""
         return OneWorld(self)
 
-    def predict(self, phi: Array, start: Array, actions: Array) -> Array:
+    def predict(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Predict the states after each interval; see :meth:`Simulator.__call__`."""
         return self.simulator(phi, start, actions)
 
-    def jacobian(self, phi: Array, start: Array, actions: Array) -> Array:
+    def jacobian(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Return the derivative of the predictions by phi; see :meth:`Simulator.jacobian`."""
         return self.simulator.jacobian(phi, start, actions)
 
-    def inputs(self, segments: Segments) -> Array:
+    def inputs(self, segments: Segments) -> Floats:
         """Return what acts in segments, as far as the effects depend on it.
 
         Shape (transition, H, body, 3), or (transition, H, body, 9) as in

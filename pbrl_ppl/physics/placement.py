@@ -9,9 +9,9 @@ import numpy as np
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics.joints import JOINT_KINDS
-from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.solids import Pairs, circles, depth, put, scenery
 from pbrl_ppl.scene import WORLD, Joint, Scene
+from pbrl_ppl.state import Floats
 
 #: Violation that noise and resting contact may explain, as a share of the smaller body's size.
 ALLOWED = 0.25
@@ -19,7 +19,7 @@ _ORIGIN = (0.0, 0.0, 0.0)
 _CHUNK = 2048  # transitions at a time, to spare memory
 
 
-def check_placement(scene: Scene, start: Array, where: Callable[[int], str] | None = None) -> None:
+def check_placement(scene: Scene, start: Floats, where: Callable[[int], str] | None = None) -> None:
     """Raise an error if bodies overlap deeply, or joints are apart, in start states.
 
     The engine would push such bodies apart, and a fit would explain that by physics. Shallow
@@ -97,7 +97,7 @@ def check_history(scene: Scene, history: History, segments: Segments) -> None:
     check_placement(scene, segments.start, where)
 
 
-def overlap(scene: Scene, poses: Array) -> Array:
+def overlap(scene: Scene, poses: Floats) -> Floats:
     """Return the penetration depth of the deepest two shapes (m), shape (n,).
 
     Negative values are lower bounds of the distance between bodies, at most that of their bounding
@@ -125,7 +125,7 @@ def overlap(scene: Scene, poses: Array) -> Array:
     return deepest
 
 
-def _apart(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
+def _apart(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
     """Yield the first transition and a message for each known joint with wrong anchors."""
     moving = {body.name: i for i, body in enumerate(scene.moving)}
     reference = {body.name: body.pose or _ORIGIN for body in scene.bodies} | {WORLD: _ORIGIN}
@@ -151,7 +151,7 @@ def _apart(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
             )
 
 
-def _anchor_distance(joint: Joint, poses: list[Array]) -> Array:
+def _anchor_distance(joint: Joint, poses: list[Floats]) -> Floats:
     anchors = (joint.anchor_a or (0.0, 0.0), joint.anchor_b or (0.0, 0.0))
     a, b = (put(np.array([at]), pose) for at, pose in zip(anchors, poses, strict=True))
     return np.asarray(np.hypot(*np.moveaxis(a - b, -1, 0))[:, 0])
@@ -167,7 +167,7 @@ def _colliding(scene: Scene) -> Pairs:
     return tuple((i, j) for i, j in pairs if j >= first)
 
 
-def _overlaps(scene: Scene, poses: Array) -> Iterator[tuple[int, str]]:
+def _overlaps(scene: Scene, poses: Floats) -> Iterator[tuple[int, str]]:
     """Yield the first transition and a message for each two shapes that overlap deeply."""
     world, pairs = scenery(scene), _colliding(scene)
     if not pairs:

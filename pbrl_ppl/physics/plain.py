@@ -10,8 +10,9 @@ import numpy as np
 import pymunk
 
 from pbrl_ppl.effects import Attached, Command, Force, at_stage
-from pbrl_ppl.physics.properties import COLUMN, Array, EngineInput
+from pbrl_ppl.physics.properties import COLUMN, EngineInput
 from pbrl_ppl.physics.world import DIVERGED, RING, STICKING, World
+from pbrl_ppl.state import Floats
 
 _EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
 
@@ -22,10 +23,10 @@ def rollout(
     given: EngineInput,
     proposal: int,
     item: int,
-    start: Array,
-    inputs: Array,
+    start: Floats,
+    inputs: Floats,
     substeps: int,
-) -> tuple[Array, bool]:
+) -> tuple[Floats, bool]:
     """Step one transition of horizon H through a new world.
 
     Parameters
@@ -107,8 +108,8 @@ def rollout(
 
 
 def _laws(
-    effects: tuple[Attached, ...], kind: type, parameters: Array, names: list[str]
-) -> Iterator[tuple[int, Any, Array]]:
+    effects: tuple[Attached, ...], kind: type, parameters: Floats, names: list[str]
+) -> Iterator[tuple[int, Any, Floats]]:
     """Yield body, stage and parameters of each law of a kind of stage."""
     first = 0
     for attached in at_stage(effects, kind):
@@ -117,7 +118,7 @@ def _laws(
         first = last
 
 
-def _place_bodies(world: World, states: Array) -> None:
+def _place_bodies(world: World, states: Floats) -> None:
     """Set the bodies' states; the engine's velocity is that of the centre of mass."""
     for body, state in zip(world.bodies, states, strict=True):
         body.angle = state[2]  # first: the centre's place depends on it
@@ -134,7 +135,7 @@ def _arm(body: pymunk.Body) -> tuple[float, float]:
     return c * x - s * y, s * x + c * y
 
 
-def _state(world: World, i: int) -> Array:
+def _state(world: World, i: int) -> Floats:
     """Return the state of a body's origin, shape (6,)."""
     body = world.bodies[i]
     x, y = _arm(body)
@@ -143,14 +144,14 @@ def _state(world: World, i: int) -> Array:
     return np.array([*body.position, body.angle, *velocity, turn], dtype=float)
 
 
-def _centre(world: World, i: int) -> Array:
+def _centre(world: World, i: int) -> Floats:
     """Return the state of the centre of mass, which moves straight in a substep."""
     body = world.bodies[i]
     place = body.local_to_world(body.center_of_gravity)
     return np.array([*place, body.angle, *body.velocity, body.angular_velocity], dtype=float)
 
 
-def _place_wheels(world: World, bodies: Array, step: float) -> None:
+def _place_wheels(world: World, bodies: Floats, step: float) -> None:
     """Put the rods' ends on the wheels' axes as predicted for the end of the substep."""
     for wheel in world.wheels:
         row = bodies[wheel.body]
@@ -163,7 +164,7 @@ def _place_wheels(world: World, bodies: Array, step: float) -> None:
         wheel.along_x.anchor_b, wheel.along_y.anchor_b = (at_x + c, at_y + s), (at_x - s, at_y + c)
 
 
-def _place_patches(world: World, bodies: Array, step: float) -> None:
+def _place_patches(world: World, bodies: Floats, step: float) -> None:
     """Put each point's rod along its velocity; split its friction with the pivot joint."""
     for patch in world.patches:
         row = bodies[patch.body]

@@ -23,8 +23,7 @@ from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import BODY_PARAMETERS, Layout
 from pbrl_ppl.physics.joints import JOINT_COLUMNS, SceneJoints
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Columns of a body's properties. ``moment`` is about the centre of mass (kg m^2), which is at
 #: ``com_x`` and ``com_y`` of the body's frame (m); ``pivot_torque`` (N m) and ``pivot_damping``
@@ -80,11 +79,11 @@ class EngineInput(NamedTuple):
         joint, 2).
     """
 
-    bodies: Array
-    joints: Array
-    discs: Array
-    commands: Array
-    forces: Array
+    bodies: Floats
+    joints: Floats
+    discs: Floats
+    commands: Floats
+    forces: Floats
     indices: NDArray[np.int64]
 
 
@@ -158,7 +157,7 @@ class EngineProperties:
         changed = {e.body for e in effects if _changed_columns(e).intersection(names)}
         return tuple(i for i, name in enumerate(self._bodies) if name in changed)
 
-    def slides(self, bodies: Array) -> NDArray[np.bool_]:
+    def slides(self, bodies: Floats) -> NDArray[np.bool_]:
         """Return which proposals have floor friction from effects, shape (proposal,)."""
         found = np.zeros(len(bodies), dtype=bool)
         for under, names in zip(self.under, (_PATCH, _WHEEL), strict=True):
@@ -166,7 +165,7 @@ class EngineProperties:
             found |= (bodies[:, :, list(under)][..., columns] > 0).any(axis=(1, 2, 3))
         return found
 
-    def values(self, attached: Attached, phi: Array, axes: int = 0) -> dict[str, Array]:
+    def values(self, attached: Attached, phi: Floats, axes: int = 0) -> dict[str, Floats]:
         """Return an effect's parameters by name, shape (proposal, 1, ...) with ``axes`` ones.
 
         A parameter that is not in phi has its null value.
@@ -178,7 +177,7 @@ class EngineProperties:
             result[parameter.name] = column.reshape(-1, *(1,) * axes)
         return result
 
-    def sensors(self, phi: Array) -> list[tuple[int, Sensor, Values]]:
+    def sensors(self, phi: Floats) -> list[tuple[int, Sensor, Values]]:
         """Return body, sensor and its parameters, shape (proposal, 1, 1), in the sensors' order."""
         return [
             (self._bodies.index(attached.body), stage, self.values(attached, phi, 2))
@@ -186,7 +185,7 @@ class EngineProperties:
             if isinstance(stage := attached.effect.stage, Sensor)
         ]
 
-    def __call__(self, phi: Array, clock: Clock | None = None) -> EngineInput:
+    def __call__(self, phi: Floats, clock: Clock | None = None) -> EngineInput:
         """Return the engine's numbers for proposals.
 
         Parameters
@@ -220,7 +219,7 @@ class EngineProperties:
         commands, forces = (self._law_parameters(phi, stage) for stage in (Command, Force))
         return EngineInput(bodies, joints, self._discs(phi), commands, forces, indices)
 
-    def _modified(self, bodies: Array, phi: Array, clock: Clock | None) -> Array:
+    def _modified(self, bodies: Floats, phi: Floats, clock: Clock | None) -> Floats:
         """Return properties after the properties stage, with the moments of inertia."""
         modifying = self._acting[Properties]
         bodies[..., COLUMN.moment] = bodies[..., COLUMN.mass] * self._unit_moment
@@ -249,13 +248,13 @@ class EngineProperties:
                 result[:, :, i, column] = row[key]
         return result
 
-    def _law_parameters(self, phi: Array, stage: type) -> Array:
+    def _law_parameters(self, phi: Floats, stage: type) -> Floats:
         """Return the parameters of the laws of a stage, one after another, shape (proposal, q)."""
         laws = self._acting[stage]
         columns = [column for law in laws for column in self.values(law, phi).values()]
         return np.stack(columns, axis=1) if columns else np.empty((len(phi), 0))
 
-    def _discs(self, phi: Array) -> Array:
+    def _discs(self, phi: Floats) -> Floats:
         """Return the structure stage's discs, shape (proposal, disc, 3)."""
         rows = [
             np.stack(np.broadcast_arrays(disc.x, disc.y, disc.radius), axis=-1)
@@ -273,7 +272,7 @@ class EngineProperties:
             )
         return discs
 
-    def _rods(self, phi: Array) -> Array:
+    def _rods(self, phi: Floats) -> Floats:
         """Return the structure stage's rods, shape (proposal, rod, 5)."""
         rods = np.empty((len(phi), len(self._tying), len(JOINT_COLUMNS)))
         for j, (attached, rod) in enumerate(self._tying):
@@ -286,7 +285,7 @@ class EngineProperties:
             )
         return rods
 
-    def _check(self, bodies: Array) -> None:
+    def _check(self, bodies: Floats) -> None:
         """Refuse impossible numbers of bodies."""
         possible = (bodies >= _LEAST) & (bodies < np.inf)
         if possible.all():

@@ -20,10 +20,10 @@ from pbrl_ppl.parameters import Layout, differentiate
 from pbrl_ppl.physics import calls, plain
 from pbrl_ppl.physics.engines import Batch, Engine, share_out
 from pbrl_ppl.physics.joints import on_rod
-from pbrl_ppl.physics.properties import Array, EngineInput, EngineProperties
+from pbrl_ppl.physics.properties import EngineInput, EngineProperties
 from pbrl_ppl.physics.world import FINER, World
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import INPUT
+from pbrl_ppl.state import INPUT, Floats
 
 if TYPE_CHECKING:
     from pbrl_ppl.physics.physics import Physics
@@ -89,7 +89,7 @@ class Simulator:
         """Restore a pickled simulator."""
         Simulator.__init__(self, physics)
 
-    def __call__(self, phi: Array, start: Array, actions: Array) -> Array:
+    def __call__(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Predict the states after each interval of each transition.
 
         Parameters
@@ -162,7 +162,7 @@ class Simulator:
             joined = tuple(zip(pairs[::2], pairs[1::2], strict=True))
             yield (joined, bool(slides), tuple(map(bool, rods))), which.ravel() == i
 
-    def _inputs(self, actions: Array) -> tuple[Array, Clock | None]:
+    def _inputs(self, actions: Floats) -> tuple[Floats, Clock | None]:
         """Inputs of the rollout, and times of the intervals."""
         if not needs_inputs(self.physics.effects):
             return np.ascontiguousarray(actions[..., :3]), None
@@ -173,7 +173,7 @@ class Simulator:
         when = actions[:, :, 0, 6:].reshape(1, -1, 3)
         return actions, Clock(*np.moveaxis(when, -1, 0))
 
-    def _states(self, phi: Array, measured: Array) -> Array:
+    def _states(self, phi: Floats, measured: Floats) -> Floats:
         """True states by the sensors' inverses, shape (1 or proposal, transition, body, 6)."""
         sensors = self._properties.sensors(phi)
         measured = measured if measured.ndim == 4 else measured[None]
@@ -190,7 +190,7 @@ class Simulator:
         fill_hinges(states, self.physics.scene)
         return states
 
-    def _on_rods(self, states: Array, joints: Array) -> Array:
+    def _on_rods(self, states: Floats, joints: Floats) -> Floats:
         """Start states with the bodies that effects tie on their rods."""
         if self._properties.tied:
             states = _each(states, len(joints))
@@ -199,7 +199,7 @@ class Simulator:
             states[:, :, i] = on_rod(states[:, :, i], joints[:, position], moment)
         return states
 
-    def jacobian(self, phi: Array, start: Array, actions: Array) -> Array:
+    def jacobian(self, phi: Floats, start: Floats, actions: Floats) -> Floats:
         """Derivative of the predictions by phi, by central differences in one batched call.
 
         Parameters
@@ -226,7 +226,7 @@ class Simulator:
         )  # fmt: skip
 
     @cached_property
-    def levels(self) -> tuple[NDArray[np.int64], Array]:
+    def levels(self) -> tuple[NDArray[np.int64], Floats]:
         """Numbers of substeps to run, the finest first, and the weights of their results.
 
         The engine's error is a series in the substep (Richardson, 1911): two runs cancel its first
@@ -275,7 +275,7 @@ class Simulator:
         return World(scene, kinds, joined, own.n_discs, patches, wheels, rods)
 
     def _run_plain(
-        self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array
+        self, choice: Choice, given: EngineInput, starts: Floats, inputs: Floats, out: Floats
     ) -> None:
         for item in range(len(out)):
             p, t = divmod(item, len(inputs))
@@ -301,7 +301,7 @@ class Simulator:
                 out[item] = total
 
     def _run_compiled(
-        self, choice: Choice, given: EngineInput, starts: Array, inputs: Array, out: Array
+        self, choice: Choice, given: EngineInput, starts: Floats, inputs: Floats, out: Floats
     ) -> None:
         batch = Batch(
             tuple(given[:-1]), self._commands, self._forces, starts, inputs,
@@ -329,12 +329,12 @@ class Simulator:
             out.reshape(shape)[:, order] = found.reshape(shape)
 
 
-def _each(states: Array, proposals: int) -> Array:
+def _each(states: Floats, proposals: int) -> Floats:
     """A copy of start states for each proposal, in the layout that the rollouts take."""
     return np.array(np.broadcast_to(states, (proposals, *states.shape[1:])), order="C")
 
 
-def after_recording(wrenches: Array, previous: Array) -> Array:
+def after_recording(wrenches: Floats, previous: Floats) -> Floats:
     """Inputs of intervals that begin when the recording has ended.
 
     Parameters
@@ -350,7 +350,7 @@ def after_recording(wrenches: Array, previous: Array) -> Array:
     return np.concatenate([wrenches, previous, np.full_like(wrenches, np.inf)], axis=-1)
 
 
-def check_shapes(scene: Scene, layout: Layout, phi: Array, start: Array, actions: Array) -> None:
+def check_shapes(scene: Scene, layout: Layout, phi: Floats, start: Floats, actions: Floats) -> None:
     """Refuse arrays of other shapes than a rollout takes, and what is not finite.
 
     Parameters

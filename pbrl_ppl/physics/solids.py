@@ -10,9 +10,9 @@ import numpy as np
 import pymunk
 from numpy.typing import NDArray
 
-from pbrl_ppl.physics.properties import Array
 from pbrl_ppl.physics.world import engine_shapes
 from pbrl_ppl.scene import WORLD, Body, Scene
+from pbrl_ppl.state import Floats
 
 Pairs = tuple[tuple[int, int], ...]
 #: Number of poses checked along each body's path.
@@ -31,8 +31,8 @@ class Solid:
     """
 
     name: str
-    parts: tuple[tuple[Array, float], ...]
-    core: Array
+    parts: tuple[tuple[Floats, float], ...]
+    core: Floats
     reach: float
     width: float
 
@@ -60,10 +60,10 @@ class Scenery:
     """
 
     solids: tuple[Solid, ...]
-    fixed: Array
+    fixed: Floats
     pairs: Pairs
 
-    def with_fixed(self, moving: Array) -> Array:
+    def with_fixed(self, moving: Floats) -> Floats:
         """Return poses or states (n, body, 3 or 6) of all solids, shape (n, solid, 3 or 6)."""
         n, _, width = moving.shape
         still = np.zeros((n, len(self.fixed), width))
@@ -90,13 +90,13 @@ def scenery(scene: Scene) -> Scenery:
     return Scenery(tuple(solids), np.array(fixed, dtype=float).reshape(-1, 3), pairs)
 
 
-def depth(a: Solid, poses_a: Array, b: Solid, poses_b: Array) -> Array:
+def depth(a: Solid, poses_a: Floats, b: Solid, poses_b: Floats) -> Floats:
     """Return the greatest penetration depth of two solids' parts at each pose (m), shape (n,)."""
     parts = product(a.parts, b.parts)
     return np.asarray(np.max([depth_of(p, poses_a, q, poses_b) for p, q in parts], axis=0))
 
 
-def circles(solids: tuple[Solid, ...], pairs: Pairs, poses: Array) -> Array:
+def circles(solids: tuple[Solid, ...], pairs: Pairs, poses: Floats) -> Floats:
     """Return penetration depths of bounding circles, or of one and a wall (m): (n, pair)."""
     i, j = np.array(pairs, dtype=int).reshape(-1, 2).T
     cores = np.array([solid.core for solid in solids])
@@ -106,7 +106,7 @@ def circles(solids: tuple[Solid, ...], pairs: Pairs, poses: Array) -> Array:
     return np.asarray(reach[i] + reach[j] - gap)
 
 
-def put(points: Array, poses: Array) -> Array:
+def put(points: Floats, poses: Floats) -> Floats:
     """Return points (k, 2) of a body's frame in the world at each pose (n, 3): (n, k, 2)."""
     c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
     x, y = points.T
@@ -114,8 +114,8 @@ def put(points: Array, poses: Array) -> Array:
 
 
 def depth_of(
-    part_a: tuple[Array, float], poses_a: Array, part_b: tuple[Array, float], poses_b: Array
-) -> Array:
+    part_a: tuple[Floats, float], poses_a: Floats, part_b: tuple[Floats, float], poses_b: Floats
+) -> Floats:
     """Return the penetration depth of two convex parts at each pose (m); negative if apart.
 
     The engine's answer is not used: it is zero for polygons whose centres coincide.
@@ -129,7 +129,7 @@ def depth_of(
     return radii + np.minimum(_behind(a, b), _behind(b, a))
 
 
-def _behind(a: Array, b: Array) -> Array:
+def _behind(a: Floats, b: Floats) -> Floats:
     """Return the least depth of corners b behind an edge of a (separating axes), (n,)."""
     least = np.full(len(a), np.inf)
     for corner, after in zip(
@@ -142,7 +142,7 @@ def _behind(a: Array, b: Array) -> Array:
     return least
 
 
-def _distance(point: Array, corners: Array) -> Array:
+def _distance(point: Floats, corners: Floats) -> Floats:
     """Return the distance of points (n, 2) from polygons (n, k, 2), negative inside, (n,)."""
     edge = np.roll(corners, -1, axis=1) - corners
     arm = point[:, None] - corners
@@ -152,14 +152,14 @@ def _distance(point: Array, corners: Array) -> Array:
     return np.asarray(np.where(inside, -distance, distance))
 
 
-def to_segment(arm: Array, edge: Array) -> Array:
+def to_segment(arm: Floats, edge: Floats) -> Floats:
     """Return the distance of points from segments, both relative to the begin (..., 2)."""
     square = np.maximum((edge**2).sum(axis=-1), np.finfo(float).tiny)
     share = np.clip((arm * edge).sum(axis=-1) / square, 0.0, 1.0)
     return np.asarray(np.hypot(*np.moveaxis(arm - share[..., None] * edge, -1, 0)))
 
 
-def touching(scene: Scene, begin: Array, end: Array) -> NDArray[np.bool_]:
+def touching(scene: Scene, begin: Floats, end: Floats) -> NDArray[np.bool_]:
     """Return whether bodies touch within an interval, or come so near that they may.
 
     Parameters
@@ -192,7 +192,7 @@ def touching(scene: Scene, begin: Array, end: Array) -> NDArray[np.bool_]:
     return touched
 
 
-def _near(world: Scenery, pairs: Pairs, states: Array, dt: float) -> NDArray[np.bool_]:
+def _near(world: Scenery, pairs: Pairs, states: Floats, dt: float) -> NDArray[np.bool_]:
     """Return the pairs whose bounding circles may meet within an interval, (n, pair)."""
     i, j = np.array(pairs).T
     width = np.array([solid.width for solid in world.solids])
@@ -202,7 +202,7 @@ def _near(world: Scenery, pairs: Pairs, states: Array, dt: float) -> NDArray[np.
     return np.asarray(circles(world.solids, pairs, states) > -way)
 
 
-def _touch_on_path(a: Solid, b: Solid, begin: Array, end: Array, dt: float) -> NDArray[np.bool_]:
+def _touch_on_path(a: Solid, b: Solid, begin: Floats, end: Floats, dt: float) -> NDArray[np.bool_]:
     """Return whether two solids touch on a free path from begin or end, (transition, 2, 6).
 
     If they touched, they would overlap on one of the paths that they would take without contact.

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import ParameterError, SimulationError
 from pbrl_ppl.physics.physics import Physics
 from pbrl_ppl.physics.placement import check_placement
 from pbrl_ppl.scene import Scene, nearest
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 class Transition:
@@ -81,7 +80,7 @@ class Transition:
         k = len(scene.moving)
         self._physics.predict(self.phi, np.zeros((0, k, 6)), np.zeros((0, 1, k, 3)))
 
-    def __call__(self, state_action: ArrayLike) -> Array:
+    def __call__(self, state_action: ArrayLike) -> Floats:
         """Eq. 2, ``R^{6k+4} -> R^{6k}``: one body is pushed for one sampling interval.
 
         Parameters
@@ -124,7 +123,7 @@ class Transition:
         states = self.predict(flat[:, : 6 * k].reshape(-1, k, 6), wrenches)
         return states.reshape(*x.shape[:-1], 6 * k)
 
-    def predict(self, start: ArrayLike, wrenches: ArrayLike) -> Array:
+    def predict(self, start: ArrayLike, wrenches: ArrayLike) -> Floats:
         """Eq. 7 with a wrench on every body, for many transitions of H intervals.
 
         Parameters

@@ -7,7 +7,6 @@ from concurrent.futures import Future, wait
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.effects import (
     Clock,
@@ -23,8 +22,7 @@ from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics.properties import COLUMNS
 from pbrl_ppl.scene import Body, Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Time after which a trial counts as an endless loop (s).
 PATIENCE = 10.0
@@ -104,14 +102,14 @@ def _try(effect: Effect, scene: Scene, history: History) -> None:
                 )
 
 
-def _middle(history: History, body: Body) -> Array:
+def _middle(history: History, body: Body) -> Floats:
     """Return a complete measured state of a body, or zeros, shape (6,)."""
     states = history.dataset["start"].sel(body=body.name).to_numpy().reshape(-1, 6)
     states = states[np.isfinite(states).all(axis=1)]
     return np.asarray(states[len(states) // 2] if len(states) else np.zeros(6))
 
 
-def _applied(effect: Effect, state: Array, parameters: Array) -> Array:
+def _applied(effect: Effect, state: Floats, parameters: Floats) -> Floats:
     """Return the results of an effect's functions at a state and parameters, as one array."""
     stage: Any = effect.stage
     named = {

@@ -12,8 +12,9 @@ from pymunk import autogeometry
 
 from pbrl_ppl.effects import hanging_body
 from pbrl_ppl.physics.joints import JOINT_KINDS, ROD, JointKind
-from pbrl_ppl.physics.properties import COLUMN, Array
+from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
+from pbrl_ppl.state import Floats
 
 #: Solver iterations. A single body without obstacles needs few, since its wheel or hinge then
 #: converges to rounding; several bodies need the engine's default, and a chain of joints more, in
@@ -267,7 +268,7 @@ class World:
             self.pivots.append(pivot)
         self.links.append(Link(position, kind, link, pivot))
 
-    def set_discs(self, discs: Array) -> None:
+    def set_discs(self, discs: Floats) -> None:
         """Place the hidden discs: x, y and radius, shape (disc, 3). A radius of 0 is no disc.
 
         They are removed and added again, since the order of contacts depends on the earlier places
@@ -283,7 +284,7 @@ class World:
             self.space.add(shape)
             self.obstacles[first + j] = x, y, x, y, radius
 
-    def set_properties(self, bodies: Array, joints: Array) -> None:
+    def set_properties(self, bodies: Floats, joints: Floats) -> None:
         """Set the engine's properties; shapes (body, column) and (joint, column)."""
         mass = bodies[self.chained, COLUMN.mass]
         ratio = mass.max() / mass.min() if len(mass) else 0.0
