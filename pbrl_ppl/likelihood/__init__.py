@@ -1,78 +1,41 @@
 """Likelihoods in numpy: data, noise, Eq. 11, whole trajectories and the log-posterior."""
 
-from pbrl_ppl.likelihood.cells import ACCELERATION, DRIFT, JOLT, Cells, cells_of, check_moves
-from pbrl_ppl.likelihood.data import Data, Observations, estimate_sigma, sigma_prior
-from pbrl_ppl.likelihood.declared import declared_problem
-from pbrl_ppl.likelihood.likelihood import (
-    GAUSSIAN,
-    Likelihood,
-    TrajectoryLikelihood,
-    TransitionLikelihood,
-    log_norm,
-    next_state_random,
-    robust,
-)
-from pbrl_ppl.likelihood.log_posterior import (
-    exponential,
-    log_noise_prior,
-    log_posterior,
-    log_prior,
-    noise_law,
-    noise_prior_slope,
-)
-from pbrl_ppl.likelihood.noise_scales import bodies_acceleration, noise_medians, ranges
-from pbrl_ppl.likelihood.problem import Problem
-from pbrl_ppl.likelihood.sensitivity import Sensitivity
-from pbrl_ppl.likelihood.simulation import simulated_trajectories, with_measurements
-from pbrl_ppl.likelihood.smoothing import (
-    along_trajectories,
-    linearised,
-    single_transitions,
-    smoothed,
-    with_sensitivity,
-)
-from pbrl_ppl.likelihood.tails import degrees_of_freedom, sum_tails, tail_places
-from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
-
-__all__ = [
-    "ACCELERATION",
-    "DRIFT",
-    "GAUSSIAN",
-    "JOLT",
-    "Cells",
-    "Data",
-    "Likelihood",
-    "Observations",
-    "Problem",
-    "Sensitivity",
-    "TrajectoryLikelihood",
-    "TrajectoryNoise",
-    "TransitionLikelihood",
-    "along_trajectories",
-    "bodies_acceleration",
-    "cells_of",
-    "check_moves",
-    "declared_problem",
-    "degrees_of_freedom",
-    "estimate_sigma",
-    "exponential",
-    "linearised",
-    "log_noise_prior",
-    "log_norm",
-    "log_posterior",
-    "log_prior",
-    "next_state_random",
-    "noise_law",
-    "noise_medians",
-    "noise_prior_slope",
-    "ranges",
-    "robust",
-    "sigma_prior",
-    "simulated_trajectories",
-    "single_transitions",
-    "smoothed",
-    "sum_tails",
-    "tail_places",
-    "with_measurements",
-    "with_sensitivity",
-]
+from pbrl_ppl.likelihood.cells import ACCELERATION as ACCELERATION
+from pbrl_ppl.likelihood.cells import DRIFT as DRIFT
+from pbrl_ppl.likelihood.cells import JOLT as JOLT
+from pbrl_ppl.likelihood.cells import Cells as Cells
+from pbrl_ppl.likelihood.cells import cells_of as cells_of
+from pbrl_ppl.likelihood.cells import check_moves as check_moves
+from pbrl_ppl.likelihood.data import Observations as Observations
+from pbrl_ppl.likelihood.data import estimate_sigma as estimate_sigma
+from pbrl_ppl.likelihood.data import sigma_prior as sigma_prior
+from pbrl_ppl.likelihood.declared import declared_problem as declared_problem
+from pbrl_ppl.likelihood.likelihood import GAUSSIAN as GAUSSIAN
+from pbrl_ppl.likelihood.likelihood import Likelihood as Likelihood
+from pbrl_ppl.likelihood.likelihood import TrajectoryLikelihood as TrajectoryLikelihood
+from pbrl_ppl.likelihood.likelihood import TransitionLikelihood as TransitionLikelihood
+from pbrl_ppl.likelihood.likelihood import log_norm as log_norm
+from pbrl_ppl.likelihood.likelihood import next_state_random as next_state_random
+from pbrl_ppl.likelihood.likelihood import robust as robust
+from pbrl_ppl.likelihood.log_posterior import exponential as exponential
+from pbrl_ppl.likelihood.log_posterior import log_noise_prior as log_noise_prior
+from pbrl_ppl.likelihood.log_posterior import log_posterior as log_posterior
+from pbrl_ppl.likelihood.log_posterior import log_prior as log_prior
+from pbrl_ppl.likelihood.log_posterior import noise_law as noise_law
+from pbrl_ppl.likelihood.log_posterior import noise_prior_slope as noise_prior_slope
+from pbrl_ppl.likelihood.noise_scales import bodies_acceleration as bodies_acceleration
+from pbrl_ppl.likelihood.noise_scales import noise_medians as noise_medians
+from pbrl_ppl.likelihood.noise_scales import ranges as ranges
+from pbrl_ppl.likelihood.problem import Problem as Problem
+from pbrl_ppl.likelihood.sensitivity import Sensitivity as Sensitivity
+from pbrl_ppl.likelihood.simulation import simulated_trajectories as simulated_trajectories
+from pbrl_ppl.likelihood.simulation import with_measurements as with_measurements
+from pbrl_ppl.likelihood.smoothing import along_trajectories as along_trajectories
+from pbrl_ppl.likelihood.smoothing import linearised as linearised
+from pbrl_ppl.likelihood.smoothing import single_transitions as single_transitions
+from pbrl_ppl.likelihood.smoothing import smoothed as smoothed
+from pbrl_ppl.likelihood.smoothing import with_sensitivity as with_sensitivity
+from pbrl_ppl.likelihood.tails import degrees_of_freedom as degrees_of_freedom
+from pbrl_ppl.likelihood.tails import sum_tails as sum_tails
+from pbrl_ppl.likelihood.tails import tail_places as tail_places
+from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise as TrajectoryNoise
