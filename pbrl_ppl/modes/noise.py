@@ -199,7 +199,7 @@ def noise_gaussian(
 
 
 #: Step of a second difference in the tails, and the least curvature.
-_STEP, _LEAST = 0.02, 1.0
+_TAIL_STEP, _LEAST_CURVATURE = 0.02, 1.0
 
 
 def _tail_cost(problem: Problem, phi: Floats, sigma: Floats) -> Callable[[Floats], float]:
@@ -234,12 +234,12 @@ def tail_precision(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     lower, upper = (end[tails] for end in box(problem.layout.priors))
     cost = _tail_cost(problem, phi, sigma)
     curvature = np.empty(len(tails))
-    for i, step in enumerate(np.minimum(_STEP, 0.25 * (upper - lower))):
+    for i, step in enumerate(np.minimum(_TAIL_STEP, 0.25 * (upper - lower))):
         middle = phi[tails].copy()
         middle[i] = np.clip(middle[i], lower[i] + step, upper[i] - step)
         ends = [middle.copy(), middle, middle.copy()]
         ends[0][i] -= step
         ends[2][i] += step
         below, at, above = (cost(end) for end in ends)
-        curvature[i] = max((below - 2 * at + above) / step**2, _LEAST)
+        curvature[i] = max((below - 2 * at + above) / step**2, _LEAST_CURVATURE)
     return curvature

@@ -59,10 +59,10 @@ def test_the_scene_file_says_it() -> None:
             'number 1: prior i_a names "e", which is no moving body or the world; did you',
         ),
         ({"i_a": {"wolrd": 1.0}}, 'did you mean "world"?'),
-        ({"i_a": {"a": -0.1}}, "prior i_a a is -0.1, expected 0 or more"),
-        ({"i_a": {"a": 0.0}}, "prior i_a has no name of a probability above 0; add one"),
-        ({"i_a": {}}, "prior i_a has no name"),
-        ({"i_a": 0.5}, "prior i_a is 0.5, expected a table of names and values"),
+        ({"i_a": {"a": -0.1}}, "i_a a is -0.1, expected 0 or more"),
+        ({"i_a": {"a": 0.0}}, "i_a has no name of a probability above 0"),
+        ({"i_a": {}}, "i_a has no name"),
+        ({"i_a": 0.5}, "i_a is 0.5, expected a table"),
     ],
 )
 def test_what_makes_no_prior_is_refused(prior, message) -> None:
@@ -71,7 +71,7 @@ def test_what_makes_no_prior_is_refused(prior, message) -> None:
 
 
 def test_named_bodies_have_no_prior() -> None:
-    with pytest.raises(SceneError, match="it has bodies and a prior of which they are; drop one"):
+    with pytest.raises(SceneError, match="it has bodies and a prior of them; drop one"):
         Joint("hinge", ("a", "b"), known=False, prior=PRIOR)
 
 

@@ -208,7 +208,7 @@ def test_whole_trajectories_tell_the_sensor_s_noise(problem, modes) -> None:
     """
     mode = modes[0]
     again = trajectory_mode(problem, mode.phi)
-    assert again.isinstance(problem.likelihood, TrajectoryLikelihood)
+    assert isinstance(again.problem.likelihood, TrajectoryLikelihood)
     sensors, steps = np.split(again.sigma, [6])
     # sqrt(1 / 2N) each, twice as much for what the states and the fitted parameters take: 4 such
     # for 6 numbers, false alarm below 1e-3
