@@ -5,7 +5,7 @@ import pytest
 
 from pbrl_ppl.effects import attach, candidates
 from pbrl_ppl.errors import EffectError
-from pbrl_ppl.physics import Physics, Simulator, Transition, build_layout, calls, independent_parts
+from pbrl_ppl.physics import Simulator, Transition, build_layout, calls, independent_parts
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.pushes import pushed
 from tests.helpers.worlds import BY_NAME, body, simulator, state
@@ -109,7 +109,7 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
 def test_paths_agree_and_order_and_chunks_change_nothing() -> None:
     sim, phi, start, actions = crowd()
     expected = sim(phi, start, actions)
-    plain = Simulator(Physics(sim.physics.changed(engine="python")))
+    plain = Simulator(sim.physics.changed(engine="python"))
     np.testing.assert_allclose(
         plain(phi, start[:8], actions[:8]), expected[:, :8], rtol=1e-9, atol=1e-9
     )
@@ -117,7 +117,7 @@ def test_paths_agree_and_order_and_chunks_change_nothing() -> None:
     np.testing.assert_array_equal(sim(phi, start[order], actions[order]), expected[:, order])
     parts = [sim(phi, start[i : i + 7], actions[i : i + 7]) for i in range(0, 30, 7)]
     np.testing.assert_array_equal(np.concatenate(parts, axis=1), expected)
-    two = Simulator(Physics(sim.physics.changed(threads=2)))
+    two = Simulator(sim.physics.changed(threads=2))
     np.testing.assert_array_equal(two(phi, start, actions), expected)
 
 

@@ -116,7 +116,7 @@ def on_hinge(scene: Scene, start: np.ndarray) -> np.ndarray:
 def test_it_agrees_with_the_engine(name) -> None:
     simulator, phi, start, inputs = case(name)
     got = simulator(phi, start, inputs)
-    reference = Simulator(Physics(simulator.physics.changed(engine="python")))
+    reference = Simulator(simulator.physics.changed(engine="python"))
     expected = reference(phi, start, inputs)
     assert np.isfinite(expected).all()
     # friction that lets a body slide, or not, is decided by the last digits now and then
@@ -142,7 +142,7 @@ def test_arrays_of_every_layout_use_the_same_machine_code() -> None:
         expected = simulator(phi, start, inputs)
         start.setflags(write=False)
         np.testing.assert_array_equal(simulator(phi, start, np.asfortranarray(inputs)), expected)
-        coarse = Simulator(Physics(simulator.physics.changed(extrapolate=False)))
+        coarse = Simulator(simulator.physics.changed(extrapolate=False))
         assert np.isfinite(coarse(phi, start, inputs)).all()
     for compiled_once in (lockstep.rollout, compiled.rollout):
         assert len(compiled_once.signatures) == 1
@@ -154,7 +154,7 @@ def test_contacts_are_left_to_the_engine() -> None:
     far = case("wheel")[0]
     touched = (near(phi, start, inputs) != far(phi, start, inputs)).any(axis=(2, 3, 4))
     assert 0.1 < touched.mean() < 0.9
-    plain = Simulator(Physics(near.physics.changed(engine="python")))(phi, start, inputs)
+    plain = Simulator(near.physics.changed(engine="python"))(phi, start, inputs)
     np.testing.assert_allclose(near(phi, start, inputs), plain, rtol=1e-9, atol=1e-9)
 
 

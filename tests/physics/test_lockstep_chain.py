@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pbrl_ppl.physics import Physics, Simulator, calls, compiled, lockstep_chain
+from pbrl_ppl.physics import Simulator, calls, compiled, lockstep_chain
 from pbrl_ppl.physics.joints import HINGE
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Body, Scene, Wall
@@ -34,7 +34,7 @@ CASES = {
 
 
 def like(sim: Simulator, **options) -> Simulator:
-    return Simulator(Physics(sim.physics.changed(**options)))
+    return Simulator(sim.physics.changed(**options))
 
 
 @pytest.fixture

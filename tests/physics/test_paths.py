@@ -34,7 +34,7 @@ def case(request):
 
 
 def like(sim: Simulator, **options) -> Simulator:
-    return Simulator(Physics(sim.physics.changed(**options)))
+    return Simulator(sim.physics.changed(**options))
 
 
 def test_plain_and_compiled_agree(case) -> None:
