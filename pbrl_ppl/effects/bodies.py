@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.scene import WORLD, Body, Joint, Scene
+from pbrl_ppl.state import Floats
 
 #: Points tried on a body, as shares of its half extent.
 _POINTS = np.array([(0.0, 0.0), (0.7, 0.0), (-0.7, 0.0), (0.0, 0.7), (0.0, -0.7)])
@@ -45,7 +45,7 @@ def hanging_body(scene: Scene, joint: Joint) -> str:
     return first if depth.get(first, 0) > depth.get(second, 1) else second
 
 
-def body_points(body: Body) -> NDArray[np.float64]:
+def body_points(body: Body) -> Floats:
     """Return the middle of a body and a point towards each side, in its frame, shape (5, 2), m."""
     x_min, x_max, y_min, y_max = body.shape.bounds
     return np.asarray(0.5 * np.array([x_max - x_min, y_max - y_min]) * _POINTS)

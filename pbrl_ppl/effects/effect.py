@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import InitVar, dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pbrl_ppl.effects.stages import STAGES, Command, Force, Law, Properties, Stage
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.state import Floats
 
 #: ``scan(scene, history, body) -> (point, q)``: grid of parameter values at which an effect is
 #: tried if its derivative at the null vanishes. The derivative is taken by parameters that are
 #: NaN, at their null value.
-Scan = Callable[[Scene, History, Body], NDArray[np.float64]]
+Scan = Callable[[Scene, History, Body], Floats]
 
 
 def always(scene: Scene, body: Body) -> bool:

@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters.layout import Layout
 from pbrl_ppl.scene import Scene, nearest
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True)
@@ -100,7 +98,7 @@ class ParameterLibrary:
         """Names of the sets, in the order of the index."""
         return tuple(name for name, _ in self.sets)
 
-    def prior(self, body: str) -> Array:
+    def prior(self, body: str) -> Floats:
         """Probability of each set for a body or class, shape (set,)."""
         given: dict[str, Any] = dict(self.probabilities or {})
         if any(isinstance(value, tuple) for value in given.values()):
@@ -108,7 +106,7 @@ class ParameterLibrary:
         p = np.array([float(given.get(name, 0.0)) for name in self.names])
         return p / p.sum() if p.sum() else np.full(len(p), 1.0 / len(p))
 
-    def table(self, layout: Layout, scene: Scene) -> Array:
+    def table(self, layout: Layout, scene: Scene) -> Floats:
         """Every entry of phi under every set, shape (p, set).
 
         Raises

@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.goals import read_tables, read_toml
 from pbrl_ppl.scene import Scene, nearest
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Quantile of the recorded pushes that a plan pushes with, and for how many intervals.
 _QUANTILE, _INTERVALS = 0.9, (2, 5)
@@ -209,7 +208,7 @@ class ActionSet:
             found.add(round(count))
         return tuple(sorted(found))
 
-    def wrenches(self, scene: Scene, which: NDArray[np.intp], heading: Array) -> Array:
+    def wrenches(self, scene: Scene, which: NDArray[np.intp], heading: Floats) -> Floats:
         """Return world-frame wrenches of chosen actions, shape (n, body, 3).
 
         Parameters

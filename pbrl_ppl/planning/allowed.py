@@ -8,18 +8,16 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.scene import Scene, nearest
-from pbrl_ppl.state import THETA, WRENCH
+from pbrl_ppl.state import THETA, WRENCH, Floats
 
-Array = NDArray[np.float64]
 #: Lowest and highest value of components of the wrench, by body.
 Bounds = Mapping[str, Mapping[str, Sequence[float]]]
 #: Wrenches (n, time, body, 3) to states (n, time + 1, body, 6).
-Predict = Callable[[Array], Array]
+Predict = Callable[[Floats], Floats]
 
 #: Pieces of a sequence within bounds by default.
 _PIECES = 8
@@ -32,13 +30,13 @@ class Allowed(Protocol):
     def pieces(self) -> int:
         """Pieces of a sequence."""
 
-    def random(self, rng: np.random.Generator, n: int) -> Array:
+    def random(self, rng: np.random.Generator, n: int) -> Floats:
         """Draw sequences from the set, shape (n, piece, ...)."""
 
-    def extreme(self, rng: np.random.Generator, n: int) -> Array:
+    def extreme(self, rng: np.random.Generator, n: int) -> Floats:
         """Draw sequences with more values at the bounds of the set."""
 
-    def wrenches(self, genes: Array, predict: Predict) -> Array:
+    def wrenches(self, genes: Floats, predict: Predict) -> Floats:
         """Return world-frame wrenches of sequences, shape (n, time, body, 3)."""
 
 
@@ -88,8 +86,8 @@ def allowed_wrenches(
 class _Within:
     """Wrenches within bounds (body, 3), each held for some intervals."""
 
-    low: Array
-    high: Array
+    low: Floats
+    high: Floats
     steps: int
     hold: int
 
@@ -97,11 +95,11 @@ class _Within:
     def pieces(self) -> int:
         return math.ceil(self.steps / self.hold)
 
-    def random(self, rng: np.random.Generator, n: int) -> Array:
+    def random(self, rng: np.random.Generator, n: int) -> Floats:
         share = rng.random((n, self.pieces, *self.low.shape))
         return np.asarray(self.low + share * (self.high - self.low))
 
-    def extreme(self, rng: np.random.Generator, n: int) -> Array:
+    def extreme(self, rng: np.random.Generator, n: int) -> Floats:
         inner = self.random(rng, n)
         ends = np.where(rng.random(inner.shape) < 0.5, self.low, self.high)
         nothing = np.clip(0.0, self.low, self.high)
@@ -110,7 +108,7 @@ class _Within:
             [kind == 0, kind == 1], [inner, np.broadcast_to(nothing, inner.shape)], ends
         )
 
-    def wrenches(self, genes: Array, predict: Predict) -> Array:
+    def wrenches(self, genes: Floats, predict: Predict) -> Floats:
         return np.repeat(genes, self.hold, axis=1)[:, : self.steps]
 
 
@@ -126,14 +124,14 @@ class _OfActions:
     def pieces(self) -> int:
         return math.ceil(self.steps / min(self.actions.intervals(self.scene)))
 
-    def random(self, rng: np.random.Generator, n: int) -> Array:
+    def random(self, rng: np.random.Generator, n: int) -> Floats:
         kinds = len(self.actions.actions), len(self.actions.intervals(self.scene))
         return rng.integers(kinds, size=(n, self.pieces, 2)).astype(float)
 
-    def extreme(self, rng: np.random.Generator, n: int) -> Array:
+    def extreme(self, rng: np.random.Generator, n: int) -> Floats:
         return self.random(rng, n)
 
-    def wrenches(self, genes: Array, predict: Predict) -> Array:
+    def wrenches(self, genes: Floats, predict: Predict) -> Floats:
         number, length = genes.astype(np.intp).transpose(2, 0, 1)
         ends = np.cumsum(np.array(self.actions.intervals(self.scene))[length], axis=1)
         time = np.arange(self.steps)

@@ -13,9 +13,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.bound import TimeToGo
 from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from pbrl_ppl.state import Floats, Ints
 
 #: Nodes expanded in one engine call; fewer under many draws, whose calls are large anyway.
 _BATCH = 32
@@ -188,7 +186,9 @@ class _Search:
             if interval == only or (only is None and interval in self.counts):
                 self._add(states, wrenches, cost, far, parents, which, interval)
 
-    def _note(self, states: Array, cost: Array, parents: Ints, which: Ints, interval: int) -> Array:
+    def _note(
+        self, states: Floats, cost: Floats, parents: Ints, which: Ints, interval: int
+    ) -> Floats:
         """Keep the cheapest edge to the goal and the nearest one; return L2 distances."""
         possible = np.isfinite(states).all(axis=(0, 2, 3)) & np.isfinite(cost)
         there = tail_mean(self.goal.shortfall(self.scene, states), self.tail) <= 1.0
@@ -209,10 +209,10 @@ class _Search:
 
     def _add(
         self,
-        states: Array,
-        wrenches: Array,
-        cost: Array,
-        far: Array,
+        states: Floats,
+        wrenches: Floats,
+        cost: Floats,
+        far: Floats,
         parents: Ints,
         which: Ints,
         interval: int,
@@ -244,7 +244,7 @@ class _Search:
         for node, value in enumerate(priority.tolist(), start=first):
             heapq.heappush(self.queue, (value, node))
 
-    def _cells(self, states: Array, far: Array) -> NDArray[np.int32]:
+    def _cells(self, states: Floats, far: Floats) -> NDArray[np.int32]:
         """Return the cell of the closed set of each node, shape (n, number)."""
         mean = np.nan_to_num(states.mean(axis=0))
         mean[..., 2] = mean_angle(np.nan_to_num(states[..., 2]))
@@ -262,12 +262,12 @@ class _Search:
         return steps[::-1]
 
 
-def mean_angle(angle: Array) -> Array:
+def mean_angle(angle: Floats) -> Floats:
     """Return the mean direction over the first axis (rad)."""
     return np.asarray(np.arctan2(np.sin(angle).mean(axis=0), np.cos(angle).mean(axis=0)))
 
 
-def played(task: Task, steps: list[tuple[int, int]]) -> Array:
+def played(task: Task, steps: list[tuple[int, int]]) -> Floats:
     """Return world-frame wrenches of actions, one an interval, shape (time, body, 3)."""
     dynamics, start, actions = task.dynamics, task.start, task.actions
     scene, states = dynamics.scene, np.repeat(start[None, None], dynamics.draws, axis=0)

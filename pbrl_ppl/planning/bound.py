@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
@@ -13,8 +12,7 @@ from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.dynamics import TransitionModel
 from pbrl_ppl.planning.goals import Goal, Target
 from pbrl_ppl.scene import Body, Scene, Shape
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Bools, Floats
 
 #: Cells along the longer side of the grid on which distances around walls are found, and the margin
 #: of the grid (m): a body can go around the end of a wall.
@@ -45,7 +43,7 @@ class TimeToGo:
     """
 
     def __init__(
-        self, dynamics: TransitionModel, goal: Goal, actions: ActionSet, start: Array
+        self, dynamics: TransitionModel, goal: Goal, actions: ActionSet, start: Floats
     ) -> None:
         scene = dynamics.scene
         self.goal, self.scene = goal, scene
@@ -59,7 +57,7 @@ class TimeToGo:
             self._turn.append(turn)
             self._fields.append(_distances(scene, scene.body(target.body), target, start[i]))
 
-    def __call__(self, states: Array) -> Array:
+    def __call__(self, states: Floats) -> Floats:
         """Return seconds, shape (draw, n), from states of shape (draw, n, body, 6)."""
         offset = self.goal.errors(self.scene, states)
         least = np.zeros(states.shape[:2])
@@ -84,7 +82,7 @@ class TimeToGo:
         return least
 
 
-def _time(way: Array, speed: Array, push: Array) -> Array:
+def _time(way: Floats, speed: Floats, push: Floats) -> Floats:
     """Return the least time for a distance at a speed and a largest acceleration."""
     way = np.maximum(way, 0.0)
     # without a push, at constant speed
@@ -95,17 +93,17 @@ def _time(way: Array, speed: Array, push: Array) -> Array:
 class _Field:
     """Distance to a target around obstacles, between the centres of a grid's cells."""
 
-    def __init__(self, values: Array, origin: Array, cell: float) -> None:
+    def __init__(self, values: Floats, origin: Floats, cell: float) -> None:
         self.values, self.origin, self.cell = values, origin, cell
 
-    def __call__(self, places: Array) -> Array:
+    def __call__(self, places: Floats) -> Floats:
         at = (places - self.origin) / self.cell
         return np.asarray(
             map_coordinates(self.values, np.moveaxis(at, -1, 0), order=1, mode="nearest")
         )
 
 
-def _distances(scene: Scene, body: Body, target: Target, start: Array) -> _Field | None:
+def _distances(scene: Scene, body: Body, target: Target, start: Floats) -> _Field | None:
     """Return distances of a body's origin from its target around obstacles; None without any."""
     static = tuple(obstacle for obstacle in scene.bodies if obstacle.static)
     if (not scene.walls and not static) or target.x is None or target.y is None:
@@ -137,7 +135,7 @@ def _distances(scene: Scene, body: Body, target: Target, start: Array) -> _Field
     return _Field(values, low, cell)
 
 
-def _graph(free: NDArray[np.bool_]) -> coo_array:
+def _graph(free: Bools) -> coo_array:
     """Return the moves between free cells; a knight's passes two others."""
     number = np.arange(free.size).reshape(free.shape)
     rows, columns, lengths = [], [], []

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.effects import Effect, catalogue
@@ -22,9 +22,7 @@ from pbrl_ppl.planning.allowed import Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.planner import start_state
 from pbrl_ppl.planning.separation import Separation
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import WRENCH, WRENCH_UNITS
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
 
 #: A log Bayes factor from which one effect is named alone: half the score statistic's `DECISIVE`.
 _NAMED = 5.0
@@ -58,7 +56,7 @@ class Suggestion:
     """
 
     scene: Scene
-    start: Array
+    start: Floats
     wrenches: xr.DataArray
     separation: xr.DataArray
     at_random: float
@@ -261,7 +259,7 @@ def suggest_actions(
 
 def _bred(
     judge: Separation, allowed: Allowed, rng: np.random.Generator, say: Callable[[str], None]
-) -> tuple[Array, float]:
+) -> tuple[Floats, float]:
     """Return the leading sequences of the last generation, and the mean value of the first.
 
     Children take pieces from two parents, and some from the allowed set.
@@ -288,17 +286,17 @@ def _bred(
     return parents[:_LEADERS], at_random
 
 
-def _wide(mask: NDArray[np.bool_], genes: Array) -> NDArray[np.bool_]:
+def _wide(mask: Bools, genes: Floats) -> Bools:
     return mask.reshape(*mask.shape, *(1,) * (genes.ndim - 2))
 
 
-def _weakest(separation: Array) -> Array:
+def _weakest(separation: Floats) -> Floats:
     """Return the least of all pairs and directions, (true, rival, ...) -> (...)."""
     off = ~np.eye(len(separation), dtype=bool)
     return np.asarray(separation[off].min(axis=0))
 
 
-def _value(separation: Array, meeting: NDArray[np.bool_]) -> Array:
+def _value(separation: Floats, meeting: Bools) -> Floats:
     """Return what sequences are ranked by: those in which bodies meet come last."""
     value = _weakest(separation)
     return np.where(np.isfinite(value), value - np.where(meeting, _MEETING, 0.0), -np.inf)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
@@ -24,9 +24,7 @@ from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.search import NODES, Found, Task, tail_mean
 from pbrl_ppl.scene import Scene, nearest
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 METHODS = ("astar", "mppi")
 #: Draws of Eq. 13's noise that a predicted distribution holds, at least.
@@ -63,8 +61,8 @@ class Plan:
 
     scene: Scene
     goal: Goal
-    start: Array
-    wrenches: Array
+    start: Floats
+    wrenches: Floats
     predicted: xr.Dataset
     reached: bool
     stopped: str
@@ -246,7 +244,7 @@ def plan(
     )  # fmt: skip
 
 
-def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) -> Array:
+def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) -> Floats:
     """The bodies' states, shape (body, 6), from what a user gives for some of them.
 
     Parameters

@@ -7,19 +7,17 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import TrajectoryNoise
 from pbrl_ppl.parameters import differentiate
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import Bools, Floats
 
 if TYPE_CHECKING:  # with the samplers, which a plan does not need
     from pbrl_ppl.criticism import Rival
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 #: Engine steps an interval at most: models are compared with each other, in the same engine.
 _SUBSTEPS = 10
@@ -43,10 +41,10 @@ class _Paths:
         Whether the engine diverged on a path, shape (path,).
     """
 
-    begin: Array
-    end: Array
-    wrenches: Array
-    before: Array
+    begin: Floats
+    end: Floats
+    wrenches: Floats
+    before: Floats
     intervals: int
     lost: Bools
 
@@ -72,18 +70,18 @@ class Separation:
     """
 
     def __init__(
-        self, rivals: Sequence[Rival], start: Array, before: Array, threads: int = 2
+        self, rivals: Sequence[Rival], start: Floats, before: Floats, threads: int = 2
     ) -> None:
         self.rivals, self.start, self.before = rivals, start, before
         self.scene = bare(rivals[0].mode.problem.scene)
         self._engines = [self._engine(rival, threads) for rival in rivals]
 
-    def path(self, wrenches: Array) -> Array:
+    def path(self, wrenches: Floats) -> Floats:
         """Return the states (n, time + 1, body, 6) that the first rival's mode predicts."""
         first = self.rivals[0]
         return np.asarray(self._rolled(first, first.mode.phi[None], wrenches)[0])
 
-    def __call__(self, wrenches: Array, draws: int) -> tuple[Array, Bools]:
+    def __call__(self, wrenches: Floats, draws: int) -> tuple[Floats, Bools]:
         """Return the expected log Bayes factors of experiments.
 
         Parameters
@@ -125,11 +123,11 @@ class Separation:
         )  # fmt: skip
         return found.after(self.before)
 
-    def _dynamics(self, rival: Rival, phi: Array) -> Dynamics:
+    def _dynamics(self, rival: Rival, phi: Floats) -> Dynamics:
         """Return a rival's dynamics at parameters (draw, p)."""
         return self._engines[self.rivals.index(rival)].at(phi)
 
-    def _rolled(self, rival: Rival, phi: Array, wrenches: Array) -> Array:
+    def _rolled(self, rival: Rival, phi: Floats, wrenches: Floats) -> Floats:
         """Return the states predicted under each draw, shape (draw, n, time + 1, body, 6)."""
         dynamics = self._dynamics(rival, phi)
         n, intervals = wrenches.shape[:2]
@@ -140,7 +138,7 @@ class Separation:
             every.append(states)
         return np.stack(every, axis=2)
 
-    def _paths(self, rival: Rival, phi: Array, wrenches: Array) -> _Paths:
+    def _paths(self, rival: Rival, phi: Floats, wrenches: Floats) -> _Paths:
         states = self._rolled(rival, phi, wrenches)
         before = np.concatenate(
             [np.broadcast_to(self.before, wrenches[:, :1].shape), wrenches[:, :-1]], axis=1
@@ -149,7 +147,7 @@ class Separation:
         states = np.where(lost[:, :, None, None, None], self.start, states)
         body = states.shape[3:]
 
-        def along(values: Array) -> Array:
+        def along(values: Floats) -> Floats:
             return np.tile(values, (len(phi), 1, 1, 1)).reshape(-1, *values.shape[2:])
 
         return _Paths(
@@ -157,7 +155,7 @@ class Separation:
             along(wrenches), along(before), wrenches.shape[1], lost.ravel(),
         )  # fmt: skip
 
-    def _explained(self, rival: Rival, paths: _Paths, met: Bools) -> tuple[Array, Array, Array]:
+    def _explained(self, rival: Rival, paths: _Paths, met: Bools) -> tuple[Floats, Floats, Floats]:
         """Return how a model explains the paths of another, three arrays of shape (path,).
 
         Squared whitened residual less what the parameters absorb, log-determinant of the
@@ -169,13 +167,13 @@ class Separation:
         spread = np.sqrt(np.maximum(np.diag(mode.covariance), 0.0))
         lower, upper = mode.problem.layout.bounds
 
-        def steps(phi: Array, begin: Array) -> Array:
+        def steps(phi: Floats, begin: Floats) -> Floats:
             """Return the cells after an interval, shape (point, transition, cell)."""
             dynamics = self._dynamics(rival, phi)
             ends = dynamics.step(begin, paths.wrenches, paths.before)
             return np.nan_to_num(cells.of(ends))
 
-        def of_phi(points: Array) -> Array:
+        def of_phi(points: Floats) -> Floats:
             return steps(points, np.broadcast_to(paths.begin, (len(points), *paths.begin.shape)))
 
         residual = cells.wrapped(cells.of(paths.end) - of_phi(mode.phi[None])[0])
