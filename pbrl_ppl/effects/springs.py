@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import least_squares
 
-from pbrl_ppl.effects.bodies import body_points, is_unpivoted
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_unpivoted
 from pbrl_ppl.effects.stages import Force, Rod, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior

@@ -1,16 +1,11 @@
 """Scenes: shapes, bodies, walls and joints as declared; TOML to `Scene` and back."""
 
-from pbrl_ppl.scene.checks import CONTACT_NAMES, nearest
-from pbrl_ppl.scene.scene import WORLD, Body, Joint, Point, Scene, Shape, Wall
-
-__all__ = [
-    "CONTACT_NAMES",
-    "WORLD",
-    "Body",
-    "Joint",
-    "Point",
-    "Scene",
-    "Shape",
-    "Wall",
-    "nearest",
-]
+from .checks import CONTACT_NAMES as CONTACT_NAMES
+from .checks import nearest as nearest
+from .scene import WORLD as WORLD
+from .scene import Body as Body
+from .scene import Joint as Joint
+from .scene import Point as Point
+from .scene import Scene as Scene
+from .scene import Shape as Shape
+from .scene import Wall as Wall
