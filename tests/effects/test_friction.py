@@ -161,7 +161,7 @@ def crowd() -> tuple[Simulator, np.ndarray, np.ndarray, np.ndarray]:
 def test_paths_agree_and_nothing_is_remembered() -> None:
     sim, phi, start, actions = crowd()
     expected = sim(phi, start, actions)
-    plain = Simulator(Physics(sim.physics.changed(engine="python")))
+    plain = Simulator(sim.physics.changed(engine="python"))
     some = plain(phi, start[:8], actions[:8])
     np.testing.assert_allclose(some, expected[:, :8], rtol=1e-9, atol=1e-9)
     order = np.random.default_rng(6).permutation(len(start))
