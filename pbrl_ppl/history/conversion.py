@@ -1,4 +1,4 @@
-"""Tables of other programs: column names, units and time steps turned into a history's."""
+"""Tables of other programs: columns renamed, units converted, time steps resampled."""
 
 import warnings
 from collections.abc import Mapping

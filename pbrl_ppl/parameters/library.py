@@ -1,4 +1,4 @@
-"""A prior over few pre-learned parameter sets, one choice a body, in place of Table 1."""
+"""Categorical prior over parameter sets learned before, in place of Table 1."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ class ParameterLibrary:
         return cls(*json.loads(text))
 
     def to_json(self) -> str:
-        """Everything, as text for a posterior file."""
+        """Return the library as JSON, for a posterior file."""
         given = {k: dict(v) if isinstance(v, tuple) else v for k, v in self.probabilities or ()}
         return json.dumps([{name: dict(values) for name, values in self.sets}, given or None])
 
@@ -99,7 +99,7 @@ class ParameterLibrary:
         return tuple(name for name, _ in self.sets)
 
     def prior(self, body: str) -> Floats:
-        """Probability of each set for a body or class, shape (set,)."""
+        """Return the probability of each set for a body or class, shape (set,)."""
         given: dict[str, Any] = dict(self.probabilities or {})
         if any(isinstance(value, tuple) for value in given.values()):
             given = dict(given.get(body, ()))
@@ -107,7 +107,7 @@ class ParameterLibrary:
         return p / p.sum() if p.sum() else np.full(len(p), 1.0 / len(p))
 
     def table(self, layout: Layout, scene: Scene) -> Floats:
-        """Every entry of phi under every set, shape (p, set).
+        """Return every entry of phi under every set, shape (p, set).
 
         Raises
         ------

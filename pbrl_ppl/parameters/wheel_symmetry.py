@@ -201,7 +201,7 @@ def beside(layout: Layout, phi: Floats, others: Floats) -> Floats:
 def change_from(layout: Layout, phi: Floats, origin: Floats) -> Floats:
     """Return the change from an origin, with wheels and angles as near to it as possible.
 
-    The engine does the same for all of these, whatever their prior says.
+    The engine predicts the same for all of these; their prior does not matter here.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def redescribed(layout: Layout, phi: Floats, rng: np.random.Generator) -> Floats
 def evened(layout: Layout, phi: Floats) -> Floats:
     """Return the change of log-prior that makes a wheel's four descriptions equally probable.
 
-    A chain then needs to see one of them only; `redescribed` gives each its own share.
+    A chain then needs to see one of them only; `redescribed` draws each with its prior probability.
 
     Parameters
     ----------

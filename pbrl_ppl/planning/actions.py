@@ -1,4 +1,4 @@
-"""Actions of a planner: wrenches on bodies and their durations."""
+"""Actions of a planner: wrenches on bodies, their durations, and sequences of them."""
 
 from __future__ import annotations
 

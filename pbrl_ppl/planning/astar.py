@@ -1,4 +1,4 @@
-"""A* over continuous transitions, with a discretised closed set; many actions per engine call."""
+"""A* over continuous transitions: the search and its heuristic, a bound on the time to the goal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Transition models of a plan: Eq. 7 or 13 at posterior draws, each with its own states."""
+"""Transition models for planning: Eqs. 7 and 13 at posterior draws."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class TransitionModel(Protocol):
 
     @property
     def draws(self) -> int:
-        """Number of models in it, each with its own states: posterior draws, or 1."""
+        """Number of posterior draws that states are predicted for; 1 for a single model."""
 
     def single(self) -> Self:
         """Return one of the models, in the middle of all."""

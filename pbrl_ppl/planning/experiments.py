@@ -1,4 +1,4 @@
-"""Experiments: actions that separate effects which the data so far cannot."""
+"""Experiments: actions that separate effects that are confounded in the data so far."""
 
 from __future__ import annotations
 
@@ -293,7 +293,7 @@ class Suggestion:
         ]
         said.append(
             f"a random sequence of the same set: {self.at_random:.3g} in the mean, for the pair"
-            " that is told apart worst"
+            " that is separated worst"
         )
         if not self.decisive:
             times = int(np.ceil(_NAMED / max(self.expected, 1e-3)))
@@ -338,7 +338,7 @@ def suggest_actions(
     catalogue: Iterable[Effect] = catalogue,
     progress: Callable[[str], None] | None = None,
 ) -> Suggestion:
-    """Find the actions that best separate effects which the data so far cannot.
+    """Find the actions that best separate effects that are confounded in the data so far.
 
     Each rival effect is fitted to the recording that the posterior holds, so that it has the size
     that explains the data. Sequences from the allowed set are then ranked by the expected log Bayes
@@ -376,7 +376,7 @@ def suggest_actions(
     catalogue : iterable of Effect
         Where the names of effects are looked up.
     progress : callable, optional
-        Told how far the search is.
+        Called with a text on the progress of the search.
 
     Returns
     -------

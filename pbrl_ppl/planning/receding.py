@@ -1,4 +1,4 @@
-"""Model predictive path integral control: a receding horizon for tasks that are all dynamics."""
+"""Model predictive path integral control (MPPI): a receding horizon for dynamic tasks."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _ARRIVAL = 0.2
 
 
 class Horizon:
-    """Receding horizon: wrenches for the next intervals, improved and moved on at every step.
+    """Receding horizon: wrenches for the next intervals, improved and shifted at every step.
 
     Wrenches may be anything up to the strongest of the action set, on all of its bodies at once.
 

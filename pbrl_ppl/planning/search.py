@@ -1,4 +1,4 @@
-"""What the searches for a plan share: task, result, risk over draws and contact penalty."""
+"""Task and result of a search for a plan, its risk over draws and its contact penalty."""
 
 from __future__ import annotations
 
