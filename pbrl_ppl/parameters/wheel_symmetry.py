@@ -105,8 +105,8 @@ def fold_draws(layout: Layout, draws: Mapping[str, Floats]) -> dict[str, Floats]
 
     Examples
     --------
-    >>> from pbrl_ppl.model.table1 import build_layout
-    >>> from pbrl_ppl.scene.scene import Body, Scene, Shape
+    >>> from pbrl_ppl.physics import build_layout
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
     >>> cart = Body("cart", Shape.box(1.0, 0.6), wheel=True)
     >>> layout = build_layout(Scene(time_step=0.1, normal_gravity=9.81, bodies=(cart,)))
     >>> equal = {"w_theta[cart]": np.array([0.0, np.pi / 2]), "mu_x[cart]": np.array([0.1, 0.4]),

@@ -84,7 +84,9 @@ class Separation:
         self, rivals: Sequence[Rival], start: Floats, before: Floats, threads: int = 2
     ) -> None:
         self.rivals, self.start, self.before = rivals, start, before
-        self.scene = bare(rivals[0].mode.problem.scene)
+        # the rivals differ in the effects that bodies declare
+        scene = rivals[0].mode.problem.scene
+        self.scene = scene.replace(bodies=tuple(replace(body, effects=()) for body in scene.bodies))
         self._engines = [self._engine(rival, threads) for rival in rivals]
 
     def path(self, wrenches: Floats) -> Floats:
@@ -224,11 +226,6 @@ class Separation:
         misfit = (r**2).sum(axis=1) - (shared * solved[..., 0]).sum(axis=1)
         absorbed = len(mode.phi) - np.trace(solved[..., 1:], axis1=1, axis2=2)
         return misfit, np.linalg.slogdet(inner)[1], absorbed
-
-
-def bare(scene: Scene) -> Scene:
-    """Return a scene without the effects that its bodies declare: the rivals differ in them."""
-    return scene.replace(bodies=tuple(replace(body, effects=()) for body in scene.bodies))
 
 
 #: A log Bayes factor from which one effect is named alone: half the score statistic's `DECISIVE`.

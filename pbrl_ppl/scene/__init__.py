@@ -1,11 +1,11 @@
 """Scenes: shapes, bodies, walls and joints as declared; TOML to `Scene` and back."""
 
+from .bodies import Body as Body
+from .bodies import Wall as Wall
 from .checks import CONTACT_NAMES as CONTACT_NAMES
+from .checks import Point as Point
 from .checks import nearest as nearest
-from .scene import WORLD as WORLD
-from .scene import Body as Body
-from .scene import Joint as Joint
-from .scene import Point as Point
+from .joints import WORLD as WORLD
+from .joints import Joint as Joint
 from .scene import Scene as Scene
-from .scene import Shape as Shape
-from .scene import Wall as Wall
+from .shape import Shape as Shape
