@@ -19,7 +19,6 @@ from .stages import Force as Force
 from .stages import Law as Law
 from .stages import Noise as Noise
 from .stages import Properties as Properties
-from .stages import Rod as Rod
 from .stages import Sensor as Sensor
 from .stages import Structure as Structure
 from .stages import Values as Values

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,23 +249,6 @@ Predict = Callable[[Floats], Floats]
 _PIECES = 8
 
 
-class Allowed(Protocol):
-    """A set of sequences, each made of pieces."""
-
-    @property
-    def pieces(self) -> int:
-        """Pieces of a sequence."""
-
-    def random(self, rng: np.random.Generator, n: int) -> Floats:
-        """Draw sequences from the set, shape (n, piece, ...)."""
-
-    def extreme(self, rng: np.random.Generator, n: int) -> Floats:
-        """Draw sequences with more values at the bounds of the set."""
-
-    def wrenches(self, genes: Floats, predict: Predict) -> Floats:
-        """Return world-frame wrenches of sequences, shape (n, time, body, 3)."""
-
-
 def allowed_wrenches(
     scene: Scene, actions: ActionSet | Bounds, steps: int, hold: int | None
 ) -> Allowed:
@@ -319,13 +302,16 @@ class _Within:
 
     @property
     def pieces(self) -> int:
+        """Number of pieces of a sequence."""
         return math.ceil(self.steps / self.hold)
 
     def random(self, rng: np.random.Generator, n: int) -> Floats:
+        """Draw sequences, shape (n, piece, ...)."""
         share = rng.random((n, self.pieces, *self.low.shape))
         return np.asarray(self.low + share * (self.high - self.low))
 
     def extreme(self, rng: np.random.Generator, n: int) -> Floats:
+        """Draw sequences with more values at the bounds."""
         inner = self.random(rng, n)
         ends = np.where(rng.random(inner.shape) < 0.5, self.low, self.high)
         nothing = np.clip(0.0, self.low, self.high)
@@ -335,6 +321,7 @@ class _Within:
         )
 
     def wrenches(self, genes: Floats, predict: Predict) -> Floats:
+        """Return world-frame wrenches of sequences, shape (n, time, body, 3)."""
         return np.repeat(genes, self.hold, axis=1)[:, : self.steps]
 
 
@@ -372,3 +359,7 @@ class _OfActions:
                 heading = np.nan_to_num(predict(out[:, :t])[:, -1, :, THETA])
             out[:, t] = self.actions.wrenches(self.scene, which[:, t], heading)
         return out
+
+
+#: A set of sequences, each made of pieces.
+Allowed = _Within | _OfActions

@@ -81,16 +81,6 @@ def rollout(
     return np.concatenate(path, axis=1)
 
 
-class StepNoise(Protocol):
-    """Noise that a step adds to states, one distribution a posterior draw."""
-
-    def add(self, states: Floats, rng: np.random.Generator) -> Floats:
-        """Return states (draw, n, body, 6) with noise."""
-
-    def single(self, draw: int) -> StepNoise:
-        """Return the noise of one draw."""
-
-
 @dataclass(frozen=True, eq=False)
 class StateNoise:
     """Noise of each state dimension, as in Eq. 11.
@@ -151,6 +141,10 @@ class AccelerationNoise:
     def single(self, draw: int) -> AccelerationNoise:
         """Return the noise of one draw."""
         return AccelerationNoise(self.sigma[draw : draw + 1], self.cells)
+
+
+#: Noise that a step adds to states, one distribution a posterior draw.
+StepNoise = StateNoise | AccelerationNoise
 
 
 class Dynamics:
