@@ -26,7 +26,7 @@ from .effects import catalogue as catalogue
 from .errors import PbrlError as PbrlError
 from .history import History as History
 from .history import Segments as Segments
-from .history import from_mujoco as from_mujoco
+from .history.mujoco import from_mujoco as from_mujoco
 from .model import SimulatorOp as SimulatorOp
 from .modes import joint_probabilities as joint_probabilities
 from .oomdp import LWR as LWR

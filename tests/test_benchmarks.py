@@ -61,10 +61,9 @@ def test_usual_parts_are_measured_unless_others_are_asked_for(
 
 
 def made_up_loop(*names):
-    """What a loop gives, as far as the benchmark tells it."""
+    """Return what the benchmark reads of a loop."""
     added = tuple(types.SimpleNamespace(effect=name, body="cart") for name in names)
-    findings = types.SimpleNamespace(provenance={"transitions": 60})
-    return types.SimpleNamespace(verdict="adequate", added=added, findings=findings)
+    return types.SimpleNamespace(verdict="adequate", added=added, provenance={"transitions": 60})
 
 
 def test_loops_on_recordings_that_are_not_there_are_left_out(

@@ -26,12 +26,12 @@ import pymunk
 import pytensor
 import pytensor.tensor as pt
 
-from pbrl_ppl import Body, Scene, Shape, Simulator, SimulatorOp
+from pbrl_ppl import Body, Scene, Shape, SimulatorOp
 from pbrl_ppl.effects import attach
 from pbrl_ppl.history import History, fill_hinges
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.parameters import Layout, box, differentiate
-from pbrl_ppl.physics import PartedSimulator, Physics, build_layout, calls
+from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, calls
 from pbrl_ppl.physics.world import World
 from pbrl_ppl.scene import Joint, Wall
 

@@ -18,8 +18,7 @@ from pathlib import Path
 import numpy as np
 
 import pbrl_ppl as pp
-from pbrl_ppl.planning.astar import astar
-from pbrl_ppl.planning.bound import TimeToGo
+from pbrl_ppl.planning.astar import TimeToGo, astar
 from pbrl_ppl.planning.search import Task
 
 sys.path.insert(0, str(Path(__file__).parent))

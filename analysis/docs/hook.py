@@ -92,7 +92,7 @@ def rooms() -> dict[str, str]:
     found: dict[str, list[str]] = {}
     for statement in ast.parse((ROOT / "pbrl_ppl" / "__init__.pyi").read_text()).body:
         if isinstance(statement, ast.ImportFrom):
-            names = found.setdefault(str(statement.module), [])
+            names = found.setdefault(str(statement.module).partition(".")[0], [])
             names += [alias.name for alias in statement.names]
     tree = ast.parse((ROOT / "pbrl_ppl" / "errors.py").read_text())
     found["errors"] = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]

@@ -33,7 +33,7 @@ def apartment_model(scene: pp.Scene, history: pp.History) -> pm.Model:
     x_min, x_max, y_min, y_max = bounds.T
     physics = pp.Physics.declare(scene)  # gives the order of phi
     # bodies that were apart in this history are simulated apart
-    simulate = pp.SimulatorOp(pp.Physics(physics.in_parts(history)))
+    simulate = pp.SimulatorOp(physics.in_parts(history))
     with pm.Model(coords={"body": list(LOG_MASS), "wheel": wheels}) as model:
         # Table 1, m and r
         mass = pm.LogNormal("mass", mu=list(LOG_MASS.values()), sigma=0.5, dims="body")

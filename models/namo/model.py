@@ -23,7 +23,7 @@ def rooms_model(scene: pp.Scene, history: pp.History) -> pm.Model:
     measured = transitions.observed  # (transition, 1, body, state)
     physics = pp.Physics.declare(scene)  # gives the order of phi
     # bodies that were apart in this history are simulated apart
-    simulate = pp.SimulatorOp(pp.Physics(physics.in_parts(history)))
+    simulate = pp.SimulatorOp(physics.in_parts(history))
     with pm.Model(
         coords={"body": ["robot", "table", "couch"], "feet": ["table", "couch"]}
     ) as model:

@@ -1,49 +1,24 @@
 """Physical effects: stages at which they act, catalogue by kind, attachment to bodies."""
 
-from pbrl_ppl.effects.bodies import hanging_body
-from pbrl_ppl.effects.catalogue import attach, candidates, catalogue
-from pbrl_ppl.effects.effect import Attached, Effect, EffectParameter, at_stage, needs_inputs
-from pbrl_ppl.effects.learned_remainder import (
-    LEARNED_REMAINDER,
-    LearnedRemainder,
-    learned_remainder,
-)
-from pbrl_ppl.effects.stages import (
-    Clock,
-    Command,
-    Disc,
-    Force,
-    Law,
-    Noise,
-    Properties,
-    Rod,
-    Sensor,
-    Structure,
-    Values,
-)
-
-__all__ = [
-    "LEARNED_REMAINDER",
-    "Attached",
-    "Clock",
-    "Command",
-    "Disc",
-    "Effect",
-    "EffectParameter",
-    "Force",
-    "Law",
-    "LearnedRemainder",
-    "Noise",
-    "Properties",
-    "Rod",
-    "Sensor",
-    "Structure",
-    "Values",
-    "at_stage",
-    "attach",
-    "candidates",
-    "catalogue",
-    "hanging_body",
-    "learned_remainder",
-    "needs_inputs",
-]
+from .catalogue import attach as attach
+from .catalogue import candidates as candidates
+from .catalogue import catalogue as catalogue
+from .effect import Attached as Attached
+from .effect import Effect as Effect
+from .effect import EffectParameter as EffectParameter
+from .effect import at_stage as at_stage
+from .effect import hanging_body as hanging_body
+from .effect import needs_inputs as needs_inputs
+from .learned_remainder import LEARNED_REMAINDER as LEARNED_REMAINDER
+from .learned_remainder import LearnedRemainder as LearnedRemainder
+from .learned_remainder import learned_remainder as learned_remainder
+from .stages import Clock as Clock
+from .stages import Command as Command
+from .stages import Disc as Disc
+from .stages import Force as Force
+from .stages import Law as Law
+from .stages import Noise as Noise
+from .stages import Properties as Properties
+from .stages import Sensor as Sensor
+from .stages import Structure as Structure
+from .stages import Values as Values

@@ -5,8 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.effects.bodies import body_points, is_pivoted
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_pivoted
 from pbrl_ppl.effects.stages import Properties
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior

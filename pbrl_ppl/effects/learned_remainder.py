@@ -64,7 +64,7 @@ def learned_remainder(table: str) -> LearnedRemainder:
     return LearnedRemainder(
         LEARNED_REMAINDER,
         tuple(EffectParameter(f"form{k + 1}", "1", prior) for k in range(len(forms))),
-        "a force that was learned from what is left, and that no law is known of",
+        "a force learned from the unexplained residual, for which no law is known",
         "C. E. Rasmussen and C. K. I. Williams, Gaussian Processes for Machine Learning (2006)",
         Force(law),
         table=table,

@@ -4,16 +4,13 @@ from itertools import combinations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from pbrl_ppl.effects.bodies import is_pivoted
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter, is_pivoted
 from pbrl_ppl.effects.stages import Disc, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene, Shape
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Intervals with the largest velocity changes that are taken for hits, and discs tried at most.
 _HITS, _DISCS = 16, 60
@@ -70,7 +67,7 @@ def _scan(scene: Scene, history: History, body: Body) -> Any:
     return np.array(discs[:_DISCS]).reshape(-1, 3)
 
 
-def _hits(shape: Shape, begin: Array, end: Array, time_step: float) -> tuple[Array, Array]:
+def _hits(shape: Shape, begin: Floats, end: Floats, time_step: float) -> tuple[Floats, Floats]:
     """Return the points of the outline that were hit, and the directions into the obstacle.
 
     Shape (hit, 2) each, in the world; points in m.
@@ -93,12 +90,12 @@ def _hits(shape: Shape, begin: Array, end: Array, time_step: float) -> tuple[Arr
     return point, inward
 
 
-def _turned(vector: Array, c: float, s: float) -> Array:
+def _turned(vector: Floats, c: float, s: float) -> Floats:
     """Return a vector (2,) turned by the angle with this cosine and sine."""
     return np.array([c * vector[0] - s * vector[1], s * vector[0] + c * vector[1]])
 
 
-def _exit(shape: Shape, direction: Array, offset: float) -> Array:
+def _exit(shape: Shape, direction: Floats, offset: float) -> Floats:
     """Return where a line, at an offset from the body's centre, leaves the outline."""
     side = np.array([-direction[1], direction[0]])
     if shape.outline is None:

@@ -5,18 +5,14 @@ from math import floor, pi
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from pbrl_ppl.effects.bodies import body_points, is_unpivoted
-from pbrl_ppl.effects.effect import Effect, EffectParameter
+from pbrl_ppl.effects.effect import Effect, EffectParameter, body_points, is_unpivoted
 from pbrl_ppl.effects.stages import Force, Rod, Structure
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
-from pbrl_ppl.state import wrapped
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats, wrapped
 
 _PLACE = Prior("normal", sigma=10.0)
 #: Anchors of a spring that a scan tries along each axis: quantiles of the measured positions.
@@ -35,7 +31,7 @@ _SHORTEST = 0.02
 _SAME = 0.01
 
 
-def _poses(history: History, body: Body, width: int) -> Array:
+def _poses(history: History, body: Body, width: int) -> Floats:
     """Return the first coordinates of a body where all were measured, shape (n, width)."""
     poses = history.dataset["start"].sel(body=body.name).to_numpy()[..., :width].reshape(-1, width)
     return np.asarray(poses[np.isfinite(poses).all(axis=1)])
@@ -148,11 +144,11 @@ def _scan_rods(scene: Scene, history: History, body: Body) -> Any:
         return np.empty((0, 5))
     spread = float(np.sqrt(poses[:, :2].var(axis=0).sum()))
 
-    def deviation(ends: Array) -> Array:
+    def deviation(ends: Floats) -> Floats:
         length = _length(ends, poses)
         return np.asarray(length - length.mean())
 
-    found: list[Array] = []
+    found: list[Floats] = []
     for begin in body_points(body):
         ends = np.array([*begin, *_centre(begin, poses)])
         fitted = least_squares(deviation, ends, x_scale="jac").x
@@ -164,19 +160,19 @@ def _scan_rods(scene: Scene, history: History, body: Body) -> Any:
     return np.array(found).reshape(-1, 5)
 
 
-def _length(ends: Array, poses: Array) -> Array:
+def _length(ends: Floats, poses: Floats) -> Floats:
     """Return the distances (n,) from a point of the body to a place: ends (4,), poses (n, 3)."""
     x, y = _positions(ends[:2], poses)
     return np.asarray(np.hypot(x - ends[2], y - ends[3]))
 
 
-def _positions(point: Array, poses: Array) -> tuple[Array, Array]:
+def _positions(point: Floats, poses: Floats) -> tuple[Floats, Floats]:
     """Return where a point of the body is in the world, shape (n,) each."""
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     return poses[:, 0] + c * point[0] - s * point[1], poses[:, 1] + s * point[0] + c * point[1]
 
 
-def _centre(point: Array, poses: Array) -> Array:
+def _centre(point: Floats, poses: Floats) -> Floats:
     """Return the centre of the circle on which a point of the body moves (Kasa, 1976)."""
     x, y = _positions(point, poses)
     table = np.column_stack([2 * x, 2 * y, np.ones(len(x))])

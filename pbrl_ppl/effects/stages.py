@@ -7,12 +7,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Values of an effect's parameters by name: arrays that broadcast, one entry per proposal.
-Values = Mapping[str, Array]
+Values = Mapping[str, Floats]
 
 #: ``law(state, command, parameters, wrench)``, all arrays of floats: one body's state (6,), its
 #: command, the effect's parameters (q,), and the wrench (3,), which it changes in place. It runs
@@ -33,9 +32,9 @@ class Disc:
         Its radius (m).
     """
 
-    x: Array
-    y: Array
-    radius: Array
+    x: Floats
+    y: Floats
+    radius: Floats
 
 
 class Rod(NamedTuple):
@@ -51,11 +50,11 @@ class Rod(NamedTuple):
         Its length (m).
     """
 
-    a_x: Array
-    a_y: Array
-    b_x: Array
-    b_y: Array
-    length: Array
+    a_x: Floats
+    a_y: Floats
+    b_x: Floats
+    b_y: Floats
+    length: Floats
 
 
 def _no_discs(parameters: Values) -> tuple[Disc, ...]:
@@ -93,11 +92,11 @@ class Clock:
         Time within the trajectory at which the interval begins and ends (s).
     """
 
-    trajectory: Array
-    begin: Array
-    end: Array
+    trajectory: Floats
+    begin: Floats
+    end: Floats
 
-    def after(self, time: Array) -> Array:
+    def after(self, time: Floats) -> Floats:
         """Return the share of each interval after a time in its trajectory (s), 0 to 1."""
         known = np.isfinite(self.end)
         begin, end = np.where(known, self.begin, 0.0), np.where(known, self.end, 1.0)
@@ -121,7 +120,7 @@ class Properties:
         (proposal, 1).
     """
 
-    modify: Callable[[dict[str, Array], Values, Clock], None]
+    modify: Callable[[dict[str, Floats], Values, Clock], None]
     timed: bool = False
 
 
@@ -174,8 +173,8 @@ class Sensor:
         ``invert(measured, parameters) -> state``, its inverse.
     """
 
-    measure: Callable[[Array, Values], Array]
-    invert: Callable[[Array, Values], Array]
+    measure: Callable[[Floats, Values], Floats]
+    invert: Callable[[Floats, Values], Floats]
 
 
 @final
@@ -190,7 +189,7 @@ class Noise:
         is a Gaussian.
     """
 
-    tail: Callable[[Values], Array]
+    tail: Callable[[Values], Floats]
 
 
 Stage = Structure | Properties | Command | Force | Sensor | Noise

@@ -1,4 +1,4 @@
-"""Rows at a trajectory's ends that belong to no model: a body still held, an abrupt stop."""
+"""Unusable rows at a trajectory's ends: a body that is still held, an abrupt stop."""
 
 from __future__ import annotations
 
@@ -47,28 +47,28 @@ class Column:
 
         Noise comes from fourth differences, changes of velocity from second ones.
         """
-        longer = [np.diff(own, 4) for own in series if len(own) > 4]
-        if not longer or not any(np.ptp(own) > 0 for own in series):
+        longer = [np.diff(values, 4) for values in series if len(values) > 4]
+        if not longer or not any(np.ptp(values) > 0 for values in series):
             return None
         every = np.concatenate(series)
         steps = np.diff(np.unique(every))
         rounding = 1e-9 * float(np.abs(every).max())
         finest = float(steps[steps > rounding].min()) if (steps > rounding).any() else 0.0
         noise = 1.4826 * float(np.median(np.abs(np.concatenate(longer)))) / np.sqrt(70.0)
-        second = np.concatenate([np.diff(own, 2) for own in series])
+        second = np.concatenate([np.diff(values, 2) for values in series])
         noise = max(noise, finest / np.sqrt(12), rounding)
         # of independent errors the second differences have six times the variance
         change = float(np.quantile(np.abs(second), 0.9)) ** 2 - 6 * (1.8 * noise) ** 2
         return cls(series, noise, float(np.sqrt(max(change, 0.0))))
 
-    def held(self, own: Floats, push: Floats) -> int:
+    def held(self, values: Floats, push: Floats) -> int:
         """Return the rows at rest at the beginning, before it moves off without a command."""
-        still = self._still(own)
-        if not LEAST <= still < len(own) - BESIDE:
+        still = self._still(values)
+        if not LEAST <= still < len(values) - BESIDE:
             return 0
         skip = max(0, still - _MOST)  # of a long rest its last rows are enough
         still -= skip
-        for window in _windows(own[skip:], still):
+        for window in _windows(values[skip:], still):
             if push[: skip + len(window)].any():
                 break
             places = np.linspace(2, still, min(2 * still - 3, _PLACES))
@@ -77,11 +77,11 @@ class Column:
                 return skip + int(np.ceil(bend.latest))
         return 0
 
-    def stopped(self, own: Floats, push: Floats) -> int:
+    def stopped(self, values: Floats, push: Floats) -> int:
         """Return the rows at the end after an abrupt change of velocity with constant commands."""
-        back = own[::-1]
+        back = values[::-1]
         still = self._still(back)
-        n = len(own)
+        n = len(values)
         tries = [(min(max(LEAST, n // 4), _MOST), 0, False)]
         if LEAST <= still < n - BESIDE:
             skip = max(0, still - _MOST)
@@ -102,11 +102,11 @@ class Column:
                     best, rows = bend, skip + int(np.floor(bend.latest)) + 1
         return rows
 
-    def _still(self, own: Floats) -> int:
+    def _still(self, values: Floats) -> int:
         """Return the number of rows at the beginning that stay within the noise of their mean."""
-        mean = np.cumsum(own) / np.arange(1, len(own) + 1)
-        off = np.abs(own - mean) > _STILL * self.noise
-        return int(np.argmax(off)) if off.any() else len(own)
+        mean = np.cumsum(values) / np.arange(1, len(values) + 1)
+        off = np.abs(values - mean) > _STILL * self.noise
+        return int(np.argmax(off)) if off.any() else len(values)
 
     def _bend(
         self, window: Floats, places: Floats, degree: int, *, rest: bool, abrupt: bool
@@ -137,9 +137,9 @@ class Column:
         if without - best.left < _CERTAIN * variance or best.left > (1 - _SHARE) * without:
             return None
         elsewhere = [
-            ((np.lib.stride_tricks.sliding_window_view(own, n) @ smooth) ** 2).sum(axis=1)
-            for own in self.series
-            if len(own) >= n
+            ((np.lib.stride_tricks.sliding_window_view(values, n) @ smooth) ** 2).sum(axis=1)
+            for values in self.series
+            if len(values) >= n
         ]
         if without < _OUTSIDE**2 * float(np.median(np.concatenate(elsewhere))):
             return None
@@ -172,10 +172,10 @@ def _fitted(window: Floats, parts: list[Floats]) -> tuple[float, float, float]:
     return float(size[0]), float(np.linalg.norm(inverse[0])), left
 
 
-def _windows(own: Floats, still: int) -> list[Floats]:
+def _windows(values: Floats, still: int) -> list[Floats]:
     """Return beginnings of a series: the rows at rest, and more and more beside them."""
     beside = (int(np.clip(times * still, BESIDE, _MOST)) for times in _LENGTHS)
-    return [own[: still + each] for each in beside if still + each <= len(own)]
+    return [values[: still + each] for each in beside if still + each <= len(values)]
 
 
 HELD, STOPPED = "held", "stopped"
@@ -262,14 +262,14 @@ def strange_ends(history: History, scene: Scene) -> list[End]:
     for body, d in product(np.flatnonzero(~follows), range(3)):
         series = [_filled(observed[t, :n, body, d], d == THETA) for t, n in enumerate(n_rows)]
         column = Column.of([each for each in series if each is not None])
-        for t, own in enumerate(series):
-            if own is None or column is None:
+        for t, values in enumerate(series):
+            if values is None or column is None:
                 continue
-            n = len(own)
+            n = len(values)
             push = action[t, :n][:, ~follows].reshape(n, -1)
             others = np.delete(observed[t, :n], body, axis=1)[..., :3]
             for first in (True, False):
-                rows = column.held(own, push) if first else column.stopped(own, push)
+                rows = column.held(values, push) if first else column.stopped(values, push)
                 if rows <= (found[t, first].rows if (t, first) in found else 0):
                     continue
                 if first:
@@ -375,20 +375,20 @@ def _near(scene: Scene, body: int, states: Floats, row: int) -> bool:
     """Return whether a wall, another body or a joint may have stopped a body at a row."""
     moving = scene.moving
     places = states[max(row - 2, 0) : row + 2, :, :2]
-    own = places[:, body]
-    if not np.isfinite(own).all():
+    values = places[:, body]
+    if not np.isfinite(values).all():
         return False  # a hinged body with a measured angle alone
-    speed = np.abs(np.diff(own, axis=0)).max() if len(own) > 1 else 0.0
+    speed = np.abs(np.diff(values, axis=0)).max() if len(values) > 1 else 0.0
     reach = (1 + _REACH) * moving[body].shape.bounding_radius + 2 * float(speed)
     for wall in scene.walls:
         start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
-        along = np.clip((own - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
-        if (np.linalg.norm(own - start - along[:, None] * way, axis=1) < reach).any():
+        along = np.clip((values - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        if (np.linalg.norm(values - start - along[:, None] * way, axis=1) < reach).any():
             return True
     others = [(each, places[:, i]) for i, each in enumerate(moving) if i != body]
     others += [(each, np.array(each.pose)[:2]) for each in scene.bodies if each.static]
     for other, place in others:
-        far = np.linalg.norm(own - place, axis=1)
+        far = np.linalg.norm(values - place, axis=1)
         if not (far > reach + (1 + _REACH) * other.shape.bounding_radius).all():
             return True
     return any(

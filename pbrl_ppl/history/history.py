@@ -335,6 +335,59 @@ class History:
         )
 
 
+def unseen(history: History) -> Bools:
+    """Return which bodies were not seen in a row, shape (trajectory, time, body).
+
+    A trajectory's first row and a kinematic body's path count as seen.
+    """
+    dataset = history.dataset
+    hidden = ~np.isfinite(dataset["observed"].to_numpy()).any(axis=-1)
+    hidden[:, 0] = False
+    hidden[..., dataset["kinematic"].to_numpy()] = False
+    rows = np.arange(hidden.shape[1]) < dataset["n_rows"].to_numpy()[:, None]
+    return np.asarray(hidden & rows[..., None])
+
+
+def longest_gap(history: History) -> int:
+    """Return the most intervals between rows with all bodies in a sparse recording, else 1.
+
+    A recording is sparse if more than half of the steps from one such row to the next skip rows: a
+    block that is seen before and after a push, say.
+    """
+    complete = np.asarray(~unseen(history).any(axis=-1))
+    rows = history.dataset["n_rows"].to_numpy()
+    gaps = np.concatenate(
+        [np.diff(np.flatnonzero(each[:n])) for each, n in zip(complete, rows, strict=True)]
+    )
+    return int(gaps.max()) if len(gaps) and np.median(gaps) > 1 else 1
+
+
+def check_start(history: History, scene: Scene) -> None:
+    """Refuse a history whose transitions start from states without measurements.
+
+    Transitions of Eq. 11 start from states as measured; in whole trajectories states are latent.
+
+    Raises
+    ------
+    HistoryError
+        If a column of the states was neither measured nor allowed to be estimated.
+    """
+    assumed = history.dataset["assumed"].to_numpy()
+    if not assumed.any():
+        return
+    parts = [
+        f'{", ".join(np.array(STATE)[columns])} of body "{body.name}"'
+        for body, columns in zip(scene.moving, assumed, strict=True)
+        if columns.any()
+    ]
+    raise HistoryError(
+        f"history: single transitions start from measured states: missing are {'; '.join(parts)};"
+        " fit whole trajectories (trajectories=True), measure them, declare the hinge that holds"
+        " the body in the scene (it gives x, y, vx, vy from theta and omega), or pass"
+        " estimate_velocities=True (it gives vx, vy, omega from x, y, theta)"
+    )
+
+
 def hashed(dataset: xr.Dataset) -> xr.Dataset:
     """Return the dataset with the hash of its measured arrays among its attributes."""
     digest = hashlib.sha256()

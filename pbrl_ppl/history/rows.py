@@ -1,4 +1,4 @@
-"""Rows of a history's table: names, cells and times checked, and arrays made of them."""
+"""Rows of a history's table: checks of names, cells and times, and conversion to arrays."""
 
 import re
 from dataclasses import dataclass

@@ -1,59 +1,26 @@
 """Phi: priors as data, the layout of the parameter vector, the wheel's symmetry."""
 
-from pbrl_ppl.parameters.layout import (
-    BODY_PARAMETERS,
-    JOINT_ANCHORS,
-    JOINT_INDICES,
-    WHEEL_PARAMETERS,
-    Block,
-    Layout,
-)
-from pbrl_ppl.parameters.library import ParameterLibrary
-from pbrl_ppl.parameters.priors import (
-    Prior,
-    box,
-    differentiate,
-    inside,
-    prior_draws,
-    prior_residual,
-    prior_slopes,
-)
-from pbrl_ppl.parameters.wheel_symmetry import (
-    Wheel,
-    beside,
-    change_from,
-    evened,
-    fold_draws,
-    fold_wheels,
-    gathered,
-    likeliest,
-    redescribed,
-    wheels,
-)
-
-__all__ = [
-    "BODY_PARAMETERS",
-    "JOINT_ANCHORS",
-    "JOINT_INDICES",
-    "WHEEL_PARAMETERS",
-    "Block",
-    "Layout",
-    "ParameterLibrary",
-    "Prior",
-    "Wheel",
-    "beside",
-    "box",
-    "change_from",
-    "differentiate",
-    "evened",
-    "fold_draws",
-    "fold_wheels",
-    "gathered",
-    "inside",
-    "likeliest",
-    "prior_draws",
-    "prior_residual",
-    "prior_slopes",
-    "redescribed",
-    "wheels",
-]
+from .layout import BODY_PARAMETERS as BODY_PARAMETERS
+from .layout import JOINT_ANCHORS as JOINT_ANCHORS
+from .layout import JOINT_INDICES as JOINT_INDICES
+from .layout import WHEEL_PARAMETERS as WHEEL_PARAMETERS
+from .layout import Block as Block
+from .layout import Layout as Layout
+from .library import ParameterLibrary as ParameterLibrary
+from .priors import Prior as Prior
+from .priors import box as box
+from .priors import differentiate as differentiate
+from .priors import inside as inside
+from .priors import prior_draws as prior_draws
+from .priors import prior_residual as prior_residual
+from .priors import prior_slopes as prior_slopes
+from .wheel_symmetry import Wheel as Wheel
+from .wheel_symmetry import beside as beside
+from .wheel_symmetry import change_from as change_from
+from .wheel_symmetry import evened as evened
+from .wheel_symmetry import fold_draws as fold_draws
+from .wheel_symmetry import fold_wheels as fold_wheels
+from .wheel_symmetry import gathered as gathered
+from .wheel_symmetry import likeliest as likeliest
+from .wheel_symmetry import redescribed as redescribed
+from .wheel_symmetry import wheels as wheels

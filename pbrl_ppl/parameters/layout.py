@@ -1,4 +1,4 @@
-"""Phi: the names of the unknown physical parameters, and dict <-> vector."""
+"""Layout of phi: names of the unknown parameters, and conversion between dict and vector."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A prior over few pre-learned parameter sets, one choice a body, in place of Table 1."""
+"""Categorical prior over parameter sets learned before, in place of Table 1."""
 
 from __future__ import annotations
 
@@ -8,13 +8,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters.layout import Layout
 from pbrl_ppl.scene import Scene, nearest
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True)
@@ -91,7 +89,7 @@ class ParameterLibrary:
         return cls(*json.loads(text))
 
     def to_json(self) -> str:
-        """Everything, as text for a posterior file."""
+        """Return the library as JSON, for a posterior file."""
         given = {k: dict(v) if isinstance(v, tuple) else v for k, v in self.probabilities or ()}
         return json.dumps([{name: dict(values) for name, values in self.sets}, given or None])
 
@@ -100,16 +98,16 @@ class ParameterLibrary:
         """Names of the sets, in the order of the index."""
         return tuple(name for name, _ in self.sets)
 
-    def prior(self, body: str) -> Array:
-        """Probability of each set for a body or class, shape (set,)."""
+    def prior(self, body: str) -> Floats:
+        """Return the probability of each set for a body or class, shape (set,)."""
         given: dict[str, Any] = dict(self.probabilities or {})
         if any(isinstance(value, tuple) for value in given.values()):
             given = dict(given.get(body, ()))
         p = np.array([float(given.get(name, 0.0)) for name in self.names])
         return p / p.sum() if p.sum() else np.full(len(p), 1.0 / len(p))
 
-    def table(self, layout: Layout, scene: Scene) -> Array:
-        """Every entry of phi under every set, shape (p, set).
+    def table(self, layout: Layout, scene: Scene) -> Floats:
+        """Return every entry of phi under every set, shape (p, set).
 
         Raises
         ------

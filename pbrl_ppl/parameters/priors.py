@@ -1,4 +1,4 @@
-"""Univariate priors as data, several of them as a space to search in, and derivatives."""
+"""Univariate priors as data, bounds of a search, and finite differences."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

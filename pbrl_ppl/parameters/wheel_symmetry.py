@@ -105,8 +105,8 @@ def fold_draws(layout: Layout, draws: Mapping[str, Floats]) -> dict[str, Floats]
 
     Examples
     --------
-    >>> from pbrl_ppl.model.table1 import build_layout
-    >>> from pbrl_ppl.scene.scene import Body, Scene, Shape
+    >>> from pbrl_ppl.physics import build_layout
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
     >>> cart = Body("cart", Shape.box(1.0, 0.6), wheel=True)
     >>> layout = build_layout(Scene(time_step=0.1, normal_gravity=9.81, bodies=(cart,)))
     >>> equal = {"w_theta[cart]": np.array([0.0, np.pi / 2]), "mu_x[cart]": np.array([0.1, 0.4]),
@@ -201,7 +201,7 @@ def beside(layout: Layout, phi: Floats, others: Floats) -> Floats:
 def change_from(layout: Layout, phi: Floats, origin: Floats) -> Floats:
     """Return the change from an origin, with wheels and angles as near to it as possible.
 
-    The engine does the same for all of these, whatever their prior says.
+    The engine predicts the same for all of these; their prior does not matter here.
 
     Parameters
     ----------
@@ -264,7 +264,7 @@ def redescribed(layout: Layout, phi: Floats, rng: np.random.Generator) -> Floats
 def evened(layout: Layout, phi: Floats) -> Floats:
     """Return the change of log-prior that makes a wheel's four descriptions equally probable.
 
-    A chain then needs to see one of them only; `redescribed` gives each its own share.
+    A chain then needs to see one of them only; `redescribed` draws each with its prior probability.
 
     Parameters
     ----------

@@ -1,22 +1,14 @@
 """Goals, actions and the searches for a plan under posterior draws."""
 
-from pbrl_ppl.planning.actions import Action, ActionSet
-from pbrl_ppl.planning.dynamics import Dynamics, TransitionModel, rollout
-from pbrl_ppl.planning.experiments import Suggestion, suggest_actions
-from pbrl_ppl.planning.goals import Goal, Target
-from pbrl_ppl.planning.planner import Plan, plan, start_state
-
-__all__ = [
-    "Action",
-    "ActionSet",
-    "Dynamics",
-    "Goal",
-    "Plan",
-    "Suggestion",
-    "Target",
-    "TransitionModel",
-    "plan",
-    "rollout",
-    "start_state",
-    "suggest_actions",
-]
+from .actions import Action as Action
+from .actions import ActionSet as ActionSet
+from .dynamics import Dynamics as Dynamics
+from .dynamics import TransitionModel as TransitionModel
+from .dynamics import rollout as rollout
+from .experiments import Suggestion as Suggestion
+from .experiments import suggest_actions as suggest_actions
+from .goals import Goal as Goal
+from .goals import Target as Target
+from .planner import Plan as Plan
+from .planner import plan as plan
+from .planner import start_state as start_state

@@ -1,4 +1,4 @@
-"""Transition models of a plan: Eq. 7 or 13 at posterior draws, each with its own states."""
+"""Transition models for planning: Eqs. 7 and 13 at posterior draws."""
 
 from __future__ import annotations
 
@@ -8,16 +8,13 @@ from dataclasses import dataclass
 from typing import Any, Protocol, Self, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, needs_inputs
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Cells, degrees_of_freedom, next_state_random, tail_places
 from pbrl_ppl.physics import Physics, after_recording
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, WRENCH
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, WRENCH, Floats
 
 
 @runtime_checkable
@@ -32,23 +29,23 @@ class TransitionModel(Protocol):
         """Known geometry, with the order of the bodies."""
 
     @property
-    def before(self) -> Array:
+    def before(self) -> Floats:
         """Wrenches that acted before the start, shape (body, 3), N and N m."""
 
     @property
     def draws(self) -> int:
-        """Number of models in it, each with its own states: posterior draws, or 1."""
+        """Number of posterior draws that states are predicted for; 1 for a single model."""
 
     def single(self) -> Self:
         """Return one of the models, in the middle of all."""
 
-    def after(self, before: Array) -> Self:
+    def after(self, before: Floats) -> Self:
         """Return the model after these previous wrenches, shape (body, 3), N and N m."""
 
-    def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
+    def acceleration(self, body: str, force: float, torque: float) -> tuple[Floats, Floats]:
         """Return a bound on what a push can do: m/s^2 and rad/s^2, shape (draw,) each."""
 
-    def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
+    def step(self, states: Floats, wrenches: Floats, previous: Floats | None = None) -> Floats:
         """Return the states after one sampling interval; NaN where the model has no answer.
 
         Parameters
@@ -59,16 +56,16 @@ class TransitionModel(Protocol):
             Now and in the interval before, shape (n, body, 3), world frame, N and N m.
         """
 
-    def noisy(self, states: Array, rng: np.random.Generator) -> Array:
+    def noisy(self, states: Floats, rng: np.random.Generator) -> Floats:
         """Return states (draw, n, body, 6) with the noise of a step."""
 
 
 def rollout(
     model: TransitionModel,
-    start: Array,
-    wrenches: Array,
+    start: Floats,
+    wrenches: Floats,
     rng: np.random.Generator | None = None,
-) -> Array:
+) -> Floats:
     """Play wrenches (time, body, 3) from a state (body, 6): shape (draw, time + 1, body, 6).
 
     With a generator, the noise of a step is added after each interval.
@@ -82,16 +79,6 @@ def rollout(
             states = model.noisy(states, rng)
         path.append(states)
     return np.concatenate(path, axis=1)
-
-
-class StepNoise(Protocol):
-    """Noise that a step adds to states, one distribution a posterior draw."""
-
-    def add(self, states: Array, rng: np.random.Generator) -> Array:
-        """Return states (draw, n, body, 6) with noise."""
-
-    def single(self, draw: int) -> StepNoise:
-        """Return the noise of one draw."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,11 +95,11 @@ class StateNoise:
         Degrees of freedom, shape (draw, 1, 1, body, 1) where they are inferred.
     """
 
-    sigma: Array
+    sigma: Floats
     columns: tuple[int, ...]
-    nu: float | Array | None
+    nu: float | Floats | None
 
-    def add(self, states: Array, rng: np.random.Generator) -> Array:
+    def add(self, states: Floats, rng: np.random.Generator) -> Floats:
         """Return states (draw, n, body, 6) with noise."""
         out, columns = states.copy(), self.columns
         for i, scale in enumerate(self.sigma):
@@ -139,10 +126,10 @@ class AccelerationNoise:
         Coordinates that they move.
     """
 
-    sigma: Array
+    sigma: Floats
     cells: Cells
 
-    def add(self, states: Array, rng: np.random.Generator) -> Array:
+    def add(self, states: Floats, rng: np.random.Generator) -> Floats:
         """Return states (draw, n, body, 6) with noise."""
         out = np.ascontiguousarray(states).copy()
         # without what a contact adds, which is not predicted
@@ -154,6 +141,10 @@ class AccelerationNoise:
     def single(self, draw: int) -> AccelerationNoise:
         """Return the noise of one draw."""
         return AccelerationNoise(self.sigma[draw : draw + 1], self.cells)
+
+
+#: Noise that a step adds to states, one distribution a posterior draw.
+StepNoise = StateNoise | AccelerationNoise
 
 
 class Dynamics:
@@ -181,7 +172,7 @@ class Dynamics:
     def __init__(
         self,
         scene: Scene,
-        phi: Array,
+        phi: Floats,
         effects: Iterable[Effect | Attached] = (),
         *,
         noise: StepNoise | None = None,
@@ -256,7 +247,7 @@ class Dynamics:
         if record.cells is not None:
             noise = AccelerationNoise(sigma, record.cells)
         else:
-            nu: float | Array | None = record.nu
+            nu: float | Floats | None = record.nu
             if tail_places(physics):
                 nu = degrees_of_freedom(physics, phi, record.nu)
             noise = StateNoise(sigma, tuple(STATE.index(name) for name in record.measured), nu)
@@ -283,19 +274,19 @@ class Dynamics:
             chosen._noise = self._noise.single(i)
         return chosen
 
-    def at(self, phi: Array) -> Dynamics:
+    def at(self, phi: Floats) -> Dynamics:
         """Return the same dynamics at other parameters, shape (draw, p), with the same worlds."""
         other = copy(self)
         other.phi = phi
         return other
 
-    def after(self, before: Array) -> Dynamics:
+    def after(self, before: Floats) -> Dynamics:
         """Return dynamics after these previous wrenches, shape (body, 3), N and N m."""
         later = copy(self)
         later.before = np.asarray(before, dtype=float).reshape(self.before.shape)
         return later
 
-    def mass(self, body: str) -> Array:
+    def mass(self, body: str) -> Floats:
         """Return a body's mass under each draw, shape (draw,), kg."""
         chosen = self.scene.body(body)
         known = dict(chosen.known)
@@ -303,7 +294,7 @@ class Dynamics:
             return np.full(self.draws, float(known["mass"]))
         return self.phi[:, self.layout.index("mass", chosen.owner)]
 
-    def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
+    def acceleration(self, body: str, force: float, torque: float) -> tuple[Floats, Floats]:
         """Return what a push can do without friction: m/s^2 and rad/s^2, shape (draw,) each."""
         shape, mass = self.scene.body(body).shape, self.mass(body)
         # a wheel or a contact at the rim turns the body as hard as it is pushed
@@ -311,7 +302,7 @@ class Dynamics:
         linear = force / mass + np.hypot(*self.scene.gravity)
         return linear, turning / (mass * shape.unit_moment)
 
-    def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
+    def step(self, states: Floats, wrenches: Floats, previous: Floats | None = None) -> Floats:
         """Return the states after one sampling interval.
 
         Parameters
@@ -340,7 +331,7 @@ class Dynamics:
         out[lost] = np.nan
         return out
 
-    def noisy(self, states: Array, rng: np.random.Generator) -> Array:
+    def noisy(self, states: Floats, rng: np.random.Generator) -> Floats:
         """Return states of shape (draw, n, body, 6) with Eq. 13's noise.
 
         Raises
@@ -353,8 +344,8 @@ class Dynamics:
         return self._noise.add(states, rng)
 
     def rollout(
-        self, start: Array, wrenches: Array, rng: np.random.Generator | None = None
-    ) -> Array:
+        self, start: Floats, wrenches: Floats, rng: np.random.Generator | None = None
+    ) -> Floats:
         """Play wrenches (time, body, 3) from a state (body, 6): shape (draw, time + 1, body, 6).
 
         With a generator, Eq. 13's noise is added after each interval.

@@ -10,13 +10,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.scene import Scene, nearest
-from pbrl_ppl.state import POSE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import POSE, Floats
 
 
 @dataclass(frozen=True)
@@ -169,7 +166,7 @@ class Goal:
         moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
-    def errors(self, scene: Scene, states: Array) -> Array:
+    def errors(self, scene: Scene, states: Floats) -> Floats:
         """Return offsets from the targets, 0 where free, shape (..., target, 3): m, m, rad.
 
         Parameters
@@ -187,7 +184,7 @@ class Goal:
         offset[..., 2] = np.mod(offset[..., 2] + np.pi, 2 * np.pi) - np.pi
         return np.where(np.isnan(wanted), 0.0, offset)
 
-    def distance(self, scene: Scene, states: Array) -> Array:
+    def distance(self, scene: Scene, states: Floats) -> Floats:
         """Return the weighted L2 distance from the targets (m), angles at the rims, shape (...)."""
         lever = np.array([scene.body(t.body).shape.bounding_radius for t in self.targets])
         weight = np.array([t.weight for t in self.targets])
@@ -195,7 +192,7 @@ class Goal:
         offset[..., 2] *= lever
         return np.asarray(np.sqrt((weight[:, None] * offset**2).sum(axis=(-2, -1))))
 
-    def shortfall(self, scene: Scene, states: Array) -> Array:
+    def shortfall(self, scene: Scene, states: Floats) -> Floats:
         """Return the error of the worst target in units of its tolerances; 1 or less is reached."""
         offset = self.errors(scene, states)
         worst = np.zeros(offset.shape[:-2])

@@ -1,4 +1,4 @@
-"""Planning from a posterior, a start and a goal; the plan as a file."""
+"""Plans from a posterior, a start and a goal, and their files."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import GoalError
@@ -24,9 +24,7 @@ from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.search import NODES, Found, Task, tail_mean
 from pbrl_ppl.scene import Scene, nearest
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 METHODS = ("astar", "mppi")
 #: Draws of Eq. 13's noise that a predicted distribution holds, at least.
@@ -56,15 +54,15 @@ class Plan:
     distance : float
         L2 distance from the goal at the end (m), as the mean of the worst ``tail`` of draws.
     nodes : int
-        States that were generated, each draw's own.
+        States that were generated, counting each draw's.
     seconds : float
         How long the search took.
     """
 
     scene: Scene
     goal: Goal
-    start: Array
-    wrenches: Array
+    start: Floats
+    wrenches: Floats
     predicted: xr.Dataset
     reached: bool
     stopped: str
@@ -78,12 +76,12 @@ class Plan:
         return len(self.wrenches) * self.scene.time_step
 
     def to_dataframe(self) -> pd.DataFrame:
-        """The plan as rows of a history without measurements but the start.
+        """Return the plan as rows of a history without measurements after the start.
 
         Returns
         -------
         DataFrame
-            Columns as DESIGN's ``history.csv``; state cells after the start are missing.
+            Columns as of :meth:`History.to_dataframe`; state cells after the start are missing.
         """
         nothing = np.full((1, len(self.wrenches), *self.start.shape), np.nan)
         return segment_rows(self.scene, self.start[None], self.wrenches[None], nothing)
@@ -100,7 +98,7 @@ class Plan:
         write_atomically(Path(path), lambda to: table.to_csv(to, index=False))
 
     def in_words(self) -> str:
-        """One sentence: whether it reaches the goal, how, and how far off it ends."""
+        """Return a sentence: whether the plan reaches the goal, how, and how far off it ends."""
         why = {
             "nodes": "the limit of nodes was reached",
             "time": "the limit of time was reached",
@@ -161,8 +159,8 @@ def plan(
     seed : int
         Of the choice of draws and of all else that is random.
     nodes : int
-        States that the search generates at most, each draw's own. The same start and seed give the
-        same plan, however busy the machine is.
+        States that the search generates at most, counting each draw's. The same start and seed
+        give the same plan, however busy the machine is.
     seconds : float, optional
         Another limit of the search; with it, the plan depends on how busy the machine is.
     before : array_like, optional
@@ -171,7 +169,7 @@ def plan(
     effects : iterable of Effect
         Where the names of the posterior's effects are looked up.
     progress : callable, optional
-        Told how far the search is.
+        Called with a text on the progress of the search.
     **options
         Of :func:`pbrl_ppl.planning.astar.astar`, such as ``weight=1`` for A* without a weight, or
         of :func:`pbrl_ppl.planning.receding.mppi`.
@@ -246,8 +244,8 @@ def plan(
     )  # fmt: skip
 
 
-def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) -> Array:
-    """The bodies' states, shape (body, 6), from what a user gives for some of them.
+def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) -> Floats:
+    """Return the bodies' states, shape (body, 6), from the states given for some of them.
 
     Parameters
     ----------

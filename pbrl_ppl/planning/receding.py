@@ -1,16 +1,14 @@
-"""Model predictive path integral control: a receding horizon for tasks that are all dynamics."""
+"""Model predictive path integral control (MPPI): a receding horizon for dynamic tasks."""
 
 from __future__ import annotations
 
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.planning.search import Found, Task, contact_cost, tail_mean
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Correlation of the noise from one interval to the next.
 _PERSISTENCE = 0.7
@@ -23,7 +21,7 @@ _ARRIVAL = 0.2
 
 
 class Horizon:
-    """Receding horizon: wrenches for the next intervals, improved and moved on at every step.
+    """Receding horizon: wrenches for the next intervals, improved and shifted at every step.
 
     Wrenches may be anything up to the strongest of the action set, on all of its bodies at once.
 
@@ -58,7 +56,7 @@ class Horizon:
         self.bodies = task.goal.places(scene)
         self.generated = 0
 
-    def improve(self, start: Array, before: Array) -> None:
+    def improve(self, start: Floats, before: Floats) -> None:
         """Draw sequences about the mean; weigh them by their cost.
 
         Parameters
@@ -85,13 +83,13 @@ class Horizon:
             weight = np.exp(-(cost - few[0]) / max(few[-1] - few[0], 1e-9))
             self.mean = np.tensordot(weight / weight.sum(), tried, axes=1)
 
-    def advance(self) -> Array:
+    def advance(self) -> Floats:
         """Return the first wrench, shape (body, 3); the others move up."""
-        first: Array = self.mean[0].copy()
+        first: Floats = self.mean[0].copy()
         self.mean = np.concatenate([self.mean[1:], self.mean[-1:]])
         return first
 
-    def _cost(self, start: Array, tried: Array, before: Array) -> Array:
+    def _cost(self, start: Floats, tried: Floats, before: Floats) -> Floats:
         """Return L2 distance from the goal (mean and last), last speed, and contacts."""
         task, horizon = self.task, tried.shape[1]
         scene, goal = task.dynamics.scene, task.goal
@@ -147,7 +145,7 @@ def mppi(
     rng = task.rng or np.random.default_rng(0)
     ahead = Horizon(task, horizon, samples, iterations, rng)
     states = np.repeat(start[None, None], dynamics.draws, axis=0)
-    wrenches: list[Array] = []
+    wrenches: list[Floats] = []
     nearest, best, stopped = np.inf, 0, "exhausted"
 
     try:

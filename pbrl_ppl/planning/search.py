@@ -1,4 +1,4 @@
-"""What the searches for a plan share: task, result, risk over draws and contact penalty."""
+"""Task and result of a search for a plan, its risk over draws and its contact penalty."""
 
 from __future__ import annotations
 
@@ -6,15 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.dynamics import TransitionModel
 from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: States that a search generates at most by default: 15 s or so for one body.
 NODES = 2_000_000
@@ -50,7 +48,7 @@ class Task:
     """
 
     dynamics: TransitionModel
-    start: Array
+    start: Floats
     goal: Goal
     actions: ActionSet
     tail: float = 1.0
@@ -79,14 +77,14 @@ class Found:
         Duration of the search.
     """
 
-    wrenches: Array
+    wrenches: Floats
     reached: bool
     stopped: str
     nodes: int
     seconds: float
 
 
-def tail_mean(values: Array, tail: float) -> Array:
+def tail_mean(values: Floats, tail: float) -> Floats:
     """Return the mean of the worst share ``tail`` of values over the first axis.
 
     1 is the expectation, less than 1 the conditional value at risk (Rockafellar and Uryasev, 2000).
@@ -103,7 +101,7 @@ def tail_mean(values: Array, tail: float) -> Array:
     return np.asarray(np.partition(values, n - worst, axis=0)[n - worst :].mean(axis=0))
 
 
-def contact_cost(goal: Goal, scene: Scene, states: Array) -> Array:
+def contact_cost(goal: Goal, scene: Scene, states: Floats) -> Floats:
     """Return the penalty of a second in contact, as a mean over the draws.
 
     Parameters

@@ -1,16 +1,11 @@
 """Scenes: shapes, bodies, walls and joints as declared; TOML to `Scene` and back."""
 
-from pbrl_ppl.scene.checks import CONTACT_NAMES, nearest
-from pbrl_ppl.scene.scene import WORLD, Body, Joint, Point, Scene, Shape, Wall
-
-__all__ = [
-    "CONTACT_NAMES",
-    "WORLD",
-    "Body",
-    "Joint",
-    "Point",
-    "Scene",
-    "Shape",
-    "Wall",
-    "nearest",
-]
+from .bodies import Body as Body
+from .bodies import Wall as Wall
+from .checks import CONTACT_NAMES as CONTACT_NAMES
+from .checks import Point as Point
+from .checks import nearest as nearest
+from .joints import WORLD as WORLD
+from .joints import Joint as Joint
+from .scene import Scene as Scene
+from .shape import Shape as Shape

@@ -1,4 +1,4 @@
-"""Bodies and walls of a scene, frozen and checked when they are built."""
+"""Bodies and walls of a scene."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -38,7 +38,7 @@ JOINT_KINDS: Mapping[str, JointKind] = {
 
 @dataclass(frozen=True)
 class Joint:
-    """J_d: a joint between two bodies, or a body and the world; what is left out is inferred.
+    """Joint between two bodies, or a body and the world (J_d); omitted fields are inferred.
 
     Attributes
     ----------

@@ -31,8 +31,6 @@ from pbrl_ppl.scene.checks import (
 from pbrl_ppl.scene.joints import WORLD, Joint
 from pbrl_ppl.scene.shape import Shape
 
-__all__ = ["WORLD", "Body", "Joint", "Point", "Scene", "Shape", "Wall"]
-
 #: Engine steps a sample, at most: twice what `close_loop` goes to where data are that exact.
 MOST_SUBSTEPS = 1280
 

@@ -5,6 +5,7 @@ import warnings
 from dataclasses import replace
 from itertools import product
 
+import arviz as az
 import numpy as np
 import pandas as pd
 import pymc as pm
@@ -18,7 +19,7 @@ from pbrl_ppl.likelihood import sigma_prior
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import learned_library, library_probabilities, problem_of
 from pbrl_ppl.posterior import save_posterior as save
-from pbrl_ppl.posterior.store import az, convergence, draws, from_groups, group, load_posterior
+from pbrl_ppl.posterior.store import convergence, draws, from_groups, group, load_posterior
 from pbrl_ppl.sampling import fit, physics_model, update
 from pbrl_ppl.scene import Body, Joint, Scene, Shape
 from tests.helpers.histories import simulated_history

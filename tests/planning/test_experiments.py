@@ -15,7 +15,7 @@ from pbrl_ppl.criticism.results import Added
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
-from pbrl_ppl.planning.separation import Separation
+from pbrl_ppl.planning.experiments import Separation
 from tests.helpers.free_puck import BOX, fitted
 from tests.helpers.one_speed import SIZE, at_one_speed, record
 from tests.helpers.stacks import file

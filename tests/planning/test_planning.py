@@ -12,7 +12,7 @@ from pbrl_ppl.errors import GoalError, PosteriorError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics import Transition, overlap
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal, astar, plan, receding
-from pbrl_ppl.planning.bound import TimeToGo
+from pbrl_ppl.planning.astar import TimeToGo
 from pbrl_ppl.scene import Joint, Scene, Shape, Wall
 from tests.helpers.pucks import ACROSS, FORCE, FREE, MASS, PUSHES, ROOM, known
 from tests.helpers.worlds import body, state

@@ -142,7 +142,7 @@ def test_an_unreachable_goal_ends_with_code_1_and_the_best(tmp_path, capsys) -> 
         (["--start", "0,0,0", "--goal", "1,1,-", "--weight", "0.5"], "weight is 0.5"),
         (
             ["--start", "0,0,0", "--goal", "1,1,-", "--weight", "1", "--method", "mppi"],
-            "--weight: it is of astar",
+            "--weight: it is for astar",
         ),
         (["--start", "0,0,0", "--goal", "1,1,-", "--draws", "5000"], "expected 1 to 1000"),
     ],

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.agents import act
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.planning import Action, ActionSet, Dynamics, plan
 from pbrl_ppl.scene import Scene, Shape
 from tests.helpers.worlds import BY_NAME, body
@@ -41,8 +42,8 @@ def test_the_plan_ends_where_it_says(method) -> None:
     found = plan(late, {"puck": (0, 0, 0)}, {"puck": (0.9, 0.3, None)}, PUSHES, method=method,
                  nodes=200_000)  # fmt: skip
     assert found.reached
-    engine = late._engine
-    whole = engine(late.phi, np.zeros((1, 1, 6)), found.wrenches[None])[0, 0]
+    physics = Physics.declare(scene(), (BY_NAME["actuator_delay"],))
+    whole = physics.predict(late.phi[0], np.zeros((1, 1, 6)), found.wrenches[None])[0]
     np.testing.assert_allclose(found.predicted["predicted"].values[0, 1:], whole, atol=1e-9)
 
 
