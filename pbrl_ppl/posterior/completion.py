@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import (
     BoundWarning,
@@ -35,8 +34,7 @@ from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.mode import Point, packed_mode
 from pbrl_ppl.posterior.record import vectors
 from pbrl_ppl.posterior.store import convergence, from_groups, group, groups
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats, Ints
 
 #: What a posterior needs before its summaries can be relied on (Vehtari et al., 2021).
 MAX_RHAT, MIN_ESS = 1.01, 400
@@ -126,13 +124,13 @@ def complete(
     return checked(problem, idata, asked)
 
 
-def _next_state(dims: tuple[str, ...], values: Array, coords: Any) -> xr.Dataset:
+def _next_state(dims: tuple[str, ...], values: Floats, coords: Any) -> xr.Dataset:
     return xr.Dataset({"next_state": (dims, values)}, coords)
 
 
 def evaluate(
-    problem: Problem, phi: Array, sigma: Array, rows: Any, rng: np.random.Generator
-) -> tuple[Array, Array]:
+    problem: Problem, phi: Floats, sigma: Floats, rows: Any, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
     """Return log-likelihoods of the transitions at draws, and next states drawn from some of them.
 
     Parameters
@@ -171,12 +169,12 @@ def evaluate(
     return likelihood, np.stack(predictive)
 
 
-def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
+def parameter_draws(problem: Problem, trace: Any) -> tuple[Floats, Floats]:
     """Return draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
     return vectors(trace, problem.layout, problem.noise_variables)
 
 
-def predictive_rows(chains: int, draws: int, cells: int) -> NDArray[np.intp]:
+def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
     """Choose draws to predict with: equally many of each chain, evenly spread, with the last one.
 
     Parameters
@@ -198,7 +196,7 @@ def predictive_rows(chains: int, draws: int, cells: int) -> NDArray[np.intp]:
 
 
 def prior_groups(
-    problem: Problem, posterior: xr.Dataset, phi: Array, sigma: Array, seed: int
+    problem: Problem, posterior: xr.Dataset, phi: Floats, sigma: Floats, seed: int
 ) -> dict[str, xr.Dataset]:
     """Return the groups ``prior`` and ``log_prior``, as ArviZ looks for them.
 
@@ -237,7 +235,7 @@ def prior_groups(
     density = np.stack([prior.log_density(sigma[:, i]) for i, prior in enumerate(noise)], axis=1)
     density = np.where(steps, -np.log(scale) - sigma[:, : len(scale)] / scale, density)
 
-    def shaped(like: xr.Dataset, of_phi: Array, of_noise: Array) -> xr.Dataset:
+    def shaped(like: xr.Dataset, of_phi: Floats, of_noise: Floats) -> xr.Dataset:
         return xr.Dataset(
             {
                 name: like[name].copy(data=values.reshape(like[name].shape))
@@ -251,7 +249,7 @@ def prior_groups(
     }
 
 
-def linearisation_errors(problem: Problem, phi: Array, sigma: Array) -> Array:
+def linearisation_errors(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     """Return log-likelihoods with the states smoothed at each draw, less the linearised ones.
 
     Parameters
@@ -277,7 +275,7 @@ def linearisation_errors(problem: Problem, phi: Array, sigma: Array) -> Array:
     return errors
 
 
-def linearisation(problem: Problem, phi: Array, sigma: Array) -> dict[str, Any]:
+def linearisation(problem: Problem, phi: Floats, sigma: Floats) -> dict[str, Any]:
     """Return a summary of :func:`linearisation_errors` at some of a posterior's draws.
 
     Parameters

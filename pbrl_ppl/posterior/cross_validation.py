@@ -8,12 +8,11 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior.data import CELLS, SMOOTHED
 from pbrl_ppl.posterior.store import DATATREE, arviz, from_groups, group, groups, smoothed
-from pbrl_ppl.state import STATE, THETA, wrapped
+from pbrl_ppl.state import STATE, THETA, Ints, wrapped
 
 #: With fewer draws, the tail that Pareto's law is fitted to has fewer than twenty.
 _LEAST_DRAWS = 100
@@ -317,7 +316,7 @@ def loo_pit(idata: Any) -> xr.DataArray:
     return measured.copy(data=np.where(np.isfinite(measured), below, np.nan))
 
 
-def predicted_rows(posterior: xr.Dataset, predictive: xr.Dataset) -> NDArray[np.intp]:
+def predicted_rows(posterior: xr.Dataset, predictive: xr.Dataset) -> Ints:
     """Return the draws that stored predictions were made with.
 
     Parameters

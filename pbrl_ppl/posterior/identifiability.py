@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
@@ -17,9 +16,7 @@ from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
 from pbrl_ppl.posterior.store import group, likeliest_draw, scalars
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 INFORMED, WEAK, PRIOR_ONLY = "informed", "weak", "prior only"
 #: What to record so that parameters show, by part of their names; the first match counts.
@@ -229,12 +226,12 @@ def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[st
     return tuple(width.parameter for width in widths if width.verdict == PRIOR_ONLY)
 
 
-def _flat(idata: Any) -> dict[str, Array]:
+def _flat(idata: Any) -> dict[str, Floats]:
     """Return posterior draws by label, shape (draw,), chains joined."""
     return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
 
 
-def _prior_draws(layout: Layout) -> dict[str, Array]:
+def _prior_draws(layout: Layout) -> dict[str, Floats]:
     """Return prior draws by label, wheels folded as the posterior's are."""
     rng = np.random.default_rng(0)
     # an anchor means something else in each body that may hold it
@@ -248,12 +245,12 @@ def _prior_draws(layout: Layout) -> dict[str, Array]:
     return fold_draws(layout, draws)
 
 
-def _natural(prior: Prior, x: Array) -> Array:
+def _natural(prior: Prior, x: Floats) -> Floats:
     """Return values on the prior's natural scale: the logarithm for ``log_normal``."""
     return np.log(x) if prior.family == "log_normal" else x
 
 
-def _spread(prior: Prior, draws: Array) -> float:
+def _spread(prior: Prior, draws: Floats) -> float:
     """Return the standard deviation on the natural scale; angular deviation of an angle (rad)."""
     if prior.family == "von_mises":
         return float(np.sqrt(2.0 * (1.0 - np.abs(np.exp(1j * draws).mean()))))
@@ -269,7 +266,7 @@ def _width(label: str, prior_sd: float, posterior_sd: float, moved: float) -> Wi
 
 
 def _widths(
-    layout: Layout, prior: Mapping[str, Array], posterior: Mapping[str, Array]
+    layout: Layout, prior: Mapping[str, Floats], posterior: Mapping[str, Floats]
 ) -> tuple[Width, ...]:
     """Return the widths of all parameters with prior draws."""
     folded = fold_draws(layout, posterior)
@@ -286,7 +283,7 @@ def _widths(
     return tuple(widths)
 
 
-def _directions(gram: Array, labels: list[str]) -> tuple[Direction, ...]:
+def _directions(gram: Floats, labels: list[str]) -> tuple[Direction, ...]:
     """Return combinations that move predictions by less than the noise, unlike their parameters."""
     active = np.flatnonzero(np.diag(gram) >= 1.0)
     part = gram[np.ix_(active, active)]
@@ -305,7 +302,7 @@ def _directions(gram: Array, labels: list[str]) -> tuple[Direction, ...]:
     return tuple(found)
 
 
-def _sparse(rows: Array) -> Array:
+def _sparse(rows: Floats) -> Floats:
     """Row-reduce a basis, so that two separate ambiguities are not mixed."""
     rows = rows.copy()
     for k in range(len(rows)):
@@ -317,7 +314,7 @@ def _sparse(rows: Array) -> Array:
     return rows
 
 
-def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array, Array]:
+def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Floats, Floats]:
     """Return the layout, the likeliest draw, and the derivative of the whitened residual there."""
     record = PosteriorRecord.of(idata)
     physics = Physics(record.scene, record.attached(effects), record.substeps, threads=2)
@@ -332,7 +329,7 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array,
     inferred = {n: draws.get("sigma", draws.get(f"sigma[{n}]")) for n in observations.names}
     sigma = np.array([stated[n] if x is None else x[best] for n, x in inferred.items()])
 
-    def residual(points: Array) -> Array:
+    def residual(points: Floats) -> Floats:
         states = physics.predict(points, data["start"].to_numpy(), data["actions"].to_numpy())
         z = TransitionLikelihood().whiten(observations.residual(states), sigma)
         return np.nan_to_num(z.reshape(len(points), -1))

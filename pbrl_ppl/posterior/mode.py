@@ -6,15 +6,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import beside
 from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode, noise_labels
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Floats, Ints
 
 #: A draw this much higher (log-posterior) than the mode shows that it is none.
 _HIGHER = 0.1
@@ -36,13 +33,13 @@ class Point:
         Index of each owner's parameter set in the library, shape (owner,), if there is one.
     """
 
-    phi: Array
-    sigma: Array
+    phi: Floats
+    sigma: Floats
     choice: Ints | None = None
 
 
 def packed_mode(
-    problem: Problem, mode: Point, phi: Array, sigma: Array, likelihood: Array
+    problem: Problem, mode: Point, phi: Floats, sigma: Floats, likelihood: Floats
 ) -> StoredMode:
     """Return a posterior's mode for its record.
 
@@ -72,7 +69,7 @@ def packed_mode(
 
 
 def updated_mode(
-    problem: Problem, earlier: Point, draws: tuple[Array, Array, Ints | None], likelihood: Array
+    problem: Problem, earlier: Point, draws: tuple[Floats, Floats, Ints | None], likelihood: Floats
 ) -> StoredMode:
     """Return the mode of an updated posterior.
 
@@ -101,7 +98,9 @@ def updated_mode(
     return _packed(problem, best, float(height[i]))
 
 
-def _packed(problem: Problem, mode: Point, height: float, draws: Array | None = None) -> StoredMode:
+def _packed(
+    problem: Problem, mode: Point, height: float, draws: Floats | None = None
+) -> StoredMode:
     """Return a point for a record, its wheels described as in draws (draw, p)."""
     layout, point, sets = problem.layout, mode.phi, None
     if problem.library is None and draws is not None:

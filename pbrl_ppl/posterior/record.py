@@ -8,7 +8,6 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, learned_remainder
 from pbrl_ppl.errors import PosteriorError
@@ -17,8 +16,7 @@ from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior.store import SCHEMA, check_schema, draws
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True)
@@ -174,7 +172,7 @@ class PosteriorRecord:
         """
         return attach(self.scene, (), known_effects(self.learned_remainder, effects))
 
-    def mode_vectors(self, layout: Layout) -> tuple[Array, Array]:
+    def mode_vectors(self, layout: Layout) -> tuple[Floats, Floats]:
         """Return the mode as vectors: phi, shape (p,), and sigma, shape (noise parameter,).
 
         Raises
@@ -204,7 +202,7 @@ def noise_labels(variables: Mapping[str, tuple[str, ...]], scalar: bool) -> list
 
 def vectors(
     idata: Any, layout: Layout, variables: Mapping[str, tuple[str, ...]]
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Return draws as vectors: phi, shape (draw, p), and sigma, shape (draw, noise parameter)."""
     named = draws(idata)
     n = len(next(iter(named.values())))

@@ -18,12 +18,10 @@ from typing import Any
 import h5py
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.files import write_atomically
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in its own InferenceData.
 DATATREE = not version("arviz").startswith("0.")
@@ -178,7 +176,7 @@ def check_schema(attrs: Mapping[str, Any], where: str) -> None:
         )
 
 
-def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Array]:
+def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Floats]:
     """Return posterior draws by name, chains joined.
 
     Parameters
@@ -275,7 +273,7 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     return r_hat | dict.fromkeys(constant, 1.0), ess | constant
 
 
-def smoothed(log_weights: Array) -> tuple[Array, float]:
+def smoothed(log_weights: Floats) -> tuple[Floats, float]:
     """Return Pareto-smoothed importance weights that sum to one, and the shape k of their tail.
 
     Parameters
@@ -312,7 +310,7 @@ def _dataset(value: Any) -> xr.Dataset:
     return value if isinstance(value, xr.Dataset) else xr.Dataset(value.to_dataset())
 
 
-def interval(values: Array, prob: float = HDI_PROB) -> tuple[float, float]:
+def interval(values: Floats, prob: float = HDI_PROB) -> tuple[float, float]:
     """Return the highest-density interval of draws: the shortest that holds ``prob`` of them."""
     ordered = np.sort(np.asarray(values).ravel())
     count = max(1, int(np.floor(prob * len(ordered))))

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 from scipy.special import i0e, i1e
 from scipy.stats import truncnorm
@@ -23,8 +22,7 @@ from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of
 from pbrl_ppl.posterior.store import group, scalars
 from pbrl_ppl.scene import Joint, Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Limits of a truncated normal: it is exponential with mu this many sigmas outside its support, and
 #: uniform with sigma this many times the width of what it covers.
@@ -122,7 +120,7 @@ def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
     return tuple(joints)
 
 
-def moment_matched(prior: Prior, draws: Array) -> Prior:
+def moment_matched(prior: Prior, draws: Floats) -> Prior:
     """Return the member of a prior's family with the draws' mean and standard deviation.
 
     These are of the logarithm for ``log_normal``, mean direction and resultant length for
@@ -173,12 +171,12 @@ def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, 
     reach = min(upper - lower, mean - lower + sd, upper - mean + sd)
     reach = reach if np.isfinite(upper - lower) else 10 * reach
 
-    def hyper(point: Array) -> tuple[float, float]:
+    def hyper(point: Floats) -> tuple[float, float]:
         sigma = float(np.exp(point[1]))
         mu = np.clip(mean + sd * point[0], lower - _OUTSIDE * sigma, upper + _OUTSIDE * sigma)
         return float(mu), sigma
 
-    def error(point: Array) -> Array:
+    def error(point: Floats) -> Floats:
         mu, sigma = hyper(point)
         law = truncnorm((lower - mu) / sigma, (upper - mu) / sigma, mu, sigma)
         return np.array([(law.mean() - mean) / sd, np.log(law.std() / sd)])

@@ -8,11 +8,9 @@ from itertools import combinations_with_replacement
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats, Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -27,9 +25,9 @@ class Piece:
         Bodies and transitions of the residuals, shapes (body,) and (transition,).
     """
 
-    places: NDArray[np.intp]
-    bodies: NDArray[np.intp]
-    rows: NDArray[np.intp]
+    places: Ints
+    bodies: Ints
+    rows: Ints
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +48,8 @@ class Pieces:
     """
 
     emulated: list[Piece]
-    rows: NDArray[np.intp]
-    exact: Callable[[Array], Array]
+    rows: Ints
+    exact: Callable[[Floats], Floats]
 
     @classmethod
     def of(cls, problem: Problem) -> Pieces:
@@ -59,7 +57,7 @@ class Pieces:
         labels = problem.layout.labels
         moving = problem.scene.moving
         met = np.zeros(problem.segments.n, dtype=bool)
-        found: list[tuple[NDArray[np.intp], NDArray[np.intp]]] = []
+        found: list[tuple[Ints, Ints]] = []
         whole = isinstance(problem.likelihood, TrajectoryLikelihood)
         for part in problem.simulator.parts:
             if not whole or len(part.bodies) == 1 or part.physics.scene.joints:
@@ -76,14 +74,14 @@ class Pieces:
         return cls(pieces, rows, _engine(problem, rows))
 
 
-def _engine(problem: Problem, rows: NDArray[np.intp]) -> Callable[[Array], Array]:
+def _engine(problem: Problem, rows: Ints) -> Callable[[Floats], Floats]:
     """Return residuals of some transitions by the engine, as a function of phi."""
     start, inputs = problem.segments.start[rows], problem.inputs[rows]
     observed = replace(problem.observations, values=problem.observations.values[rows])
     sensitivity = problem.likelihood.sensitivity
     followed = None if sensitivity is None else sensitivity.at(rows)
 
-    def residual(phi: Array) -> Array:
+    def residual(phi: Floats) -> Floats:
         if followed is None:
             return observed.residual(problem.simulator(phi, start, inputs))
         return observed.residual(followed.predicted(problem.simulator, phi, start, inputs))
@@ -95,9 +93,9 @@ class _Fit(NamedTuple):
     """Polynomials of a piece: their residuals, the scaling of the parameters, and the weights."""
 
     where: tuple[Any, ...]
-    centre: Array
-    scale: Array
-    weights: Array
+    centre: Floats
+    scale: Floats
+    weights: Floats
 
 
 class Emulator:
@@ -118,10 +116,10 @@ class Emulator:
         Degree of the polynomials.
     """
 
-    def __init__(self, pieces: Pieces, phi: Array, residual: Array, degree: int) -> None:
+    def __init__(self, pieces: Pieces, phi: Floats, residual: Floats, degree: int) -> None:
         self.shape, self.degree, self.pieces = residual.shape[1:], degree, pieces
         self._fits: list[_Fit] = []
-        self._last: dict[int, Array] = {}
+        self._last: dict[int, Floats] = {}
         self._residual = np.zeros(self.shape)
         for piece in pieces.emulated:
             x = phi[:, piece.places]
@@ -132,7 +130,7 @@ class Emulator:
             weights = np.asarray(np.linalg.lstsq(terms, targets, rcond=None)[0], dtype=float)
             self._fits.append(_Fit(where, centre, scale, weights))
 
-    def __call__(self, phi: Array) -> Array:
+    def __call__(self, phi: Floats) -> Floats:
         """Return residuals for phi of shape (p,); the next call changes the array."""
         for i, piece in enumerate(self.pieces.emulated):
             x, fit = phi[piece.places], self._fits[i]
@@ -150,19 +148,19 @@ class Emulator:
         """Whether all residuals are linear in the terms of one piece."""
         return len(self.pieces.emulated) == 1 and not len(self.pieces.rows)
 
-    def terms(self, phi: Array, piece: int) -> Array:
+    def terms(self, phi: Floats, piece: int) -> Floats:
         """Return the monomials of a piece, shape (term,), for phi of shape (p,)."""
         fit, x = self._fits[piece], phi[self.pieces.emulated[piece].places]
         return monomials((x - fit.centre) / fit.scale, self.degree)
 
     @property
-    def basis(self) -> Array:
+    def basis(self) -> Floats:
         """Residuals of a single piece for each term, shape (term, transition, H, body, state)."""
         weights = self._fits[0].weights
         return np.asarray(weights.reshape(len(weights), *self.shape))
 
 
-def monomials(z: Array, degree: int) -> Array:
+def monomials(z: Floats, degree: int) -> Floats:
     """Return the monomials of z, shape (..., p), up to a degree, shape (..., term)."""
     columns = [np.ones((*z.shape[:-1], 1)), z]
     for d in range(2, degree + 1):

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError, MeetingWarning
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
@@ -28,8 +27,7 @@ from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, prior_starts, summed
 from pbrl_ppl.sampling.starts import dispersed, from_posterior
 from pbrl_ppl.sampling.traces import appended
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: The sampler where none is asked for.
 DEFAULT = "metropolis"
@@ -252,7 +250,7 @@ def _checked_problem(model: pm.Model, method: str, start: Any, resume: Any) -> P
     return problem
 
 
-def _joined_model(problem: Problem, phi: Array, sigma: Array) -> pm.Model | None:
+def _joined_model(problem: Problem, phi: Floats, sigma: Floats) -> pm.Model | None:
     """Return a model whose bodies that meet at draws (n, p) and (n, state) are in one part.
 
     The likelihood simulates bodies apart that were apart in the data. None if they do not meet

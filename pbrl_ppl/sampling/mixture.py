@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
@@ -26,10 +25,7 @@ from pbrl_ppl.modes import (
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES, ParameterLibrary
 from pbrl_ppl.posterior import Point, from_groups, group, groups
 from pbrl_ppl.sampling.traces import as_trace, posterior_dataset
-
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Bools, Floats, Ints
 
 #: Configurations less probable than this share of the best get no draws: they would be a handful.
 NEGLIGIBLE = 1e-3
@@ -122,7 +118,7 @@ def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:
     return Point(phi[0], best.mode.sigma)
 
 
-def allocate(probability: Array, n: int) -> Labels:
+def allocate(probability: Floats, n: int) -> Ints:
     """Share ``n`` draws out by probability, to within one draw each (largest remainders).
 
     Examples
@@ -142,9 +138,9 @@ def _values(
     problem: Problem,
     found: Sequence[Weighed],
     traces: Mapping[int, Any],
-    label: Labels,
+    label: Ints,
     rng: np.random.Generator,
-) -> dict[str, Array]:
+) -> dict[str, Floats]:
     """Return the whole model's variables, shape (chain, draw, ...), from the traces."""
     layout = problem.layout
     phi = np.full((*label.shape, layout.size), np.nan)
@@ -167,8 +163,8 @@ def _values(
 
 def _set_indices(
     problem: Problem,
-    phi: Array,
-    here: NDArray[np.bool_],
+    phi: Floats,
+    here: Bools,
     joint: str,
     pair: Pair,
     rng: np.random.Generator,
@@ -181,9 +177,7 @@ def _set_indices(
     _put_indices(problem, phi, here, joint, drawn)
 
 
-def _put_indices(
-    problem: Problem, phi: Array, here: NDArray[np.bool_], joint: str, chosen: Labels
-) -> None:
+def _put_indices(problem: Problem, phi: Floats, here: Bools, joint: str, chosen: Ints) -> None:
     """Put indices of the flat table of (i_a, i_b) into phi, and swap the anchors, in place."""
     layout, own = problem.layout, phi[here]
     a, b = (layout.index(name, joint) for name in JOINT_INDICES)
@@ -194,7 +188,7 @@ def _put_indices(
     phi[here] = own
 
 
-def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator | None) -> None:
+def _fill_anchors(problem: Problem, phi: Floats, rng: np.random.Generator | None) -> None:
     """Draw the anchors of joints that join nothing from their prior, given the index, in place.
 
     At the prior's centre without a generator.
@@ -213,7 +207,7 @@ def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator | None)
                 column[here] = prior.centre if rng is None else prior.sample(rng, n)
 
 
-def _stats(traces: Mapping[int, Any], label: Labels) -> xr.Dataset:
+def _stats(traces: Mapping[int, Any], label: Ints) -> xr.Dataset:
     """Return the samplers' statistics of the draws; those that differ in shape are left out."""
     records = {
         i: group(t, "sample_stats").isel(draw=slice(label.shape[1])) for i, t in traces.items()

@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import chi2, norm
@@ -24,9 +23,7 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws, prior_draws, wheels
 from pbrl_ppl.posterior import HDI_PROB, layout_of, moment_matched, scalars, scene_of
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import wrapped
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Bools, Floats, wrapped
 
 #: A robot informs where its data say at least this share of what the prior says (of precision);
 #: less is within the error of a posterior's width.
@@ -65,14 +62,14 @@ class Population:
         Whose data say something of it, shape (robot,).
     """
 
-    weights: Array
-    spread: Array
-    centre: Array
-    centre_sd: Array
-    value: Array
-    value_sd: Array
+    weights: Floats
+    spread: Floats
+    centre: Floats
+    centre_sd: Floats
+    value: Floats
+    value_sd: Floats
     p_same: float
-    informed: NDArray[np.bool_]
+    informed: Bools
 
     def mean(self, q: float) -> float:
         """Return a quantile of the kind's mean."""
@@ -92,7 +89,7 @@ class Population:
 
 
 def population(
-    estimate: Array, sd: Array, *, centre: float, width: float, spread: float
+    estimate: Floats, sd: Floats, *, centre: float, width: float, spread: float
 ) -> Population:
     """Pool normal likelihoods partially, integrated over mean and spread.
 
@@ -138,7 +135,7 @@ def population(
     return Population(weights, tau, middle, total**-0.5, value, deviation, p_same, informed)
 
 
-def _quantile(weights: Array, mean: Array, sd: Array, q: float) -> float:
+def _quantile(weights: Floats, mean: Floats, sd: Floats, q: float) -> float:
     """Return a quantile of a mixture of normals."""
     some = weights > _NOTHING
     weights, mean, sd = weights[some] / weights[some].sum(), mean[some], sd[some]
@@ -173,7 +170,7 @@ class Pooled:
     populations: Mapping[str, Population]
     left_out: tuple[str, ...]
     _families: Mapping[str, tuple[str, float]]
-    _single: Mapping[str, Array]
+    _single: Mapping[str, Floats]
 
     def table(self) -> pd.DataFrame:
         """Return one row a parameter, in its unit; the spread is on ``scale`` (logarithms: shares).
@@ -315,10 +312,10 @@ def _table1(layout: Layout) -> list[str]:
 
 def _drawn(
     names: tuple[str, ...], posteriors: list[Any], layouts: list[Layout]
-) -> list[dict[str, Array]]:
+) -> list[dict[str, Floats]]:
     """Return each robot's draws of its bodies' parameters; equal wheels are described alike."""
-    result: list[dict[str, Array]] = []
-    first: Array | None = None
+    result: list[dict[str, Floats]] = []
+    first: Floats | None = None
     for name, idata, layout in zip(names, posteriors, layouts, strict=True):
         posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
         if lacking := [label for label in layout.labels if label not in posterior]:
@@ -351,7 +348,7 @@ def _scale(prior: Prior) -> str:
     return {"log_normal": "logarithm", "von_mises": "angle"}.get(prior.family, "itself")
 
 
-def _moments(prior: Prior, draws: Array) -> tuple[float, float]:
+def _moments(prior: Prior, draws: Floats) -> tuple[float, float]:
     """Return mean and standard deviation of draws, of an angle about its mean direction."""
     if prior.family != "von_mises":
         return float(draws.mean()), float(draws.std())
@@ -360,7 +357,7 @@ def _moments(prior: Prior, draws: Array) -> tuple[float, float]:
 
 
 def _pooled(
-    priors: list[Prior], draws: list[Array], spread: float, free: bool
+    priors: list[Prior], draws: list[Floats], spread: float, free: bool
 ) -> tuple[Population, float]:
     """Return the population of a parameter, and the angle that its scale is about."""
     matched = [moment_matched(prior, x) for prior, x in zip(priors, draws, strict=True)]

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import (
     BoundWarning,
@@ -30,9 +29,8 @@ from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
 from pbrl_ppl.sampling.fitting import fit
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, rank
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, Floats
 
-Array = NDArray[np.float64]
 #: One replication's numbers, by name, each a list over the parameters.
 Record = dict[str, list[float]]
 
@@ -61,9 +59,9 @@ class Truth(NamedTuple):
         Shape (transition, H, body, state).
     """
 
-    phi: Array
-    sigma: Array
-    values: Array
+    phi: Floats
+    sigma: Floats
+    values: Floats
 
 
 def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
@@ -113,7 +111,7 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
     )
 
 
-def _trajectories(design: Problem, phi: Array, sigma: Array, seed: int) -> Array:
+def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int) -> Floats:
     """Return measured states of whole trajectories, one set a draw; 0 where nothing is measured."""
     every = [
         simulated_trajectories(design, phi[i], sigma[i], np.random.default_rng([seed, i]))
@@ -123,7 +121,7 @@ def _trajectories(design: Problem, phi: Array, sigma: Array, seed: int) -> Array
     return np.where(measured, np.array(every), 0.0)
 
 
-def simulated(design: Problem, values: Array) -> Problem:
+def simulated(design: Problem, values: Floats) -> Problem:
     """Return the problem with other next states in place of the measured ones.
 
     Its history has one trajectory a segment, so that each starts from the design's own state.
@@ -207,7 +205,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     }
 
 
-def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
+def _quantities(problem: Problem, phi: Floats, sigma: Floats, likelihood: Floats) -> Floats:
     """Return the ranked quantities: folded phi, sigma, log-likelihood, shape (draw, quantity)."""
     sigma = problem.likelihood.free(sigma)
     return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])

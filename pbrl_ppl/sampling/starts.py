@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import expit
 
@@ -17,8 +16,7 @@ from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import Prior, Wheel, gathered, inside, wheels
 from pbrl_ppl.posterior import group, parameter_draws
 from pbrl_ppl.sampling.metropolis import Gaussian
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Distances at which a posterior is evaluated, in standard deviations; its fall at the first one.
 _FAR, _LOW = (2.0, 4.0, 8.0, 16.0), 2.5
@@ -59,7 +57,7 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
     return [*blocks, Gaussian(entries, noise_mean, noise_covariance, cheap)]
 
 
-def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
+def blank_point(model: pm.Model, problem: Problem) -> dict[str, Floats]:
     """Return zeros of the shapes of the continuous variables, by their names in the sampler.
 
     ``model.initial_point()`` would compile a function.
@@ -96,7 +94,7 @@ def constrain(prior: Prior, u: Any) -> Any:
     return u
 
 
-def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
+def _laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
     """Return mode and Laplace covariance in the sampler's space, no wider than a prior's."""
     pairs = [
         unconstrain(prior, x) for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
@@ -109,7 +107,7 @@ def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     return mean, shrink[:, None] * covariance * shrink + 1e-12 * np.eye(len(scale))
 
 
-def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Array:
+def widened(problem: Problem, mode: Mode, mean: Floats, covariance: Floats) -> Floats:
     """Return a covariance in the sampler's space, widened where the posterior falls off slowly.
 
     At a kink, or with few contacts, the curvature overstates how well a parameter is known, and an
@@ -140,7 +138,7 @@ def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Arr
     return np.asarray(covariance + np.diag(variance * (stretch**2 - 1.0)))
 
 
-def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
+def _log_density(problem: Problem, u: Floats, sigma: Floats) -> Floats:
     """Return the log-posterior up to a constant at points (point, p) of the sampler's space.
 
     It is -inf on numerical overflow: at a mass of zero, or at the end of a support.
@@ -158,7 +156,7 @@ def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
     return height
 
 
-def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
+def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
     """Return mean and covariance of log sigma: half the inverse of the number of measurements."""
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         return mode.noise_gaussian()
@@ -167,7 +165,7 @@ def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     return mean, np.diag(0.5 / np.maximum(counts, 1))
 
 
-def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Array]]:
+def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Floats]]:
     """Draw starts about two posterior standard deviations from the mode, one a chain."""
     problem, priors = mode.problem, mode.problem.layout.priors
     low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
@@ -184,7 +182,7 @@ def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[st
     return starts
 
 
-def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, Array]]]:
+def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, Floats]]]:
     """Return a Gaussian approximation of a posterior, as a mode, and the last draw of each chain.
 
     Parameters
@@ -228,7 +226,7 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
     return mode, [problem.named(phi[i], sigma[i]) for i in last]
 
 
-def _range(prior: Prior) -> Array:
+def _range(prior: Prior) -> Floats:
     """Return the 2 % and 98 % quantiles of a prior, by simulation: they limit the starts."""
     return np.quantile(prior.sample(np.random.default_rng(0), 2000), [0.02, 0.98])
 

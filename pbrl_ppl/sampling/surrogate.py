@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pymc as pm
-from numpy.typing import NDArray
 from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
 
@@ -14,8 +13,7 @@ from pbrl_ppl.parameters import inside
 from pbrl_ppl.sampling.emulator import Emulator, Pieces, monomials
 from pbrl_ppl.sampling.metropolis import Gaussian, explore
 from pbrl_ppl.sampling.starts import blank_point, evened_logp
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Factor of the surrogate's log-likelihood: a chain would stick if its tails were too light.
 _FLATTER = 0.9
@@ -63,7 +61,7 @@ class Unpack:
         self._function.trust_input = True
         self._states = len(problem.noise_prior[0])
 
-    def __call__(self, q: Array) -> tuple[Array, Array, float]:
+    def __call__(self, q: Floats) -> tuple[Floats, Floats, float]:
         """Return parameters (p,), noise (state,) and the log-density of prior and transforms."""
         prior, *values = self._function(q)
         phi, noise = values[: self._parameters], values[self._parameters :]
@@ -95,14 +93,14 @@ class Surrogate:
         self._linear = gaussian and emulator.linear
         self._noise, self._form, self._first = b"", np.zeros((0, 0)), (np.zeros(0), 0.0)
 
-    def __call__(self, q: Array) -> float:
+    def __call__(self, q: Floats) -> float:
         """Return the log-density at the sampler's vector."""
         phi, sigma, prior = self.unpack(q)
         if not np.isfinite(prior):
             return -np.inf
         return prior + _FLATTER * self._likelihood(phi, sigma)
 
-    def _likelihood(self, phi: Array, sigma: Array) -> float:
+    def _likelihood(self, phi: Floats, sigma: Floats) -> float:
         """Return the log-likelihood; a quadratic form where the noise is that of the last call."""
         noise = sigma.tobytes()
         if self._linear and noise == self._noise:
@@ -182,7 +180,7 @@ def emulate(
     return best[1]
 
 
-def errors(approximate: Array, exact: Array, draws: int) -> Array:
+def errors(approximate: Floats, exact: Floats, draws: int) -> Floats:
     """Return errors of log-likelihoods at an emulator's draws, and at likely points farther off.
 
     Draws of an emulator whose posterior is too narrow would confirm it.
@@ -199,7 +197,7 @@ def errors(approximate: Array, exact: Array, draws: int) -> Array:
     return np.asarray((approximate - exact)[far])
 
 
-def spread(problem: Problem, phi: Array) -> Array:
+def spread(problem: Problem, phi: Floats) -> Floats:
     """Return draws, and as many again farther from their middle, shape (2 n, p).
 
     Where friction makes a kink, the posterior may be wider beyond it than the first runs.

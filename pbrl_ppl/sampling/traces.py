@@ -8,11 +8,9 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.posterior import from_groups, group, groups
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
@@ -72,7 +70,7 @@ def appended(earlier: Any, trace: Any) -> Any:
     return from_groups(data, {})
 
 
-def posterior_dataset(model: pm.Model, values: Mapping[str, Array]) -> xr.Dataset:
+def posterior_dataset(model: pm.Model, values: Mapping[str, Floats]) -> xr.Dataset:
     """Return draws, shape (chain, draw, ...), with the model's dimensions and coordinates."""
     data = {
         name: (("chain", "draw", *(model.named_vars_to_dims.get(name) or ())), value)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
@@ -17,7 +16,7 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     problem_of,
 )
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, Floats
 
 #: With fewer draws there is nothing to choose from.
 _LEAST_DRAWS = 100
@@ -128,7 +127,7 @@ def more_noise(problem: Problem, cells: Cells) -> list[str]:
     ]
 
 
-def judgement(held: NDArray[np.float64], new: NDArray[np.float64]) -> str:
+def judgement(held: Floats, new: Floats) -> str:
     """Return a text on whether new transitions may be of the same bodies as the posterior's.
 
     Parameters

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl import posterior as files
 from pbrl_ppl.effects import Effect, catalogue
@@ -44,8 +43,7 @@ from pbrl_ppl.sampling.update_checks import (
     judgement,
     more_noise,
 )
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats, Ints
 
 #: Group that keeps the draws as they were fitted, with their weights: resampled anew from them at
 #: every update, draws lose much less than if each update resampled the last one's.
@@ -215,13 +213,13 @@ class _Weighted:
 
     problem: Problem
     base: xr.Dataset
-    phi: Array
-    sigma: Array
+    phi: Floats
+    sigma: Floats
     data: dict[str, xr.Dataset]
     attributes: dict[str, Any]
-    earlier: Array
-    likelihood: Array
-    weights: Array
+    earlier: Floats
+    likelihood: Floats
+    weights: Floats
     share: float
     k: float
     more_noise: list[str]
@@ -365,7 +363,7 @@ def _used(data: xr.Dataset) -> xr.Dataset:
     return data.drop_vars([str(c) for c in data.coords if not set(data[c].dims) <= dims])
 
 
-def _systematic(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def _systematic(weights: Floats, n: int, rng: np.random.Generator) -> Ints:
     """Return ``n`` indices in increasing order by systematic resampling."""
     ends = np.cumsum(weights)
     indices = np.searchsorted(ends / ends[-1], (rng.uniform() + np.arange(n)) / n)
@@ -393,7 +391,7 @@ def _base(idata: Any) -> xr.Dataset:
     )
 
 
-def _with_new(base: xr.Dataset, likelihood: Array, predictive: Array) -> xr.Dataset:
+def _with_new(base: xr.Dataset, likelihood: Floats, predictive: Floats) -> xr.Dataset:
     """Add likelihoods (draw, transition) of new transitions, and predictions of them."""
     shape = base.sizes["chain"], base.sizes["draw"], -1
     both = [base["log_likelihood"].to_numpy(), likelihood.reshape(shape)]
