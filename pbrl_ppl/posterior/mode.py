@@ -10,7 +10,7 @@ import numpy as np
 from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import beside
-from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode, noise_labels
+from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode
 from pbrl_ppl.state import Floats, Ints
 
 #: A draw this much higher (log-posterior) than the mode shows that it is none.
@@ -109,10 +109,9 @@ def _packed(
         names = problem.library.names
         chosen = zip(problem.scene.owners, mode.choice.tolist(), strict=True)
         sets = {owner: names[i] for owner, i in chosen}
-    labels = noise_labels(problem.noise_variables, problem.scalar_sigma)
     return StoredMode(
         dict(zip(layout.labels, point.tolist(), strict=True)),
-        dict(zip(labels, mode.sigma.tolist(), strict=False)),  # a scalar is repeated
+        dict(zip(problem.noise_labels, mode.sigma.tolist(), strict=False)),  # a scalar is repeated
         height,
         sets,
     )

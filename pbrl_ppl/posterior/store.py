@@ -102,7 +102,7 @@ def save_posterior(idata: Any, path: str | Path) -> None:
     path = Path(path)
     if not path.parent.is_dir():
         raise OutputError(
-            f"{path}: cannot write there: no such folder; choose an existing, writable folder"
+            f"{path}: cannot be written: no such folder; choose an existing, writable folder"
         )
     write_atomically(path, lambda temporary: _write(idata, temporary))
 
@@ -150,8 +150,7 @@ def load_posterior(path: str | Path) -> Any:
             f"{path}: this is not a NetCDF file; pass one that fit saved"
         ) from error
     check_schema(attrs, str(path))
-    missing = [name for name in _NEEDED if name not in found]
-    if missing:
+    if missing := [name for name in _NEEDED if name not in found]:
         raise PosteriorError(f"{path}: it lacks {', '.join(missing)}; save the whole fit again")
     return from_groups(found, attrs)
 
@@ -233,6 +232,11 @@ def scalars(posterior: Any) -> xr.Dataset:
             label = f"{name}[{', '.join(labels)}]" if labels else str(name)
             flat[label] = scalar.reset_coords(drop=True).transpose("chain", "draw")
     return xr.Dataset(flat)
+
+
+def columns(idata: Any) -> dict[str, Floats]:
+    """Return posterior draws by label, such as ``mass[cart]``, shape (draw,), chains joined."""
+    return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
 
 
 def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
