@@ -42,6 +42,7 @@ from .store import from_groups as from_groups
 from .store import group as group
 from .store import groups as groups
 from .store import interval as interval
+from .store import labelled_draws as labelled_draws
 from .store import likeliest_draw as likeliest_draw
 from .store import load_posterior as load_posterior
 from .store import save_posterior as save_posterior

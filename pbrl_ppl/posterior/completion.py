@@ -170,7 +170,7 @@ def evaluate(
 
 
 def parameter_draws(problem: Problem, trace: Any) -> tuple[Floats, Floats]:
-    """Return draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
+    """Return a problem's draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
     return vectors(trace, problem.layout, problem.noise_variables)
 
 
@@ -420,7 +420,6 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         units |= dict.fromkeys((ACCELERATION, JOLT), "m/s^2, of omega rad/s^2")
         units[DRIFT] = "the unit of each position"
-    posterior = posterior.copy()
     for name in units.keys() & set(posterior.data_vars):
         posterior[str(name)].attrs["units"] = units[str(name)]
     return posterior

@@ -175,8 +175,7 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
             f" {len(problem.measured)}; pass the history that it was fitted to"
         )
     names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
-    missing = [name for name in names if name not in posterior]
-    if missing:
+    if missing := [name for name in names if name not in posterior]:
         raise PosteriorError(f"posterior: it has no {', '.join(missing)}; of another model?")
     if not whole:
         return problem
@@ -215,14 +214,13 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
     cells = recorded_cells(problem.scene, given)
     states = given[SMOOTHED].to_numpy()
     data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
-    noise = linearised(
-        problem.on(data), cells, given["slope"].to_numpy(), given["linearised_at"].to_numpy()
-    )
+    problem, slope = problem.on(data), given["slope"].to_numpy()
+    noise = linearised(problem, cells, slope, given["linearised_at"].to_numpy())
     if _SENSITIVITY in given:
         origin, before = given[_ORIGIN].to_numpy(), given[_SENSITIVITY].to_numpy()
         follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
         noise = replace(noise, sensitivity=follow)
-    return problem.on(data).along(noise)
+    return problem.along(noise)
 
 
 def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:

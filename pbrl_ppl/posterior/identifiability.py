@@ -15,7 +15,7 @@ from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
-from pbrl_ppl.posterior.store import group, likeliest_draw, scalars
+from pbrl_ppl.posterior.store import group, labelled_draws, likeliest_draw
 from pbrl_ppl.state import STATE, Floats
 
 INFORMED, WEAK, PRIOR_ONLY = "informed", "weak", "prior only"
@@ -176,7 +176,7 @@ def identify(
         said.table()
         said.sentences  # ('The data say nothing about r[cart] and mu_c[cart]: record ...',)
     """
-    posterior = None if isinstance(fitted, Mode) else _flat(fitted)
+    posterior = None if isinstance(fitted, Mode) else labelled_draws(fitted)
     if isinstance(fitted, Mode):
         mode = fitted
     if mode is not None:
@@ -222,13 +222,8 @@ def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[st
         If the posterior holds no scene.
     """
     layout = layout_of(idata, effects)
-    widths = _widths(layout, _prior_draws(layout), _flat(idata))
+    widths = _widths(layout, _prior_draws(layout), labelled_draws(idata))
     return tuple(width.parameter for width in widths if width.verdict == PRIOR_ONLY)
-
-
-def _flat(idata: Any) -> dict[str, Floats]:
-    """Return posterior draws by label, shape (draw,), chains joined."""
-    return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
 
 
 def _prior_draws(layout: Layout) -> dict[str, Floats]:
@@ -323,7 +318,7 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Floats
     columns = tuple(STATE.index(name) for name in record.measured)
     observations = Observations(measured.to_numpy(), columns)
     best = likeliest_draw(idata)
-    draws = _flat(idata)
+    draws = labelled_draws(idata)
     phi = inside(layout.priors, np.array([draws[label][best] for label in layout.labels]))
     stated = dict.fromkeys(observations.names, np.inf) | dict(record.scene.noise)
     inferred = {n: draws.get("sigma", draws.get(f"sigma[{n}]")) for n in observations.names}

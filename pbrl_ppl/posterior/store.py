@@ -234,7 +234,7 @@ def scalars(posterior: Any) -> xr.Dataset:
     return xr.Dataset(flat)
 
 
-def columns(idata: Any) -> dict[str, Floats]:
+def labelled_draws(idata: Any) -> dict[str, Floats]:
     """Return posterior draws by label, such as ``mass[cart]``, shape (draw,), chains joined."""
     return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
 

@@ -20,7 +20,7 @@ from pbrl_ppl.modes import ATTRIBUTE, index_law
 from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, fold_draws
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of
-from pbrl_ppl.posterior.store import group, scalars
+from pbrl_ppl.posterior.store import group, labelled_draws, scalars
 from pbrl_ppl.scene import Joint, Scene
 from pbrl_ppl.state import Floats
 
@@ -67,8 +67,7 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
         model = pp.physics_model(scene, pp.History.load("tuesday.csv", scene))
     """
     scene, layout = scene_of(idata), layout_of(idata, effects)
-    posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
-    draws = fold_draws(layout, posterior)
+    draws = fold_draws(layout, labelled_draws(idata))
     found: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for block in layout.blocks:
         # a remainder is of one recording, and no physics that a scene could declare

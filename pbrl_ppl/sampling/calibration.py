@@ -22,7 +22,7 @@ from rich.progress import track
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
-from pbrl_ppl.files import write_atomically
+from pbrl_ppl.files import write_text
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, declared_problem
 from pbrl_ppl.posterior import versions
@@ -143,7 +143,8 @@ def calibrate(
         if store is not None and _file(store, i).is_file():
             done[i] = _read(_file(store, i))
         else:
-            tasks[i] = partial(replicate, design, truth, _seed(seed, i), settings)
+            own_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
+            tasks[i] = partial(replicate, design, truth, own_seed, settings)
     with closing(_results(tasks, executor)) as results:
         shown = track(
             results,
@@ -159,7 +160,7 @@ def calibrate(
                 failures[i] = f"replication {i}: {type(error).__name__}: {error}"
                 continue
             if store is not None:
-                write_atomically(_file(store, i), partial(_write, text=json.dumps(record)))
+                write_text(_file(store, i), json.dumps(record) + "\n")
             done[i] = record
     failed = tuple(failures[i] for i in sorted(failures))
     if not done:
@@ -179,10 +180,6 @@ def calibrate(
         attrs={key: json.dumps(value) for key, value in about.items()} | {"redrawn": redrawn},
         **columns,
     )
-
-
-def _seed(seed: int, number: int) -> int:
-    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
 def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[tuple[int, Any]]:
@@ -227,7 +224,7 @@ def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
         if not path.exists():
             if any(folder.iterdir()):
                 raise OutputError(f"{folder}: holds other files; choose a new or an empty folder")
-            write_atomically(path, partial(_write, text=json.dumps(about, indent=1)))
+            write_text(path, json.dumps(about, indent=1) + "\n")
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         if isinstance(error, OutputError):
@@ -252,7 +249,3 @@ def _read(path: Path) -> Record:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         raise OutputError(f"{path}: cannot be read: {error}; delete it to run it again") from error
-
-
-def _write(path: Path, text: str) -> int:
-    return path.write_text(text + "\n", encoding="utf-8")

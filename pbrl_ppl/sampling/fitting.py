@@ -11,7 +11,7 @@ import numpy as np
 import pymc as pm
 
 from pbrl_ppl.errors import FitError, MeetingWarning
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_mode, find_trajectory_mode, following, weigh
 from pbrl_ppl.posterior import (
@@ -184,17 +184,12 @@ def fit(
         point = stored_mode(problem, resume)
     else:
         held: Mode | None = getattr(model, "mode", None)  # of physics_model
-        search = (
-            find_mode
-            if isinstance(problem.likelihood, TransitionLikelihood)
-            else find_trajectory_mode
-        )
+        whole = isinstance(problem.likelihood, TrajectoryLikelihood)
+        search = find_trajectory_mode if whole else find_mode
         mode = start or held or search(problem, seed=seed)
-        if (
-            isinstance(mode.problem.likelihood, TrajectoryLikelihood) and mode is not held
-        ):  # linearised at it by now
+        if isinstance(mode.problem.likelihood, TrajectoryLikelihood) and mode is not held:
             mode = mode if start is None else following(start)
-            problem = mode.problem
+            problem = mode.problem  # linearised at the mode
             model = build_model(problem)
         if joined := _joined_model(problem, mode.phi[None], mode.sigma[None]):
             return again(joined)

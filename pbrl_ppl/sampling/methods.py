@@ -12,10 +12,11 @@ import pymc as pm
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.modes import Mode
+from pbrl_ppl.posterior import from_groups, groups
+from pbrl_ppl.sampling.emulator import Surrogate, Unpack, emulate
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps, Schedule
 from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
-from pbrl_ppl.sampling.surrogate import Surrogate, Unpack, emulate
-from pbrl_ppl.sampling.traces import as_trace, thinned
+from pbrl_ppl.sampling.traces import as_trace
 
 #: Engine steps that cost no more than the rest of a sampler's step.
 _LITTLE = 2000
@@ -91,7 +92,12 @@ class Job:
             if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
                 raise KeyboardInterrupt from error
             raise
-        return thinned(trace, steps_a_draw)
+        if steps_a_draw == 1:
+            return trace
+        data = groups(trace)
+        for name in ("posterior", "sample_stats"):
+            data[name] = data[name].isel(draw=slice(steps_a_draw - 1, None, steps_a_draw))
+        return from_groups(data, {})
 
 
 def _metropolis(job: Job) -> Any:

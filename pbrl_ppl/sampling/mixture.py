@@ -246,9 +246,9 @@ def summed(model: pm.Model, draws: int, chains: int, seed: int) -> tuple[Any, Po
 
 def prior_starts(problem: Problem, rng: np.random.Generator, chains: int) -> list[dict[str, Any]]:
     """Draw starts of chains: each owner's set from the prior, sigma at its prior's median."""
-    library, median = _library(problem), problem.noise_prior[0]
+    median = problem.noise_prior[0]
     sigma = np.exp(np.log(median).mean()) if problem.scalar_sigma else median
-    laws = [library.prior(owner) for owner in problem.scene.owners]
+    laws = [_library(problem).prior(owner) for owner in problem.scene.owners]
     return [
         {"library_index": np.array([rng.choice(len(p), p=p) for p in laws]), "sigma": sigma}
         for _ in range(chains)

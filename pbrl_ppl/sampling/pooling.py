@@ -21,7 +21,7 @@ from scipy.stats import chi2, norm
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws, prior_draws, wheels
-from pbrl_ppl.posterior import HDI_PROB, layout_of, moment_matched, scalars, scene_of
+from pbrl_ppl.posterior import HDI_PROB, labelled_draws, layout_of, moment_matched, scene_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats, wrapped
 
@@ -317,7 +317,7 @@ def _drawn(
     result: list[dict[str, Floats]] = []
     first: Floats | None = None
     for name, idata, layout in zip(names, posteriors, layouts, strict=True):
-        posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
+        posterior = labelled_draws(idata)
         if lacking := [label for label in layout.labels if label not in posterior]:
             raise PosteriorError(f"pool: {name} has no {lacking[0]}, which its scene asks for")
         folded = fold_draws(layout, posterior)

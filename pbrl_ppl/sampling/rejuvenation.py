@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, log_noise_prior
@@ -30,7 +28,6 @@ def rejuvenate(
     phi: Floats,
     sigma: Floats,
     rng: np.random.Generator,
-    progress: Callable[[str], None] = lambda stage: None,
 ) -> tuple[Floats, Floats, float]:
     """Rejuvenate particles of a posterior by Metropolis steps, until they have decorrelated.
 
@@ -49,8 +46,6 @@ def rejuvenate(
         Equally weighted draws, shapes (particle, p) and (particle, state).
     rng : Generator
         Of the moves.
-    progress : callable
-        Called with a text after every round.
 
     Returns
     -------
@@ -62,14 +57,11 @@ def rejuvenate(
     wide = problem.with_physics(threads=max(problem.physics.threads, 2))
     mover = _Mover(wide, phi, sigma)
     begin, rates = mover.u.copy(), []
-    for turn in range(_ROUNDS):
+    for _ in range(_ROUNDS):
         rates.append(np.mean([mover.move(group, rng) for group in mover.groups()]))
-        left = _correlation(begin, mover.u)
-        progress(f"moving {len(phi)} draws: round {turn + 1}, correlation {left:.2f}")
-        if left < _FORGOTTEN:
+        if _correlation(begin, mover.u) < _FORGOTTEN:
             break
-    every = np.ones(len(problem.noise_prior[0]))
-    return mover.phi(mover.u), np.exp(mover.noise) * every, float(np.mean(rates))
+    return mover.phi(mover.u), mover.sigma(mover.noise), float(np.mean(rates))
 
 
 def _correlation(before: Floats, after: Floats) -> float:
@@ -113,6 +105,10 @@ class _Mover:
         columns = [constrain(prior, u[..., i]) for i, prior in enumerate(self.priors)]
         return np.asarray(inside(self.priors, np.stack(columns, axis=-1)) if columns else u)
 
+    def sigma(self, noise: Floats) -> Floats:
+        """Return all noise parameters at the logarithms of the inferred ones."""
+        return np.asarray(np.exp(noise) * np.ones(len(self.problem.noise_prior[0])))
+
     def prior(self, u: Floats) -> Floats:
         """Return the log-density of each part's parameters, transformed, shape (particle, part)."""
         phi = self.phi(u)
@@ -124,17 +120,16 @@ class _Mover:
 
     def likelihood(self, residual: Floats, noise: Floats, u: Floats) -> Floats:
         """Return the log-likelihood of each part at log sigma (particle, state)."""
-        problem, sigma = self.problem, np.exp(noise)
-        sigma = sigma * np.ones(len(problem.noise_prior[0]))
+        problem, sigma = self.problem, self.sigma(noise)
         measured, phi = problem.observations.measured, self.phi(u)
         nu = problem.nu(phi)
         if len(self.parts) == 1:
             return np.asarray(problem.log_density(residual, sigma, phi).sum(axis=-1)[:, None])
         result = np.empty((len(residual), len(self.parts)))
         for j, part in enumerate(self.parts):
-            own = residual[..., part.bodies, :]
-            seen = measured[..., part.bodies, :]
-            each = problem.likelihood.log_density(own, sigma, seen, _of_bodies(nu, part.bodies))
+            nu_of = nu[..., part.bodies, :] if isinstance(nu, np.ndarray) else nu
+            some, seen = residual[..., part.bodies, :], measured[..., part.bodies, :]
+            each = problem.likelihood.log_density(some, sigma, seen, nu_of)
             result[:, j] = each.sum(axis=-1)
         return result
 
@@ -245,8 +240,3 @@ def _spread(points: Floats, columns: Ints) -> Floats:
         return np.zeros((0, 0))
     covariance = np.cov(points[:, columns], rowvar=False).reshape(2 * (len(columns),))
     return covariance + 1e-9 * np.diag(np.diag(covariance)) + 1e-12 * np.eye(len(columns))
-
-
-def _of_bodies(nu: float | Floats | None, bodies: Ints) -> float | Floats | None:
-    """Return the degrees of freedom of some bodies."""
-    return nu[..., bodies, :] if isinstance(nu, np.ndarray) else nu

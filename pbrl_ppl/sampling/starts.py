@@ -10,7 +10,6 @@ import pymc as pm
 from scipy.linalg import block_diag
 from scipy.special import expit
 
-from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import Prior, Wheel, gathered, inside, wheels
@@ -35,24 +34,19 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
         offset += size
     where = np.concatenate([np.zeros(0, int), *(places[b.name] for b in problem.layout.blocks)])
     mean, covariance = _laplace(problem, mode)
-    blocks = []
-    for part in problem.simulator.parts:
-        i = part.places
-        if len(i):
-            blocks.append(Gaussian(where[i], mean[i], covariance[np.ix_(i, i)]))
+    blocks = [
+        Gaussian(where[i], mean[i], covariance[np.ix_(i, i)])
+        for i in (part.places for part in problem.simulator.parts)
+        if len(i)
+    ]
     entries = np.concatenate([places[name] for name in problem.noise_variables])
     noise_mean, noise_covariance = _sigma_laplace(problem, mode)
     # along trajectories another noise costs a filter's gains; of Eq. 11 it may move with phi
     independent = isinstance(problem.likelihood, TransitionLikelihood)
     if len(blocks) == 1 and independent:
-        only = blocks[0]
-        return [
-            Gaussian(
-                np.concatenate([only.places, entries]),
-                np.concatenate([only.mean, noise_mean]),
-                block_diag(only.covariance, noise_covariance),
-            )
-        ]
+        (only,) = blocks
+        both = np.concatenate([only.places, entries]), np.concatenate([only.mean, noise_mean])
+        return [Gaussian(*both, block_diag(only.covariance, noise_covariance))]
     cheap = _CHEAP if independent else _CHEAP_ALONG
     return [*blocks, Gaussian(entries, noise_mean, noise_covariance, cheap)]
 
@@ -96,10 +90,8 @@ def constrain(prior: Prior, u: Any) -> Any:
 
 def _laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
     """Return mode and Laplace covariance in the sampler's space, no wider than a prior's."""
-    pairs = [
-        unconstrain(prior, x) for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
-    ]
-    mean, scale = np.array(pairs).reshape(-1, 2).T
+    pairs = map(unconstrain, problem.layout.priors, mode.phi)
+    mean, scale = np.array(list(pairs)).reshape(-1, 2).T
     covariance = scale[:, None] * mode.covariance * scale
     covariance = widened(problem, mode, mean, covariance)
     deviation = np.sqrt(np.diag(covariance))
@@ -168,7 +160,10 @@ def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
 def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Floats]]:
     """Draw starts about two posterior standard deviations from the mode, one a chain."""
     problem, priors = mode.problem, mode.problem.layout.priors
-    low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
+    # the 2 % and 98 % quantiles of the priors, by simulation, limit the starts
+    samples = (prior.sample(np.random.default_rng(0), 2000) for prior in priors)
+    quantiles = [np.quantile(sample, [0.02, 0.98]) for sample in samples]
+    low, high = np.array(quantiles).reshape(-1, 2).T
     factor, starts = mode.factor, []
     centre, wide = np.log(mode.sigma), np.full(len(mode.sigma), 0.1)
     if isinstance(problem.likelihood, TrajectoryLikelihood):
@@ -188,7 +183,7 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, F
     Parameters
     ----------
     problem : Problem
-        Of the same scene, effects and measured dimensions.
+        Of the same scene, effects and measured dimensions, as :func:`linearised_as` checks.
     idata : InferenceData or DataTree
         The posterior.
 
@@ -198,37 +193,16 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, F
         At the mean, with the draws' covariance.
     starts : list of dict
         One point a chain.
-
-    Raises
-    ------
-    PosteriorError
-        If its variables are not the problem's.
     """
     posterior = group(idata, "posterior")
-    names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
-    missing = [name for name in names if name not in posterior]
-    if missing:
-        raise PosteriorError(f"start: the posterior has no {', '.join(missing)}; of another model?")
     phi, sigma = parameter_draws(problem, idata)
     phi = gathered(problem.layout, phi)
     covariance = np.cov(phi, rowvar=False).reshape(2 * (problem.layout.size,))
-    cells = problem.observations.values.size
-    mode = Mode(
-        problem,
-        phi.mean(axis=0),
-        sigma.mean(axis=0),
-        np.zeros((cells, problem.layout.size)),
-        covariance,
-        np.nan,
-    )
+    jacobian = np.zeros((problem.observations.values.size, problem.layout.size))
+    mode = Mode(problem, phi.mean(axis=0), sigma.mean(axis=0), jacobian, covariance, np.nan)
     chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
     last = np.arange(1, chains + 1) * draws - 1
     return mode, [problem.named(phi[i], sigma[i]) for i in last]
-
-
-def _range(prior: Prior) -> Floats:
-    """Return the 2 % and 98 % quantiles of a prior, by simulation: they limit the starts."""
-    return np.quantile(prior.sample(np.random.default_rng(0), 2000), [0.02, 0.98])
 
 
 def evened_logp(model: pm.Model, problem: Problem) -> Any:
@@ -252,17 +226,14 @@ def evened_logp(model: pm.Model, problem: Problem) -> Any:
     uneven = [wheel for wheel in wheels(problem.layout) if wheel.period > 1]
     if not uneven:
         return 0.0
-    change = sum(_of_wheel(model, problem, wheel) for wheel in uneven)
+    change = sum(_evened(model, problem, wheel) for wheel in uneven)
     return model.replace_rvs_by_values([change])[0]
 
 
-def _of_wheel(model: pm.Model, problem: Problem, wheel: Wheel) -> Any:
-    places = {
-        f"{block.name}[{owner}]": (block.name, i)
-        for block in problem.layout.blocks
-        for i, owner in enumerate(block.owners)
-    }
-    angle, *mus = (model[name][i] for name, i in (places[label] for label in wheel.labels))
+def _evened(model: pm.Model, problem: Problem, wheel: Wheel) -> Any:
+    """Return the correction for one wheel."""
+    entries = [(b.name, i) for b in problem.layout.blocks for i in range(len(b.owners))]
+    angle, *mus = (model[name][i] for name, i in (entries[place] for place in wheel.places))
     direction, *frictions = wheel.priors
     terms = []
     for turns in range(4):

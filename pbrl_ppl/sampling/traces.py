@@ -1,4 +1,4 @@
-"""Traces in PyMC's form: made of draws, thinned or concatenated."""
+"""Traces in PyMC's form: from draws made without PyMC, or concatenated."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pbrl_ppl.posterior import from_groups, group, groups
+from pbrl_ppl.posterior import CELLS, from_groups, group, groups
 from pbrl_ppl.state import Floats
 
 
@@ -26,16 +26,12 @@ def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]
         The sampler's statistics of each draw, shape (chain, draw).
     """
     problem, posterior = model.problem, posterior_dataset(model, draws)
-    segments = problem.segments
-
     per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
     given = {
-        "start": (("transition", "body", "full_state"), segments.start),
+        "start": (("transition", "body", "full_state"), problem.segments.start),
         "actions": (("transition", "step", "body", "wrench"), problem.inputs),
     }
-    observed = {
-        "next_state": (("transition", "step", "body", "state"), problem.observations.values)
-    }
+    observed = {"next_state": (CELLS, problem.observations.values)}
     return from_groups(
         {
             "posterior": posterior,
@@ -45,18 +41,6 @@ def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]
         },
         {},
     )
-
-
-def thinned(trace: Any, thin: int) -> Any:
-    """Keep each ``thin``-th draw."""
-    if thin == 1:
-        return trace
-    per_draw = ("posterior", "sample_stats")
-    data = {
-        name: dataset.isel(draw=slice(thin - 1, None, thin)) if name in per_draw else dataset
-        for name, dataset in groups(trace).items()
-    }
-    return from_groups(data, {})
 
 
 def appended(earlier: Any, trace: Any) -> Any:
