@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import xarray as xr
 
 from pbrl_ppl.errors import FitError, MeetingWarning
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
@@ -18,7 +19,9 @@ from pbrl_ppl.posterior import (
     Point,
     PosteriorRecord,
     complete,
+    from_groups,
     group,
+    groups,
     linearised_as,
     parameter_draws,
     stored_mode,
@@ -26,7 +29,6 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, prior_starts, summed
 from pbrl_ppl.sampling.starts import dispersed, from_posterior
-from pbrl_ppl.sampling.traces import appended
 from pbrl_ppl.state import Floats
 
 #: The sampler where none is asked for.
@@ -153,7 +155,7 @@ def fit(
             starts = prior_starts(problem, np.random.default_rng(seed), chains)
         job = Job(
             model=model,
-            about=mode,
+            mode=mode,
             seed=seed,
             draws=draws,
             tune=chosen.tune if tune is None else tune,
@@ -204,7 +206,7 @@ def fit(
     if resume is not None:
         if sizes["chain"] < all_chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
-        trace = appended(resume, trace)
+        trace = _appended(resume, trace)
     asked = (draws, all_chains) if cut else None
     return complete(problem, trace, seed=seed, method=method, asked=asked, mode=point)
 
@@ -286,3 +288,14 @@ def _as_in(model: pm.Model, idata: Any) -> pm.Model:
         problem = problem.with_physics(together=known)
     problem = linearised_as(problem, idata)
     return model if problem is model.problem else build_model(problem)
+
+
+def _appended(earlier: Any, trace: Any) -> Any:
+    """Return the draws of two runs, the earlier ones first."""
+    data = groups(trace)
+    for name in ("posterior", "sample_stats"):
+        old, new = group(earlier, name), data[name]
+        shared = [str(variable) for variable in new.data_vars if variable in old]
+        both = xr.concat([old[shared], new[shared]], dim="draw")
+        data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
+    return from_groups(data, {})

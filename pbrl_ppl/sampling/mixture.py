@@ -24,7 +24,7 @@ from pbrl_ppl.modes import (
 )
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES, ParameterLibrary
 from pbrl_ppl.posterior import Point, from_groups, group, groups
-from pbrl_ppl.sampling.traces import as_trace, posterior_dataset
+from pbrl_ppl.sampling.methods import as_trace, posterior_dataset
 from pbrl_ppl.state import Bools, Floats, Ints
 
 #: Configurations less probable than this share of the best get no draws: they would be a handful.
@@ -111,8 +111,7 @@ def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:
     values = dict(zip(best.mode.problem.layout.labels, best.mode.phi.tolist(), strict=True))
     phi = np.array([values.get(label, np.nan) for label in layout.labels])[None]
     for joint, pair in best.configuration.pairs:
-        a, b = (layout.priors[layout.index(name, joint)].probabilities for name in JOINT_INDICES)
-        law = index_law(pair, problem.scene, a, b)
+        law = _index_law(problem, joint, pair)
         _put_indices(problem, phi, np.array([True]), joint, np.array([law.argmax()]))
     _fill_anchors(problem, phi, None)
     return Point(phi[0], best.mode.sigma)
@@ -154,27 +153,20 @@ def _values(
             for j, owner in enumerate(block.owners):
                 phi[here, layout.index(block.name, owner)] = values[here, j]
         for joint, pair in found[i].configuration.pairs:
-            _set_indices(problem, phi, here, joint, pair, rng)
+            law = _index_law(problem, joint, pair)
+            drawn_pairs = rng.choice(law.size, size=int(here.sum()), p=law.ravel())
+            _put_indices(problem, phi, here, joint, drawn_pairs)
     _fill_anchors(problem, phi, rng)
     named = layout.to_dict(phi)
     indices = {name: named[name].astype(int) for name in JOINT_INDICES}
     return named | indices | {"sigma": sigma}
 
 
-def _set_indices(
-    problem: Problem,
-    phi: Floats,
-    here: Bools,
-    joint: str,
-    pair: Pair,
-    rng: np.random.Generator,
-) -> None:
-    """Draw i_a and i_b of what a joint joins, and swap its anchors to match, in place."""
+def _index_law(problem: Problem, joint: str, pair: Pair) -> Floats:
+    """Return the probabilities of (i_a, i_b) of what a joint joins, shape (name, name)."""
     places = (problem.layout.index(name, joint) for name in JOINT_INDICES)
-    law = index_law(pair, problem.scene,
-                    *(problem.layout.priors[place].probabilities for place in places))  # fmt: skip
-    drawn = rng.choice(law.size, size=int(here.sum()), p=law.ravel())
-    _put_indices(problem, phi, here, joint, drawn)
+    a, b = (problem.layout.priors[place].probabilities for place in places)
+    return index_law(pair, problem.scene, a, b)
 
 
 def _put_indices(problem: Problem, phi: Floats, here: Bools, joint: str, chosen: Ints) -> None:

@@ -34,6 +34,8 @@ _MIDDLE, _ENDS = 0.5, ((1 - HDI_PROB) / 2, (1 + HDI_PROB) / 2)
 _ANY_ANGLE, _SHARPEST = np.pi / np.sqrt(3), 1e6
 #: For the moments of a wheel's prior once it is described in one way.
 _PRIOR_DRAWS = 4000
+#: The scales on which priors are normal, by their family.
+_SCALES = {"log_normal": "logarithm", "von_mises": "angle"}
 #: The grid of the spread, in units of its prior's scale.
 _LEAST, _MOST, _POINTS = 1e-6, 6.0, 800
 #: A point of the grid that is less probable changes no quantile.
@@ -296,7 +298,7 @@ def pool(
         family = layouts[0].priors[layouts[0].labels.index(label)]
         found, reference = _pooled(own, draws, spread, family.uniform)
         populations[label] = found
-        families[label] = (_scale(own[0]), reference)
+        families[label] = (_SCALES.get(own[0].family, "itself"), reference)
         single[label] = np.array([_moments(prior, x) for prior, x in zip(own, draws, strict=True)])
         if found.informed.any():
             priors[label] = _next_prior(family, found, reference)
@@ -342,10 +344,6 @@ def _priors(layout: Layout) -> dict[str, Prior]:
             folded = fold_draws(layout, dict(zip(wheel.labels, drawn.T, strict=True)))
             priors |= {label: moment_matched(priors[label], x) for label, x in folded.items()}
     return priors
-
-
-def _scale(prior: Prior) -> str:
-    return {"log_normal": "logarithm", "von_mises": "angle"}.get(prior.family, "itself")
 
 
 def _moments(prior: Prior, draws: Floats) -> tuple[float, float]:

@@ -40,9 +40,14 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
         if len(i)
     ]
     entries = np.concatenate([places[name] for name in problem.noise_variables])
-    noise_mean, noise_covariance = _sigma_laplace(problem, mode)
     # along trajectories another noise costs a filter's gains; of Eq. 11 it may move with phi
     independent = isinstance(problem.likelihood, TransitionLikelihood)
+    if independent:  # the variance of log sigma is half the inverse of the number of measurements
+        counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
+        noise_mean = problem.likelihood.free(np.log(mode.sigma))
+        noise_covariance = np.diag(0.5 / np.maximum(counts, 1))
+    else:
+        noise_mean, noise_covariance = mode.noise_gaussian()
     if len(blocks) == 1 and independent:
         (only,) = blocks
         both = np.concatenate([only.places, entries]), np.concatenate([only.mean, noise_mean])
@@ -146,15 +151,6 @@ def _log_density(problem: Problem, u: Floats, sigma: Floats) -> Floats:
             likelihood = problem.log_density(problem.residual(x), sigma, x).sum(axis=-1)
             height[there] = likelihood + problem.layout.log_prior(x).sum(axis=-1) - slope[there]
     return height
-
-
-def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
-    """Return mean and covariance of log sigma: half the inverse of the number of measurements."""
-    if isinstance(problem.likelihood, TrajectoryLikelihood):
-        return mode.noise_gaussian()
-    counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
-    mean = problem.likelihood.free(np.log(mode.sigma))
-    return mean, np.diag(0.5 / np.maximum(counts, 1))
 
 
 def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Floats]]:

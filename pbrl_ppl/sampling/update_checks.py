@@ -8,7 +8,7 @@ import numpy as np
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
-from pbrl_ppl.likelihood import Cells, Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import (
     PosteriorRecord,
     from_groups,
@@ -67,7 +67,7 @@ def as_recorded(idata: Any, history: History) -> History:
 
 
 def check_history(idata: Any, record: PosteriorRecord, history: History) -> None:
-    """Refuse a history of other bodies, dimensions or sampling, or of nothing to go on with."""
+    """Refuse a history of other bodies, dimensions or time step, or without usable start."""
     scene, measured = record.scene, record.measured
     names = tuple(body.name for body in scene.moving)
     if history.bodies != names:
@@ -114,17 +114,6 @@ def check_engine(idata: Any, problem: Problem) -> None:
             f" off by {off:.2g} or more): it was made with other effects or another"
             " version; fit all data anew"
         )
-
-
-def more_noise(problem: Problem, cells: Cells) -> list[str]:
-    """Return noise parameters that the cells of all data have and the posterior has not."""
-    held = problem.noise_variables
-    return [
-        f"{name}[{dimension}]"
-        for name, dimensions in cells.variables.items()
-        for dimension in dimensions
-        if dimension not in held.get(name, ())
-    ]
 
 
 def judgement(held: Floats, new: Floats) -> str:

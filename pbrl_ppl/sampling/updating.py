@@ -41,7 +41,6 @@ from pbrl_ppl.sampling.update_checks import (
     check_history,
     check_posterior,
     judgement,
-    more_noise,
 )
 from pbrl_ppl.state import Floats, Ints
 
@@ -258,15 +257,16 @@ def _weighted(
     if np.isfinite(log_weights.max()):
         weights, k = files.smoothed(log_weights)
         share = 1.0 / (len(weights) * float((weights**2).sum()))
-    cells, louder = None, []
+    changed = replace(record, together=tuple(problem.physics.together))
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         cells = files.recorded_cells(problem.scene, data["constant_data"])
-        louder = more_noise(problem, cells)
-    changed = replace(record, together=tuple(problem.physics.together), cells=cells)
+        changed = replace(changed, cells=cells)
+    more_noise = [label for label in changed.noise_labels if label not in problem.noise_labels]
     attributes = dict(idata.attrs) | changed.attributes()
     return _Weighted(
-        problem, base, phi, sigma, data, attributes, earlier, likelihood, weights, share, k, louder
-    )
+        problem, base, phi, sigma, data, attributes, earlier, likelihood, weights, share, k,
+        more_noise,
+    )  # fmt: skip
 
 
 def _without_fit(
@@ -279,7 +279,9 @@ def _without_fit(
     base = new.base
     if new.least_share >= _MOVE and not new.heavy and not new.more_noise:
         result = _reweighted(new, rng)
-        if not _worn(base, result):
+        # reweighting may cost too much of the effective sample size
+        ess = float(base["min_ess"])
+        if ess < MIN_ESS or min(files.convergence(result)[1].values()) >= MIN_ESS:
             return files.checked(new.problem, result), new.problem, {"did": "reweighted"}
     # from here on all data are needed
     whole = problem_of(from_groups(groups(idata) | new.data, new.attributes), effects)
@@ -316,13 +318,6 @@ def _mode(earlier: Any, updated: Any, effects: tuple[Effect, ...]) -> Any:
         choice = files.draws(updated)["library_index"].astype(np.intp)
     begin = files.stored_mode(problem, earlier)
     return files.updated_mode(problem, begin, (phi, sigma, choice), likelihood)
-
-
-def _worn(base: xr.Dataset, result: Any) -> bool:
-    """Return whether the effective sample size fell below its minimum by reweighting."""
-    if float(base["min_ess"]) < MIN_ESS:
-        return False
-    return min(files.convergence(result)[1].values()) < MIN_ESS
 
 
 def _reweighted(new: _Weighted, rng: np.random.Generator) -> Any:
