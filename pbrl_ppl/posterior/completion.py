@@ -36,19 +36,19 @@ from pbrl_ppl.posterior.record import vectors
 from pbrl_ppl.posterior.store import convergence, from_groups, group, groups
 from pbrl_ppl.state import Floats, Ints
 
-#: What a posterior needs before its summaries can be relied on (Vehtari et al., 2021).
+#: Largest R-hat and least effective sample size of reliable summaries (Vehtari et al., 2021).
 MAX_RHAT, MIN_ESS = 1.01, 400
-#: Draws are simulated in groups of so many, or more if that makes fewer transitions.
+#: Draws are simulated in groups of this many, or of more with at most this many transitions.
 _DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE = 64, 20_000
-#: With fewer draws a chain, convergence is not known.
+#: Fewest draws a chain for which R-hat is defined.
 _LEAST_DRAWS = 4
 #: A parameter is stuck if this share of its draws is within this share of its support's end.
 _STUCK, _NEAR = 0.5, 0.01
-#: Draws for which predictions are stored: at most, at least, and numbers in all.
+#: Draws with stored predictions, at most and at least; predicted numbers in all.
 _MOST_PREDICTED, _LEAST_PREDICTED, _NUMBERS = 200, 50, 2_000_000
 #: Draws at which the states are smoothed again to check the linearisation.
 _CHECKED_DRAWS = 16
-#: Standard deviation of the differences (nats) above which the linearised posterior is another one:
+#: Standard deviation of the differences (nats) above which the linearisation does not hold:
 #: draws weighted by exp(difference) would be worth exp(-4), 2 %, of their number.
 MOST = 2.0
 
@@ -175,7 +175,7 @@ def parameter_draws(problem: Problem, trace: Any) -> tuple[Floats, Floats]:
 
 
 def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
-    """Choose draws to predict with: equally many of each chain, evenly spread, with the last one.
+    """Return draws to predict with: equally many of each chain, evenly spread, the last included.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def prior_groups(
     noise = [Prior("log_normal", mu=float(mu), sigma=spread) for mu in centre]
     steps = exponential(problem)[: len(centre)]
     scale = np.exp(centre) / np.log(2.0)
-    # apart from the generator of the predictions
+    # independent of the generator of the predictions
     rng = np.random.default_rng([seed, 1])
     drawn = prior_draws(layout.priors, rng, len(phi)) if layout.size else phi
     noise_drawn = prior_draws(noise, rng, len(phi))
@@ -361,7 +361,7 @@ def _warnings(
         )
     else:
         short = []
-        # judged as it is written: 1.0104 is no failure to reach 1.01
+        # rounded as in the message: 1.0104 passes
         if not round(r_hat[worst_hat], 3) <= MAX_RHAT:
             short.append(f"R-hat is {r_hat[worst_hat]:.3f} for {worst_hat} (want <= {MAX_RHAT})")
         if not ess[worst_ess] >= MIN_ESS:

@@ -14,7 +14,7 @@ from pbrl_ppl.posterior.data import CELLS, SMOOTHED
 from pbrl_ppl.posterior.store import DATATREE, arviz, from_groups, group, groups, smoothed
 from pbrl_ppl.state import STATE, THETA, Floats, Ints, wrapped
 
-#: With fewer draws, the tail that Pareto's law is fitted to has fewer than twenty.
+#: Fewest draws: with fewer, the Pareto distribution is fitted to a tail of fewer than twenty.
 _LEAST_DRAWS = 100
 #: The dimension over which measured numbers are joined.
 _NUMBER = "number"
@@ -109,7 +109,7 @@ def compare(before: Any, after: Any) -> Comparison | None:
         if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
             return None
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # about Pareto k, which is in the result
+        # warnings about Pareto k, which is in the result
         warnings.simplefilter("ignore")
         az = arviz()
         try:
@@ -137,7 +137,7 @@ def _summary(loo: Any) -> LeaveOneOut:
     """Return the summary of an ArviZ result, whose names differ between 0.x and 1.x."""
     elpd, p = (loo.elpd, loo.p) if DATATREE else (loo["elpd_loo"], loo["p_loo"])
     good = float(loo.good_k)
-    # written so that a shape that is not a number counts as high
+    # NaN counts as high
     high = int((~(np.asarray(loo.pareto_k) <= good)).sum())
     return LeaveOneOut(float(elpd), float(loo.se), float(p), high, good)
 
@@ -282,7 +282,7 @@ def loo_pit(idata: Any) -> xr.DataArray:
     likelihood = group(idata, "log_likelihood")["next_state"].stack(samples)
     likelihood = likelihood.transpose("transition", "sample")
     measured = group(idata, "observed_data")["next_state"].transpose(*CELLS)
-    # smoothed with all draws: the tail is better known
+    # smoothed over all draws, for a better estimate of the tail
     weights = np.stack([smoothed(-each)[0][rows] for each in likelihood.to_numpy()], axis=1)
     weights /= weights.sum(axis=0)
     below = np.einsum("rt,rthbs->thbs", weights, _deviations(predicted, measured) <= 0.0)

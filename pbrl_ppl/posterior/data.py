@@ -36,9 +36,9 @@ CELLS = ("transition", "step", "body", "state")
 SMOOTHED = "smoothed"
 #: Names of the parameters that the states were smoothed at, and of the states' derivative by them.
 _ORIGIN, _SENSITIVITY = "smoothed_at", "sensitivity"
-#: Variables and dimensions of the recording have this before their names.
+#: Prefix of the recording's variables and dimensions.
 _PREFIX = "recorded_"
-#: Coordinates of the dimension ``transition`` that are no index.
+#: Coordinates of the dimension ``transition`` beside its index.
 _PLACES = ("trajectory", "time")
 
 
@@ -90,7 +90,7 @@ def problem_of(
 ) -> Problem:
     """Return the problem that a posterior was fitted to, from what the posterior holds.
 
-    A user's own effects are not in it.
+    Pass effects of a user in ``effects``: the posterior holds their names alone.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ def problem_of(
         observed[..., columns] = values
         history = from_segments(record.scene, start, actions, observed)
     elif actions.shape[-1] == len(INPUT):  # recorded since
-        # after a trajectory's end there is none: of the first interval alone
+        # of the first interval: there is no number after a trajectory's end
         history = history.numbered(float(actions[:, 0, :, INPUT.index("trajectory")].max()) + 1.0)
     problem = Problem.of(
         record.scene,
@@ -137,7 +137,7 @@ def problem_of(
     stored = with_recording(problem, given, record.data_sha256)
     if not other or isinstance(stored.likelihood, TransitionLikelihood):
         return stored
-    # linearised where the posterior is
+    # linearised at the posterior's likeliest draw
     phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
     best = likeliest_draw(idata)
     problem = along_trajectories(problem, phi[best], sigma[best], stored.trajectory_noise.cells)

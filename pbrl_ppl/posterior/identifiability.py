@@ -19,18 +19,18 @@ from pbrl_ppl.posterior.store import group, labelled_draws, likeliest_draw
 from pbrl_ppl.state import STATE, Floats
 
 INFORMED, WEAK, PRIOR_ONLY = "informed", "weak", "prior only"
-#: What to record so that parameters show, by part of their names; the first match counts.
+#: What to record to inform parameters, by part of their names; the first match counts.
 _CURES = (
     ((" r[", " mu_c["), "record contacts (collisions with a wall or another body)"),
     (("torque", "inertia", "angular", "w_theta", "pivot"), "record the body turning"),
 )
 _ANY_CURE = "record motion in which that matters"
-#: Ratio of posterior to prior sd below which data inform, and from which they hardly do. The latter
+#: Ratio of posterior to prior sd below which data inform, and above which they do not. The latter
 #: allows for the error of an sd from a hundred effective draws, 7 %.
 CLEARLY, HARDLY = 0.5, 0.85
-#: A mean that moved by this many prior sds was moved by the data, whatever the width.
+#: Shift of the mean, in prior sds, above which the data inform whatever the width.
 _MOVED = 0.3
-#: Squared column norm in prior sds: below it the data alone would be a tenth of the prior.
+#: Squared column norm in prior sds below which the data's precision is a tenth of the prior's.
 _NO_EFFECT = 0.1
 #: Parameters with less than this share of the strongest effect in a direction are left out of it.
 _MINOR = 0.2
@@ -229,7 +229,7 @@ def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[st
 def _prior_draws(layout: Layout) -> dict[str, Floats]:
     """Return prior draws by label, wheels folded as the posterior's are."""
     rng = np.random.default_rng(0)
-    # an anchor means something else in each body that may hold it
+    # anchors in different bodies cannot be compared
     free = {owner for b in layout.blocks if b.name in JOINT_INDICES for owner in b.owners}
     draws = {
         f"{block.name}[{owner}]": prior.sample(rng, _PRIOR_DRAWS)
@@ -298,7 +298,7 @@ def _directions(gram: Floats, labels: list[str]) -> tuple[Direction, ...]:
 
 
 def _sparse(rows: Floats) -> Floats:
-    """Row-reduce a basis, so that two separate ambiguities are not mixed."""
+    """Return the row-reduced basis, which does not mix separate ambiguities."""
     rows = rows.copy()
     for k in range(len(rows)):
         i, j = divmod(int(np.abs(rows[k:]).argmax()), rows.shape[1])
@@ -310,7 +310,7 @@ def _sparse(rows: Floats) -> Floats:
 
 
 def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Floats, Floats]:
-    """Return the layout, the likeliest draw, and the derivative of the whitened residual there."""
+    """Return the layout, the likeliest draw, and the whitened residual's derivative there."""
     record = PosteriorRecord.of(idata)
     physics = Physics(record.scene, record.attached(effects), record.substeps, threads=2)
     layout = physics.layout

@@ -1,4 +1,4 @@
-"""Mode (MAP) of a posterior: found, described as the draws are, and read back."""
+"""Mode (MAP) of a posterior: search, storage and loading."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pbrl_ppl.parameters import beside
 from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode
 from pbrl_ppl.state import Floats, Ints
 
-#: A draw this much higher (log-posterior) than the mode shows that it is none.
+#: Log-posterior of a draw above that of the mode from which the mode is climbed to again (nats).
 _HIGHER = 0.1
-#: Rounds of a climb that begins near the top.
+#: Rounds of a climb that starts near the mode.
 _CLIMB = 5
 
 

@@ -1,4 +1,4 @@
-"""Record of a fit: what a posterior file says beside its draws, in one versioned schema."""
+"""Record of a fit: everything in a posterior file but its arrays, in one versioned schema."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ class PosteriorRecord:
                 f"posterior: it does not say its {', '.join(missing)}; make it with pbrl_ppl.fit"
             )
         given = [field for field in fields(cls) if field.name in attrs]
-        # the type's name, without what it is of and "| None"
+        # the type's first word: "tuple[str, ...] | None" is "tuple"
         kinds = {field.name: re.split(r"\W", str(field.type))[0] for field in given}
         return cls(**{name: _READ[kind](attrs[name]) for name, kind in kinds.items()})
 

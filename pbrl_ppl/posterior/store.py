@@ -1,8 +1,8 @@
-"""Posteriors as files and draws; the one place that knows ArviZ 0.x from 1.x.
+"""Posteriors as files and draws; the one module that tells ArviZ 0.x from 1.x.
 
 Files are written by xarray through h5netcdf, one NetCDF group a dataset, and not by ArviZ: its
-generations have a writer each (``InferenceData.to_netcdf``, ``DataTree.to_netcdf``), with an
-engine, compression and coordinates of its own. Written here, a file is laid out the same by both
+generations have a writer each (``InferenceData.to_netcdf``, ``DataTree.to_netcdf``), with
+different engines, compression and coordinates. Written here, a file has the same layout in both
 and needs no netCDF4. ``arviz.from_netcdf`` of either and ``xarray.open_datatree`` read it.
 """
 
@@ -23,7 +23,7 @@ from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.state import Floats
 
-#: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in its own InferenceData.
+#: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in an InferenceData.
 DATATREE = not version("arviz").startswith("0.")
 
 #: Level of the intervals in reports, as in ArviZ 0.x.
@@ -260,13 +260,13 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     if not flat.data_vars:
         return dict.fromkeys(constant, 1.0), constant
     az = arviz()
-    # chains that each stand still at a place of their own have an infinite R-hat
+    # constant chains with different values have an infinite R-hat
     with np.errstate(divide="ignore", invalid="ignore"):
-        # the generations differ in the tail that they look at by default
+        # the tail's default quantiles differ between the generations
         hat, bulk, tail = (
             _dataset(measure)
             for measure in (
-                # of one chain there is none, which ArviZ says in a warning for each parameter
+                # undefined for one chain: ArviZ would warn for each parameter
                 az.rhat(flat) if flat.sizes["chain"] > 1 else flat.max() * np.nan,
                 az.ess(flat, method="bulk"),
                 az.ess(flat, method="tail", prob=(0.05, 0.95)),
@@ -294,12 +294,12 @@ def smoothed(log_weights: Floats) -> tuple[Floats, float]:
         are too few different ones to say.
     """
     result, k = log_weights, np.inf
-    # in the tail are values that differ, or ArviZ refuses; a tail that is endless overflows
+    # ArviZ refuses a tail of equal values; a very long tail overflows
     with contextlib.suppress(ValueError), np.errstate(over="ignore"):
         if DATATREE:
             from arviz_stats.base import array_stats
 
-            # it takes log-likelihoods, whose inverse is the weight in leave-one-out
+            # it takes log-likelihoods, the negative log-weights of leave-one-out
             result, k = array_stats.psislw(-log_weights, axis=-1)
         else:
             result, k = arviz().psislw(log_weights)

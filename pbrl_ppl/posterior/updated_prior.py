@@ -27,17 +27,17 @@ from pbrl_ppl.state import Floats
 #: Limits of a truncated normal: it is exponential with mu this many sigmas outside its support, and
 #: uniform with sigma this many times the width of what it covers.
 _OUTSIDE, _LEVEL = 5.0, 5.0
-#: Limits of a von Mises concentration: as good as uniform, and 0.001 rad.
+#: Limits of a von Mises concentration: nearly uniform, and 0.001 rad.
 _KAPPA = (1e-3, 1e6)
-#: Variables of a posterior that are no parameters.
+#: Variables of a posterior that are not parameters.
 _OTHERS = ("library_index", "sigma")
 
 
 def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene:
     """Return the posterior's scene with the posterior as its prior.
 
-    A fit of new data can start from it. It keeps each parameter's own distribution, in Table
-    1's family, without the dependence between parameters. A joint of unknown bodies gets the
+    A fit of new data can start from it. It keeps each parameter's marginal distribution, in
+    Table 1's family, without the dependence between parameters. A joint of unknown bodies gets the
     posterior probabilities of its indices. Joints' anchors have no prior in a scene and sigma's is
     taken from the data: both start afresh.
 
@@ -70,7 +70,7 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
     draws = fold_draws(layout, labelled_draws(idata))
     found: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for block in layout.blocks:
-        # a remainder is of one recording, and no physics that a scene could declare
+        # a learned remainder belongs to one recording and cannot be declared in a scene
         if block.of != "body" or LEARNED_REMAINDER in block.name:
             continue
         for owner, prior in zip(block.owners, block.priors, strict=True):
@@ -180,7 +180,7 @@ def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, 
         law = truncnorm((lower - mu) / sigma, (upper - mu) / sigma, mu, sigma)
         return np.array([(law.mean() - mean) / sd, np.log(law.std() / sd)])
 
-    # a posterior that no bound touches keeps its moments
+    # far from the bounds, the moments are those of the normal itself
     begin = np.array([0.0, np.log(min(sd, 0.9 * _LEVEL * reach))])
     far = _LEVEL * reach / sd * (_OUTSIDE + 1)
     limits = ([-far, np.log(0.5 * sd)], [far, np.log(_LEVEL * reach)])

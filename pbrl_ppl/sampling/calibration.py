@@ -1,6 +1,6 @@
 """Simulation-based calibration of the whole pipeline (Talts et al., 2018; Modrák et al., 2023).
 
-Parameters are drawn from the model's own prior, next states are simulated with them from the
+Parameters are drawn from the model's prior, next states are simulated with them from the
 history's start states (Eq. 13), and the whole fit is run on these. If prior, engine, likelihood and
 sampler belong together, the true values' ranks among the posterior draws are uniform.
 """
@@ -30,7 +30,7 @@ from pbrl_ppl.sampling.ranks import Calibration
 from pbrl_ppl.sampling.replication import Record, draw_truths, labels, replicate
 from pbrl_ppl.scene import Scene
 
-#: What the replications in a folder depend on.
+#: File of all that the replications in a folder depend on.
 _DESIGN = "design.json"
 
 
@@ -129,7 +129,7 @@ def calibrate(
             "calibrate: which bodies a joint joins is unknown, and ranks are for parameters that"
             " are not whole numbers; name the bodies in the scene"
         )
-    # a prior that looked at the simulated data would not be the one they were simulated from
+    # fixed here: taken from simulated data, it would not be the prior that they were drawn from
     median, spread = design.noise_prior
     design = design.with_likelihood(prior=(tuple(median.tolist()), spread))
     settings = {"draws": draws, "tune": tune, "chains": chains, **options}
@@ -143,8 +143,8 @@ def calibrate(
         if store is not None and _file(store, i).is_file():
             done[i] = _read(_file(store, i))
         else:
-            own_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
-            tasks[i] = partial(replicate, design, truth, own_seed, settings)
+            fit_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
+            tasks[i] = partial(replicate, design, truth, fit_seed, settings)
     with closing(_results(tasks, executor)) as results:
         shown = track(
             results,

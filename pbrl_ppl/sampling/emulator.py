@@ -19,17 +19,16 @@ from pbrl_ppl.sampling.metropolis import Gaussian, explore
 from pbrl_ppl.sampling.starts import blank_point, evened_logp
 from pbrl_ppl.state import Floats, Ints
 
-#: Factor of the surrogate's log-likelihood: a chain would stick if its tails were too light.
+#: Factor of the surrogate's log-likelihood: with lighter tails than the posterior's, chains stick.
 _FLATTER = 0.9
 #: Degrees to try; engine runs a coefficient, at least and at most; rounds of each.
 _DEGREES, _A_COEFFICIENT, _LEAST, _MOST, _ROUNDS = (1, 2), 4, 100, 400, 4
-#: How far off (standard deviation) the log-likelihood may be: half of the moves still pass. Where
-#: no round comes so close, the best will do if it is so far off: a fifth of them pass, of those
-#: that would cost an engine run each.
+#: Standard deviation of the log-likelihood's error at which a fit ends (half of the moves are then
+#: accepted), and the largest of a usable emulator (a fifth of them are).
 _CLOSE, _ENOUGH = 1.0, 2.0
-#: Points farther off count if their likelihood is above this quantile of the draws'.
+#: Points farther out count if their likelihood is above this quantile of the draws'.
 _LIKELY = 0.05
-#: Half of the runs are so many times as far from the middle as draws from the posterior.
+#: Half of the runs are this many times as far from the mean as draws from the posterior.
 _FARTHER = 2.0
 #: Steps of the exploring chain between two runs.
 _APART = 20
@@ -269,7 +268,7 @@ class Surrogate:
                 basis = self.emulator.basis
                 likelihood = self.problem.likelihood
                 white = likelihood.whiten(basis, sigma)
-                # along trajectories what was measured is in each of them
+                # for trajectories each includes the measurements
                 white[1:] -= likelihood.whiten(0.0 * basis[0], sigma)
                 flat = white.reshape(len(white), -1)
                 self._form = flat @ flat.T

@@ -31,7 +31,7 @@ from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, prior_s
 from pbrl_ppl.sampling.starts import dispersed, from_posterior
 from pbrl_ppl.state import Floats
 
-#: The sampler where none is asked for.
+#: The default sampler.
 DEFAULT = "metropolis"
 #: Draws of a trace at which contacts between parts are looked for, at most.
 _CHECKED_DRAWS = 50
@@ -133,7 +133,7 @@ def fit(
     )  # fmt: skip
     library = problem.library
     chosen = METHODS[method] if library is None else OVER_LIBRARY.get(method, METHODS[method])
-    # with one set there is nothing to walk over
+    # with one set there is no choice to sample
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
     draws = chosen.draws if draws is None else draws
     chains = chosen.chains if chains is None else chains
@@ -166,7 +166,7 @@ def fit(
             starts=starts,
         )
         with model, warnings.catch_warnings():
-            # convergence is checked and reported in this package's own words
+            # of PyMC's processes
             warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
             # draws from the prior, of which SMC needs some, are not compiled on the newer stack
             warnings.filterwarnings("ignore", message="Numba will use object mode")

@@ -17,7 +17,7 @@ from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps, Schedule
 from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
 from pbrl_ppl.state import Floats
 
-#: Engine steps that cost no more than the rest of a sampler's step.
+#: Engine steps below which a surrogate does not pay.
 _LITTLE = 2000
 
 
@@ -94,7 +94,7 @@ def _metropolis(job: Job) -> Any:
         jumps = Jumps((deepcopy(blocks[0]), *others))  # the block itself adapts
     else:
         jumps = None
-    # an exact step of one block, in engine steps; where that is little, looking ahead is no use
+    # engine steps of one exact step of a block
     engine = problem.simulator
     cost = engine.steps * problem.segments.n * problem.data.horizon / len(engine.parts)
     rough, schedule = None, Schedule(thin=job.thin)

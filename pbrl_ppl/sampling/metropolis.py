@@ -23,7 +23,7 @@ from pbrl_ppl.state import Floats, Ints
 TARGET_ACCEPTANCE = 0.234
 #: Best step of a random walk in one dimension, in standard deviations.
 _ALONE = 2.4
-#: The first guess of a covariance counts as much as this many steps.
+#: Weight of the first guess of a covariance, in steps.
 _GUESS = 300
 _LARGEST_BETA = float(np.log(0.95))
 
@@ -108,7 +108,7 @@ class Gaussian:
         walk = shift is not None or bool(rng.uniform() < 0.5)
         moved = q.copy()
         correction: Any = 0.0
-        if alone:  # where one entry may vanish and others not, no common step suits all
+        if alone:  # an entry near zero needs another step than the others
             i = int(rng.integers(len(self.places)))
             step = _ALONE * np.sqrt(self.covariance[i, i])
             moved[self.places[i]] += step * rng.standard_normal()
@@ -272,7 +272,7 @@ class AdaptiveMetropolis(ArrayStepShared):
     def astep(self, q0: RaveledVars) -> tuple[RaveledVars, list[dict[str, Any]]]:
         """Go ``thin`` times over the blocks."""
         q = q0.data.copy()
-        # the exact posterior is for the draws that are kept: tuning makes do with the rough one
+        # tuning draws are discarded, so the rough posterior is enough for them
         near = self.logp if self.rough is None or not self.tune else self.rough
         here = float(near(q))
         rates, exact = [], []

@@ -27,7 +27,7 @@ from pbrl_ppl.posterior import Point, from_groups, group, groups
 from pbrl_ppl.sampling.methods import as_trace, posterior_dataset
 from pbrl_ppl.state import Bools, Floats, Ints
 
-#: Configurations less probable than this share of the best get no draws: they would be a handful.
+#: Configurations less probable than this share of the best get no draws.
 NEGLIGIBLE = 1e-3
 
 
@@ -171,13 +171,14 @@ def _index_law(problem: Problem, joint: str, pair: Pair) -> Floats:
 
 def _put_indices(problem: Problem, phi: Floats, here: Bools, joint: str, chosen: Ints) -> None:
     """Put indices of the flat table of (i_a, i_b) into phi, and swap the anchors, in place."""
-    layout, own = problem.layout, phi[here]
+    layout, some = problem.layout, phi[here]
     a, b = (layout.index(name, joint) for name in JOINT_INDICES)
-    own[:, a], own[:, b] = np.divmod(chosen, len(problem.scene.joinable))
-    turned = own[:, a] > own[:, b]
+    some[:, a], some[:, b] = np.divmod(chosen, len(problem.scene.joinable))
+    turned = some[:, a] > some[:, b]
     anchors = np.array([layout.index(name, joint) for name in JOINT_ANCHORS])
-    own[:, anchors] = np.where(turned[:, None], own[:, np.roll(anchors, 2)], own[:, anchors])
-    phi[here] = own
+    swapped = some[:, np.roll(anchors, 2)]
+    some[:, anchors] = np.where(turned[:, None], swapped, some[:, anchors])
+    phi[here] = some
 
 
 def _fill_anchors(problem: Problem, phi: Floats, rng: np.random.Generator | None) -> None:

@@ -25,14 +25,14 @@ from pbrl_ppl.posterior import HDI_PROB, labelled_draws, layout_of, moment_match
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats, wrapped
 
-#: A robot informs where its data say at least this share of what the prior says (of precision);
-#: less is within the error of a posterior's width.
+#: Least precision of a robot's data, as a share of the prior's, that informs the population; less
+#: is within the error of a posterior's width.
 _INFORMS = 0.2
 #: Quantiles: the middle, and the ends of the usual interval.
 _MIDDLE, _ENDS = 0.5, ((1 - HDI_PROB) / 2, (1 + HDI_PROB) / 2)
-#: An angle of which nothing is known has this width; a von Mises this concentration at most.
+#: Standard deviation of a uniform angle, and the largest concentration of a von Mises.
 _ANY_ANGLE, _SHARPEST = np.pi / np.sqrt(3), 1e6
-#: For the moments of a wheel's prior once it is described in one way.
+#: Draws for the moments of a wheel's prior, folded to one of its equal descriptions.
 _PRIOR_DRAWS = 4000
 #: The scales on which priors are normal, by their family.
 _SCALES = {"log_normal": "logarithm", "von_mises": "angle"}
@@ -122,7 +122,7 @@ def population(
     log_weight -= 0.5 * ((middle - centre) / width) ** 2 + 0.5 * (tau / spread) ** 2
     log_weight += np.log(tau)  # the grid is even in the logarithm
     weights = np.exp(log_weight - log_weight.max())
-    # of each robot given the spread: its own estimate and the mean of the kind, whose error it has
+    # each robot's mean given the spread lies between its estimate and the population's mean
     share = tau**2 * precision
     value = share * own + (1 - share) * middle
     variance = (1 - share) * tau**2 + (1 - share) ** 2 / total
@@ -287,19 +287,19 @@ def pool(
                 f" {', '.join(_table1(layouts[0]))}; expected the same scene"
             )
     drawn = _drawn(names, list(posteriors.values()), layouts)
-    shared = [label for label in drawn[0] if all(label in own for own in drawn)]
-    every = dict.fromkeys(label for own in drawn for label in own)
+    shared = [label for label in drawn[0] if all(label in each for each in drawn)]
+    every = dict.fromkeys(label for each in drawn for label in each)
     populations, families, single, priors = {}, {}, {}, {}
     by_layout = {layout: _priors(layout) for layout in layouts}  # most are the same
     every_prior = [by_layout[layout] for layout in layouts]
     for label in shared:
-        own = [each[label] for each in every_prior]
+        prior_of = [each[label] for each in every_prior]
         draws = [each[label] for each in drawn]
         family = layouts[0].priors[layouts[0].labels.index(label)]
-        found, reference = _pooled(own, draws, spread, family.uniform)
+        found, reference = _pooled(prior_of, draws, spread, family.uniform)
         populations[label] = found
-        families[label] = (_SCALES.get(own[0].family, "itself"), reference)
-        single[label] = np.array([_moments(prior, x) for prior, x in zip(own, draws, strict=True)])
+        families[label] = (_SCALES.get(prior_of[0].family, "itself"), reference)
+        single[label] = np.array(list(map(_moments, prior_of, draws)))
         if found.informed.any():
             priors[label] = _next_prior(family, found, reference)
     left_out = tuple(label for label in every if label not in shared)
@@ -363,7 +363,7 @@ def _pooled(
         return _pooled_angles(priors, matched, spread, free)
     before = np.array([prior.sigma**-2.0 for prior in priors])
     after = np.array([each.sigma**-2.0 for each in matched])
-    # a product of normals has the sum of the precisions: what the data said is the difference
+    # precisions of a product of normals add up: the data's is the difference
     precision = after - before
     informed = precision > _INFORMS * before
     weighted = np.array([each.mu for each in matched]) * after

@@ -47,7 +47,7 @@ def rank(draws: Floats, truth: float, effective: float) -> tuple[int, int]:
     (2, 9)
     """
     size = int(np.clip(effective, 1, min(MOST_DRAWS, len(draws))))
-    # the middles of equal parts: no draw is next to another chain's first
+    # the middles of equal parts
     kept = draws[((np.arange(size) + 0.5) * len(draws) / size).astype(int)]
     return int((kept < truth).sum()), size
 

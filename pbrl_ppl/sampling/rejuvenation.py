@@ -10,11 +10,11 @@ from pbrl_ppl.sampling.metropolis import TARGET_ACCEPTANCE, Gaussian
 from pbrl_ppl.sampling.starts import constrain, unconstrain
 from pbrl_ppl.state import Bools, Floats, Ints
 
-#: Steps under the coarse posterior for each one that is judged exactly, and of the noise.
+#: Steps under the coarse posterior for each exact decision, and of the noise.
 _INNER, _NOISE_STEPS = 15, 10
-#: Steps a round where it does not.
+#: Steps a round without the coarse posterior.
 _PLAIN_STEPS = 5
-#: Standard deviation of the coarse log-likelihood's error up to which it is looked ahead with.
+#: Largest standard deviation of the coarse log-likelihood's error at which it is used.
 _CLOSE = 1.0
 #: Rounds end when no parameter correlates more than this with its start, or after so many: then
 #: copies of one particle are nearly independent.
@@ -89,7 +89,7 @@ class _Mover:
         ]
         columns = np.arange(self.noise.shape[1])
         self.of_noise = Gaussian(columns, self.noise.mean(axis=0), _spread(self.noise, columns))
-        # the coarse engine's error is taken off where most of the posterior is
+        # the coarse engine is corrected by its error at the particles' mean
         centre = self.phi(self.u.mean(axis=0))
         self.coarse = problem.coarse.simulator
         self.correction = problem.predict(centre) - problem.predict(centre, self.coarse)

@@ -34,13 +34,13 @@ from pbrl_ppl.state import STATE, Floats
 #: One replication's numbers, by name, each a list over the parameters.
 Record = dict[str, list[float]]
 
-#: A fit with fewer than 99 effective draws is repeated so often, with so many times the draws.
+#: Most repetitions of a fit with fewer than 99 effective draws, and the factor of its draws.
 _AGAIN, _LONGER = 2, 4
-#: Draws from the prior are given up where fewer than one in so many is possible.
+#: Most draws from the prior for each one that the engine can simulate.
 _MOST_REDRAWN = 50
 
 
-#: Warnings of a fit that no replication repeats.
+#: Warnings of a fit that are ignored in replications.
 _KNOWN = (
     ConvergenceWarning, BoundWarning, LinearisationWarning, MeetingWarning, UninformedWarning,
 )  # fmt: skip
@@ -124,7 +124,7 @@ def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int) -> Flo
 def simulated(design: Problem, values: Floats) -> Problem:
     """Return the problem with other next states in place of the measured ones.
 
-    Its history has one trajectory a segment, so that each starts from the design's own state.
+    Its history has one trajectory a segment, so that each starts from the design's state.
 
     Parameters
     ----------
@@ -163,13 +163,13 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     dict of str to list
         ``rank``, ``size``, ``truth``, ``ess`` and ``r_hat``, over the parameters.
     """
-    # bodies that met in the simulation belong together, however far apart they ended
+    # bodies that met in the simulation are simulated in one world
     problem = simulated(design, truth.values).joined(truth.phi[None], truth.sigma[None])
     model = build_model(problem)
     settings = {"cores": 1, **settings}
     for again in range(_AGAIN + 1):
         with warnings.catch_warnings():
-            # convergence is in the result; the others are of made-up data
+            # convergence is in the result; the other warnings are about simulated data
             for kind in _KNOWN:
                 warnings.simplefilter("ignore", kind)
             idata = fit(model, seed=seed, progress=False, **settings)
@@ -183,7 +183,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
             name: (("chain", "draw"), column.reshape(shape))
             for name, column in zip(labels(problem), drawn.T, strict=True)
         }
-        # of the folded draws: a chain that changes between equal wheels has not failed to mix
+        # of folded draws: a change between equal descriptions of a wheel is no failure to mix
         r_hat, ess = convergence(from_groups({"posterior": xr.Dataset(data)}, {}))
         if min(ess.values()) >= MOST_DRAWS or again == _AGAIN:
             break

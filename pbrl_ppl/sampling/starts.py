@@ -17,7 +17,8 @@ from pbrl_ppl.posterior import group, parameter_draws
 from pbrl_ppl.sampling.metropolis import Gaussian
 from pbrl_ppl.state import Floats
 
-#: Distances at which a posterior is evaluated, in standard deviations; its fall at the first one.
+#: Distances at which a posterior is evaluated (standard deviations), and the fall (nats) from which
+#: a point is outside; a Gaussian falls by 2 at the first.
 _FAR, _LOW = (2.0, 4.0, 8.0, 16.0), 2.5
 #: Steps of the noise a round; along trajectories one of the two noises may vanish.
 _CHEAP, _CHEAP_ALONG = 5, 30
@@ -40,7 +41,7 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
         if len(i)
     ]
     entries = np.concatenate([places[name] for name in problem.noise_variables])
-    # along trajectories another noise costs a filter's gains; of Eq. 11 it may move with phi
+    # along trajectories each change of the noise costs a run of the filter: a block by itself
     independent = isinstance(problem.likelihood, TransitionLikelihood)
     if independent:  # the variance of log sigma is half the inverse of the number of measurements
         counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
@@ -125,7 +126,7 @@ def widened(problem: Problem, mode: Mode, mean: Floats, covariance: Floats) -> F
     ends = np.array([*_FAR, *(-far for far in _FAR)])[:, None]
     top = _log_density(problem, mean[None], mode.sigma)
     stretch = np.ones(len(mean))
-    # one at a time, for each is a rollout of all data; the others stay where they are
+    # one parameter at a time: each point is a simulation of all data
     for i, step in enumerate(np.diag(np.sqrt(variance))):
         fall = top - _log_density(problem, mean + ends * step, mode.sigma)
         # on either side, up to the first point that has fallen

@@ -18,14 +18,13 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.state import STATE, Floats
 
-#: With fewer draws there is nothing to choose from.
+#: Fewest draws to resample from.
 _LEAST_DRAWS = 100
-#: How far the stored likelihood of a transition may be from what the engine gives now.
+#: Largest difference between stored and recomputed log-likelihoods of a transition (nats).
 _SAME = 0.01
-#: Transitions at which that is checked, under one draw.
+#: Transitions whose likelihoods are recomputed, at one draw.
 _CHECKED = 50
-#: Standard errors by which new transitions must be less probable than the fitted ones to count as
-#: predicted worse.
+#: Difference of mean log-likelihood, in standard errors, from which new data are predicted worse.
 _WORSE = 3.0
 
 

@@ -44,15 +44,15 @@ from pbrl_ppl.sampling.update_checks import (
 )
 from pbrl_ppl.state import Floats, Ints
 
-#: Group that keeps the draws as they were fitted, with their weights: resampled anew from them at
-#: every update, draws lose much less than if each update resampled the last one's.
+#: Group of the fitted draws with their weights. Each update resamples these: resampling the draws
+#: of the last update would lose more of them.
 BASE = "before_updates"
-#: Share of the draws that the weights are worth: below the first the draws are moved, below the
-#: second all data are fitted anew.
+#: Effective share of the weighted draws below which they are moved, and below which all data are
+#: fitted anew.
 _MOVE, _REFIT = 0.5, 0.05
-#: Shape of the weights' tail above which they do not even show their own error.
+#: Pareto k of the weights above which all data are fitted anew.
 _HEAVY = 0.7
-#: Draws that are moved at most.
+#: Most draws that are moved.
 _WALKERS = 1000
 
 
@@ -279,13 +279,13 @@ def _without_fit(
     base = new.base
     if new.least_share >= _MOVE and not new.heavy and not new.more_noise:
         result = _reweighted(new, rng)
-        # reweighting may cost too much of the effective sample size
+        # reweighting lowers the effective sample size
         ess = float(base["min_ess"])
         if ess < MIN_ESS or min(files.convergence(result)[1].values()) >= MIN_ESS:
             return files.checked(new.problem, result), new.problem, {"did": "reweighted"}
     # from here on all data are needed
     whole = problem_of(from_groups(groups(idata) | new.data, new.attributes), effects)
-    # sets of parameters, and which bodies a joint joins, cannot be moved by steps
+    # discrete choices (sets of a library, bodies of a joint) have no Metropolis steps here
     chosen_among = whole.library is not None or whole.layout.discrete.any()
     if new.share < _REFIT or new.heavy or chosen_among or new.more_noise:
         return None, whole, {}
