@@ -137,22 +137,12 @@ def fit(
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
     draws = chosen.draws if draws is None else draws
     chains = chosen.chains if chains is None else chains
-    point: Point | None
-    if library is not None and not walks:
-        trace, point = summed(model, draws, chains, seed)
-        if joined := _joined_of_draws(problem, trace):
-            return again(joined)
-        return complete(problem, trace, seed=seed, method="exact sum over the library", mode=point)
     if method == "map":
         draws = chains = 1
 
-    def sampled(
-        model: pm.Model, mode: Mode | None, starts: list[dict[str, Any]] | None = None
-    ) -> Any:
-        if starts is None and mode is not None:
+    def sampled(model: pm.Model, mode: Any, starts: list[dict[str, Any]] | None = None) -> Any:
+        if starts is None:
             starts = dispersed(mode, np.random.default_rng(seed), chains)
-        elif starts is None:
-            starts = prior_starts(problem, np.random.default_rng(seed), chains)
         job = Job(
             model=model,
             mode=mode,
@@ -175,8 +165,12 @@ def fit(
     model = _as_in(model, resume)
     problem = model.problem
     if walks:
-        trace = sampled(model, None)
+        starts = prior_starts(problem, np.random.default_rng(seed), chains)
+        trace = sampled(model, None, starts)
         point = most_frequent(problem, trace)
+    elif library is not None:
+        trace, point = summed(model, draws, chains, seed)
+        method = "exact sum over the library"
     elif problem.layout.discrete.any():
         found = weigh(problem, seed=seed, progress=progress)
         point = most_probable(problem, found)
