@@ -1,110 +1,54 @@
 """Posterior files: save, load, draws, what the data inform, the next prior."""
 
-from pbrl_ppl.posterior.completion import (
-    MIN_ESS,
-    checked,
-    complete,
-    evaluate,
-    parameter_draws,
-    prior_groups,
-)
-from pbrl_ppl.posterior.cross_validation import (
-    Comparison,
-    by_number,
-    by_trajectory,
-    compare,
-    left_out,
-    loo_pit,
-    predicted_rows,
-    separate,
-)
-from pbrl_ppl.posterior.data import (
-    CELLS,
-    both_places,
-    both_recordings,
-    linearised_as,
-    placed,
-    problem_of,
-    recorded,
-    recorded_cells,
-    recording,
-    versions,
-)
-from pbrl_ppl.posterior.identifiability import Identifiability, identify, uninformed
-from pbrl_ppl.posterior.mode import Point, stored_mode, updated_mode
-from pbrl_ppl.posterior.record import PosteriorRecord, layout_of, scene_of, vectors
-from pbrl_ppl.posterior.store import (
-    DATATREE,
-    HDI_PROB,
-    convergence,
-    draws,
-    from_groups,
-    group,
-    groups,
-    interval,
-    likeliest_draw,
-    load_posterior,
-    save_posterior,
-    scalars,
-    smoothed,
-)
-from pbrl_ppl.posterior.updated_prior import (
-    learned_library,
-    library_probabilities,
-    moment_matched,
-    updated_scene,
-)
-
-__all__ = [
-    "CELLS",
-    "DATATREE",
-    "HDI_PROB",
-    "MIN_ESS",
-    "Comparison",
-    "Identifiability",
-    "Point",
-    "PosteriorRecord",
-    "both_places",
-    "both_recordings",
-    "by_number",
-    "by_trajectory",
-    "checked",
-    "compare",
-    "complete",
-    "convergence",
-    "draws",
-    "evaluate",
-    "from_groups",
-    "group",
-    "groups",
-    "identify",
-    "interval",
-    "layout_of",
-    "learned_library",
-    "left_out",
-    "library_probabilities",
-    "likeliest_draw",
-    "linearised_as",
-    "load_posterior",
-    "loo_pit",
-    "moment_matched",
-    "parameter_draws",
-    "placed",
-    "predicted_rows",
-    "prior_groups",
-    "problem_of",
-    "recorded",
-    "recorded_cells",
-    "recording",
-    "save_posterior",
-    "scalars",
-    "scene_of",
-    "separate",
-    "smoothed",
-    "stored_mode",
-    "uninformed",
-    "updated_mode",
-    "updated_scene",
-    "vectors",
-    "versions",
-]
+from .completion import MIN_ESS as MIN_ESS
+from .completion import checked as checked
+from .completion import complete as complete
+from .completion import evaluate as evaluate
+from .completion import parameter_draws as parameter_draws
+from .completion import prior_groups as prior_groups
+from .cross_validation import Comparison as Comparison
+from .cross_validation import by_number as by_number
+from .cross_validation import by_trajectory as by_trajectory
+from .cross_validation import compare as compare
+from .cross_validation import left_out as left_out
+from .cross_validation import loo_pit as loo_pit
+from .cross_validation import predicted_rows as predicted_rows
+from .cross_validation import separate as separate
+from .data import CELLS as CELLS
+from .data import both_places as both_places
+from .data import both_recordings as both_recordings
+from .data import linearised_as as linearised_as
+from .data import placed as placed
+from .data import problem_of as problem_of
+from .data import recorded as recorded
+from .data import recorded_cells as recorded_cells
+from .data import recording as recording
+from .data import versions as versions
+from .identifiability import Identifiability as Identifiability
+from .identifiability import identify as identify
+from .identifiability import uninformed as uninformed
+from .mode import Point as Point
+from .mode import stored_mode as stored_mode
+from .mode import updated_mode as updated_mode
+from .record import PosteriorRecord as PosteriorRecord
+from .record import layout_of as layout_of
+from .record import scene_of as scene_of
+from .record import vectors as vectors
+from .store import DATATREE as DATATREE
+from .store import HDI_PROB as HDI_PROB
+from .store import convergence as convergence
+from .store import draws as draws
+from .store import from_groups as from_groups
+from .store import group as group
+from .store import groups as groups
+from .store import interval as interval
+from .store import labelled_draws as labelled_draws
+from .store import likeliest_draw as likeliest_draw
+from .store import load_posterior as load_posterior
+from .store import save_posterior as save_posterior
+from .store import scalars as scalars
+from .store import smoothed as smoothed
+from .updated_prior import learned_library as learned_library
+from .updated_prior import library_probabilities as library_probabilities
+from .updated_prior import moment_matched as moment_matched
+from .updated_prior import updated_scene as updated_scene

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import (
     BoundWarning,
@@ -35,22 +34,21 @@ from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.mode import Point, packed_mode
 from pbrl_ppl.posterior.record import vectors
 from pbrl_ppl.posterior.store import convergence, from_groups, group, groups
+from pbrl_ppl.state import Floats, Ints
 
-Array = NDArray[np.float64]
-
-#: What a posterior needs before its summaries can be relied on (Vehtari et al., 2021).
+#: Largest R-hat and least effective sample size of reliable summaries (Vehtari et al., 2021).
 MAX_RHAT, MIN_ESS = 1.01, 400
-#: Draws are simulated in groups of so many, or more if that makes fewer transitions.
+#: Draws are simulated in groups of this many, or of more with at most this many transitions.
 _DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE = 64, 20_000
-#: With fewer draws a chain, convergence is not known.
+#: Fewest draws a chain for which R-hat is defined.
 _LEAST_DRAWS = 4
 #: A parameter is stuck if this share of its draws is within this share of its support's end.
 _STUCK, _NEAR = 0.5, 0.01
-#: Draws for which predictions are stored: at most, at least, and numbers in all.
+#: Draws with stored predictions, at most and at least; predicted numbers in all.
 _MOST_PREDICTED, _LEAST_PREDICTED, _NUMBERS = 200, 50, 2_000_000
 #: Draws at which the states are smoothed again to check the linearisation.
 _CHECKED_DRAWS = 16
-#: Standard deviation of the differences (nats) above which the linearised posterior is another one:
+#: Standard deviation of the differences (nats) above which the linearisation does not hold:
 #: draws weighted by exp(difference) would be worth exp(-4), 2 %, of their number.
 MOST = 2.0
 
@@ -126,13 +124,13 @@ def complete(
     return checked(problem, idata, asked)
 
 
-def _next_state(dims: tuple[str, ...], values: Array, coords: Any) -> xr.Dataset:
+def _next_state(dims: tuple[str, ...], values: Floats, coords: Any) -> xr.Dataset:
     return xr.Dataset({"next_state": (dims, values)}, coords)
 
 
 def evaluate(
-    problem: Problem, phi: Array, sigma: Array, rows: Any, rng: np.random.Generator
-) -> tuple[Array, Array]:
+    problem: Problem, phi: Floats, sigma: Floats, rows: Any, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
     """Return log-likelihoods of the transitions at draws, and next states drawn from some of them.
 
     Parameters
@@ -171,13 +169,13 @@ def evaluate(
     return likelihood, np.stack(predictive)
 
 
-def parameter_draws(problem: Problem, trace: Any) -> tuple[Array, Array]:
-    """Return draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
+def parameter_draws(problem: Problem, trace: Any) -> tuple[Floats, Floats]:
+    """Return a problem's draws as vectors: phi, shape (draw, p), and sigma, shape (draw, state)."""
     return vectors(trace, problem.layout, problem.noise_variables)
 
 
-def predictive_rows(chains: int, draws: int, cells: int) -> NDArray[np.intp]:
-    """Choose draws to predict with: equally many of each chain, evenly spread, with the last one.
+def predictive_rows(chains: int, draws: int, cells: int) -> Ints:
+    """Return draws to predict with: equally many of each chain, evenly spread, the last included.
 
     Parameters
     ----------
@@ -198,7 +196,7 @@ def predictive_rows(chains: int, draws: int, cells: int) -> NDArray[np.intp]:
 
 
 def prior_groups(
-    problem: Problem, posterior: xr.Dataset, phi: Array, sigma: Array, seed: int
+    problem: Problem, posterior: xr.Dataset, phi: Floats, sigma: Floats, seed: int
 ) -> dict[str, xr.Dataset]:
     """Return the groups ``prior`` and ``log_prior``, as ArviZ looks for them.
 
@@ -229,7 +227,7 @@ def prior_groups(
     noise = [Prior("log_normal", mu=float(mu), sigma=spread) for mu in centre]
     steps = exponential(problem)[: len(centre)]
     scale = np.exp(centre) / np.log(2.0)
-    # apart from the generator of the predictions
+    # independent of the generator of the predictions
     rng = np.random.default_rng([seed, 1])
     drawn = prior_draws(layout.priors, rng, len(phi)) if layout.size else phi
     noise_drawn = prior_draws(noise, rng, len(phi))
@@ -237,7 +235,7 @@ def prior_groups(
     density = np.stack([prior.log_density(sigma[:, i]) for i, prior in enumerate(noise)], axis=1)
     density = np.where(steps, -np.log(scale) - sigma[:, : len(scale)] / scale, density)
 
-    def shaped(like: xr.Dataset, of_phi: Array, of_noise: Array) -> xr.Dataset:
+    def shaped(like: xr.Dataset, of_phi: Floats, of_noise: Floats) -> xr.Dataset:
         return xr.Dataset(
             {
                 name: like[name].copy(data=values.reshape(like[name].shape))
@@ -251,7 +249,7 @@ def prior_groups(
     }
 
 
-def linearisation_errors(problem: Problem, phi: Array, sigma: Array) -> Array:
+def linearisation_errors(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     """Return log-likelihoods with the states smoothed at each draw, less the linearised ones.
 
     Parameters
@@ -277,7 +275,7 @@ def linearisation_errors(problem: Problem, phi: Array, sigma: Array) -> Array:
     return errors
 
 
-def linearisation(problem: Problem, phi: Array, sigma: Array) -> dict[str, Any]:
+def linearisation(problem: Problem, phi: Floats, sigma: Floats) -> dict[str, Any]:
     """Return a summary of :func:`linearisation_errors` at some of a posterior's draws.
 
     Parameters
@@ -363,7 +361,7 @@ def _warnings(
         )
     else:
         short = []
-        # judged as it is written: 1.0104 is no failure to reach 1.01
+        # rounded as in the message: 1.0104 passes
         if not round(r_hat[worst_hat], 3) <= MAX_RHAT:
             short.append(f"R-hat is {r_hat[worst_hat]:.3f} for {worst_hat} (want <= {MAX_RHAT})")
         if not ess[worst_ess] >= MIN_ESS:
@@ -422,7 +420,6 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         units |= dict.fromkeys((ACCELERATION, JOLT), "m/s^2, of omega rad/s^2")
         units[DRIFT] = "the unit of each position"
-    posterior = posterior.copy()
     for name in units.keys() & set(posterior.data_vars):
         posterior[str(name)].attrs["units"] = units[str(name)]
     return posterior

@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior.data import CELLS, SMOOTHED
 from pbrl_ppl.posterior.store import DATATREE, arviz, from_groups, group, groups, smoothed
-from pbrl_ppl.state import STATE, THETA, wrapped
+from pbrl_ppl.state import STATE, THETA, Floats, Ints, wrapped
 
-#: With fewer draws, the tail that Pareto's law is fitted to has fewer than twenty.
+#: Fewest draws: with fewer, the Pareto distribution is fitted to a tail of fewer than twenty.
 _LEAST_DRAWS = 100
 #: The dimension over which measured numbers are joined.
 _NUMBER = "number"
@@ -110,7 +109,7 @@ def compare(before: Any, after: Any) -> Comparison | None:
         if sizes["chain"] * sizes["draw"] < _LEAST_DRAWS:
             return None
     with warnings.catch_warnings(), np.errstate(all="ignore"):
-        # about Pareto k, which is in the result
+        # warnings about Pareto k, which is in the result
         warnings.simplefilter("ignore")
         az = arviz()
         try:
@@ -119,7 +118,8 @@ def compare(before: Any, after: Any) -> Comparison | None:
             difference, error = (0.0, 0.0) if after is before else _gain(az, first, second)
         except Exception:  # a report can do without
             return None
-    found = Comparison(_summary(first), _summary(second), difference, error, _n(first), unit)
+    count = int(first.n_data_points)
+    found = Comparison(_summary(first), _summary(second), difference, error, count, unit)
     numbers = (found.before.elpd_loo, found.after.elpd_loo, difference, error)
     return found if np.isfinite(numbers).all() else None
 
@@ -137,13 +137,9 @@ def _summary(loo: Any) -> LeaveOneOut:
     """Return the summary of an ArviZ result, whose names differ between 0.x and 1.x."""
     elpd, p = (loo.elpd, loo.p) if DATATREE else (loo["elpd_loo"], loo["p_loo"])
     good = float(loo.good_k)
-    # written so that a shape that is not a number counts as high
+    # NaN counts as high
     high = int((~(np.asarray(loo.pareto_k) <= good)).sum())
     return LeaveOneOut(float(elpd), float(loo.se), float(p), high, good)
-
-
-def _n(loo: Any) -> int:
-    return int(loo.n_data_points)
 
 
 def left_out(idata: Any) -> str:
@@ -219,39 +215,24 @@ def by_number(idata: Any) -> Any:
         az.plot_loo_pit(pp.by_number(idata), y="next_state")  # ArviZ 0.x
         az.plot_loo_pit(pp.by_number(idata))  # ArviZ 1.x
     """
-    if "before_updates" in groups(idata):
-        raise PosteriorError(
-            "by_number: the draws were reweighted by update and do not belong to single"
-            " predictions; fit all data anew"
-        )
+    _check_not_reweighted(idata, "by_number")
     if left_out(idata) == "trajectory":
         raise PosteriorError(
             "by_number: the posterior is of whole trajectories, whose later transitions have seen"
             " the one left out; fit with trajectories=False, or take az.loo of by_trajectory"
         )
-    posterior = group(idata, "posterior")
-    predictive = group(idata, "posterior_predictive")["next_state"].transpose(
-        "chain", "draw", *CELLS
-    )
-    chains, draws = predictive.sizes["chain"], predictive.sizes["draw"]
-    rows = predicted_rows(posterior, predictive.to_dataset(name="next_state"))
+    predictive = group(idata, "posterior_predictive")["next_state"]
+    predictive = predictive.transpose("chain", "draw", *CELLS)
+    some = {"draw": predictive["draw"].to_numpy()}
+    posterior = group(idata, "posterior").sel(some).drop_vars(["chain", "draw"])
+    likelihood = group(idata, "log_likelihood")["next_state"].sel(some)
+    each = likelihood.transpose("chain", "draw", "transition").to_numpy()
     measured = group(idata, "observed_data")["next_state"].transpose(*CELLS)
     values = measured.to_numpy()
     seen = np.flatnonzero(np.isfinite(values))
     places = np.unravel_index(seen, values.shape)
-    off = predictive.to_numpy() - values
-    angle = measured["state"].to_numpy() == STATE[THETA]
-    off[..., angle] = wrapped(off[..., angle])
-    predicted = (values + off).reshape(chains, draws, -1)[..., seen]
-
-    def chosen(variable: xr.DataArray) -> Any:
-        """Return dims after chain and draw, and values at the draws that have predictions."""
-        variable = variable.transpose("chain", "draw", ...)
-        values = variable.to_numpy().reshape(-1, *variable.shape[2:])[rows]
-        return variable.dims[2:], values.reshape(chains, draws, *values.shape[1:])
-
-    thinned = {name: chosen(variable) for name, variable in posterior.data_vars.items()}
-    each = chosen(group(idata, "log_likelihood")["next_state"])[1][..., places[0]]
+    predicted = values + _deviations(predictive, measured)
+    predicted = predicted.reshape(*predicted.shape[:2], -1)[..., seen]
     labels = {
         dim: (_NUMBER, np.asarray(measured[dim])[place])
         for dim, place in zip(CELLS, places, strict=True)
@@ -259,11 +240,9 @@ def by_number(idata: Any) -> Any:
     sampled = ("chain", "draw", _NUMBER)
     return from_groups(
         {
-            "posterior": xr.Dataset(
-                {name: (("chain", "draw", *dims), value) for name, (dims, value) in thinned.items()}
-            ),
+            "posterior": posterior.transpose("chain", "draw", ...),
             "posterior_predictive": xr.Dataset({"next_state": (sampled, predicted)}, labels),
-            "log_likelihood": xr.Dataset({"next_state": (sampled, each)}, labels),
+            "log_likelihood": xr.Dataset({"next_state": (sampled, each[..., places[0]])}, labels),
             "observed_data": xr.Dataset({"next_state": (_NUMBER, values.ravel()[seen])}, labels),
         },
         idata.attrs,
@@ -295,11 +274,7 @@ def loo_pit(idata: Any) -> xr.DataArray:
         If it lacks a group, or its draws were reweighted by :func:`pbrl_ppl.update`, after which
         the predictions are no longer those of single draws.
     """
-    if "before_updates" in groups(idata):
-        raise PosteriorError(
-            "loo_pit: the draws were reweighted by update and do not belong to single predictions;"
-            " fit all data anew"
-        )
+    _check_not_reweighted(idata, "loo_pit")
     predictive = group(idata, "posterior_predictive")
     rows = predicted_rows(group(idata, "posterior"), predictive)
     samples = {"sample": ("chain", "draw")}
@@ -307,17 +282,31 @@ def loo_pit(idata: Any) -> xr.DataArray:
     likelihood = group(idata, "log_likelihood")["next_state"].stack(samples)
     likelihood = likelihood.transpose("transition", "sample")
     measured = group(idata, "observed_data")["next_state"].transpose(*CELLS)
-    # smoothed with all draws: the tail is better known
+    # smoothed over all draws, for a better estimate of the tail
     weights = np.stack([smoothed(-each)[0][rows] for each in likelihood.to_numpy()], axis=1)
     weights /= weights.sum(axis=0)
-    off = predicted.to_numpy() - measured.to_numpy()
-    angle = measured["state"].to_numpy() == STATE[THETA]
-    off[..., angle] = wrapped(off[..., angle])
-    below = np.einsum("rt,rthbs->thbs", weights, off <= 0.0)
+    below = np.einsum("rt,rthbs->thbs", weights, _deviations(predicted, measured) <= 0.0)
     return measured.copy(data=np.where(np.isfinite(measured), below, np.nan))
 
 
-def predicted_rows(posterior: xr.Dataset, predictive: xr.Dataset) -> NDArray[np.intp]:
+def _check_not_reweighted(idata: Any, what: str) -> None:
+    """Refuse a posterior whose predictions are not those of single draws."""
+    if "before_updates" in groups(idata):
+        raise PosteriorError(
+            f"{what}: the draws were reweighted by update and do not belong to single predictions;"
+            " fit all data anew"
+        )
+
+
+def _deviations(predicted: xr.DataArray, measured: xr.DataArray) -> Floats:
+    """Return predicted minus measured states, angles wrapped, shape of ``predicted``."""
+    off = predicted.to_numpy() - measured.to_numpy()
+    angle = measured["state"].to_numpy() == STATE[THETA]
+    off[..., angle] = wrapped(off[..., angle])
+    return np.asarray(off)
+
+
+def predicted_rows(posterior: xr.Dataset, predictive: xr.Dataset) -> Ints:
     """Return the draws that stored predictions were made with.
 
     Parameters

@@ -37,9 +37,9 @@ CELLS = ("transition", "step", "body", "state")
 SMOOTHED = "smoothed"
 #: Names of the parameters that the states were smoothed at, and of the states' derivative by them.
 _ORIGIN, _SENSITIVITY = "smoothed_at", "sensitivity"
-#: Variables and dimensions of the recording have this before their names.
+#: Prefix of the recording's variables and dimensions.
 _PREFIX = "recorded_"
-#: Coordinates of the dimension ``transition`` that are no index.
+#: Coordinates of the dimension ``transition`` beside its index.
 _PLACES = ("trajectory", "time")
 
 
@@ -91,7 +91,7 @@ def problem_of(
 ) -> Problem:
     """Return the problem that a posterior was fitted to, from what the posterior holds.
 
-    A user's own effects are not in it.
+    Pass effects of a user in ``effects``: the posterior holds their names alone.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def problem_of(
         observed[..., columns] = values
         history = from_segments(record.scene, start, actions, observed)
     elif actions.shape[-1] == len(INPUT):  # recorded since
-        # after a trajectory's end there is none: of the first interval alone
+        # of the first interval: there is no number after a trajectory's end
         history = history.numbered(float(actions[:, 0, :, INPUT.index("trajectory")].max()) + 1.0)
     problem = Problem.of(
         Physics(
@@ -140,7 +140,7 @@ def problem_of(
     stored = with_recording(problem, given, record.data_sha256)
     if not other or isinstance(stored.likelihood, TransitionLikelihood):
         return stored
-    # linearised where the posterior is
+    # linearised at the posterior's likeliest draw
     phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
     best = likeliest_draw(idata)
     problem = along_trajectories(problem, phi[best], sigma[best], stored.trajectory_noise.cells)
@@ -178,8 +178,7 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
             f" {len(problem.measured)}; pass the history that it was fitted to"
         )
     names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
-    missing = [name for name in names if name not in posterior]
-    if missing:
+    if missing := [name for name in names if name not in posterior]:
         raise PosteriorError(f"posterior: it has no {', '.join(missing)}; of another model?")
     if not whole:
         return problem
@@ -218,14 +217,13 @@ def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Pro
     cells = recorded_cells(problem.scene, given)
     states = given[SMOOTHED].to_numpy()
     data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
-    noise = linearised(
-        problem.on(data), cells, given["slope"].to_numpy(), given["linearised_at"].to_numpy()
-    )
+    problem, slope = problem.on(data), given["slope"].to_numpy()
+    noise = linearised(problem, cells, slope, given["linearised_at"].to_numpy())
     if _SENSITIVITY in given:
         origin, before = given[_ORIGIN].to_numpy(), given[_SENSITIVITY].to_numpy()
         follow = Sensitivity(problem.scene, problem.layout, cells, noise.slope, origin, before)
         noise = replace(noise, sensitivity=follow)
-    return problem.on(data).along(noise)
+    return problem.along(noise)
 
 
 def recorded(scene: Scene, given: xr.Dataset, data_sha256: str = "") -> History:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
@@ -16,24 +15,22 @@ from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
-from pbrl_ppl.posterior.store import group, likeliest_draw, scalars
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.posterior.store import group, labelled_draws, likeliest_draw
+from pbrl_ppl.state import STATE, Floats
 
 INFORMED, WEAK, PRIOR_ONLY = "informed", "weak", "prior only"
-#: What to record so that parameters show, by part of their names; the first match counts.
+#: What to record to inform parameters, by part of their names; the first match counts.
 _CURES = (
     ((" r[", " mu_c["), "record contacts (collisions with a wall or another body)"),
     (("torque", "inertia", "angular", "w_theta", "pivot"), "record the body turning"),
 )
 _ANY_CURE = "record motion in which that matters"
-#: Ratio of posterior to prior sd below which data inform, and from which they hardly do. The latter
+#: Ratio of posterior to prior sd below which data inform, and above which they do not. The latter
 #: allows for the error of an sd from a hundred effective draws, 7 %.
 CLEARLY, HARDLY = 0.5, 0.85
-#: A mean that moved by this many prior sds was moved by the data, whatever the width.
+#: Shift of the mean, in prior sds, above which the data inform whatever the width.
 _MOVED = 0.3
-#: Squared column norm in prior sds: below it the data alone would be a tenth of the prior.
+#: Squared column norm in prior sds below which the data's precision is a tenth of the prior's.
 _NO_EFFECT = 0.1
 #: Parameters with less than this share of the strongest effect in a direction are left out of it.
 _MINOR = 0.2
@@ -179,7 +176,7 @@ def identify(
         said.table()
         said.sentences  # ('The data say nothing about r[cart] and mu_c[cart]: record ...',)
     """
-    posterior = None if isinstance(fitted, Mode) else _flat(fitted)
+    posterior = None if isinstance(fitted, Mode) else labelled_draws(fitted)
     if isinstance(fitted, Mode):
         mode = fitted
     if mode is not None:
@@ -225,19 +222,14 @@ def uninformed(idata: Any, *, effects: Iterable[Effect] = catalogue) -> tuple[st
         If the posterior holds no scene.
     """
     layout = layout_of(idata, effects)
-    widths = _widths(layout, _prior_draws(layout), _flat(idata))
+    widths = _widths(layout, _prior_draws(layout), labelled_draws(idata))
     return tuple(width.parameter for width in widths if width.verdict == PRIOR_ONLY)
 
 
-def _flat(idata: Any) -> dict[str, Array]:
-    """Return posterior draws by label, shape (draw,), chains joined."""
-    return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
-
-
-def _prior_draws(layout: Layout) -> dict[str, Array]:
+def _prior_draws(layout: Layout) -> dict[str, Floats]:
     """Return prior draws by label, wheels folded as the posterior's are."""
     rng = np.random.default_rng(0)
-    # an anchor means something else in each body that may hold it
+    # anchors in different bodies cannot be compared
     free = {owner for b in layout.blocks if b.name in JOINT_INDICES for owner in b.owners}
     draws = {
         f"{block.name}[{owner}]": prior.sample(rng, _PRIOR_DRAWS)
@@ -248,12 +240,12 @@ def _prior_draws(layout: Layout) -> dict[str, Array]:
     return fold_draws(layout, draws)
 
 
-def _natural(prior: Prior, x: Array) -> Array:
+def _natural(prior: Prior, x: Floats) -> Floats:
     """Return values on the prior's natural scale: the logarithm for ``log_normal``."""
     return np.log(x) if prior.family == "log_normal" else x
 
 
-def _spread(prior: Prior, draws: Array) -> float:
+def _spread(prior: Prior, draws: Floats) -> float:
     """Return the standard deviation on the natural scale; angular deviation of an angle (rad)."""
     if prior.family == "von_mises":
         return float(np.sqrt(2.0 * (1.0 - np.abs(np.exp(1j * draws).mean()))))
@@ -269,7 +261,7 @@ def _width(label: str, prior_sd: float, posterior_sd: float, moved: float) -> Wi
 
 
 def _widths(
-    layout: Layout, prior: Mapping[str, Array], posterior: Mapping[str, Array]
+    layout: Layout, prior: Mapping[str, Floats], posterior: Mapping[str, Floats]
 ) -> tuple[Width, ...]:
     """Return the widths of all parameters with prior draws."""
     folded = fold_draws(layout, posterior)
@@ -286,7 +278,7 @@ def _widths(
     return tuple(widths)
 
 
-def _directions(gram: Array, labels: list[str]) -> tuple[Direction, ...]:
+def _directions(gram: Floats, labels: list[str]) -> tuple[Direction, ...]:
     """Return combinations that move predictions by less than the noise, unlike their parameters."""
     active = np.flatnonzero(np.diag(gram) >= 1.0)
     part = gram[np.ix_(active, active)]
@@ -305,8 +297,8 @@ def _directions(gram: Array, labels: list[str]) -> tuple[Direction, ...]:
     return tuple(found)
 
 
-def _sparse(rows: Array) -> Array:
-    """Row-reduce a basis, so that two separate ambiguities are not mixed."""
+def _sparse(rows: Floats) -> Floats:
+    """Return the row-reduced basis, which does not mix separate ambiguities."""
     rows = rows.copy()
     for k in range(len(rows)):
         i, j = divmod(int(np.abs(rows[k:]).argmax()), rows.shape[1])
@@ -317,8 +309,8 @@ def _sparse(rows: Array) -> Array:
     return rows
 
 
-def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array, Array]:
-    """Return the layout, the likeliest draw, and the derivative of the whitened residual there."""
+def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Floats, Floats]:
+    """Return the layout, the likeliest draw, and the whitened residual's derivative there."""
     record = PosteriorRecord.of(idata)
     physics = Physics(record.scene, record.attached(effects), record.substeps, threads=2)
     layout = physics.layout
@@ -326,13 +318,13 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Array,
     columns = tuple(STATE.index(name) for name in record.measured)
     observations = Observations(measured.to_numpy(), columns)
     best = likeliest_draw(idata)
-    draws = _flat(idata)
+    draws = labelled_draws(idata)
     phi = inside(layout.priors, np.array([draws[label][best] for label in layout.labels]))
     stated = dict.fromkeys(observations.names, np.inf) | dict(record.scene.noise)
     inferred = {n: draws.get("sigma", draws.get(f"sigma[{n}]")) for n in observations.names}
     sigma = np.array([stated[n] if x is None else x[best] for n, x in inferred.items()])
 
-    def residual(points: Array) -> Array:
+    def residual(points: Floats) -> Floats:
         states = physics.predict(points, data["start"].to_numpy(), data["actions"].to_numpy())
         z = TransitionLikelihood().whiten(observations.residual(states), sigma)
         return np.nan_to_num(z.reshape(len(points), -1))

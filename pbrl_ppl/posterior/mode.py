@@ -1,4 +1,4 @@
-"""Mode (MAP) of a posterior: found, described as the draws are, and read back."""
+"""Mode (MAP) of a posterior: search, storage and loading."""
 
 from __future__ import annotations
 
@@ -6,19 +6,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import Problem, log_posterior
 from pbrl_ppl.modes import find_mode
 from pbrl_ppl.parameters import beside
-from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode, noise_labels
+from pbrl_ppl.posterior.record import PosteriorRecord, StoredMode
+from pbrl_ppl.state import Floats, Ints
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
-
-#: A draw this much higher (log-posterior) than the mode shows that it is none.
+#: Log-posterior of a draw above that of the mode from which the mode is climbed to again (nats).
 _HIGHER = 0.1
-#: Rounds of a climb that begins near the top.
+#: Rounds of a climb that starts near the mode.
 _CLIMB = 5
 
 
@@ -36,13 +33,13 @@ class Point:
         Index of each owner's parameter set in the library, shape (owner,), if there is one.
     """
 
-    phi: Array
-    sigma: Array
+    phi: Floats
+    sigma: Floats
     choice: Ints | None = None
 
 
 def packed_mode(
-    problem: Problem, mode: Point, phi: Array, sigma: Array, likelihood: Array
+    problem: Problem, mode: Point, phi: Floats, sigma: Floats, likelihood: Floats
 ) -> StoredMode:
     """Return a posterior's mode for its record.
 
@@ -72,7 +69,7 @@ def packed_mode(
 
 
 def updated_mode(
-    problem: Problem, earlier: Point, draws: tuple[Array, Array, Ints | None], likelihood: Array
+    problem: Problem, earlier: Point, draws: tuple[Floats, Floats, Ints | None], likelihood: Floats
 ) -> StoredMode:
     """Return the mode of an updated posterior.
 
@@ -101,7 +98,9 @@ def updated_mode(
     return _packed(problem, best, float(height[i]))
 
 
-def _packed(problem: Problem, mode: Point, height: float, draws: Array | None = None) -> StoredMode:
+def _packed(
+    problem: Problem, mode: Point, height: float, draws: Floats | None = None
+) -> StoredMode:
     """Return a point for a record, its wheels described as in draws (draw, p)."""
     layout, point, sets = problem.layout, mode.phi, None
     if problem.library is None and draws is not None:
@@ -110,10 +109,9 @@ def _packed(problem: Problem, mode: Point, height: float, draws: Array | None = 
         names = problem.library.names
         chosen = zip(problem.scene.owners, mode.choice.tolist(), strict=True)
         sets = {owner: names[i] for owner, i in chosen}
-    labels = noise_labels(problem.noise_variables, problem.scalar_sigma)
     return StoredMode(
         dict(zip(layout.labels, point.tolist(), strict=True)),
-        dict(zip(labels, mode.sigma.tolist(), strict=False)),  # a scalar is repeated
+        dict(zip(problem.noise_labels, mode.sigma.tolist(), strict=False)),  # a scalar is repeated
         height,
         sets,
     )

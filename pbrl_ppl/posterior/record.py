@@ -1,14 +1,14 @@
-"""Record of a fit: what a posterior file says beside its draws, in one versioned schema."""
+"""Record of a fit: everything in a posterior file but its arrays, in one versioned schema."""
 
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, learned_remainder
 from pbrl_ppl.errors import PosteriorError
@@ -17,8 +17,7 @@ from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior.store import SCHEMA, check_schema, draws
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True)
@@ -41,10 +40,6 @@ class StoredMode:
     noise: Mapping[str, float]
     log_posterior: float
     sets: Mapping[str, str] | None = None
-
-    def text(self) -> str:
-        """Return the mode as JSON."""
-        return json.dumps({name: v for name, v in asdict(self).items() if v is not None})
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,12 +141,10 @@ class PosteriorRecord:
             raise PosteriorError(
                 f"posterior: it does not say its {', '.join(missing)}; make it with pbrl_ppl.fit"
             )
-        values = {
-            field.name: _READ[field.name](attrs[field.name])
-            for field in fields(cls)
-            if field.name in attrs
-        }
-        return cls(**values)
+        given = [field for field in fields(cls) if field.name in attrs]
+        # the type's first word: "tuple[str, ...] | None" is "tuple"
+        kinds = {field.name: re.split(r"\W", str(field.type))[0] for field in given}
+        return cls(**{name: _READ[kind](attrs[name]) for name, kind in kinds.items()})
 
     def attributes(self) -> dict[str, Any]:
         """Return the attributes of the file: plain text, numbers and JSON."""
@@ -172,9 +165,16 @@ class PosteriorRecord:
         EffectError
             If one is not among them.
         """
-        return attach(self.scene, (), known_effects(self.learned_remainder, effects))
+        return _attached(self.scene, self.learned_remainder, effects)
 
-    def mode_vectors(self, layout: Layout) -> tuple[Array, Array]:
+    @property
+    def noise_labels(self) -> list[str]:
+        """Labels of the noise parameters, such as ``sigma[x]``; ``sigma`` for a scalar."""
+        if self.scalar_sigma:
+            return ["sigma"]
+        return [f"{name}[{of}]" for name, about in self.noise_variables.items() for of in about]
+
+    def mode_vectors(self, layout: Layout) -> tuple[Floats, Floats]:
         """Return the mode as vectors: phi, shape (p,), and sigma, shape (noise parameter,).
 
         Raises
@@ -184,27 +184,18 @@ class PosteriorRecord:
         """
         if self.mode is None:
             raise PosteriorError("posterior: it holds no mode; ask for draws, or fit it again")
-        labels = noise_labels(self.noise_variables, self.scalar_sigma)
-        missing = [label for label in layout.labels if label not in self.mode.parameters]
-        missing += [label for label in labels if label not in self.mode.noise]
-        if missing:
+        values, labels = {**self.mode.parameters, **self.mode.noise}, self.noise_labels
+        if missing := [label for label in (*layout.labels, *labels) if label not in values]:
             raise PosteriorError(f"posterior: its mode has no {', '.join(missing)}; fit it again")
-        phi = np.array([self.mode.parameters[label] for label in layout.labels], dtype=float)
-        sigma = np.array([self.mode.noise[label] for label in labels])
+        phi = np.array([values[label] for label in layout.labels], dtype=float)
+        sigma = np.array([values[label] for label in labels])
         width = sum(map(len, self.noise_variables.values()))
         return phi, np.broadcast_to(sigma, width).copy()
 
 
-def noise_labels(variables: Mapping[str, tuple[str, ...]], scalar: bool) -> list[str]:
-    """Return ``sigma[x]`` and the like, in the order of sigma; ``sigma`` for a scalar."""
-    if scalar:
-        return ["sigma"]
-    return [f"{name}[{dimension}]" for name, about in variables.items() for dimension in about]
-
-
 def vectors(
     idata: Any, layout: Layout, variables: Mapping[str, tuple[str, ...]]
-) -> tuple[Array, Array]:
+) -> tuple[Floats, Floats]:
     """Return draws as vectors: phi, shape (draw, p), and sigma, shape (draw, noise parameter)."""
     named = draws(idata)
     n = len(next(iter(named.values())))
@@ -213,9 +204,10 @@ def vectors(
     return layout.to_vectors(named, n), np.broadcast_to(sigma, (n, width))
 
 
-def known_effects(table: Any, effects: Iterable[Effect]) -> tuple[Effect, ...]:
-    """Return the effects, and the learned remainder of a table where there is one."""
-    return (*effects, *(() if table is None else (learned_remainder(str(table)),)))
+def _attached(scene: Scene, table: str | None, effects: Iterable[Effect]) -> tuple[Attached, ...]:
+    """Return the effects of a scene, and the learned remainder of a table where there is one."""
+    learned = () if table is None else (learned_remainder(str(table)),)
+    return attach(scene, (), (*effects, *learned))
 
 
 def scene_of(idata: Any) -> Scene:
@@ -231,14 +223,10 @@ def scene_of(idata: Any) -> Scene:
     return Scene.from_toml(str(idata.attrs["scene"]))
 
 
-def attached_effects(idata: Any, effects: Iterable[Effect] = catalogue) -> tuple[Attached, ...]:
-    """Return the effects of a posterior's scene, looked up among ``effects`` by name."""
-    return attach(scene_of(idata), (), known_effects(idata.attrs.get("learned_remainder"), effects))
-
-
 def layout_of(idata: Any, effects: Iterable[Effect] = catalogue) -> Layout:
     """Return the layout of a posterior's parameters."""
-    return build_layout(scene_of(idata), attached_effects(idata, effects))
+    scene, table = scene_of(idata), idata.attrs.get("learned_remainder")
+    return build_layout(scene, _attached(scene, table, effects))
 
 
 def _written(value: Any) -> Any:
@@ -248,10 +236,9 @@ def _written(value: Any) -> Any:
     if isinstance(value, ParameterLibrary):
         return value.to_json()
     if isinstance(value, StoredMode):
-        return value.text()
+        return json.dumps({name: v for name, v in asdict(value).items() if v is not None})
     if isinstance(value, Cells):
-        return json.dumps({f.name: np.asarray(getattr(value, f.name)).tolist()
-                           for f in fields(value)})  # fmt: skip
+        return json.dumps({name: np.asarray(v).tolist() for name, v in asdict(value).items()})
     if isinstance(value, bool):  # NetCDF has no such attribute
         return int(value)
     return value if isinstance(value, int | float | str) else json.dumps(value)
@@ -269,38 +256,21 @@ def _cells(text: Any) -> Cells:
     return Cells(**arrays, push=push, memory=memory, **tuples)
 
 
-def _json(text: Any) -> Any:
-    return json.loads(str(text))
-
-
 def _tuple(text: Any) -> Any:
-    return tuple(tuple(item) if isinstance(item, list) else item for item in _json(text))
+    items = json.loads(str(text))
+    return tuple(tuple(item) if isinstance(item, list) else item for item in items)
 
 
-#: How each field is read from its attribute.
+#: How attributes are read, by the type of the field.
 _READ: Mapping[str, Callable[[Any], Any]] = {
-    "scene": lambda text: Scene.from_toml(str(text)),
-    "effects": _tuple,
-    "horizon": int,
-    "substeps": int,
-    "together": _tuple,
-    "measured": _tuple,
-    "scalar_sigma": bool,
-    "sigma_prior": _tuple,
-    "data_sha256": str,
-    "seed": int,
-    "versions": _json,
-    "method": str,
-    "nu": float,
-    "library": lambda text: ParameterLibrary.from_json(str(text)),
-    "learned_remainder": str,
-    "cells": _cells,
-    "mode": lambda text: StoredMode(**_json(text)),
-    "linearisation": _json,
-    "configurations": _tuple,
-    "updates": _tuple,
-    "max_rhat": float,
-    "min_ess": float,
-    "warnings": _tuple,
-    "interrupted": bool,
+    "Scene": lambda text: Scene.from_toml(str(text)),
+    "ParameterLibrary": lambda text: ParameterLibrary.from_json(str(text)),
+    "Cells": _cells,
+    "StoredMode": lambda text: StoredMode(**json.loads(str(text))),
+    "Mapping": lambda text: json.loads(str(text)),
+    "tuple": _tuple,
+    "bool": bool,
+    "int": int,
+    "float": float,
+    "str": str,
 }

@@ -1,8 +1,8 @@
-"""Posteriors as files and draws; the one place that knows ArviZ 0.x from 1.x.
+"""Posteriors as files and draws; the one module that tells ArviZ 0.x from 1.x.
 
 Files are written by xarray through h5netcdf, one NetCDF group a dataset, and not by ArviZ: its
-generations have a writer each (``InferenceData.to_netcdf``, ``DataTree.to_netcdf``), with an
-engine, compression and coordinates of its own. Written here, a file is laid out the same by both
+generations have a writer each (``InferenceData.to_netcdf``, ``DataTree.to_netcdf``), with
+different engines, compression and coordinates. Written here, a file has the same layout in both
 and needs no netCDF4. ``arviz.from_netcdf`` of either and ``xarray.open_datatree`` read it.
 """
 
@@ -18,14 +18,12 @@ from typing import Any
 import h5py
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import OutputError, PosteriorError
 from pbrl_ppl.files import write_atomically
+from pbrl_ppl.state import Floats
 
-Array = NDArray[np.float64]
-
-#: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in its own InferenceData.
+#: ArviZ 1.x stores groups in an xarray.DataTree, 0.x in an InferenceData.
 DATATREE = not version("arviz").startswith("0.")
 
 #: Level of the intervals in reports, as in ArviZ 0.x.
@@ -104,7 +102,7 @@ def save_posterior(idata: Any, path: str | Path) -> None:
     path = Path(path)
     if not path.parent.is_dir():
         raise OutputError(
-            f"{path}: cannot write there: no such folder; choose an existing, writable folder"
+            f"{path}: cannot be written: no such folder; choose an existing, writable folder"
         )
     write_atomically(path, lambda temporary: _write(idata, temporary))
 
@@ -152,8 +150,7 @@ def load_posterior(path: str | Path) -> Any:
             f"{path}: this is not a NetCDF file; pass one that fit saved"
         ) from error
     check_schema(attrs, str(path))
-    missing = [name for name in _NEEDED if name not in found]
-    if missing:
+    if missing := [name for name in _NEEDED if name not in found]:
         raise PosteriorError(f"{path}: it lacks {', '.join(missing)}; save the whole fit again")
     return from_groups(found, attrs)
 
@@ -178,7 +175,7 @@ def check_schema(attrs: Mapping[str, Any], where: str) -> None:
         )
 
 
-def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Array]:
+def draws(idata: Any, n: int | None = None, seed: int = 0) -> dict[str, Floats]:
     """Return posterior draws by name, chains joined.
 
     Parameters
@@ -237,6 +234,11 @@ def scalars(posterior: Any) -> xr.Dataset:
     return xr.Dataset(flat)
 
 
+def labelled_draws(idata: Any) -> dict[str, Floats]:
+    """Return posterior draws by label, such as ``mass[cart]``, shape (draw,), chains joined."""
+    return {str(name): variable.to_numpy().ravel() for name, variable in scalars(idata).items()}
+
+
 def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     """Return R-hat, and the smaller of bulk and tail effective size, of every scalar parameter.
 
@@ -258,13 +260,13 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     if not flat.data_vars:
         return dict.fromkeys(constant, 1.0), constant
     az = arviz()
-    # chains that each stand still at a place of their own have an infinite R-hat
+    # constant chains with different values have an infinite R-hat
     with np.errstate(divide="ignore", invalid="ignore"):
-        # the generations differ in the tail that they look at by default
+        # the tail's default quantiles differ between the generations
         hat, bulk, tail = (
             _dataset(measure)
             for measure in (
-                # of one chain there is none, which ArviZ says in a warning for each parameter
+                # undefined for one chain: ArviZ would warn for each parameter
                 az.rhat(flat) if flat.sizes["chain"] > 1 else flat.max() * np.nan,
                 az.ess(flat, method="bulk"),
                 az.ess(flat, method="tail", prob=(0.05, 0.95)),
@@ -275,7 +277,7 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     return r_hat | dict.fromkeys(constant, 1.0), ess | constant
 
 
-def smoothed(log_weights: Array) -> tuple[Array, float]:
+def smoothed(log_weights: Floats) -> tuple[Floats, float]:
     """Return Pareto-smoothed importance weights that sum to one, and the shape k of their tail.
 
     Parameters
@@ -292,12 +294,12 @@ def smoothed(log_weights: Array) -> tuple[Array, float]:
         are too few different ones to say.
     """
     result, k = log_weights, np.inf
-    # in the tail are values that differ, or ArviZ refuses; a tail that is endless overflows
+    # ArviZ refuses a tail of equal values; a very long tail overflows
     with contextlib.suppress(ValueError), np.errstate(over="ignore"):
         if DATATREE:
             from arviz_stats.base import array_stats
 
-            # it takes log-likelihoods, whose inverse is the weight in leave-one-out
+            # it takes log-likelihoods, the negative log-weights of leave-one-out
             result, k = array_stats.psislw(-log_weights, axis=-1)
         else:
             result, k = arviz().psislw(log_weights)
@@ -312,7 +314,7 @@ def _dataset(value: Any) -> xr.Dataset:
     return value if isinstance(value, xr.Dataset) else xr.Dataset(value.to_dataset())
 
 
-def interval(values: Array, prob: float = HDI_PROB) -> tuple[float, float]:
+def interval(values: Floats, prob: float = HDI_PROB) -> tuple[float, float]:
     """Return the highest-density interval of draws: the shortest that holds ``prob`` of them."""
     ordered = np.sort(np.asarray(values).ravel())
     count = max(1, int(np.floor(prob * len(ordered))))

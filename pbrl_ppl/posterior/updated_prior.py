@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.optimize import brentq, least_squares
 from scipy.special import i0e, i1e
 from scipy.stats import truncnorm
@@ -21,25 +20,24 @@ from pbrl_ppl.modes import ATTRIBUTE, index_law
 from pbrl_ppl.parameters import JOINT_INDICES, ParameterLibrary, Prior, fold_draws
 from pbrl_ppl.physics import index_priors
 from pbrl_ppl.posterior.record import layout_of, scene_of
-from pbrl_ppl.posterior.store import group, scalars
+from pbrl_ppl.posterior.store import group, labelled_draws, scalars
 from pbrl_ppl.scene import Joint, Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Limits of a truncated normal: it is exponential with mu this many sigmas outside its support, and
 #: uniform with sigma this many times the width of what it covers.
 _OUTSIDE, _LEVEL = 5.0, 5.0
-#: Limits of a von Mises concentration: as good as uniform, and 0.001 rad.
+#: Limits of a von Mises concentration: nearly uniform, and 0.001 rad.
 _KAPPA = (1e-3, 1e6)
-#: Variables of a posterior that are no parameters.
+#: Variables of a posterior that are not parameters.
 _OTHERS = ("library_index", "sigma")
 
 
 def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene:
     """Return the posterior's scene with the posterior as its prior.
 
-    A fit of new data can start from it. It keeps each parameter's own distribution, in Table
-    1's family, without the dependence between parameters. A joint of unknown bodies gets the
+    A fit of new data can start from it. It keeps each parameter's marginal distribution, in
+    Table 1's family, without the dependence between parameters. A joint of unknown bodies gets the
     posterior probabilities of its indices. Joints' anchors have no prior in a scene and sigma's is
     taken from the data: both start afresh.
 
@@ -69,11 +67,10 @@ def updated_scene(idata: Any, *, effects: Iterable[Effect] = catalogue) -> Scene
         model = pp.physics_model(scene, pp.History.load("tuesday.csv", scene))
     """
     scene, layout = scene_of(idata), layout_of(idata, effects)
-    posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
-    draws = fold_draws(layout, posterior)
+    draws = fold_draws(layout, labelled_draws(idata))
     found: defaultdict[str, dict[str, dict[str, float]]] = defaultdict(dict)
     for block in layout.blocks:
-        # a remainder is of one recording, and no physics that a scene could declare
+        # a learned remainder belongs to one recording and cannot be declared in a scene
         if block.of != "body" or LEARNED_REMAINDER in block.name:
             continue
         for owner, prior in zip(block.owners, block.priors, strict=True):
@@ -122,7 +119,7 @@ def _joints(idata: Any, scene: Scene) -> tuple[Joint, ...]:
     return tuple(joints)
 
 
-def moment_matched(prior: Prior, draws: Array) -> Prior:
+def moment_matched(prior: Prior, draws: Floats) -> Prior:
     """Return the member of a prior's family with the draws' mean and standard deviation.
 
     These are of the logarithm for ``log_normal``, mean direction and resultant length for
@@ -173,17 +170,17 @@ def _parent(mean: float, sd: float, lower: float, upper: float) -> tuple[float, 
     reach = min(upper - lower, mean - lower + sd, upper - mean + sd)
     reach = reach if np.isfinite(upper - lower) else 10 * reach
 
-    def hyper(point: Array) -> tuple[float, float]:
+    def hyper(point: Floats) -> tuple[float, float]:
         sigma = float(np.exp(point[1]))
         mu = np.clip(mean + sd * point[0], lower - _OUTSIDE * sigma, upper + _OUTSIDE * sigma)
         return float(mu), sigma
 
-    def error(point: Array) -> Array:
+    def error(point: Floats) -> Floats:
         mu, sigma = hyper(point)
         law = truncnorm((lower - mu) / sigma, (upper - mu) / sigma, mu, sigma)
         return np.array([(law.mean() - mean) / sd, np.log(law.std() / sd)])
 
-    # a posterior that no bound touches keeps its moments
+    # far from the bounds, the moments are those of the normal itself
     begin = np.array([0.0, np.log(min(sd, 0.9 * _LEVEL * reach))])
     far = _LEVEL * reach / sd * (_OUTSIDE + 1)
     limits = ([-far, np.log(0.5 * sd)], [far, np.log(_LEVEL * reach)])

@@ -1,10 +1,10 @@
 """Draws from the posterior: `fit` and its samplers, `update`, and whether the sampler is right."""
 
-from pbrl_ppl.sampling.calibration import calibrate
-from pbrl_ppl.sampling.declaration import physics_model
-from pbrl_ppl.sampling.fitting import fit
-from pbrl_ppl.sampling.pooling import Pooled, pool
-from pbrl_ppl.sampling.ranks import Calibration, bins
-from pbrl_ppl.sampling.updating import update
-
-__all__ = ["Calibration", "Pooled", "bins", "calibrate", "fit", "physics_model", "pool", "update"]
+from .calibration import calibrate as calibrate
+from .declaration import physics_model as physics_model
+from .fitting import fit as fit
+from .pooling import Pooled as Pooled
+from .pooling import pool as pool
+from .ranks import Calibration as Calibration
+from .ranks import bins as bins
+from .updating import update as update

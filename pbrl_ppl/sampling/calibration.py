@@ -1,6 +1,6 @@
 """Simulation-based calibration of the whole pipeline (Talts et al., 2018; Modrák et al., 2023).
 
-Parameters are drawn from the model's own prior, next states are simulated with them from the
+Parameters are drawn from the model's prior, next states are simulated with them from the
 history's start states (Eq. 13), and the whole fit is run on these. If prior, engine, likelihood and
 sampler belong together, the true values' ranks among the posterior draws are uniform.
 """
@@ -22,7 +22,7 @@ from rich.progress import track
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
-from pbrl_ppl.files import write_atomically
+from pbrl_ppl.files import write_text
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import (
     Problem,
@@ -36,7 +36,7 @@ from pbrl_ppl.sampling.ranks import Calibration
 from pbrl_ppl.sampling.replication import Record, draw_truths, labels, replicate
 from pbrl_ppl.scene import Scene
 
-#: What the replications in a folder depend on.
+#: File of all that the replications in a folder depend on.
 _DESIGN = "design.json"
 
 
@@ -138,7 +138,7 @@ def calibrate(
             "calibrate: which bodies a joint joins is unknown, and ranks are for parameters that"
             " are not whole numbers; name the bodies in the scene"
         )
-    # a prior that looked at the simulated data would not be the one they were simulated from
+    # fixed here: taken from simulated data, it would not be the prior that they were drawn from
     median, spread = design.noise_prior
     design = design.with_likelihood(prior=(tuple(median.tolist()), spread))
     settings = {"draws": draws, "tune": tune, "chains": chains, **options}
@@ -152,7 +152,8 @@ def calibrate(
         if store is not None and _file(store, i).is_file():
             done[i] = _read(_file(store, i))
         else:
-            tasks[i] = partial(replicate, design, truth, _seed(seed, i), settings)
+            fit_seed = int(np.random.SeedSequence([seed, i]).generate_state(1)[0])
+            tasks[i] = partial(replicate, design, truth, fit_seed, settings)
     with closing(_results(tasks, executor)) as results:
         shown = track(
             results,
@@ -168,7 +169,7 @@ def calibrate(
                 failures[i] = f"replication {i}: {type(error).__name__}: {error}"
                 continue
             if store is not None:
-                write_atomically(_file(store, i), partial(_write, text=json.dumps(record)))
+                write_text(_file(store, i), json.dumps(record) + "\n")
             done[i] = record
     failed = tuple(failures[i] for i in sorted(failures))
     if not done:
@@ -188,10 +189,6 @@ def calibrate(
         attrs={key: json.dumps(value) for key, value in about.items()} | {"redrawn": redrawn},
         **columns,
     )
-
-
-def _seed(seed: int, number: int) -> int:
-    return int(np.random.SeedSequence([seed, number]).generate_state(1)[0])
 
 
 def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[tuple[int, Any]]:
@@ -236,7 +233,7 @@ def _opened(folder: Path, about: Mapping[str, Any]) -> Path:
         if not path.exists():
             if any(folder.iterdir()):
                 raise OutputError(f"{folder}: holds other files; choose a new or an empty folder")
-            write_atomically(path, partial(_write, text=json.dumps(about, indent=1)))
+            write_text(path, json.dumps(about, indent=1) + "\n")
         found = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         if isinstance(error, OutputError):
@@ -261,7 +258,3 @@ def _read(path: Path) -> Record:
         return dict(json.loads(path.read_text(encoding="utf-8")))
     except (OSError, ValueError) as error:
         raise OutputError(f"{path}: cannot be read: {error}; delete it to run it again") from error
-
-
-def _write(path: Path, text: str) -> int:
-    return path.write_text(text + "\n", encoding="utf-8")

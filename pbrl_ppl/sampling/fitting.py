@@ -9,17 +9,19 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-from numpy.typing import NDArray
+import xarray as xr
 
 from pbrl_ppl.errors import FitError, MeetingWarning
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_mode, find_trajectory_mode, following, weigh
 from pbrl_ppl.posterior import (
     Point,
     PosteriorRecord,
     complete,
+    from_groups,
     group,
+    groups,
     linearised_as,
     parameter_draws,
     stored_mode,
@@ -27,11 +29,9 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, prior_starts, summed
 from pbrl_ppl.sampling.starts import dispersed, from_posterior
-from pbrl_ppl.sampling.traces import appended
+from pbrl_ppl.state import Floats
 
-Array = NDArray[np.float64]
-
-#: The sampler where none is asked for.
+#: The default sampler.
 DEFAULT = "metropolis"
 #: Draws of a trace at which contacts between parts are looked for, at most.
 _CHECKED_DRAWS = 50
@@ -133,29 +133,19 @@ def fit(
     )  # fmt: skip
     library = problem.library
     chosen = METHODS[method] if library is None else OVER_LIBRARY.get(method, METHODS[method])
-    # with one set there is nothing to walk over
+    # with one set there is no choice to sample
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
     draws = chosen.draws if draws is None else draws
     chains = chosen.chains if chains is None else chains
-    point: Point | None
-    if library is not None and not walks:
-        trace, point = summed(model, draws, chains, seed)
-        if joined := _joined_of_draws(problem, trace):
-            return again(joined)
-        return complete(problem, trace, seed=seed, method="exact sum over the library", mode=point)
     if method == "map":
         draws = chains = 1
 
-    def sampled(
-        model: pm.Model, mode: Mode | None, starts: list[dict[str, Any]] | None = None
-    ) -> Any:
-        if starts is None and mode is not None:
+    def sampled(model: pm.Model, mode: Any, starts: list[dict[str, Any]] | None = None) -> Any:
+        if starts is None:
             starts = dispersed(mode, np.random.default_rng(seed), chains)
-        elif starts is None:
-            starts = prior_starts(problem, np.random.default_rng(seed), chains)
         job = Job(
             model=model,
-            about=mode,
+            mode=mode,
             seed=seed,
             draws=draws,
             tune=chosen.tune if tune is None else tune,
@@ -166,7 +156,7 @@ def fit(
             starts=starts,
         )
         with model, warnings.catch_warnings():
-            # convergence is checked and reported in this package's own words
+            # of PyMC's processes
             warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
             # draws from the prior, of which SMC needs some, are not compiled on the newer stack
             warnings.filterwarnings("ignore", message="Numba will use object mode")
@@ -175,8 +165,12 @@ def fit(
     model = _as_in(model, resume)
     problem = model.problem
     if walks:
-        trace = sampled(model, None)
+        starts = prior_starts(problem, np.random.default_rng(seed), chains)
+        trace = sampled(model, None, starts)
         point = most_frequent(problem, trace)
+    elif library is not None:
+        trace, point = summed(model, draws, chains, seed)
+        method = "exact sum over the library"
     elif problem.layout.discrete.any():
         found = weigh(problem, seed=seed, progress=progress)
         point = most_probable(problem, found)
@@ -186,17 +180,12 @@ def fit(
         point = stored_mode(problem, resume)
     else:
         held: Mode | None = getattr(model, "mode", None)  # of physics_model
-        search = (
-            find_mode
-            if isinstance(problem.likelihood, TransitionLikelihood)
-            else find_trajectory_mode
-        )
+        whole = isinstance(problem.likelihood, TrajectoryLikelihood)
+        search = find_trajectory_mode if whole else find_mode
         mode = start or held or search(problem, seed=seed)
-        if (
-            isinstance(mode.problem.likelihood, TrajectoryLikelihood) and mode is not held
-        ):  # linearised at it by now
+        if isinstance(mode.problem.likelihood, TrajectoryLikelihood) and mode is not held:
             mode = mode if start is None else following(start)
-            problem = mode.problem
+            problem = mode.problem  # linearised at the mode
             model = build_model(problem)
         if joined := _joined_model(problem, mode.phi[None], mode.sigma[None]):
             return again(joined)
@@ -211,7 +200,7 @@ def fit(
     if resume is not None:
         if sizes["chain"] < all_chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
-        trace = appended(resume, trace)
+        trace = _appended(resume, trace)
     asked = (draws, all_chains) if cut else None
     return complete(problem, trace, seed=seed, method=method, asked=asked, mode=point)
 
@@ -252,7 +241,7 @@ def _checked_problem(model: pm.Model, method: str, start: Any, resume: Any) -> P
     return problem
 
 
-def _joined_model(problem: Problem, phi: Array, sigma: Array) -> pm.Model | None:
+def _joined_model(problem: Problem, phi: Floats, sigma: Floats) -> pm.Model | None:
     """Return a model whose bodies that meet at draws (n, p) and (n, state) are in one part.
 
     The likelihood simulates bodies apart that were apart in the data. None if they do not meet
@@ -293,3 +282,14 @@ def _as_in(model: pm.Model, idata: Any) -> pm.Model:
         problem = problem.with_physics(together=known)
     problem = linearised_as(problem, idata)
     return model if problem is model.problem else build_model(problem)
+
+
+def _appended(earlier: Any, trace: Any) -> Any:
+    """Return the draws of two runs, the earlier ones first."""
+    data = groups(trace)
+    for name in ("posterior", "sample_stats"):
+        old, new = group(earlier, name), data[name]
+        shared = [str(variable) for variable in new.data_vars if variable in old]
+        both = xr.concat([old[shared], new[shared]], dim="draw")
+        data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
+    return from_groups(data, {})

@@ -9,15 +9,15 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
+import xarray as xr
 
-from pbrl_ppl.errors import FitError
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.posterior import CELLS, from_groups, groups
+from pbrl_ppl.sampling.emulator import Surrogate, Unpack, emulate
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps, Schedule
 from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
-from pbrl_ppl.sampling.surrogate import Surrogate, Unpack, emulate
-from pbrl_ppl.sampling.traces import as_trace, thinned
+from pbrl_ppl.state import Floats
 
-#: Engine steps that cost no more than the rest of a sampler's step.
+#: Engine steps below which a surrogate does not pay.
 _LITTLE = 2000
 
 
@@ -44,10 +44,10 @@ class Method:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Arguments of a sampler's run; ``about`` is None over the sets of a library."""
+    """Arguments of a sampler's run; ``mode`` is a Mode, or None over the sets of a library."""
 
     model: pm.Model
-    about: Mode | None
+    mode: Any
     seed: int
     draws: int
     tune: int
@@ -56,20 +56,6 @@ class Job:
     cores: int
     progress: bool
     starts: list[dict[str, Any]]
-
-    @property
-    def mode(self) -> Mode:
-        """Mode that the chains start about.
-
-        Raises
-        ------
-        FitError
-            If there is none.
-        """
-        if self.about is None:
-            raise FitError("fit: a model with a library has no mode to sample about; leave out"
-                           " method=, or use 'paper'")  # fmt: skip
-        return self.about
 
     def sample(self, step: Any, steps_a_draw: int = 1) -> Any:
         """Run ``pm.sample`` from the starts, without its checks of convergence."""
@@ -91,7 +77,12 @@ class Job:
             if "Not enough samples" in str(error):  # PyMC's answer to an early interrupt
                 raise KeyboardInterrupt from error
             raise
-        return thinned(trace, steps_a_draw)
+        if steps_a_draw == 1:
+            return trace
+        data = groups(trace)
+        for name in ("posterior", "sample_stats"):
+            data[name] = data[name].isel(draw=slice(steps_a_draw - 1, None, steps_a_draw))
+        return from_groups(data, {})
 
 
 def _metropolis(job: Job) -> Any:
@@ -103,7 +94,7 @@ def _metropolis(job: Job) -> Any:
         jumps = Jumps((deepcopy(blocks[0]), *others))  # the block itself adapts
     else:
         jumps = None
-    # an exact step of one block, in engine steps; where that is little, looking ahead is no use
+    # engine steps of one exact step of a block
     engine = problem.simulator
     cost = engine.steps * problem.segments.n * problem.data.horizon / len(engine.parts)
     rough, schedule = None, Schedule(thin=job.thin)
@@ -179,6 +170,52 @@ def _laplace(job: Job) -> Any:
     sigma = np.exp(centre + noise)
     values = mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
     return as_trace(job.model, values, {"accept": np.ones(shape)})
+
+
+def as_trace(model: pm.Model, draws: Mapping[str, Any], stats: Mapping[str, Any]) -> Any:
+    """Return a trace in PyMC's form, of draws made without PyMC.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        As made by ``physics_model``; has the dimensions of each variable.
+    draws : mapping of str to ndarray
+        By the variables' names, shape (chain, draw, ...).
+    stats : mapping of str to ndarray
+        The sampler's statistics of each draw, shape (chain, draw).
+    """
+    problem, posterior = model.problem, posterior_dataset(model, draws)
+    per_draw = {name: (("chain", "draw"), value) for name, value in stats.items()}
+    given = {
+        "start": (("transition", "body", "full_state"), problem.segments.start),
+        "actions": (("transition", "step", "body", "wrench"), problem.inputs),
+    }
+    observed = {"next_state": (CELLS, problem.observations.values)}
+    return from_groups(
+        {
+            "posterior": posterior,
+            "sample_stats": xr.Dataset(per_draw, {d: posterior[d] for d in ("chain", "draw")}),
+            "observed_data": labelled(model, observed),
+            "constant_data": labelled(model, given),
+        },
+        {},
+    )
+
+
+def posterior_dataset(model: pm.Model, values: Mapping[str, Floats]) -> xr.Dataset:
+    """Return draws, shape (chain, draw, ...), with the model's dimensions and coordinates."""
+    data = {
+        name: (("chain", "draw", *(model.named_vars_to_dims.get(name) or ())), value)
+        for name, value in values.items()
+    }
+    chains, draws = next(iter(values.values())).shape[:2]
+    return labelled(model, data).assign_coords(chain=np.arange(chains), draw=np.arange(draws))
+
+
+def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
+    """Return variables (dims, values) with the model's coordinates of their dimensions."""
+    used = {dim for dims, _ in variables.values() for dim in dims if dim in model.coords}
+    return xr.Dataset(variables, {dim: list(model.coords[dim]) for dim in used})
 
 
 #: The samplers by name. The paper's schedule is that of Table 2 for the cart: 30 chains of 20,000

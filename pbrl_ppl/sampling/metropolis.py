@@ -8,7 +8,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pymc as pm
-from numpy.typing import NDArray
 from pymc.blocking import RaveledVars
 from pymc.pytensorf import compile as compile_function
 from pymc.pytensorf import join_nonshared_inputs
@@ -18,13 +17,13 @@ from pymc.step_methods.state import dataclass_state
 from pymc.util import get_value_vars_from_user_vars
 from scipy.linalg.lapack import dtrtrs
 
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats, Ints
 
 #: Best acceptance rate of a random walk in many dimensions (Roberts, Gelman and Gilks, 1997).
 TARGET_ACCEPTANCE = 0.234
 #: Best step of a random walk in one dimension, in standard deviations.
 _ALONE = 2.4
-#: The first guess of a covariance counts as much as this many steps.
+#: Weight of the first guess of a covariance, in steps.
 _GUESS = 300
 _LARGEST_BETA = float(np.log(0.95))
 
@@ -50,11 +49,11 @@ class Gaussian:
         look ahead. 0 for other blocks.
     """
 
-    places: NDArray[np.intp]
-    mean: Array
-    covariance: Array
+    places: Ints
+    mean: Floats
+    covariance: Floats
     cheap: int = 0
-    factor: Array = field(init=False)
+    factor: Floats = field(init=False)
     log_scale: float = field(init=False)
     log_beta: float = float(np.log(0.6))
     seen: int = 0
@@ -64,16 +63,16 @@ class Gaussian:
         self.factor = np.asarray(np.linalg.cholesky(self.covariance), dtype=float)
         self.log_scale = float(np.log(2.38 / np.sqrt(max(len(self.places), 1))))
 
-    def depth(self, x: Array) -> Any:
+    def depth(self, x: Floats) -> Any:
         """Return minus the log-density at points (..., d), up to a constant."""
         return 0.5 * (self.standardised(x) ** 2).sum(axis=0)
 
-    def standardised(self, x: Array) -> Array:
+    def standardised(self, x: Floats) -> Floats:
         """Return points (..., d) in units of this Gaussian, shape (d, ...)."""
         # called for each step: scipy's `solve_triangular` takes ten times as long to check
         return np.asarray(dtrtrs(self.factor, (x - self.mean).T, lower=True)[0])
 
-    def propose(self, x: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, Any]:
+    def propose(self, x: Floats, walk: bool, rng: np.random.Generator) -> tuple[Floats, Any]:
         """Return a proposal from each point (..., d), and the logarithm of the Hastings ratio."""
         noise = rng.standard_normal(x.shape) @ self.factor.T
         if walk:
@@ -84,13 +83,13 @@ class Gaussian:
 
     def move(
         self,
-        q: Array,
+        q: Floats,
         here: float,
-        density: Callable[[Array], Any],
+        density: Callable[[Floats], Any],
         rng: np.random.Generator,
         tune: bool,
         shift: Any = None,
-    ) -> tuple[Array, float, float]:
+    ) -> tuple[Floats, float, float]:
         """Make a Metropolis step of the block in the vector q, whose log-density is ``here``.
 
         With several modes, ``shift`` is from this block's mode to that of the point, shape (d,):
@@ -109,7 +108,7 @@ class Gaussian:
         walk = shift is not None or bool(rng.uniform() < 0.5)
         moved = q.copy()
         correction: Any = 0.0
-        if alone:  # where one entry may vanish and others not, no common step suits all
+        if alone:  # an entry near zero needs another step than the others
             i = int(rng.integers(len(self.places)))
             step = _ALONE * np.sqrt(self.covariance[i, i])
             moved[self.places[i]] += step * rng.standard_normal()
@@ -131,7 +130,7 @@ class Gaussian:
         else:
             self.log_beta = min(self.log_beta + change, _LARGEST_BETA)
 
-    def learn(self, x: Array, rate: float, walk: bool | None) -> None:
+    def learn(self, x: Floats, rate: float, walk: bool | None) -> None:
         """Adapt mean and covariance to the chain's place, and a kind of move to its acceptance."""
         self.seen += 1
         gain = 1.0 / (self.seen + _GUESS)
@@ -161,14 +160,14 @@ class Jumps:
 
     modes: tuple[Gaussian, ...]
 
-    def shift(self, q: Array) -> Array:
+    def shift(self, q: Floats) -> Floats:
         """Return the shift from the first mode to that of the vector q, shape (d,)."""
         depths = [float(h.depth(q[h.places]) + np.log(np.diag(h.factor)).sum()) for h in self.modes]
         return np.asarray(self.modes[int(np.argmin(depths))].mean - self.modes[0].mean)
 
     def move(
-        self, q: Array, here: float, density: Callable[[Array], Any], rng: np.random.Generator
-    ) -> tuple[Array, float]:
+        self, q: Floats, here: float, density: Callable[[Floats], Any], rng: np.random.Generator
+    ) -> tuple[Floats, float]:
         """Jump from the vector q, whose log-density is ``here``; return both after the jump."""
         first, second = (self.modes[i] for i in rng.choice(len(self.modes), 2, replace=False))
         moved = q.copy()
@@ -251,11 +250,11 @@ class AdaptiveMetropolis(ArrayStepShared):
         vars: Any,
         *,
         blocks: list[Gaussian],
-        rough: Callable[[Array], float] | None = None,
+        rough: Callable[[Floats], float] | None = None,
         schedule: Schedule = Schedule(),
         jumps: Jumps | None = None,
         extra: Any = 0.0,
-        initial_point: dict[str, Array] | None = None,
+        initial_point: dict[str, Floats] | None = None,
         rng: Any = None,
     ) -> None:
         model = pm.modelcontext(None)
@@ -273,7 +272,7 @@ class AdaptiveMetropolis(ArrayStepShared):
     def astep(self, q0: RaveledVars) -> tuple[RaveledVars, list[dict[str, Any]]]:
         """Go ``thin`` times over the blocks."""
         q = q0.data.copy()
-        # the exact posterior is for the draws that are kept: tuning makes do with the rough one
+        # tuning draws are discarded, so the rough posterior is enough for them
         near = self.logp if self.rough is None or not self.tune else self.rough
         here = float(near(q))
         rates, exact = [], []
@@ -310,11 +309,11 @@ class AdaptiveMetropolis(ArrayStepShared):
 
 def explore(
     blocks: list[Gaussian],
-    density: Callable[[Array], float],
-    q: Array,
+    density: Callable[[Floats], float],
+    q: Floats,
     rounds: int,
     rng: np.random.Generator,
-) -> Array:
+) -> Floats:
     """Return the states of a chain of rounds over the blocks, which adapt.
 
     Parameters

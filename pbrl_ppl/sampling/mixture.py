@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pymc as pm
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
@@ -25,13 +24,10 @@ from pbrl_ppl.modes import (
 )
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES, ParameterLibrary
 from pbrl_ppl.posterior import Point, from_groups, group, groups
-from pbrl_ppl.sampling.traces import as_trace, posterior_dataset
+from pbrl_ppl.sampling.methods import as_trace, posterior_dataset
+from pbrl_ppl.state import Bools, Floats, Ints
 
-Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
-Ints = NDArray[np.intp]
-
-#: Configurations less probable than this share of the best get no draws: they would be a handful.
+#: Configurations less probable than this share of the best get no draws.
 NEGLIGIBLE = 1e-3
 
 
@@ -115,14 +111,13 @@ def most_probable(problem: Problem, found: Sequence[Weighed]) -> Point:
     values = dict(zip(best.mode.problem.layout.labels, best.mode.phi.tolist(), strict=True))
     phi = np.array([values.get(label, np.nan) for label in layout.labels])[None]
     for joint, pair in best.configuration.pairs:
-        a, b = (layout.priors[layout.index(name, joint)].probabilities for name in JOINT_INDICES)
-        law = index_law(pair, problem.scene, a, b)
+        law = _index_law(problem, joint, pair)
         _put_indices(problem, phi, np.array([True]), joint, np.array([law.argmax()]))
     _fill_anchors(problem, phi, None)
     return Point(phi[0], best.mode.sigma)
 
 
-def allocate(probability: Array, n: int) -> Labels:
+def allocate(probability: Floats, n: int) -> Ints:
     """Share ``n`` draws out by probability, to within one draw each (largest remainders).
 
     Examples
@@ -142,9 +137,9 @@ def _values(
     problem: Problem,
     found: Sequence[Weighed],
     traces: Mapping[int, Any],
-    label: Labels,
+    label: Ints,
     rng: np.random.Generator,
-) -> dict[str, Array]:
+) -> dict[str, Floats]:
     """Return the whole model's variables, shape (chain, draw, ...), from the traces."""
     layout = problem.layout
     phi = np.full((*label.shape, layout.size), np.nan)
@@ -158,43 +153,35 @@ def _values(
             for j, owner in enumerate(block.owners):
                 phi[here, layout.index(block.name, owner)] = values[here, j]
         for joint, pair in found[i].configuration.pairs:
-            _set_indices(problem, phi, here, joint, pair, rng)
+            law = _index_law(problem, joint, pair)
+            drawn_pairs = rng.choice(law.size, size=int(here.sum()), p=law.ravel())
+            _put_indices(problem, phi, here, joint, drawn_pairs)
     _fill_anchors(problem, phi, rng)
     named = layout.to_dict(phi)
     indices = {name: named[name].astype(int) for name in JOINT_INDICES}
     return named | indices | {"sigma": sigma}
 
 
-def _set_indices(
-    problem: Problem,
-    phi: Array,
-    here: NDArray[np.bool_],
-    joint: str,
-    pair: Pair,
-    rng: np.random.Generator,
-) -> None:
-    """Draw i_a and i_b of what a joint joins, and swap its anchors to match, in place."""
+def _index_law(problem: Problem, joint: str, pair: Pair) -> Floats:
+    """Return the probabilities of (i_a, i_b) of what a joint joins, shape (name, name)."""
     places = (problem.layout.index(name, joint) for name in JOINT_INDICES)
-    law = index_law(pair, problem.scene,
-                    *(problem.layout.priors[place].probabilities for place in places))  # fmt: skip
-    drawn = rng.choice(law.size, size=int(here.sum()), p=law.ravel())
-    _put_indices(problem, phi, here, joint, drawn)
+    a, b = (problem.layout.priors[place].probabilities for place in places)
+    return index_law(pair, problem.scene, a, b)
 
 
-def _put_indices(
-    problem: Problem, phi: Array, here: NDArray[np.bool_], joint: str, chosen: Labels
-) -> None:
+def _put_indices(problem: Problem, phi: Floats, here: Bools, joint: str, chosen: Ints) -> None:
     """Put indices of the flat table of (i_a, i_b) into phi, and swap the anchors, in place."""
-    layout, own = problem.layout, phi[here]
+    layout, some = problem.layout, phi[here]
     a, b = (layout.index(name, joint) for name in JOINT_INDICES)
-    own[:, a], own[:, b] = np.divmod(chosen, len(problem.scene.joinable))
-    turned = own[:, a] > own[:, b]
+    some[:, a], some[:, b] = np.divmod(chosen, len(problem.scene.joinable))
+    turned = some[:, a] > some[:, b]
     anchors = np.array([layout.index(name, joint) for name in JOINT_ANCHORS])
-    own[:, anchors] = np.where(turned[:, None], own[:, np.roll(anchors, 2)], own[:, anchors])
-    phi[here] = own
+    swapped = some[:, np.roll(anchors, 2)]
+    some[:, anchors] = np.where(turned[:, None], swapped, some[:, anchors])
+    phi[here] = some
 
 
-def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator | None) -> None:
+def _fill_anchors(problem: Problem, phi: Floats, rng: np.random.Generator | None) -> None:
     """Draw the anchors of joints that join nothing from their prior, given the index, in place.
 
     At the prior's centre without a generator.
@@ -213,7 +200,7 @@ def _fill_anchors(problem: Problem, phi: Array, rng: np.random.Generator | None)
                 column[here] = prior.centre if rng is None else prior.sample(rng, n)
 
 
-def _stats(traces: Mapping[int, Any], label: Labels) -> xr.Dataset:
+def _stats(traces: Mapping[int, Any], label: Ints) -> xr.Dataset:
     """Return the samplers' statistics of the draws; those that differ in shape are left out."""
     records = {
         i: group(t, "sample_stats").isel(draw=slice(label.shape[1])) for i, t in traces.items()
@@ -252,9 +239,9 @@ def summed(model: pm.Model, draws: int, chains: int, seed: int) -> tuple[Any, Po
 
 def prior_starts(problem: Problem, rng: np.random.Generator, chains: int) -> list[dict[str, Any]]:
     """Draw starts of chains: each owner's set from the prior, sigma at its prior's median."""
-    library, median = _library(problem), problem.noise_prior[0]
+    median = problem.noise_prior[0]
     sigma = np.exp(np.log(median).mean()) if problem.scalar_sigma else median
-    laws = [library.prior(owner) for owner in problem.scene.owners]
+    laws = [_library(problem).prior(owner) for owner in problem.scene.owners]
     return [
         {"library_index": np.array([rng.choice(len(p), p=p) for p in laws]), "sigma": sigma}
         for _ in range(chains)

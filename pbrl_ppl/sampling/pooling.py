@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import ndtr
 from scipy.stats import chi2, norm
@@ -22,21 +21,21 @@ from scipy.stats import chi2, norm
 from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.parameters import Layout, Prior, beside, fold_draws, prior_draws, wheels
-from pbrl_ppl.posterior import HDI_PROB, layout_of, moment_matched, scalars, scene_of
+from pbrl_ppl.posterior import HDI_PROB, labelled_draws, layout_of, moment_matched, scene_of
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import wrapped
+from pbrl_ppl.state import Bools, Floats, wrapped
 
-Array = NDArray[np.float64]
-
-#: A robot informs where its data say at least this share of what the prior says (of precision);
-#: less is within the error of a posterior's width.
+#: Least precision of a robot's data, as a share of the prior's, that informs the population; less
+#: is within the error of a posterior's width.
 _INFORMS = 0.2
 #: Quantiles: the middle, and the ends of the usual interval.
 _MIDDLE, _ENDS = 0.5, ((1 - HDI_PROB) / 2, (1 + HDI_PROB) / 2)
-#: An angle of which nothing is known has this width; a von Mises this concentration at most.
+#: Standard deviation of a uniform angle, and the largest concentration of a von Mises.
 _ANY_ANGLE, _SHARPEST = np.pi / np.sqrt(3), 1e6
-#: For the moments of a wheel's prior once it is described in one way.
+#: Draws for the moments of a wheel's prior, folded to one of its equal descriptions.
 _PRIOR_DRAWS = 4000
+#: The scales on which priors are normal, by their family.
+_SCALES = {"log_normal": "logarithm", "von_mises": "angle"}
 #: The grid of the spread, in units of its prior's scale.
 _LEAST, _MOST, _POINTS = 1e-6, 6.0, 800
 #: A point of the grid that is less probable changes no quantile.
@@ -65,14 +64,14 @@ class Population:
         Whose data say something of it, shape (robot,).
     """
 
-    weights: Array
-    spread: Array
-    centre: Array
-    centre_sd: Array
-    value: Array
-    value_sd: Array
+    weights: Floats
+    spread: Floats
+    centre: Floats
+    centre_sd: Floats
+    value: Floats
+    value_sd: Floats
     p_same: float
-    informed: NDArray[np.bool_]
+    informed: Bools
 
     def mean(self, q: float) -> float:
         """Return a quantile of the kind's mean."""
@@ -92,7 +91,7 @@ class Population:
 
 
 def population(
-    estimate: Array, sd: Array, *, centre: float, width: float, spread: float
+    estimate: Floats, sd: Floats, *, centre: float, width: float, spread: float
 ) -> Population:
     """Pool normal likelihoods partially, integrated over mean and spread.
 
@@ -123,7 +122,7 @@ def population(
     log_weight -= 0.5 * ((middle - centre) / width) ** 2 + 0.5 * (tau / spread) ** 2
     log_weight += np.log(tau)  # the grid is even in the logarithm
     weights = np.exp(log_weight - log_weight.max())
-    # of each robot given the spread: its own estimate and the mean of the kind, whose error it has
+    # each robot's mean given the spread lies between its estimate and the population's mean
     share = tau**2 * precision
     value = share * own + (1 - share) * middle
     variance = (1 - share) * tau**2 + (1 - share) ** 2 / total
@@ -138,7 +137,7 @@ def population(
     return Population(weights, tau, middle, total**-0.5, value, deviation, p_same, informed)
 
 
-def _quantile(weights: Array, mean: Array, sd: Array, q: float) -> float:
+def _quantile(weights: Floats, mean: Floats, sd: Floats, q: float) -> float:
     """Return a quantile of a mixture of normals."""
     some = weights > _NOTHING
     weights, mean, sd = weights[some] / weights[some].sum(), mean[some], sd[some]
@@ -173,7 +172,7 @@ class Pooled:
     populations: Mapping[str, Population]
     left_out: tuple[str, ...]
     _families: Mapping[str, tuple[str, float]]
-    _single: Mapping[str, Array]
+    _single: Mapping[str, Floats]
 
     def table(self) -> pd.DataFrame:
         """Return one row a parameter, in its unit; the spread is on ``scale`` (logarithms: shares).
@@ -288,19 +287,19 @@ def pool(
                 f" {', '.join(_table1(layouts[0]))}; expected the same scene"
             )
     drawn = _drawn(names, list(posteriors.values()), layouts)
-    shared = [label for label in drawn[0] if all(label in own for own in drawn)]
-    every = dict.fromkeys(label for own in drawn for label in own)
+    shared = [label for label in drawn[0] if all(label in each for each in drawn)]
+    every = dict.fromkeys(label for each in drawn for label in each)
     populations, families, single, priors = {}, {}, {}, {}
     by_layout = {layout: _priors(layout) for layout in layouts}  # most are the same
     every_prior = [by_layout[layout] for layout in layouts]
     for label in shared:
-        own = [each[label] for each in every_prior]
+        prior_of = [each[label] for each in every_prior]
         draws = [each[label] for each in drawn]
         family = layouts[0].priors[layouts[0].labels.index(label)]
-        found, reference = _pooled(own, draws, spread, family.uniform)
+        found, reference = _pooled(prior_of, draws, spread, family.uniform)
         populations[label] = found
-        families[label] = (_scale(own[0]), reference)
-        single[label] = np.array([_moments(prior, x) for prior, x in zip(own, draws, strict=True)])
+        families[label] = (_SCALES.get(prior_of[0].family, "itself"), reference)
+        single[label] = np.array(list(map(_moments, prior_of, draws)))
         if found.informed.any():
             priors[label] = _next_prior(family, found, reference)
     left_out = tuple(label for label in every if label not in shared)
@@ -315,12 +314,12 @@ def _table1(layout: Layout) -> list[str]:
 
 def _drawn(
     names: tuple[str, ...], posteriors: list[Any], layouts: list[Layout]
-) -> list[dict[str, Array]]:
+) -> list[dict[str, Floats]]:
     """Return each robot's draws of its bodies' parameters; equal wheels are described alike."""
-    result: list[dict[str, Array]] = []
-    first: Array | None = None
+    result: list[dict[str, Floats]] = []
+    first: Floats | None = None
     for name, idata, layout in zip(names, posteriors, layouts, strict=True):
-        posterior = {str(k): v.to_numpy().ravel() for k, v in scalars(idata).items()}
+        posterior = labelled_draws(idata)
         if lacking := [label for label in layout.labels if label not in posterior]:
             raise PosteriorError(f"pool: {name} has no {lacking[0]}, which its scene asks for")
         folded = fold_draws(layout, posterior)
@@ -347,11 +346,7 @@ def _priors(layout: Layout) -> dict[str, Prior]:
     return priors
 
 
-def _scale(prior: Prior) -> str:
-    return {"log_normal": "logarithm", "von_mises": "angle"}.get(prior.family, "itself")
-
-
-def _moments(prior: Prior, draws: Array) -> tuple[float, float]:
+def _moments(prior: Prior, draws: Floats) -> tuple[float, float]:
     """Return mean and standard deviation of draws, of an angle about its mean direction."""
     if prior.family != "von_mises":
         return float(draws.mean()), float(draws.std())
@@ -360,7 +355,7 @@ def _moments(prior: Prior, draws: Array) -> tuple[float, float]:
 
 
 def _pooled(
-    priors: list[Prior], draws: list[Array], spread: float, free: bool
+    priors: list[Prior], draws: list[Floats], spread: float, free: bool
 ) -> tuple[Population, float]:
     """Return the population of a parameter, and the angle that its scale is about."""
     matched = [moment_matched(prior, x) for prior, x in zip(priors, draws, strict=True)]
@@ -368,7 +363,7 @@ def _pooled(
         return _pooled_angles(priors, matched, spread, free)
     before = np.array([prior.sigma**-2.0 for prior in priors])
     after = np.array([each.sigma**-2.0 for each in matched])
-    # a product of normals has the sum of the precisions: what the data said is the difference
+    # precisions of a product of normals add up: the data's is the difference
     precision = after - before
     informed = precision > _INFORMS * before
     weighted = np.array([each.mu for each in matched]) * after

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.stats import binom, chisquare
 
 from pbrl_ppl.files import write_atomically
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Draws among which a true value is ranked, so that there are 100 ranks.
 MOST_DRAWS = 99
@@ -24,7 +22,7 @@ FALSE_ALARM = 0.01
 _BINS, _LEAST_A_BIN = (20, 10, 5, 4, 2), 5
 
 
-def rank(draws: Array, truth: float, effective: float) -> tuple[int, int]:
+def rank(draws: Floats, truth: float, effective: float) -> tuple[int, int]:
     """Return the rank of a true value among draws, thinned to about independent ones.
 
     Parameters
@@ -49,12 +47,12 @@ def rank(draws: Array, truth: float, effective: float) -> tuple[int, int]:
     (2, 9)
     """
     size = int(np.clip(effective, 1, min(MOST_DRAWS, len(draws))))
-    # the middles of equal parts: no draw is next to another chain's first
+    # the middles of equal parts
     kept = draws[((np.arange(size) + 0.5) * len(draws) / size).astype(int)]
     return int((kept < truth).sum()), size
 
 
-def uniformity(position: Array) -> float:
+def uniformity(position: Floats) -> float:
     """Return the chi-squared p-value that positions are uniform on (0, 1).
 
     Parameters
@@ -76,7 +74,7 @@ def bins(n: int) -> int:
     return next((b for b in _BINS if n >= _LEAST_A_BIN * b), _BINS[-1])
 
 
-def holm(p_values: Array) -> Array:
+def holm(p_values: Floats) -> Floats:
     """Return p-values corrected for their number by Holm's step-down method, shape (m,).
 
     Examples
@@ -119,14 +117,14 @@ class Calibration:
     @classmethod
     def of(
         cls,
-        rank: Array,
-        size: Array,
+        rank: Floats,
+        size: Floats,
         parameters: list[str],
         *,
-        replication: Array | None = None,
+        replication: Floats | None = None,
         failures: tuple[str, ...] = (),
         attrs: dict[str, object] | None = None,
-        **others: Array,
+        **others: Floats,
     ) -> Calibration:
         """Return a calibration of ranks and numbers of draws, shape (replication, parameter) each.
 
@@ -135,7 +133,7 @@ class Calibration:
         rank, size : ndarray
             As from :func:`rank`.
         parameters : list of str
-            Labels.
+            Ints.
         replication : ndarray, optional
             Their numbers.
         failures : tuple of str

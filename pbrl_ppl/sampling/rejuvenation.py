@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, log_noise_prior
 from pbrl_ppl.parameters import evened, gathered, inside
 from pbrl_ppl.sampling.metropolis import TARGET_ACCEPTANCE, Gaussian
 from pbrl_ppl.sampling.starts import constrain, unconstrain
+from pbrl_ppl.state import Bools, Floats, Ints
 
-Array = NDArray[np.float64]
-Bools = NDArray[np.bool_]
-
-#: Steps under the coarse posterior for each one that is judged exactly, and of the noise.
+#: Steps under the coarse posterior for each exact decision, and of the noise.
 _INNER, _NOISE_STEPS = 15, 10
-#: Steps a round where it does not.
+#: Steps a round without the coarse posterior.
 _PLAIN_STEPS = 5
-#: Standard deviation of the coarse log-likelihood's error up to which it is looked ahead with.
+#: Largest standard deviation of the coarse log-likelihood's error at which it is used.
 _CLOSE = 1.0
 #: Rounds end when no parameter correlates more than this with its start, or after so many: then
 #: copies of one particle are nearly independent.
@@ -30,11 +25,10 @@ _NUMBERS = 4_000_000
 
 def rejuvenate(
     problem: Problem,
-    phi: Array,
-    sigma: Array,
+    phi: Floats,
+    sigma: Floats,
     rng: np.random.Generator,
-    progress: Callable[[str], None] = lambda stage: None,
-) -> tuple[Array, Array, float]:
+) -> tuple[Floats, Floats, float]:
     """Rejuvenate particles of a posterior by Metropolis steps, until they have decorrelated.
 
     Independent parts of the scene are moved and accepted separately, given the noise; then the
@@ -52,8 +46,6 @@ def rejuvenate(
         Equally weighted draws, shapes (particle, p) and (particle, state).
     rng : Generator
         Of the moves.
-    progress : callable
-        Called with a text after every round.
 
     Returns
     -------
@@ -65,17 +57,14 @@ def rejuvenate(
     wide = problem.with_physics(threads=max(problem.physics.threads, 2))
     mover = _Mover(wide, phi, sigma)
     begin, rates = mover.u.copy(), []
-    for turn in range(_ROUNDS):
+    for _ in range(_ROUNDS):
         rates.append(np.mean([mover.move(group, rng) for group in mover.groups()]))
-        left = _correlation(begin, mover.u)
-        progress(f"moving {len(phi)} draws: round {turn + 1}, correlation {left:.2f}")
-        if left < _FORGOTTEN:
+        if _correlation(begin, mover.u) < _FORGOTTEN:
             break
-    every = np.ones(len(problem.noise_prior[0]))
-    return mover.phi(mover.u), np.exp(mover.noise) * every, float(np.mean(rates))
+    return mover.phi(mover.u), mover.sigma(mover.noise), float(np.mean(rates))
 
 
-def _correlation(before: Array, after: Array) -> float:
+def _correlation(before: Floats, after: Floats) -> float:
     """Return the largest correlation over the columns between the particles before and after."""
     a, b = before - before.mean(axis=0), after - after.mean(axis=0)
     size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
@@ -85,7 +74,7 @@ def _correlation(before: Array, after: Array) -> float:
 class _Mover:
     """Particles in the unconstrained space, with their proposals and densities."""
 
-    def __init__(self, problem: Problem, phi: Array, sigma: Array) -> None:
+    def __init__(self, problem: Problem, phi: Floats, sigma: Floats) -> None:
         self.problem, self.priors = problem, problem.layout.priors
         phi = inside(self.priors, gathered(problem.layout, phi))
         pairs = [unconstrain(prior, x) for prior, x in zip(self.priors, phi.T, strict=True)]
@@ -100,7 +89,7 @@ class _Mover:
         ]
         columns = np.arange(self.noise.shape[1])
         self.of_noise = Gaussian(columns, self.noise.mean(axis=0), _spread(self.noise, columns))
-        # the coarse engine's error is taken off where most of the posterior is
+        # the coarse engine is corrected by its error at the particles' mean
         centre = self.phi(self.u.mean(axis=0))
         self.coarse = problem.coarse.simulator
         self.correction = problem.predict(centre) - problem.predict(centre, self.coarse)
@@ -111,12 +100,16 @@ class _Mover:
         size = max(1, _NUMBERS // max(self.problem.observations.values.size, 1))
         return [slice(i, i + size) for i in range(0, len(self.u), size)]
 
-    def phi(self, u: Array) -> Array:
+    def phi(self, u: Floats) -> Floats:
         """Return the parameters at unconstrained ones, shape (..., p)."""
         columns = [constrain(prior, u[..., i]) for i, prior in enumerate(self.priors)]
         return np.asarray(inside(self.priors, np.stack(columns, axis=-1)) if columns else u)
 
-    def prior(self, u: Array) -> Array:
+    def sigma(self, noise: Floats) -> Floats:
+        """Return all noise parameters at the logarithms of the inferred ones."""
+        return np.asarray(np.exp(noise) * np.ones(len(self.problem.noise_prior[0])))
+
+    def prior(self, u: Floats) -> Floats:
         """Return the log-density of each part's parameters, transformed, shape (particle, part)."""
         phi = self.phi(u)
         layout = self.problem.layout
@@ -125,28 +118,27 @@ class _Mover:
             terms[:, i] -= np.log(unconstrain(prior, phi[:, i])[1])
         return np.stack([terms[:, part.places].sum(axis=1) for part in self.parts], axis=1)
 
-    def likelihood(self, residual: Array, noise: Array, u: Array) -> Array:
+    def likelihood(self, residual: Floats, noise: Floats, u: Floats) -> Floats:
         """Return the log-likelihood of each part at log sigma (particle, state)."""
-        problem, sigma = self.problem, np.exp(noise)
-        sigma = sigma * np.ones(len(problem.noise_prior[0]))
+        problem, sigma = self.problem, self.sigma(noise)
         measured, phi = problem.observations.measured, self.phi(u)
         nu = problem.nu(phi)
         if len(self.parts) == 1:
             return np.asarray(problem.log_density(residual, sigma, phi).sum(axis=-1)[:, None])
         result = np.empty((len(residual), len(self.parts)))
         for j, part in enumerate(self.parts):
-            own = residual[..., part.bodies, :]
-            seen = measured[..., part.bodies, :]
-            each = problem.likelihood.log_density(own, sigma, seen, _of_bodies(nu, part.bodies))
+            nu_of = nu[..., part.bodies, :] if isinstance(nu, np.ndarray) else nu
+            some, seen = residual[..., part.bodies, :], measured[..., part.bodies, :]
+            each = problem.likelihood.log_density(some, sigma, seen, nu_of)
             result[:, j] = each.sum(axis=-1)
         return result
 
-    def exact(self, u: Array, noise: Array) -> tuple[Array, Array]:
+    def exact(self, u: Floats, noise: Floats) -> tuple[Floats, Floats]:
         """Return the log-density of each part, and the residuals."""
         residual = self.problem.residual(self.phi(u))
         return self.prior(u) + self.likelihood(residual, noise, u), residual
 
-    def rough(self, u: Array, noise: Array) -> Array:
+    def rough(self, u: Floats, noise: Floats) -> Floats:
         """Return the log-density of each part with the coarse engine."""
         states = self.problem.predict(self.phi(u), self.coarse) + self.correction
         residual = self.problem.observations.residual(states)
@@ -174,7 +166,7 @@ class _Mover:
         self.u[group], self.noise[group] = u, self._noisy(residual, noise, u, rng)
         return float(np.mean(rates))
 
-    def _chosen(self, accepted: Bools, y: Array, u: Array) -> Array:
+    def _chosen(self, accepted: Bools, y: Floats, u: Floats) -> Floats:
         """Return the particles with the proposal for the parts (particle, part) that accept it."""
         result = u.copy()
         for j, part in enumerate(self.parts):
@@ -183,25 +175,25 @@ class _Mover:
             )
         return result
 
-    def _propose(self, u: Array, walk: bool, rng: np.random.Generator) -> tuple[Array, Array]:
+    def _propose(self, u: Floats, walk: bool, rng: np.random.Generator) -> tuple[Floats, Floats]:
         """Return a proposal, and the logarithm of each part's Hastings ratio."""
         y, gain = u.copy(), np.zeros((len(u), len(self.parts)))
         for j, block in enumerate(self.blocks):
             y[:, block.places], gain[:, j] = block.propose(u[:, block.places], walk, rng)
         return y, gain
 
-    def _learn(self, rates: Array, walk: bool) -> None:
+    def _learn(self, rates: Floats, walk: bool) -> None:
         """Adapt the parts' step sizes to acceptance rates over all particles."""
         for block, rate in zip(self.blocks, rates, strict=True):
             block.lengthen(rate - TARGET_ACCEPTANCE, walk)
 
-    def _ahead(self, u: Array, noise: Array, rng: np.random.Generator) -> tuple[Array, Array]:
+    def _ahead(self, u: Floats, noise: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
         """Return a proposal of steps under the coarse posterior, and its log Hastings ratio.
 
         The steps must be as likely in the reverse order: step sizes adapt only at the end.
         """
         begin = here = self.rough(u, noise)
-        rates: dict[bool, list[Array]] = {True: [], False: []}
+        rates: dict[bool, list[Floats]] = {True: [], False: []}
         for _ in range(_INNER):
             walk = bool(rng.uniform() < 0.5)
             y, gain = self._propose(u, walk, rng)
@@ -214,10 +206,12 @@ class _Mover:
                 self._learn(np.mean(measured, axis=0), walk)
         return u, begin - here
 
-    def _noisy(self, residual: Array, noise: Array, u: Array, rng: np.random.Generator) -> Array:
+    def _noisy(
+        self, residual: Floats, noise: Floats, u: Floats, rng: np.random.Generator
+    ) -> Floats:
         """Return the noise, shape (particle, state), after steps at given residuals."""
 
-        def density(at: Array) -> Array:
+        def density(at: Floats) -> Floats:
             likelihood = self.likelihood(residual, at, u).sum(axis=1)
             return np.asarray(log_noise_prior(self.problem, at) + likelihood)
 
@@ -233,21 +227,16 @@ class _Mover:
         return noise
 
 
-def _accepted(log_ratio: Array, rng: np.random.Generator) -> Bools:
+def _accepted(log_ratio: Floats, rng: np.random.Generator) -> Bools:
     """Return whether each proposal is accepted; not where a density is not a number."""
     with np.errstate(invalid="ignore"):
         passes = np.log(rng.uniform(size=log_ratio.shape)) < log_ratio
     return np.asarray(passes)
 
 
-def _spread(points: Array, columns: NDArray[np.intp]) -> Array:
+def _spread(points: Floats, columns: Ints) -> Floats:
     """Return the covariance of some columns, never singular."""
     if not len(columns):  # of a part whose parameters are known
         return np.zeros((0, 0))
     covariance = np.cov(points[:, columns], rowvar=False).reshape(2 * (len(columns),))
     return covariance + 1e-9 * np.diag(np.diag(covariance)) + 1e-12 * np.eye(len(columns))
-
-
-def _of_bodies(nu: float | Array | None, bodies: NDArray[np.intp]) -> float | Array | None:
-    """Return the degrees of freedom of some bodies."""
-    return nu[..., bodies, :] if isinstance(nu, np.ndarray) else nu

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import (
     BoundWarning,
@@ -30,19 +29,18 @@ from pbrl_ppl.parameters import fold_wheels
 from pbrl_ppl.posterior import convergence, from_groups, group, parameter_draws, problem_of
 from pbrl_ppl.sampling.fitting import fit
 from pbrl_ppl.sampling.ranks import MOST_DRAWS, rank
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, Floats
 
-Array = NDArray[np.float64]
 #: One replication's numbers, by name, each a list over the parameters.
 Record = dict[str, list[float]]
 
-#: A fit with fewer than 99 effective draws is repeated so often, with so many times the draws.
+#: Most repetitions of a fit with fewer than 99 effective draws, and the factor of its draws.
 _AGAIN, _LONGER = 2, 4
-#: Draws from the prior are given up where fewer than one in so many is possible.
+#: Most draws from the prior for each one that the engine can simulate.
 _MOST_REDRAWN = 50
 
 
-#: Warnings of a fit that no replication repeats.
+#: Warnings of a fit that are ignored in replications.
 _KNOWN = (
     ConvergenceWarning, BoundWarning, LinearisationWarning, MeetingWarning, UninformedWarning,
 )  # fmt: skip
@@ -61,9 +59,9 @@ class Truth(NamedTuple):
         Shape (transition, H, body, state).
     """
 
-    phi: Array
-    sigma: Array
-    values: Array
+    phi: Floats
+    sigma: Floats
+    values: Floats
 
 
 def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
@@ -113,7 +111,7 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
     )
 
 
-def _trajectories(design: Problem, phi: Array, sigma: Array, seed: int) -> Array:
+def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int) -> Floats:
     """Return measured states of whole trajectories, one set a draw; 0 where nothing is measured."""
     every = [
         simulated_trajectories(design, phi[i], sigma[i], np.random.default_rng([seed, i]))
@@ -123,10 +121,10 @@ def _trajectories(design: Problem, phi: Array, sigma: Array, seed: int) -> Array
     return np.where(measured, np.array(every), 0.0)
 
 
-def simulated(design: Problem, values: Array) -> Problem:
+def simulated(design: Problem, values: Floats) -> Problem:
     """Return the problem with other next states in place of the measured ones.
 
-    Its history has one trajectory a segment, so that each starts from the design's own state.
+    Its history has one trajectory a segment, so that each starts from the design's state.
 
     Parameters
     ----------
@@ -165,13 +163,13 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     dict of str to list
         ``rank``, ``size``, ``truth``, ``ess`` and ``r_hat``, over the parameters.
     """
-    # bodies that met in the simulation belong together, however far apart they ended
+    # bodies that met in the simulation are simulated in one world
     problem = simulated(design, truth.values).joined(truth.phi[None], truth.sigma[None])
     model = build_model(problem)
     settings = {"cores": 1, **settings}
     for again in range(_AGAIN + 1):
         with warnings.catch_warnings():
-            # convergence is in the result; the others are of made-up data
+            # convergence is in the result; the other warnings are about simulated data
             for kind in _KNOWN:
                 warnings.simplefilter("ignore", kind)
             idata = fit(model, seed=seed, progress=False, **settings)
@@ -185,7 +183,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
             name: (("chain", "draw"), column.reshape(shape))
             for name, column in zip(labels(problem), drawn.T, strict=True)
         }
-        # of the folded draws: a chain that changes between equal wheels has not failed to mix
+        # of folded draws: a change between equal descriptions of a wheel is no failure to mix
         r_hat, ess = convergence(from_groups({"posterior": xr.Dataset(data)}, {}))
         if min(ess.values()) >= MOST_DRAWS or again == _AGAIN:
             break
@@ -207,7 +205,7 @@ def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, A
     }
 
 
-def _quantities(problem: Problem, phi: Array, sigma: Array, likelihood: Array) -> Array:
+def _quantities(problem: Problem, phi: Floats, sigma: Floats, likelihood: Floats) -> Floats:
     """Return the ranked quantities: folded phi, sigma, log-likelihood, shape (draw, quantity)."""
     sigma = problem.likelihood.free(sigma)
     return np.hstack([fold_wheels(problem.layout, phi), sigma, likelihood[:, None]])

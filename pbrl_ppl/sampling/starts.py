@@ -7,20 +7,18 @@ from typing import Any
 
 import numpy as np
 import pymc as pm
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from scipy.special import expit
 
-from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import Prior, Wheel, gathered, inside, wheels
 from pbrl_ppl.posterior import group, parameter_draws
 from pbrl_ppl.sampling.metropolis import Gaussian
+from pbrl_ppl.state import Floats
 
-Array = NDArray[np.float64]
-
-#: Distances at which a posterior is evaluated, in standard deviations; its fall at the first one.
+#: Distances at which a posterior is evaluated (standard deviations), and the fall (nats) from which
+#: a point is outside; a Gaussian falls by 2 at the first.
 _FAR, _LOW = (2.0, 4.0, 8.0, 16.0), 2.5
 #: Steps of the noise a round; along trajectories one of the two noises may vanish.
 _CHEAP, _CHEAP_ALONG = 5, 30
@@ -37,29 +35,29 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
         offset += size
     where = np.concatenate([np.zeros(0, int), *(places[b.name] for b in problem.layout.blocks)])
     mean, covariance = _laplace(problem, mode)
-    blocks = []
-    for part in problem.simulator.parts:
-        i = part.places
-        if len(i):
-            blocks.append(Gaussian(where[i], mean[i], covariance[np.ix_(i, i)]))
+    blocks = [
+        Gaussian(where[i], mean[i], covariance[np.ix_(i, i)])
+        for i in (part.places for part in problem.simulator.parts)
+        if len(i)
+    ]
     entries = np.concatenate([places[name] for name in problem.noise_variables])
-    noise_mean, noise_covariance = _sigma_laplace(problem, mode)
-    # along trajectories another noise costs a filter's gains; of Eq. 11 it may move with phi
+    # along trajectories each change of the noise costs a run of the filter: a block by itself
     independent = isinstance(problem.likelihood, TransitionLikelihood)
+    if independent:  # the variance of log sigma is half the inverse of the number of measurements
+        counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
+        noise_mean = problem.likelihood.free(np.log(mode.sigma))
+        noise_covariance = np.diag(0.5 / np.maximum(counts, 1))
+    else:
+        noise_mean, noise_covariance = mode.noise_gaussian()
     if len(blocks) == 1 and independent:
-        only = blocks[0]
-        return [
-            Gaussian(
-                np.concatenate([only.places, entries]),
-                np.concatenate([only.mean, noise_mean]),
-                block_diag(only.covariance, noise_covariance),
-            )
-        ]
+        (only,) = blocks
+        both = np.concatenate([only.places, entries]), np.concatenate([only.mean, noise_mean])
+        return [Gaussian(*both, block_diag(only.covariance, noise_covariance))]
     cheap = _CHEAP if independent else _CHEAP_ALONG
     return [*blocks, Gaussian(entries, noise_mean, noise_covariance, cheap)]
 
 
-def blank_point(model: pm.Model, problem: Problem) -> dict[str, Array]:
+def blank_point(model: pm.Model, problem: Problem) -> dict[str, Floats]:
     """Return zeros of the shapes of the continuous variables, by their names in the sampler.
 
     ``model.initial_point()`` would compile a function.
@@ -96,12 +94,10 @@ def constrain(prior: Prior, u: Any) -> Any:
     return u
 
 
-def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
+def _laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
     """Return mode and Laplace covariance in the sampler's space, no wider than a prior's."""
-    pairs = [
-        unconstrain(prior, x) for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
-    ]
-    mean, scale = np.array(pairs).reshape(-1, 2).T
+    pairs = map(unconstrain, problem.layout.priors, mode.phi)
+    mean, scale = np.array(list(pairs)).reshape(-1, 2).T
     covariance = scale[:, None] * mode.covariance * scale
     covariance = widened(problem, mode, mean, covariance)
     deviation = np.sqrt(np.diag(covariance))
@@ -109,7 +105,7 @@ def _laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
     return mean, shrink[:, None] * covariance * shrink + 1e-12 * np.eye(len(scale))
 
 
-def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Array:
+def widened(problem: Problem, mode: Mode, mean: Floats, covariance: Floats) -> Floats:
     """Return a covariance in the sampler's space, widened where the posterior falls off slowly.
 
     At a kink, or with few contacts, the curvature overstates how well a parameter is known, and an
@@ -130,7 +126,7 @@ def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Arr
     ends = np.array([*_FAR, *(-far for far in _FAR)])[:, None]
     top = _log_density(problem, mean[None], mode.sigma)
     stretch = np.ones(len(mean))
-    # one at a time, for each is a rollout of all data; the others stay where they are
+    # one parameter at a time: each point is a simulation of all data
     for i, step in enumerate(np.diag(np.sqrt(variance))):
         fall = top - _log_density(problem, mean + ends * step, mode.sigma)
         # on either side, up to the first point that has fallen
@@ -140,7 +136,7 @@ def widened(problem: Problem, mode: Mode, mean: Array, covariance: Array) -> Arr
     return np.asarray(covariance + np.diag(variance * (stretch**2 - 1.0)))
 
 
-def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
+def _log_density(problem: Problem, u: Floats, sigma: Floats) -> Floats:
     """Return the log-posterior up to a constant at points (point, p) of the sampler's space.
 
     It is -inf on numerical overflow: at a mass of zero, or at the end of a support.
@@ -158,19 +154,13 @@ def _log_density(problem: Problem, u: Array, sigma: Array) -> Array:
     return height
 
 
-def _sigma_laplace(problem: Problem, mode: Mode) -> tuple[Array, Array]:
-    """Return mean and covariance of log sigma: half the inverse of the number of measurements."""
-    if isinstance(problem.likelihood, TrajectoryLikelihood):
-        return mode.noise_gaussian()
-    counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
-    mean = problem.likelihood.free(np.log(mode.sigma))
-    return mean, np.diag(0.5 / np.maximum(counts, 1))
-
-
-def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Array]]:
+def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[str, Floats]]:
     """Draw starts about two posterior standard deviations from the mode, one a chain."""
     problem, priors = mode.problem, mode.problem.layout.priors
-    low, high = np.array([_range(prior) for prior in priors]).reshape(-1, 2).T
+    # the 2 % and 98 % quantiles of the priors, by simulation, limit the starts
+    samples = (prior.sample(np.random.default_rng(0), 2000) for prior in priors)
+    quantiles = [np.quantile(sample, [0.02, 0.98]) for sample in samples]
+    low, high = np.array(quantiles).reshape(-1, 2).T
     factor, starts = mode.factor, []
     centre, wide = np.log(mode.sigma), np.full(len(mode.sigma), 0.1)
     if isinstance(problem.likelihood, TrajectoryLikelihood):
@@ -184,13 +174,13 @@ def dispersed(mode: Mode, rng: np.random.Generator, chains: int) -> list[dict[st
     return starts
 
 
-def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, Array]]]:
+def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, Floats]]]:
     """Return a Gaussian approximation of a posterior, as a mode, and the last draw of each chain.
 
     Parameters
     ----------
     problem : Problem
-        Of the same scene, effects and measured dimensions.
+        Of the same scene, effects and measured dimensions, as :func:`linearised_as` checks.
     idata : InferenceData or DataTree
         The posterior.
 
@@ -200,37 +190,16 @@ def from_posterior(problem: Problem, idata: Any) -> tuple[Mode, list[dict[str, A
         At the mean, with the draws' covariance.
     starts : list of dict
         One point a chain.
-
-    Raises
-    ------
-    PosteriorError
-        If its variables are not the problem's.
     """
     posterior = group(idata, "posterior")
-    names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
-    missing = [name for name in names if name not in posterior]
-    if missing:
-        raise PosteriorError(f"start: the posterior has no {', '.join(missing)}; of another model?")
     phi, sigma = parameter_draws(problem, idata)
     phi = gathered(problem.layout, phi)
     covariance = np.cov(phi, rowvar=False).reshape(2 * (problem.layout.size,))
-    cells = problem.observations.values.size
-    mode = Mode(
-        problem,
-        phi.mean(axis=0),
-        sigma.mean(axis=0),
-        np.zeros((cells, problem.layout.size)),
-        covariance,
-        np.nan,
-    )
+    jacobian = np.zeros((problem.observations.values.size, problem.layout.size))
+    mode = Mode(problem, phi.mean(axis=0), sigma.mean(axis=0), jacobian, covariance, np.nan)
     chains, draws = posterior.sizes["chain"], posterior.sizes["draw"]
     last = np.arange(1, chains + 1) * draws - 1
     return mode, [problem.named(phi[i], sigma[i]) for i in last]
-
-
-def _range(prior: Prior) -> Array:
-    """Return the 2 % and 98 % quantiles of a prior, by simulation: they limit the starts."""
-    return np.quantile(prior.sample(np.random.default_rng(0), 2000), [0.02, 0.98])
 
 
 def evened_logp(model: pm.Model, problem: Problem) -> Any:
@@ -254,17 +223,14 @@ def evened_logp(model: pm.Model, problem: Problem) -> Any:
     uneven = [wheel for wheel in wheels(problem.layout) if wheel.period > 1]
     if not uneven:
         return 0.0
-    change = sum(_of_wheel(model, problem, wheel) for wheel in uneven)
+    change = sum(_evened(model, problem, wheel) for wheel in uneven)
     return model.replace_rvs_by_values([change])[0]
 
 
-def _of_wheel(model: pm.Model, problem: Problem, wheel: Wheel) -> Any:
-    places = {
-        f"{block.name}[{owner}]": (block.name, i)
-        for block in problem.layout.blocks
-        for i, owner in enumerate(block.owners)
-    }
-    angle, *mus = (model[name][i] for name, i in (places[label] for label in wheel.labels))
+def _evened(model: pm.Model, problem: Problem, wheel: Wheel) -> Any:
+    """Return the correction for one wheel."""
+    entries = [(b.name, i) for b in problem.layout.blocks for i in range(len(b.owners))]
+    angle, *mus = (model[name][i] for name, i in (entries[place] for place in wheel.places))
     direction, *frictions = wheel.priors
     terms = []
     for turns in range(4):

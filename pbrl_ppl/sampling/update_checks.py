@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import HistoryError, PosteriorError
 from pbrl_ppl.history import History, check_start, measured_alone, unused_velocities
-from pbrl_ppl.likelihood import Cells, Problem
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import (
     PosteriorRecord,
     from_groups,
@@ -17,16 +16,15 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     problem_of,
 )
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, Floats
 
-#: With fewer draws there is nothing to choose from.
+#: Fewest draws to resample from.
 _LEAST_DRAWS = 100
-#: How far the stored likelihood of a transition may be from what the engine gives now.
+#: Largest difference between stored and recomputed log-likelihoods of a transition (nats).
 _SAME = 0.01
-#: Transitions at which that is checked, under one draw.
+#: Transitions whose likelihoods are recomputed, at one draw.
 _CHECKED = 50
-#: Standard errors by which new transitions must be less probable than the fitted ones to count as
-#: predicted worse.
+#: Difference of mean log-likelihood, in standard errors, from which new data are predicted worse.
 _WORSE = 3.0
 
 
@@ -68,7 +66,7 @@ def as_recorded(idata: Any, history: History) -> History:
 
 
 def check_history(idata: Any, record: PosteriorRecord, history: History) -> None:
-    """Refuse a history of other bodies, dimensions or sampling, or of nothing to go on with."""
+    """Refuse a history of other bodies, dimensions or time step, or without usable start."""
     scene, measured = record.scene, record.measured
     names = tuple(body.name for body in scene.moving)
     if history.bodies != names:
@@ -117,18 +115,7 @@ def check_engine(idata: Any, problem: Problem) -> None:
         )
 
 
-def more_noise(problem: Problem, cells: Cells) -> list[str]:
-    """Return noise parameters that the cells of all data have and the posterior has not."""
-    held = problem.noise_variables
-    return [
-        f"{name}[{dimension}]"
-        for name, dimensions in cells.variables.items()
-        for dimension in dimensions
-        if dimension not in held.get(name, ())
-    ]
-
-
-def judgement(held: NDArray[np.float64], new: NDArray[np.float64]) -> str:
+def judgement(held: Floats, new: Floats) -> str:
     """Return a text on whether new transitions may be of the same bodies as the posterior's.
 
     Parameters

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl import posterior as files
 from pbrl_ppl.effects import Effect, catalogue
@@ -42,20 +41,18 @@ from pbrl_ppl.sampling.update_checks import (
     check_history,
     check_posterior,
     judgement,
-    more_noise,
 )
+from pbrl_ppl.state import Floats, Ints
 
-Array = NDArray[np.float64]
-
-#: Group that keeps the draws as they were fitted, with their weights: resampled anew from them at
-#: every update, draws lose much less than if each update resampled the last one's.
+#: Group of the fitted draws with their weights. Each update resamples these: resampling the draws
+#: of the last update would lose more of them.
 BASE = "before_updates"
-#: Share of the draws that the weights are worth: below the first the draws are moved, below the
-#: second all data are fitted anew.
+#: Effective share of the weighted draws below which they are moved, and below which all data are
+#: fitted anew.
 _MOVE, _REFIT = 0.5, 0.05
-#: Shape of the weights' tail above which they do not even show their own error.
+#: Pareto k of the weights above which all data are fitted anew.
 _HEAVY = 0.7
-#: Draws that are moved at most.
+#: Most draws that are moved.
 _WALKERS = 1000
 
 
@@ -215,13 +212,13 @@ class _Weighted:
 
     problem: Problem
     base: xr.Dataset
-    phi: Array
-    sigma: Array
+    phi: Floats
+    sigma: Floats
     data: dict[str, xr.Dataset]
     attributes: dict[str, Any]
-    earlier: Array
-    likelihood: Array
-    weights: Array
+    earlier: Floats
+    likelihood: Floats
+    weights: Floats
     share: float
     k: float
     more_noise: list[str]
@@ -260,15 +257,16 @@ def _weighted(
     if np.isfinite(log_weights.max()):
         weights, k = files.smoothed(log_weights)
         share = 1.0 / (len(weights) * float((weights**2).sum()))
-    cells, louder = None, []
+    changed = replace(record, together=tuple(problem.physics.together))
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         cells = files.recorded_cells(problem.scene, data["constant_data"])
-        louder = more_noise(problem, cells)
-    changed = replace(record, together=tuple(problem.physics.together), cells=cells)
+        changed = replace(changed, cells=cells)
+    more_noise = [label for label in changed.noise_labels if label not in problem.noise_labels]
     attributes = dict(idata.attrs) | changed.attributes()
     return _Weighted(
-        problem, base, phi, sigma, data, attributes, earlier, likelihood, weights, share, k, louder
-    )
+        problem, base, phi, sigma, data, attributes, earlier, likelihood, weights, share, k,
+        more_noise,
+    )  # fmt: skip
 
 
 def _without_fit(
@@ -281,11 +279,13 @@ def _without_fit(
     base = new.base
     if new.least_share >= _MOVE and not new.heavy and not new.more_noise:
         result = _reweighted(new, rng)
-        if not _worn(base, result):
+        # reweighting lowers the effective sample size
+        ess = float(base["min_ess"])
+        if ess < MIN_ESS or min(files.convergence(result)[1].values()) >= MIN_ESS:
             return files.checked(new.problem, result), new.problem, {"did": "reweighted"}
     # from here on all data are needed
     whole = problem_of(from_groups(groups(idata) | new.data, new.attributes), effects)
-    # sets of parameters, and which bodies a joint joins, cannot be moved by steps
+    # discrete choices (sets of a library, bodies of a joint) have no Metropolis steps here
     chosen_among = whole.library is not None or whole.layout.discrete.any()
     if new.share < _REFIT or new.heavy or chosen_among or new.more_noise:
         return None, whole, {}
@@ -318,13 +318,6 @@ def _mode(earlier: Any, updated: Any, effects: tuple[Effect, ...]) -> Any:
         choice = files.draws(updated)["library_index"].astype(np.intp)
     begin = files.stored_mode(problem, earlier)
     return files.updated_mode(problem, begin, (phi, sigma, choice), likelihood)
-
-
-def _worn(base: xr.Dataset, result: Any) -> bool:
-    """Return whether the effective sample size fell below its minimum by reweighting."""
-    if float(base["min_ess"]) < MIN_ESS:
-        return False
-    return min(files.convergence(result)[1].values()) < MIN_ESS
 
 
 def _reweighted(new: _Weighted, rng: np.random.Generator) -> Any:
@@ -365,7 +358,7 @@ def _used(data: xr.Dataset) -> xr.Dataset:
     return data.drop_vars([str(c) for c in data.coords if not set(data[c].dims) <= dims])
 
 
-def _systematic(weights: Array, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
+def _systematic(weights: Floats, n: int, rng: np.random.Generator) -> Ints:
     """Return ``n`` indices in increasing order by systematic resampling."""
     ends = np.cumsum(weights)
     indices = np.searchsorted(ends / ends[-1], (rng.uniform() + np.arange(n)) / n)
@@ -393,7 +386,7 @@ def _base(idata: Any) -> xr.Dataset:
     )
 
 
-def _with_new(base: xr.Dataset, likelihood: Array, predictive: Array) -> xr.Dataset:
+def _with_new(base: xr.Dataset, likelihood: Floats, predictive: Floats) -> xr.Dataset:
     """Add likelihoods (draw, transition) of new transitions, and predictions of them."""
     shape = base.sizes["chain"], base.sizes["draw"], -1
     both = [base["log_likelihood"].to_numpy(), likelihood.reshape(shape)]

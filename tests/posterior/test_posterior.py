@@ -208,7 +208,7 @@ def test_a_truncated_file(tmp_path) -> None:
 def test_a_foreign_netcdf_file(tmp_path) -> None:
     path = tmp_path / "rain.nc"
     xr.Dataset({"rain": ("day", [1.0, 2.0])}).to_netcdf(path, engine="h5netcdf")
-    with pytest.raises(PosteriorError, match=r"rain\.nc: this is no posterior file of pbrl_ppl"):
+    with pytest.raises(PosteriorError, match=r"rain\.nc: this is no posterior of pbrl_ppl"):
         load_posterior(path)
 
 

@@ -189,8 +189,8 @@ def test_the_order_of_hyper_parameters_means_nothing() -> None:
             ParameterError,
             "body 'cart': prior of linear_drag_coefficient has 'kappa', expected mu and sigma",
         ),
-        ({"mass": {"sigma": 0.0}}, (), SceneError, 'body "cart": prior mass sigma is 0.0'),
-        ({"mass": {"mu": np.nan}}, (), SceneError, "prior mass mu is nan, expected a finite"),
+        ({"mass": {"sigma": 0.0}}, (), SceneError, 'body "cart": mass: sigma is 0.0'),
+        ({"mass": {"mu": np.nan}}, (), SceneError, "mass: mu is nan, expected a finite"),
         (
             {"mu_c": {"mu": -5.0, "sigma": 0.01}},
             (),

@@ -11,10 +11,9 @@ from pbrl_ppl.likelihood import Problem, along_trajectories, single_transitions
 from pbrl_ppl.modes import find_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.store import group
-from pbrl_ppl.sampling import fit, fitting, physics_model, surrogate
-from pbrl_ppl.sampling.emulator import Emulator, Piece, Pieces
+from pbrl_ppl.sampling import emulator, fit, methods, physics_model
+from pbrl_ppl.sampling.emulator import Emulator, Piece, Pieces, Surrogate, Unpack, emulate
 from pbrl_ppl.sampling.starts import gaussian_blocks
-from pbrl_ppl.sampling.surrogate import Surrogate, Unpack, emulate
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -107,7 +106,7 @@ def test_it_follows_the_engine_over_the_posterior(model) -> None:
     assert found is not None
     rough = Surrogate(model.problem, unpack, found)
     logp = model.compile_logp()
-    wide = surrogate.explore(blocks, rough, blocks[0].mean, 2000, np.random.default_rng(4))
+    wide = emulator.explore(blocks, rough, blocks[0].mean, 2000, np.random.default_rng(4))
     off = []
     for q in wide[::40]:
         phi, sigma, prior = unpack(q)
@@ -123,7 +122,7 @@ def test_runs_reach_farther_than_the_posterior_and_stay_in_the_support(model) ->
     """A kink beyond the first draws was never seen, and a chain beyond it stood still."""
     mode = find_mode(model.problem, seed=1)
     drawn = mode.draws(np.random.default_rng(2), 200)
-    runs = surrogate.spread(model.problem, drawn)
+    runs = emulator.spread(model.problem, drawn)
     np.testing.assert_array_equal(runs[:200], drawn)
     lower, upper = model.problem.layout.supports(runs)
     assert ((runs >= lower) & (runs <= upper)).all()
@@ -135,7 +134,7 @@ def test_errors_count_farther_off_where_the_engine_says_it_is_as_likely() -> Non
     """Of cart-null's kinks an emulator learned one side, whose draws confirmed it."""
     exact = np.array([-1.0, -2.0, -3.0, -4.0, -2.5, -40.0])
     told = exact + np.array([0.1, 0.0, -0.1, 0.0, -6.0, 9.0])
-    np.testing.assert_allclose(surrogate.errors(told, exact, 4), [0.1, 0.0, -0.1, 0.0, -6.0])
+    np.testing.assert_allclose(emulator.errors(told, exact, 4), [0.1, 0.0, -0.1, 0.0, -6.0])
 
 
 def test_none_where_no_polynomial_is_close(model, monkeypatch) -> None:
@@ -163,7 +162,7 @@ def test_looking_ahead_changes_nothing_but_the_speed(model, monkeypatch) -> None
     options = {"seed": 2, "chains": 2, "cores": 1, "progress": False, "tune": 300}
     ahead = fit(model, draws=800, **options)
     assert float(group(ahead, "sample_stats")["look_ahead_accept"].mean()) > 0.5
-    monkeypatch.setattr(fitting, "_LITTLE", np.inf)
+    monkeypatch.setattr(methods, "_LITTLE", np.inf)
     plain = fit(model, draws=300, **options)
     assert np.isnan(group(plain, "sample_stats")["look_ahead_accept"]).all()
     first, second = group(ahead, "posterior"), group(plain, "posterior")
