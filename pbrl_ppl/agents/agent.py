@@ -7,15 +7,12 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.agents.revision import Revision
 from pbrl_ppl.agents.world import Task
 from pbrl_ppl.oomdp import LWR, OOLWR
 from pbrl_ppl.planning import Dynamics, TransitionModel, plan, rollout
-from pbrl_ppl.state import THETA, wrapped
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import THETA, Floats, wrapped
 
 
 class Agent(ABC):
@@ -66,7 +63,7 @@ class Agent(ABC):
         """Model to plan with; None before anything was learned."""
 
     @abstractmethod
-    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+    def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Observe a transition.
 
         Parameters
@@ -85,7 +82,7 @@ class Agent(ABC):
         """Current estimates of physical parameters by label; none by default."""
         return {}
 
-    def act(self, state: Array) -> Array:
+    def act(self, state: Floats) -> Floats:
         """Return the next action: planned, or random without a plan.
 
         Parameters
@@ -116,7 +113,7 @@ class Agent(ABC):
         self._last = wrenches[chosen]
         return self._last.copy()
 
-    def _planned(self, model: TransitionModel, state: Array) -> Array:
+    def _planned(self, model: TransitionModel, state: Floats) -> Floats:
         """Return a plan's wrenches, shape (time, body, 3): the old ones if they still do."""
         task = self.task
         if len(self._ahead):
@@ -149,8 +146,8 @@ class PhysicsAgent(Agent):
 
 
 def prediction_errors(
-    dynamics: Dynamics, state: Array, action: Array, after: Array, previous: Array | None = None
-) -> Array:
+    dynamics: Dynamics, state: Floats, action: Floats, after: Floats, previous: Floats | None = None
+) -> Floats:
     """Return the absolute errors of the mean prediction of each transition, shape (n, body, 6).
 
     Parameters
@@ -184,7 +181,7 @@ class _RegressionAgent(Agent):
         """Regression; None before it has any data."""
         return self._learner if self._learner.transitions else None
 
-    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+    def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Learn from a transition; arguments as for :meth:`Agent.observe`."""
         self._learner.observe(state, action, next_state)
 
@@ -273,5 +270,5 @@ class TrueModelAgent(Agent):
         """True dynamics."""
         return self._dynamics
 
-    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+    def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Do nothing: there is nothing to learn."""

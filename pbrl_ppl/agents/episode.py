@@ -9,15 +9,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Floats
 
 _KIND = "episode"
 #: Variables of an episode, and their dimensions.
@@ -200,7 +197,7 @@ class Episode:
         """Effects added to the model and kept: ``effect``, ``body`` and ``transitions`` before."""
         return list(json.loads(self.dataset.attrs.get("added", "[]")))
 
-    def rewards(self, steps: int) -> Array:
+    def rewards(self, steps: int) -> Floats:
         """Return the rewards at the start and so many steps, shape (steps + 1,), m.
 
         The last reward is repeated after the end of the episode.

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.episode import VARIABLES, Episode
@@ -20,9 +19,7 @@ from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.agents.world import Outcome, Task
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.posterior import save_posterior
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 #: Makes an agent from a seed.
 MakeAgent = Callable[[int], Agent]
@@ -40,10 +37,10 @@ class AnyWorld(Protocol):
     def task(self) -> Task:
         """Scene, goal and actions."""
 
-    def reset(self, seed: int) -> Array:
+    def reset(self, seed: int) -> Floats:
         """Go back to the start and return the state, shape (body, 6), SI units."""
 
-    def step(self, action: Array) -> Outcome:
+    def step(self, action: Floats) -> Outcome:
         """Hold an action, shape (body, 3), over one sampling interval."""
 
 
@@ -301,7 +298,7 @@ def _description(world: AnyWorld) -> str:
     return str(getattr(world, "description", ""))
 
 
-def check_state(task: Task, given: Any, method: str) -> Array:
+def check_state(task: Task, given: Any, method: str) -> Floats:
     """Return a state that a world's method returned, shape (body, 6), after a check.
 
     Raises

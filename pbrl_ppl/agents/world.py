@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import EpisodeError, GoalError
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal, start_state
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Largest difference of an action from one of the set, for rounding (N and N m).
 _ROUNDING = 1e-9
@@ -65,25 +63,25 @@ class Task:
         start_state(self.scene, {})
 
     @property
-    def start(self) -> Array:
+    def start(self) -> Floats:
         """State at which an episode begins, shape (body, 6), SI units."""
         return start_state(self.scene, {})
 
-    def reward(self, state: Array) -> float:
+    def reward(self, state: Floats) -> float:
         """Return minus the L2 distance of the bodies from their goal (m), as in section 5."""
         return -float(self.goal.distance(self.scene, state))
 
-    def reached(self, state: Array) -> bool:
+    def reached(self, state: Floats) -> bool:
         """Return whether a state (body, 6) is within the goal's tolerances."""
         return bool(self.goal.shortfall(self.scene, state) <= 1.0)
 
-    def wrenches(self, state: Array) -> Array:
+    def wrenches(self, state: Floats) -> Floats:
         """Return all actions in a state (body, 6), shape (action, body, 3), world frame, N, N m."""
         count = len(self.actions.actions)
         heading = np.repeat(state[None, :, 2], count, axis=0)
         return self.actions.wrenches(self.scene, np.arange(count), heading)
 
-    def check_action(self, state: Array, action: Array) -> None:
+    def check_action(self, state: Floats, action: Floats) -> None:
         """Check that an action is one of the set in this state.
 
         Raises
@@ -123,8 +121,8 @@ class Outcome:
         Whether the goal is reached, which ends the episode.
     """
 
-    state: Array
-    observed: Array
+    state: Floats
+    observed: Floats
     reward: float
     bumped: bool
     reached: bool
@@ -200,7 +198,7 @@ class World:
         values = dict(zip(truth.layout.labels, truth.phi[0].tolist(), strict=True))
         return json.dumps({"engine": type(self).__name__, **values})
 
-    def reset(self, seed: int) -> Array:
+    def reset(self, seed: int) -> Floats:
         """Go back to the start; the seed is that of the noise and the start.
 
         Returns
@@ -219,7 +217,7 @@ class World:
         self._state, self._last = start_state(self.task.scene, state), self._truth.before
         return self._state.copy()
 
-    def step(self, action: Array) -> Outcome:
+    def step(self, action: Floats) -> Outcome:
         """Hold an action over one sampling interval.
 
         Parameters
@@ -246,7 +244,7 @@ class World:
             reached=self.task.reached(state),
         )
 
-    def _play(self, state: Array, action: Array) -> Array:
+    def _play(self, state: Floats, action: Floats) -> Floats:
         """Return the state (body, 6) after an interval."""
         after = self._truth.step(state[None, None], action[None], self._last[None])
         return np.asarray(after[0, 0])

@@ -10,16 +10,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Correlations, ResidualTest
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.state import STATE, WRENCH
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
 _WHITENESS, _COMMANDS = "whiteness", "correlation with commands"
 
@@ -37,12 +34,12 @@ class _Place(NamedTuple):
 class _Correlation:
     """Correlations and numbers of pairs, shape (lag, series, coordinate)."""
 
-    values: Array
-    pairs: Array
+    values: Floats
+    pairs: Floats
     criteria: Criteria
 
     @property
-    def enough(self) -> NDArray[np.bool_]:
+    def enough(self) -> Bools:
         """Return which were taken over enough pairs."""
         return np.asarray(self.pairs > self.criteria.residual.least_pairs)
 
@@ -52,7 +49,7 @@ class _Correlation:
         statistic = float((self.pairs * self.values**2)[self.enough].sum())
         return float(chi2.sf(statistic, max(int(self.enough.sum()), 1)))
 
-    def passes(self, p_value: float, share: Array) -> bool:
+    def passes(self, p_value: float, share: Floats) -> bool:
         """Return whether no correlation is significant and large beside the noise and the motion.
 
         ``share`` is the size of innovations over the change in a step, shape (coordinate,).
@@ -62,7 +59,7 @@ class _Correlation:
         large &= np.abs(self.values) * share > criteria.negligible
         return p_value > criteria.false_alarm or not (large & self.enough).any()
 
-    def worst(self, weights: Array) -> _Place:
+    def worst(self, weights: Floats) -> _Place:
         """Return the largest one, weighted by coordinate."""
         size = np.where(self.enough, np.abs(self.values), 0.0) * weights
         lag, series, cell = map(int, np.unravel_index(int(np.argmax(size)), size.shape))
@@ -114,10 +111,10 @@ def correlation_tests(
 
 
 def _lagged(
-    white: Array,
-    seen: NDArray[np.bool_],
-    number: NDArray[np.intp],
-    series: Array | None,
+    white: Floats,
+    seen: Bools,
+    number: Ints,
+    series: Floats | None,
     criteria: Criteria,
 ) -> _Correlation:
     """Return correlations with series some intervals before, or of each coordinate with itself."""
@@ -139,7 +136,7 @@ def _lagged(
     return _Correlation(np.array(values), np.array(pairs), criteria)
 
 
-def _commands(mode: Mode) -> tuple[Array, list[str]]:
+def _commands(mode: Mode) -> tuple[Floats, list[str]]:
     """Return the commands that vary, standardised, shape (transition, series), and their names."""
     segments, scene = mode.problem.segments, mode.problem.scene
     columns, names = [], []
@@ -153,7 +150,7 @@ def _commands(mode: Mode) -> tuple[Array, list[str]]:
     return np.array(columns).reshape(len(columns), segments.n).T, names
 
 
-def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTest:
+def _whiteness(own: _Correlation, share: Floats, cells: list[str]) -> ResidualTest:
     """Return the test of innovations' correlation with earlier ones."""
     p_value = own.p_value
     passed = own.passes(p_value, share)
@@ -168,10 +165,10 @@ def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTes
 
 
 def _regression_p_value(
-    white: Array,
-    seen: NDArray[np.bool_],
-    number: NDArray[np.intp],
-    commands: Array,
+    white: Floats,
+    seen: Bools,
+    number: Ints,
+    commands: Floats,
     criteria: Criteria,
 ) -> float | None:
     """Return the p-value of the regression on commands of several lags; None if data are too few.
@@ -199,7 +196,7 @@ def _regression_p_value(
 
 
 def _driven(
-    driven: _Correlation, p_value: float, share: Array, cells: list[str], names: list[str]
+    driven: _Correlation, p_value: float, share: Floats, cells: list[str], names: list[str]
 ) -> ResidualTest:
     """Return the test of innovations' correlation with commands."""
     passed = driven.passes(p_value, share)

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from pbrl_ppl.criticism.criteria import Criteria
@@ -15,9 +14,7 @@ from pbrl_ppl.criticism.results import Unexplained
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats, Ints
 
 #: Permutations a body: the smallest p-value is a fifth of the significance.
 _PERMUTATIONS = 500
@@ -142,8 +139,8 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
 
 
 def _in_both_frames(
-    y: Array, dimension: NDArray[np.intp], features: Array
-) -> tuple[Array, list[str], list[int]]:
+    y: Floats, dimension: Ints, features: Floats
+) -> tuple[Floats, list[str], list[int]]:
     """Return innovations in the world frame and velocities' in the body's, names and columns."""
     names, of = [STATE[d] for d in dimension], list(range(len(dimension)))
     velocities = [names.index(name) for name in ("vx", "vy") if name in names]
@@ -156,7 +153,7 @@ def _in_both_frames(
     return np.hstack([y, turned]), [*names, "forward speed", "sideways speed"], [*of, *velocities]
 
 
-def recorded_quantities(problem: Problem, body: int) -> Array:
+def recorded_quantities(problem: Problem, body: int) -> Floats:
     """Return ``QUANTITIES`` at the start of each transition, shape (transition, quantity)."""
     segments = problem.segments
     x, y, theta, vx, vy, omega = segments.start[:, body].T
@@ -177,7 +174,7 @@ def recorded_quantities(problem: Problem, body: int) -> Array:
     return np.hstack([single, single[:, pairs].prod(axis=2)])
 
 
-def _kernels(features: Array) -> Iterator[Array]:
+def _kernels(features: Floats) -> Iterator[Floats]:
     """Yield a Gaussian kernel of each quantity's ranks, scaled to unit range, shape (n, n)."""
     ranks = (rankdata(features, axis=0) - 1) / max(len(features) - 1, 1)  # equal ones share theirs
     varies = np.ptp(features, axis=0) > 1e-9
@@ -186,7 +183,7 @@ def _kernels(features: Array) -> Iterator[Array]:
         yield np.exp(-0.5 * (difference / 0.2) ** 2) * moves / max(int(varies.sum()), 1)
 
 
-def _summed(features: Array) -> Array:
+def _summed(features: Floats) -> Floats:
     """Return the kernel of all quantities together, shape (n, n)."""
     kernel = np.zeros((len(features), len(features)))
     for term in _kernels(features):
@@ -194,7 +191,7 @@ def _summed(features: Array) -> Array:
     return kernel
 
 
-def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
+def _cross_validated(kernel: Floats, groups: Ints, rng: np.random.Generator) -> Floats:
     """Return the matrix that predicts each transition from those of other groups."""
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))
@@ -205,14 +202,14 @@ def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Ge
     return smoother
 
 
-def _explained(smoother: Array, y: Array) -> Array:
+def _explained(smoother: Floats, y: Floats) -> Floats:
     """Return the share of variance predicted, per column."""
     size = np.maximum((y**2).sum(axis=0), 1e-300)
     return np.asarray(1.0 - ((y - smoother @ y) ** 2).sum(axis=0) / size)
 
 
 def _describe(
-    body: str, dimension: str, features: Array, y: Array, share: float, p_value: float
+    body: str, dimension: str, features: Floats, y: Floats, share: float, p_value: float
 ) -> Unexplained:
     """Return the dependence with the quantity that contributes most to the regression."""
     weights = np.linalg.solve(_summed(features) + _RIDGE * np.eye(len(y)), y)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.correlation import correlation_tests
@@ -16,9 +15,7 @@ from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexp
 from pbrl_ppl.criticism.unexplained import UnexplainedAcceleration, noise_alone
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 #: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
@@ -156,7 +153,7 @@ def _acceleration(excess: UnexplainedAcceleration) -> ResidualTest:
 
 
 def _forecasts(
-    mode: Mode, sigma: Array, horizon: int, criteria: Criteria
+    mode: Mode, sigma: Floats, horizon: int, criteria: Criteria
 ) -> tuple[ResidualTest, Growth]:
     """Return the test of forecasts' errors against those of noise and a negligible acceleration."""
     noise = mode.problem.trajectory_noise

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
@@ -20,9 +19,7 @@ from pbrl_ppl.history import (
 from pbrl_ppl.likelihood import cells_of, check_moves
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats, Ints
 
 
 def checked_histories(
@@ -96,7 +93,7 @@ def _unused(history: History) -> tuple[UnusedVelocity, ...]:
     return unused_velocities(history.select(clear) if most else history)
 
 
-def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Array:
+def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
     """Return errors of single measurements that a fitted model and all others contradict.
 
     They are judged by the residual given all other measurements (auxiliary residuals), without any
@@ -141,7 +138,7 @@ def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Array:
     return found
 
 
-def _beside(size: Array, trajectory: NDArray[np.intp], row: NDArray[np.intp]) -> Array:
+def _beside(size: Floats, trajectory: Ints, row: Ints) -> Floats:
     """Return the larger residual of the rows before and after, shape of ``size``; NaN if none."""
     table = np.full((trajectory.max() + 1, row.max() + 3), np.nan)
     some = np.isfinite(size)

@@ -6,15 +6,12 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.likelihood import Problem, noise_medians, ranges
 from pbrl_ppl.modes import Mode, nearby_mode, profile_sigma, trajectory_evidence, trajectory_mode
-
-Array = NDArray[np.float64]
 
 #: Correlations from row to row that are tried: errors that last two, five and twenty rows.
 _MEMORIES = (0.5, 0.8, 0.95)

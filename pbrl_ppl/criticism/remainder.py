@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
@@ -26,9 +25,7 @@ from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 #: Transitions that the process is fitted to, at most.
 _MOST = 400
@@ -173,7 +170,7 @@ def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRem
     return learned_remainder(json.dumps(table | {"forms": block_diag(*blocks).tolist()}))
 
 
-def _process(x: Array, y: Array, seed: int, needed: float) -> tuple[float, Array] | None:
+def _process(x: Floats, y: Floats, seed: int, needed: float) -> tuple[float, Floats] | None:
     """Return the standard deviation of a force and its length scales; None if it is noise."""
     try:
         from sklearn.exceptions import ConvergenceWarning
@@ -201,7 +198,7 @@ def _process(x: Array, y: Array, seed: int, needed: float) -> tuple[float, Array
     return scale * float(np.sqrt(fitted.k1.constant_value)), np.atleast_1d(fitted.k2.length_scale)
 
 
-def residual_forces(mode: Mode, body: str) -> tuple[Array, dict[int, Array]]:
+def residual_forces(mode: Mode, body: str) -> tuple[Floats, dict[int, Floats]]:
     """Return the residual accelerations of steps as forces in a body's frame.
 
     Returns
@@ -234,7 +231,7 @@ def residual_forces(mode: Mode, body: str) -> tuple[Array, dict[int, Array]]:
         known["mass"] if "mass" in known else mode.phi[problem.layout.index("mass", declared.owner)]
     )
     mass = float(mass)
-    forces: dict[int, Array] = {}
+    forces: dict[int, Floats] = {}
     if places[0] is not None and places[1] is not None:
         ax, ay = added[:, places[0]], added[:, places[1]]
         forces |= {0: mass * (c * ax + s * ay), 1: mass * (c * ay - s * ax)}

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.criticism.results import Added
 from pbrl_ppl.criticism.score import rank_candidates
@@ -20,8 +19,7 @@ from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.posterior import likeliest_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Attribute of a posterior with its groups of inseparable effects.
 _GROUPS = "not_separable"
@@ -46,8 +44,8 @@ class Rival:
 
     attached: Attached
     mode: Mode
-    draws: Array
-    sigma: Array
+    draws: Floats
+    sigma: Floats
 
     @property
     def name(self) -> str:

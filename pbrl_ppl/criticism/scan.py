@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pbrl_ppl.criticism.criteria import ScoreCriteria
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.modes import Mode
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Grid points that are simulated in one call.
 _AT_ONCE = 8
@@ -34,8 +32,8 @@ class Look:
         The parameter of each column; empty for a whole change.
     """
 
-    values: Array
-    signature: Array
+    values: Floats
+    signature: Floats
     columns: tuple[int, ...]
 
 
@@ -65,7 +63,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
     own = [labels.index(label) for label in candidate.labels]  # places in the wider vector
     null = np.array(effect.null)
 
-    def whitened(points: Array) -> Array:
+    def whitened(points: Floats) -> Floats:
         phi = np.zeros((len(points), wide.layout.size))
         phi[:, declared] = mode.phi
         phi[:, own] = points
@@ -95,10 +93,10 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
 
 
 def _points(
-    proposed: Array, free: Array, null: Array, steps: tuple[Array, Array]
-) -> tuple[Array, list[tuple[Array, tuple[int, ...], list[int]]]]:
+    proposed: Floats, free: Floats, null: Floats, steps: tuple[Floats, Floats]
+) -> tuple[Floats, list[tuple[Floats, tuple[int, ...], list[int]]]]:
     """Return points to simulate, and each grid point's values, free columns and rows of points."""
-    points: list[Array] = []
+    points: list[Floats] = []
     plan = []
     for row, unknown in zip(proposed, free, strict=True):
         values = np.where(unknown, null, row)
@@ -116,7 +114,7 @@ def _points(
 
 
 def detection_limits(
-    effect: Effect, unit: Array, tried: int, criteria: ScoreCriteria
+    effect: Effect, unit: Floats, tried: int, criteria: ScoreCriteria
 ) -> dict[str, float]:
     """Return the smallest detectable size of each parameter, the others at their null values.
 
@@ -138,7 +136,7 @@ def detection_limits(
 def detection_limits_of_scan(
     effect: Effect,
     looks: Sequence[Look],
-    units: Sequence[Array],
+    units: Sequence[Floats],
     candidates: int,
     criteria: ScoreCriteria,
 ) -> dict[str, float]:
@@ -189,7 +187,7 @@ def _needed(tried: int, criteria: ScoreCriteria) -> float:
     return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
 
 
-def _sizes(unit: Array, tried: int, criteria: ScoreCriteria) -> list[float]:
+def _sizes(unit: Floats, tried: int, criteria: ScoreCriteria) -> list[float]:
     """Return the detectable size of each column."""
     with np.errstate(divide="ignore"):
         return [float(size) for size in _needed(tried, criteria) / unit]

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
@@ -16,9 +15,7 @@ from pbrl_ppl.criticism.scan import caps, detection_limits, detection_limits_of_
 from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import prior_residual, prior_slopes
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Floats, Ints
 
 #: Decimals of a p-value's logarithm: effects that are the same physics differ by rounding.
 _EQUAL = 3
@@ -45,8 +42,8 @@ class Signature:
     attached: Attached
     candidate: Candidate
     log_p: float
-    basis: Array
-    direction: Array
+    basis: Floats
+    direction: Floats
 
 
 def rank_candidates(
@@ -100,7 +97,7 @@ def rank_candidates(
     return sorted(map(score, candidates), key=order)
 
 
-def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Array, list[Array]]:
+def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Floats, list[Floats]]:
     """Return residual, Jacobian and every candidate's signature, with the prior as further rows.
 
     Returns
@@ -129,7 +126,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
     lower, upper = (bound[new] for bound in wide.layout.bounds)
     begin = np.array([1e-3 * min(wide.layout.priors[place].sigma, 1.0) for place in new])
 
-    def predict(points: Array) -> Array:
+    def predict(points: Floats) -> Floats:
         phi = np.tile(null, (len(points), 1))
         phi[:, new] = points
         return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
@@ -150,10 +147,10 @@ class _Evidence:
     statistic: float
     log_p: float
     share: float
-    size: Array
-    basis: Array
-    direction: Array
-    unit: Array
+    size: Floats
+    basis: Floats
+    direction: Floats
+    unit: Floats
 
 
 def _none(n: int) -> _Evidence:
@@ -177,12 +174,12 @@ class _Test:
         Which signatures are absorbed.
     """
 
-    q: Array
-    residual: Array
+    q: Floats
+    residual: Floats
     candidates: int
     criteria: Criteria
 
-    def evidence(self, signature: Array, sides: Ints, scales: Array) -> _Evidence:
+    def evidence(self, signature: Floats, sides: Ints, scales: Floats) -> _Evidence:
         """Return the score test of a signature.
 
         Parameters
@@ -231,13 +228,13 @@ def _sides(attached: Attached) -> Ints:
     return np.array([int(null == low) - int(null == high) for null, low, high in supports])
 
 
-def _scales(attached: Attached) -> Array:
+def _scales(attached: Attached) -> Floats:
     """Return the typical sizes of an effect's parameters under their priors."""
     return np.array([parameter.prior.sigma for parameter in attached.effect.parameters])
 
 
 def _signature(
-    attached: Attached, evidence: _Evidence, values: Array, n_looks: int, test: _Test
+    attached: Attached, evidence: _Evidence, values: Floats, n_looks: int, test: _Test
 ) -> Signature:
     """Return a candidate's signature, its p-value corrected for grid points and candidates."""
     effect, limits = attached.effect, {}

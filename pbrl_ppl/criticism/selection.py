@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import Criteria
@@ -28,8 +27,7 @@ from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, trajectory_evidence, trajectory_mode
 from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -338,7 +336,7 @@ def _informed(mode: Mode, attached: Attached, informed: float) -> int:
     return int(narrow.sum())
 
 
-def _width_over_prior(mode: Mode) -> Array:
+def _width_over_prior(mode: Mode) -> Floats:
     """Return posterior standard deviations in units of the prior's, shape (p,)."""
     slopes = prior_slopes(mode.problem.layout.priors, mode.phi)
     return np.asarray(np.sqrt(np.diag(mode.covariance)) * np.abs(slopes))
