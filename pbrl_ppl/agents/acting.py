@@ -62,7 +62,7 @@ def act(
     intervals: int = 200,
     **options: Any,
 ) -> Acted:
-    """Plan, play the start of the plan, measure, and plan again, until the goal is reached.
+    """Plan, play the start of the plan, measure and replan until the goal is reached.
 
     Parameters
     ----------

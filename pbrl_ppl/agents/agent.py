@@ -60,7 +60,7 @@ class Agent(ABC):
     @property
     @abstractmethod
     def model(self) -> TransitionModel | None:
-        """Model to plan with; None before anything was learned."""
+        """Return the model to plan with; None before anything was learned."""
 
     @abstractmethod
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
@@ -79,7 +79,7 @@ class Agent(ABC):
 
     @property
     def estimates(self) -> Mapping[str, float]:
-        """Current estimates of physical parameters by label; none by default."""
+        """Return current estimates of physical parameters by label; none by default."""
         return {}
 
     def act(self, state: Floats) -> Floats:
@@ -133,12 +133,12 @@ class PhysicsAgent(Agent):
 
     @property
     def model(self) -> Dynamics | None:
-        """Eq. 7 with the estimated parameters; None before the first estimate."""
+        """Return Eq. 7 with the estimated parameters; None before the first estimate."""
         return self._dynamics
 
     @property
     def estimates(self) -> Mapping[str, float]:
-        """Parameters by label, SI units: the mode, or of draws the nearest to their mean."""
+        """Return parameters by label, SI units: the mode, or the draw nearest to the mean."""
         if self._dynamics is None:
             return {}
         middle = self._dynamics.single()
@@ -178,7 +178,7 @@ class _RegressionAgent(Agent):
 
     @property
     def model(self) -> LWR | OOLWR | None:
-        """Regression; None before it has any data."""
+        """Return the regression; None before it has any data."""
         return self._learner if self._learner.transitions else None
 
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
@@ -267,7 +267,7 @@ class TrueModelAgent(Agent):
 
     @property
     def model(self) -> Dynamics:
-        """True dynamics."""
+        """Return the true dynamics."""
         return self._dynamics
 
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:

@@ -116,7 +116,7 @@ class Box2DWorld(World):
 
     @property
     def description(self) -> str:
-        """Engine, true parameters and ``acting``, as JSON."""
+        """Return engine, true parameters and ``acting``, as JSON."""
         acting = {} if self._acting is None else {"acting": repr(self._acting)}
         return json.dumps(json.loads(super().description) | acting)
 

@@ -148,7 +148,7 @@ class Episode:
             differ = (name for name, value in fields if value != vars(scene).get(name))
             raise EpisodeError(
                 f"{path}: this is an episode of another scene ({', '.join(differ)} differ); give"
-                " its own scene, or another folder"
+                " the episode's scene, or another folder"
             )
         return episode
 
@@ -164,37 +164,37 @@ class Episode:
 
     @property
     def scene(self) -> Scene:
-        """Scene of the episode."""
+        """Return the scene of the episode."""
         return Scene.from_toml(self.dataset.attrs["scene"])
 
     @property
     def agent(self) -> str:
-        """Name of the agent."""
+        """Return the name of the agent."""
         return str(self.dataset.attrs["agent"])
 
     @property
     def seed(self) -> int:
-        """Seed of the world and the agent."""
+        """Return the seed of the world and the agent."""
         return int(self.dataset.attrs["seed"])
 
     @property
     def reached(self) -> bool:
-        """Whether the goal was reached."""
+        """Return whether the goal was reached."""
         return bool(self.dataset.attrs["reached"])
 
     @property
     def steps(self) -> int:
-        """Number of actions."""
+        """Return the number of actions."""
         return int(self.dataset.sizes["interval"])
 
     @property
     def bumps(self) -> int:
-        """Number of intervals in which a body touched a wall or another body."""
+        """Return the number of intervals in which a body touched a wall or another body."""
         return int(self.dataset["bumped"].sum())
 
     @property
     def added(self) -> list[dict[str, Any]]:
-        """Effects added to the model and kept: ``effect``, ``body`` and ``transitions`` before."""
+        """Return the added effects: ``effect``, ``body``, and ``transitions`` before."""
         return list(json.loads(self.dataset.attrs.get("added", "[]")))
 
     def rewards(self, steps: int) -> Floats:

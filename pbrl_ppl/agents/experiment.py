@@ -35,7 +35,7 @@ class AnyWorld(Protocol):
 
     @property
     def task(self) -> Task:
-        """Scene, goal and actions."""
+        """Return scene, goal and actions."""
 
     def reset(self, seed: int) -> Floats:
         """Go back to the start and return the state, shape (body, 6), SI units."""

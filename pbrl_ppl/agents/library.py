@@ -104,7 +104,7 @@ class LibraryAgent(PhysicsAgent):
 
     @property
     def probabilities(self) -> pd.DataFrame:
-        """Posterior probabilities: one row per body or class, one column per set."""
+        """Return posterior probabilities: one row per body or class, one column per set."""
         return pd.DataFrame(self._probability, index=list(self.library.names)).T
 
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:

@@ -64,7 +64,7 @@ class Task:
 
     @property
     def start(self) -> Floats:
-        """State at which an episode begins, shape (body, 6), SI units."""
+        """Return the state at which an episode begins, shape (body, 6), SI units."""
         return start_state(self.scene, {})
 
     def reward(self, state: Floats) -> float:
@@ -193,7 +193,7 @@ class World:
 
     @property
     def description(self) -> str:
-        """Engine and true parameters, those of effects included, as JSON for an episode's file."""
+        """Return engine and true parameters, those of effects too, as JSON for episode files."""
         truth = self._truth
         values = dict(zip(truth.layout.labels, truth.phi[0].tolist(), strict=True))
         return json.dumps({"engine": type(self).__name__, **values})

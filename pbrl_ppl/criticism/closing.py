@@ -69,7 +69,7 @@ def close_loop(
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Loop:
-    """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
+    """Fit a model, add the effects that its residual shows, and compare on held-out data.
 
     Parameters
     ----------
@@ -124,14 +124,13 @@ def close_loop(
     task = _Task(scene, tuple(catalogue), seed, substeps, draws, method, criteria, say)
     if test is None:
         train, test = train.split(0.25, seed)
-        given = test
-    else:
-        given = test
-        if scene.test_is_later:  # an effect from some trajectory on still acts in the test
-            test = test.numbered(float(train.dataset["number"].max()) + 1.0)
+        numbered = test
+    else:  # an effect from some trajectory on still acts in a later test
+        after = float(train.dataset["number"].max()) + 1.0
+        numbered = test.numbered(after) if scene.test_is_later else test
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
-        return replace(_closed(task, train, test), held_out=given, catalogue=task.catalogue)
+        return replace(_closed(task, train, numbered), held_out=test, catalogue=task.catalogue)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +180,7 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
     effects = attach(scene, (), task.catalogue)
     say(Stage.CHECK_PRIOR)
     prior = _prior_test(task, train, effects)
-    if not prior.passed:  # nobody wants the fit of wrong units
+    if not prior.passed:  # before the long fit: units may be wrong
         hint = "the declared prior does not explain this recording, unless a missing effect is why"
         warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
     say(Stage.FIT)
@@ -292,7 +291,7 @@ def _prior_test(
     share = float(checked.dataset["share_beyond"].max())
     sentence, *more = checked.summary
     if more:
-        sentence = f"{sentence}; so it is with {len(more)} more"
+        sentence = f"{sentence}; {len(more)} more likewise"
     return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, sentence)
 
 

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import rankdata
 
 from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.cross_validation import folds
-from pbrl_ppl.criticism.results import Unexplained
+from pbrl_ppl.criticism.results import ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.state import STATE, Floats, Ints
 
+#: Name of the test.
+DEPENDENCE = "dependence on state, command and time"
 #: Permutations a body: the smallest p-value is a fifth of the significance.
 _PERMUTATIONS = 500
 _FOLDS = 5
@@ -65,23 +66,9 @@ PRODUCTS = {
 QUANTITIES = FEATURES | {name: f"{FEATURES[a]} {FEATURES[b]}" for name, (a, b) in PRODUCTS.items()}
 
 
-@dataclass(frozen=True)
-class Dependence:
-    """Result of the test for dependence.
-
-    Parameters
-    ----------
-    tested : bool
-        Whether there were enough transitions.
-    found : Unexplained or None
-        The strongest dependence; None if none is significant.
-    """
-
-    tested: bool
-    found: Unexplained | None = None
-
-
-def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Dependence:
+def find_dependence(
+    mode: Mode, criteria: Criteria, *, seed: int = 0
+) -> tuple[ResidualTest, Unexplained | None]:
     """Test whether the innovations of a fitted model depend on state, action or time.
 
     A kernel ridge regression with one smooth term a quantity, or product of two, predicts the
@@ -99,14 +86,16 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
 
     Returns
     -------
-    Dependence
-        The strongest dependence.
+    test : ResidualTest
+        Untested with too few transitions.
+    found : Unexplained or None
+        The strongest dependence; None if none is significant.
     """
     rng = np.random.default_rng(seed)
     problem = mode.problem
     n, limits = problem.segments.n, criteria.residual
     if n < limits.least_transitions:
-        return Dependence(tested=False)
+        return ResidualTest.untested(DEPENDENCE, "too few transitions"), None
     tests = len(problem.scene.dynamic)
     permutations = _PERMUTATIONS * tests - 1
     chosen = np.sort(rng.permutation(n)[:_MOST])
@@ -135,7 +124,10 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
             continue
         if best is None or shares[at] > best.share:
             best = _describe(body.name, names[at], features, y[:, at], shares[at], p_value)
-    return Dependence(tested=True, found=best)
+    if best is None:
+        sentence = "the innovations depend on no recorded quantity"
+        return ResidualTest(DEPENDENCE, 1.0, 0.0, True, sentence), None
+    return ResidualTest(DEPENDENCE, best.p_value, best.share, False, best.sentence), best
 
 
 def _in_both_frames(

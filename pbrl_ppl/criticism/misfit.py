@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import Criteria
-from pbrl_ppl.criticism.dependence import Dependence, find_dependence
+from pbrl_ppl.criticism.dependence import DEPENDENCE, find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import UnexplainedAcceleration, noise_alone
@@ -20,7 +20,6 @@ from pbrl_ppl.state import STATE, Floats
 #: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
 _NOTHING_RECORDED = "nothing that was recorded"
-DEPENDENCE = "dependence on state, command and time"
 #: Lengths of forecasts that a picture shows, at most.
 _LENGTHS = 6
 
@@ -98,26 +97,15 @@ def find_misfit(
     seed : int
         Seed of the permutations.
     """
-    dependence = find_dependence(mode, excess.criteria, seed=seed)
+    of_dependence, dependence = find_dependence(mode, excess.criteria, seed=seed)
     of_correlation, correlations = correlation_tests(mode, excess.criteria)
     of_forecasts, growth = _forecasts(mode, noise_alone(mode, excess), horizon, excess.criteria)
-    tests = (_acceleration(excess), *of_correlation, of_forecasts, _dependence(dependence))
+    tests = (_acceleration(excess), *of_correlation, of_forecasts, of_dependence)
     failed = [test for test in tests if not test.passed]
     unexplained = None
     if failed:
-        unexplained = dependence.found or _located(failed[0], mode, excess)
+        unexplained = dependence or _located(failed[0], mode, excess)
     return Misfit(tests, unexplained, correlations, growth)
-
-
-def _dependence(dependence: Dependence) -> ResidualTest:
-    """Return the test of dependence on state, command and time."""
-    if not dependence.tested:
-        return ResidualTest.untested(DEPENDENCE, "too few transitions")
-    found = dependence.found
-    if found is None:
-        sentence = "the innovations depend on no recorded quantity"
-        return ResidualTest(DEPENDENCE, 1.0, 0.0, True, sentence)
-    return ResidualTest(DEPENDENCE, found.p_value, found.share, False, found.sentence)
 
 
 def _located(test: ResidualTest, mode: Mode, excess: UnexplainedAcceleration) -> Unexplained:

@@ -74,7 +74,7 @@ def criticise(
     criteria : Criteria
         When the engine's error is small enough.
     progress : callable, optional
-        Told the name of each stage.
+        Called with the name of each stage.
 
     Returns
     -------

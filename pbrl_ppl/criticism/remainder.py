@@ -13,7 +13,8 @@ from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.cross_validation import gain
-from pbrl_ppl.criticism.rivals import likeliest_mode
+from pbrl_ppl.criticism.refinement import with_effects
+from pbrl_ppl.criticism.rivals import posterior_mode
 from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learned_remainder
@@ -94,7 +95,7 @@ def learn_remainder(
     """
     say = progress or (lambda stage: None)
     with threadpool_limits(1, "blas"):
-        mode = likeliest_mode(posterior, tuple(catalogue))
+        mode = posterior_mode(posterior, tuple(catalogue))
         present = [attached.effect.name for attached in mode.problem.physics.effects]
         if LEARNED_REMAINDER in present:
             raise FitError("posterior: it has a learned remainder already; take one without")
@@ -127,11 +128,9 @@ def remainder_in_words(before: Any, after: Any) -> str:
 
 def _refitted(mode: Mode, effect: LearnedRemainder, body: str) -> Mode:
     """Return the mode with the learned force, fitted from its zero on."""
-    effects = (*mode.problem.physics.effects, effect.on(body))
-    problem = mode.problem.with_physics(effects=effects)
-    phi = problem.layout.from_layout(mode.problem.layout, mode.phi)
-    phi[[problem.layout.labels.index(label) for label in effect.on(body).labels]] = 0.0
-    return trajectory_mode(problem, phi, mode.sigma)
+    attached = effect.on(body)
+    effects = (*mode.problem.physics.effects, attached)
+    return trajectory_mode(*with_effects(mode, effects, {attached: 0.0}), mode.sigma)
 
 
 def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRemainder:
@@ -227,10 +226,10 @@ def residual_forces(mode: Mode, body: str) -> tuple[Floats, dict[int, Floats]]:
     velocity = np.stack([c * vx + s * vy, c * vy - s * vx, omega], axis=1)
     declared = problem.scene.body(body)
     known = dict(declared.known)
-    mass = (
-        known["mass"] if "mass" in known else mode.phi[problem.layout.index("mass", declared.owner)]
-    )
-    mass = float(mass)
+    if "mass" in known:
+        mass = float(known["mass"])
+    else:
+        mass = float(mode.phi[problem.layout.index("mass", declared.owner)])
     forces: dict[int, Floats] = {}
     if places[0] is not None and places[1] is not None:
         ax, ay = added[:, places[0]], added[:, places[1]]

@@ -113,26 +113,6 @@ def _points(
     return np.array(points), plan
 
 
-def detection_limits(
-    effect: Effect, unit: Floats, tried: int, criteria: ScoreCriteria
-) -> dict[str, float]:
-    """Return the smallest detectable size of each parameter, the others at their null values.
-
-    Parameters
-    ----------
-    effect : Effect
-        The effect.
-    unit : ndarray
-        Change of the prediction by one unit of each parameter, in units of noise, shape (q,).
-    tried : int
-        Number of tests that the p-value is corrected for.
-    criteria : ScoreCriteria
-        P-value and power of the limit.
-    """
-    sizes = _sizes(unit, tried, criteria)
-    return dict(zip((p.name for p in effect.parameters), sizes, strict=True))
-
-
 def detection_limits_of_scan(
     effect: Effect,
     looks: Sequence[Look],
@@ -170,7 +150,9 @@ def detection_limits_of_scan(
         seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
         found[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
     for look, unit in zip(looks, units, strict=True):
-        for column, size in zip(look.columns, _sizes(unit, tried, criteria), strict=False):
+        for column, size in zip(
+            look.columns, detectable_sizes(unit, tried, criteria), strict=False
+        ):
             found[names[column]] = min(found.get(names[column], np.inf), size)
     return found
 
@@ -187,7 +169,17 @@ def _needed(tried: int, criteria: ScoreCriteria) -> float:
     return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
 
 
-def _sizes(unit: Floats, tried: int, criteria: ScoreCriteria) -> list[float]:
-    """Return the detectable size of each column."""
+def detectable_sizes(unit: Floats, tried: int, criteria: ScoreCriteria) -> list[float]:
+    """Return the smallest detectable size of each column, the others at their null values.
+
+    Parameters
+    ----------
+    unit : ndarray
+        Change of the prediction by one unit of each column, in units of noise, shape (column,).
+    tried : int
+        Number of tests that the p-value is corrected for.
+    criteria : ScoreCriteria
+        P-value and power of the limit.
+    """
     with np.errstate(divide="ignore"):
         return [float(size) for size in _needed(tried, criteria) / unit]

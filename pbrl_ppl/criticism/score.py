@@ -11,8 +11,9 @@ from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.scan import caps, detection_limits, detection_limits_of_scan, looks
+from pbrl_ppl.criticism.scan import caps, detectable_sizes, detection_limits_of_scan, looks
 from pbrl_ppl.effects import Attached, Noise
+from pbrl_ppl.likelihood import TrajectoryLikelihood
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
@@ -238,10 +239,11 @@ def _signature(
 ) -> Signature:
     """Return a candidate's signature, its p-value corrected for grid points and candidates."""
     effect, limits = attached.effect, {}
-    if effect.scan is None:
-        limits = detection_limits(effect, evidence.unit, test.candidates, test.criteria.score)
-    log_p = min(0.0, evidence.log_p + np.log(max(1, n_looks)))
     names = [parameter.name for parameter in effect.parameters]
+    if effect.scan is None:
+        sizes = detectable_sizes(evidence.unit, test.candidates, test.criteria.score)
+        limits = dict(zip(names, sizes, strict=True))
+    log_p = min(0.0, evidence.log_p + np.log(max(1, n_looks)))
     candidate = Candidate(
         effect=effect.name,
         body=attached.body,
@@ -297,12 +299,13 @@ def _tail_score(mode: Mode, attached: Attached, test: _Test) -> Signature:
     (z^4 - 2 z^2 - 1) / 4; without its projection on sigma's score it is the fourth Hermite
     polynomial over 4, of variance 3/2.
     """
-    noise = mode.problem.trajectory_noise
-    seen = mode.problem.observations.measured if noise is None else noise.seen
+    problem = mode.problem
+    along = isinstance(problem.likelihood, TrajectoryLikelihood)
+    seen = problem.trajectory_noise.seen if along else problem.observations.measured
     whitened = test.residual[: seen.size].reshape(seen.shape)
     # coordinates that never move have no noise, and would make all others look heavy-tailed
     loud = seen & (np.abs(whitened).max(axis=0) > test.criteria.score.visible)
-    z = whitened[loud] if mode.problem.nu(mode.phi) is None else np.zeros(0)
+    z = whitened[loud] if problem.nu(mode.phi) is None else np.zeros(0)
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0

@@ -103,7 +103,7 @@ class SectorContacts:
 
     @property
     def directions(self) -> Floats:
-        """Directions of the rays in the body's frame, sector by sector, shape (ray, 2)."""
+        """Return the rays' directions in the body's frame, sector by sector, shape (ray, 2)."""
         middle = np.arange(self.sectors * self.rays) + 0.5 * (1 - self.rays)
         angle = 2 * np.pi * middle / (self.sectors * self.rays)
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)

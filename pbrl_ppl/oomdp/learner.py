@@ -176,12 +176,12 @@ class Learner(ABC):
 
     @property
     def draws(self) -> int:
-        """Number of draws: 1, a point estimate."""
+        """Return the number of draws: 1, a point estimate."""
         return 1
 
     @property
     def before(self) -> Floats:
-        """Wrench before the first interval: zeros, shape (body, 3)."""
+        """Return the wrench before the first interval: zeros, shape (body, 3)."""
         return np.zeros((len(self.scene.moving), len(WRENCH)))
 
     def single(self) -> Self:

@@ -144,7 +144,7 @@ class Experience:
 
     @property
     def counts(self) -> dict[Key, int]:
-        """Number of transitions in each observed condition."""
+        """Return the number of transitions in each observed condition."""
         return {key: len(rows) for key, rows in self._rows.items()}
 
     def predict(self, x: Floats, flags: Bools) -> Floats:
