@@ -13,7 +13,13 @@ from threadpoolctl import threadpool_limits
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.held_out import HeldOut, example_rollout, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
-from pbrl_ppl.criticism.misfit import PRIOR, Misfit, find_misfit, with_negligible_acceleration
+from pbrl_ppl.criticism.misfit import (
+    NOTHING_RECORDED,
+    PRIOR,
+    Misfit,
+    find_misfit,
+    with_negligible_acceleration,
+)
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.recordings import checked_histories, outliers
@@ -421,18 +427,12 @@ def _acceleration(before: UnexplainedAcceleration, after: UnexplainedAcceleratio
 def _worse(before: Errors, after: Errors) -> Unexplained:
     """Return what is unexplained where the revised model's held-out error is the larger one."""
     rise = after.normalised_rmse / before.normalised_rmse - 1.0
-    return Unexplained(
-        body="",
-        dimension="",
-        depends_on="nothing that was recorded",
-        share=0.0,
-        p_value=float("nan"),
-        sentence=(
-            "the revised model forecasts the held-out trajectories worse than the declared one: its"
-            f" error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
-            f" {before.normalised_rmse:.3g} times the noise"
-        ),
+    sentence = (
+        "the revised model forecasts the held-out trajectories worse than the declared one: its"
+        f" error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
+        f" {before.normalised_rmse:.3g} times the noise"
     )
+    return Unexplained("", "", NOTHING_RECORDED, 0.0, float("nan"), sentence)
 
 
 def _added(step: Step, revised: _Model) -> Added:

@@ -111,11 +111,7 @@ def correlation_tests(
 
 
 def _lagged(
-    white: Floats,
-    seen: Bools,
-    number: Ints,
-    series: Floats | None,
-    criteria: Criteria,
+    white: Floats, seen: Bools, number: Ints, series: Floats | None, criteria: Criteria
 ) -> _Correlation:
     """Return correlations with series some intervals before, or of each coordinate with itself."""
     values, pairs = [], []
@@ -150,11 +146,7 @@ def _commands(mode: Mode) -> tuple[Floats, list[str]]:
 
 
 def _regression_p_value(
-    white: Floats,
-    seen: Bools,
-    number: Ints,
-    commands: Floats,
-    criteria: Criteria,
+    white: Floats, seen: Bools, number: Ints, commands: Floats, criteria: Criteria
 ) -> float | None:
     """Return the p-value of the regression on commands of several lags; None if data are too few.
 

@@ -105,11 +105,14 @@ class HeldOut:
         phi, sigma = parameter_draws(mode.problem, posterior)
         rng = np.random.default_rng(seed)
         chosen = rng.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
+        phi, sigma = phi[chosen], sigma[chosen]
+        residual = self.problem.residual(phi, self.problem.one_world)
+        density = self.problem.log_density(residual, sigma, phi)
         return Errors(
             one_step_rmse=forecast(self.problem, mode.phi, mode.sigma, 1).rmse(),
             rollout_rmse=forecast(self.problem, mode.phi, mode.sigma, rollout).rmse(),
             normalised_rmse=float(np.sqrt((self.whitened(unit) ** 2).sum() / seen.sum())),
-            elpd=float(_elpd(self.problem, phi[chosen], sigma[chosen]).sum()),
+            elpd=float((logsumexp(density, axis=0) - np.log(len(phi))).sum()),
         )
 
     def noise_floor(self, sigma: Floats, rollout: int) -> Errors:
@@ -154,9 +157,3 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
         before=predicted[0],
         after=predicted[1],
     )
-
-
-def _elpd(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
-    """Return the log predictive density of each held-out transition, shape (transition,)."""
-    density = problem.log_density(problem.residual(phi, problem.one_world), sigma, phi)
-    return np.asarray(logsumexp(density, axis=0) - np.log(len(phi)))

@@ -19,7 +19,8 @@ from pbrl_ppl.state import STATE, Floats
 
 #: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
-_NOTHING_RECORDED = "nothing that was recorded"
+#: What an unexplained residual depends on where no quantity predicts it.
+NOTHING_RECORDED = "nothing that was recorded"
 #: Lengths of forecasts that a picture shows, at most.
 _LENGTHS = 6
 
@@ -65,7 +66,7 @@ class Misfit:
         """Return the misfit with one more test, which is the unexplained one if no other fails."""
         unexplained = self.unexplained
         if unexplained is None and not test.passed:
-            unexplained = Unexplained("", "", _NOTHING_RECORDED, 0.0, 0.0, test.sentence)
+            unexplained = Unexplained("", "", NOTHING_RECORDED, 0.0, 0.0, test.sentence)
         return replace(self, tests=(*self.tests, test), unexplained=unexplained)
 
 
@@ -116,7 +117,7 @@ def _located(test: ResidualTest, mode: Mode, excess: UnexplainedAcceleration) ->
     columns = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
     size = (mode.whitened_residual[:, columns] ** 2).mean(axis=0)
     body = mode.problem.scene.moving[int(places[columns[int(np.argmax(size))]] // len(STATE))].name
-    return Unexplained(body, name, _NOTHING_RECORDED, test.size, test.p_value, test.sentence)
+    return Unexplained(body, name, NOTHING_RECORDED, test.size, test.p_value, test.sentence)
 
 
 def _acceleration(excess: UnexplainedAcceleration) -> ResidualTest:

@@ -62,7 +62,11 @@ def checked_histories(
                 f"{which} history: it has a row each {step:g} s, the scene each"
                 f" {scene.time_step:g} s; load it with this scene"
             )
-    same, unused = test is train, _unused(train)
+    same = test is train
+    # a bad frame makes positions look noisy, and a measured velocity as if they predicted it
+    clear = np.flatnonzero(~bad_frames(train).any(axis=(1, 2, 3)))
+    most = 2 * len(clear) >= train.n_trajectories
+    unused = unused_velocities(train.select(clear) if most else train)
     train, test = measured_alone(train, unused), measured_alone(test, unused)
     train, bad = without_bad_frames(train)
     test, more = without_bad_frames(test)
@@ -81,16 +85,6 @@ def checked_histories(
         )
     held_out = [] if same else [f"held out: {frame}" for frame in more]
     return train, test, unused, (*map(str, bad), *held_out)
-
-
-def _unused(history: History) -> tuple[UnusedVelocity, ...]:
-    """Return the velocities that are not used, judged without bad trajectories if few are bad.
-
-    A bad frame makes positions look noisy, and a measured velocity as if they predicted it.
-    """
-    clear = np.flatnonzero(~bad_frames(history).any(axis=(1, 2, 3)))
-    most = 2 * len(clear) >= history.n_trajectories
-    return unused_velocities(history.select(clear) if most else history)
 
 
 def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:

@@ -102,7 +102,9 @@ def learn_remainder(
         say(Stage.LEARN)
         effect = _learned(mode, body, seed, criteria)
         say(Stage.REFIT)
-        refitted = _refitted(mode, effect, body)
+        attached = effect.on(body)
+        start = with_effects(mode, (*mode.problem.physics.effects, attached), {attached: 0.0})
+        refitted = trajectory_mode(*start, mode.sigma)
         gained = gain(mode, refitted, criteria)
         if gained.total < criteria.min_elpd or not gained.certain(criteria.min_elpd_se):
             raise FitError(
@@ -124,13 +126,6 @@ def remainder_in_words(before: Any, after: Any) -> str:
         f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
         f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {unit}"
     )
-
-
-def _refitted(mode: Mode, effect: LearnedRemainder, body: str) -> Mode:
-    """Return the mode with the learned force, fitted from its zero on."""
-    attached = effect.on(body)
-    effects = (*mode.problem.physics.effects, attached)
-    return trajectory_mode(*with_effects(mode, effects, {attached: 0.0}), mode.sigma)
 
 
 def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRemainder:

@@ -395,7 +395,8 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
     monkeypatch.setattr(loop_module, "fit", rough)
     monkeypatch.setattr(loop_module, "build_model", lambda problem: problem)
     mode = _Mode(SimpleNamespace(with_physics=lambda threads: None))
+    task = SimpleNamespace(method=method, seed=1, draws=None, criteria=DEFAULT, say=print)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        loop_module._posterior(mode, method, 1, None, DEFAULT, print)
+        loop_module._posterior(task, mode)
     assert len(caught) == said
