@@ -217,7 +217,7 @@ def until_it_fits(stage: str) -> None:
 
 @pytest.mark.one_stack
 def test_wrong_units_are_told_before_the_fit(clean) -> None:
-    told = pytest.warns(PriorWarning, match="of puck changes .* check units.*; so it is with")
+    told = pytest.warns(PriorWarning, match="of puck changes .* check units.*; [0-9]+ more")
     with told, pytest.raises(Fitting):
         loop([millinewtons(frame) for frame in clean], progress=until_it_fits)
     with warnings.catch_warnings():
