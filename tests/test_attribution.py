@@ -153,7 +153,7 @@ def test_a_twin_is_a_right_name(attribution, row) -> None:
 
 def test_excess_and_baselines_by_hand(attribution, row) -> None:
     found = row("catalogued", "effects-added", "linear_drag")
-    found["error"]["after"]["rollout_rmse"] = {"x": 0.011, "vx": 0.11}
+    found.findings["error"]["after"]["rollout_rmse"] = {"x": 0.011, "vx": 0.11}
     # the loop may leave out a velocity that looks as if computed from positions
     oracle = attribution.oracle.Oracle(99.0, 1e-9, {"x": 0.01, "vx": 0.1, "vy": 0.1})
     rows = [

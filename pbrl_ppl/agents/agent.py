@@ -114,7 +114,7 @@ class Agent(ABC):
         return self._last.copy()
 
     def _planned(self, model: TransitionModel, state: Floats) -> Floats:
-        """Return a plan's wrenches, shape (time, body, 3): the old ones if they still do."""
+        """Return wrenches (time, body, 3): the last plan's if it reaches the goal."""
         task = self.task
         if len(self._ahead):
             end = rollout(model.after(self._last), state, self._ahead)[:, -1]

@@ -274,7 +274,7 @@ def _run_and_save(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path:
 
 
 def _stored(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
-    """Return the episode of a file, after a check that it belongs to this experiment."""
+    """Return the episode of a file; check seed, noise, limit, world and start."""
     episode = Episode.load(path, world.task.scene)
     expected = {"seed": seed, "sigma": world.sigma, "limit": steps}
     for name, value in expected.items():

@@ -83,7 +83,7 @@ class LibraryAgent(PhysicsAgent):
         self.method = method
         scene = task.scene
         if any(body.effects or body.kinematic for body in scene.bodies):
-            raise FitError("PBRL: the scene has effects or a kinematic body, which no set is for")
+            raise FitError("PBRL: no library is for effects or kinematic bodies; take PBRLAgent")
         self.library, self.fits = library, 0
         self._layout = build_layout(scene)
         self._table = library.table(self._layout, scene)

@@ -21,7 +21,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Task:
-    """What an agent is given: a scene, a goal, and actions; not the dynamics.
+    """Scene, goal and actions of an agent; the dynamics are unknown to it.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class Task:
         if self.actions.intervals(self.scene) != (1,):
             raise GoalError(
                 f"task: actions last {self.actions.durations} s, expected one sampling interval of"
-                f" {self.scene.time_step:g} s; an agent chooses anew after each"
+                f" {self.scene.time_step:g} s; an agent chooses an action for each"
             )
         start_state(self.scene, {})
 

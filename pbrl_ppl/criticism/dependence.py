@@ -214,7 +214,7 @@ def _describe(
         share=float(share),
         p_value=min(1.0, p_value),
         sentence=(
-            f"the error of {dimension} of {body} still depends on its {name}:"
-            f" {share:.0%} of it could be predicted, and nothing in the catalogue does so"
+            f"the error of {dimension} of {body} depends on its {name}: a regression predicts"
+            f" {share:.0%} of its variance, and no effect in the catalogue does"
         ),
     )

@@ -167,7 +167,7 @@ def _forecasts(
     passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
     dt = mode.problem.scene.time_step
     seconds = longest * dt
-    sentence = f"forecasts of {seconds:g} s are as good as noise lets them be"
+    sentence = f"errors of forecasts of {seconds:g} s are those of noise"
     if not passed:
         sentence = (
             f"after {seconds:g} s the error of {name} is {worst:.1f} times what noise and"

@@ -132,7 +132,7 @@ class Learner(ABC):
         if len({len(values) for values in arrays}) > 1:
             raise HistoryError(
                 f"observe: got {', '.join(str(len(values)) for values in arrays)} states, actions"
-                " and next states, expected as many of each"
+                " and next states, expected equal numbers"
             )
         begin, wrench, after = arrays
         flags = self.predicates(begin, wrench)
