@@ -195,7 +195,7 @@ class Box2DWorld(World):
 
 
 class _Products(Box2D.b2ContactListener):
-    """Takes products for friction and restitution; Box2D's default is the root and the maximum."""
+    """Contact listener that multiplies frictions and restitutions, as the package's engine does."""
 
     def PreSolve(self, contact: Any, manifold: Any) -> None:
         pair = contact.fixtureA.userData, contact.fixtureB.userData
