@@ -371,7 +371,8 @@ def _put_together(
         verdict = NOT_CONVERGED
     added = tuple(_added(step, revised) for step in steps)
     keep_groups(revised.posterior, added)
-    noise = noise_alone(revised.mode, revised.excess)
+    first, last = declared.excess, revised.excess
+    noise = noise_alone(revised.mode, last)
     return Loop(
         scene=scene,
         verdict=verdict,
@@ -401,26 +402,17 @@ def _put_together(
             "rollout_seconds": rollout * scene.time_step,
         },
         tests=misfit.tests,
-        acceleration=_acceleration(declared.excess, revised.excess),
+        acceleration=Acceleration(
+            first.by_name(first.size),
+            last.by_name(last.size),
+            first.by_name(first.relative),
+            last.by_name(last.relative),
+            last.by_name(last.certain),
+        ),
         correlations=misfit.correlations,
         growth=misfit.growth,
         identifiability=identify(revised.posterior, mode=revised.mode),
         loo=compare(declared.posterior, revised.posterior),
-    )
-
-
-def _acceleration(before: UnexplainedAcceleration, after: UnexplainedAcceleration) -> Acceleration:
-    """Return the unexplained accelerations of both models by name."""
-
-    def named(excess: UnexplainedAcceleration, values: Any) -> dict[str, Any]:
-        return dict(zip(excess.names, values.tolist(), strict=True))
-
-    return Acceleration(
-        named(before, before.size),
-        named(after, after.size),
-        named(before, before.relative),
-        named(after, after.relative),
-        named(after, after.certain),
     )
 
 

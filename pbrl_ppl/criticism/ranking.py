@@ -106,7 +106,7 @@ def criticise(
     return Ranking(
         tuple(signature.candidate for signature in ranked),
         dict(zip(mode.problem.layout.labels, mode.phi.tolist(), strict=True)),
-        dict(zip(excess.names, excess.size.tolist(), strict=True)),
+        excess.by_name(excess.size),
         mode.problem.physics.substeps,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.stats import chi2
@@ -41,6 +42,10 @@ class UnexplainedAcceleration:
     p_value: Floats
     numerical: Floats
     criteria: Criteria = DEFAULT
+
+    def by_name(self, values: Floats | Bools) -> dict[str, Any]:
+        """Return values of the velocities, shape (velocity,), by name."""
+        return dict(zip(self.names, values.tolist(), strict=True))
 
     @property
     def certain(self) -> Bools:
