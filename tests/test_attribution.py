@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
+from pbrl_ppl.effects import attach
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.state import STATE
 from tests.helpers.places import ROOT
 
@@ -151,7 +153,7 @@ def test_a_twin_is_a_right_name(attribution, row) -> None:
 
 def test_excess_and_baselines_by_hand(attribution, row) -> None:
     found = row("catalogued", "effects-added", "linear_drag")
-    found["error"]["after"]["rollout_rmse"] = {"x": 0.011, "vx": 0.11}
+    found.findings["error"]["after"]["rollout_rmse"] = {"x": 0.011, "vx": 0.11}
     # the loop may leave out a velocity that looks as if computed from positions
     oracle = attribution.oracle.Oracle(99.0, 1e-9, {"x": 0.01, "vx": 0.1, "vy": 0.1})
     rows = [
@@ -276,7 +278,7 @@ def test_a_drawn_body_makes_histories_that_its_scene_explains(attribution, sort)
     again, _ = case.histories(seed=0)
     assert again.data_sha256 == train.data_sha256 != case.histories(seed=1)[0].data_sha256
     scene = case.body.scene.replace(substeps=200)
-    problem = pp.model.Problem.of(scene, train, pp.effects.attach(scene))
+    problem = Problem.of(scene, train, attach(scene))
     truth = {
         f"{name}[{s.name}]": getattr(s, name) for s in setups for name in ("mass", "r", "mu_c")
     }

@@ -7,15 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from pbrl_ppl.errors import GoalError
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.planning import ActionSet, Goal, TransitionModel, plan, start_state
 from pbrl_ppl.posterior import scene_of
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +38,8 @@ class Acted:
     """
 
     scene: Scene
-    states: Array
-    wrenches: Array
+    states: Floats
+    wrenches: Floats
     reached: bool
     distance: float
     plans: int
@@ -53,7 +52,7 @@ class Acted:
 
 
 def act(
-    world: Callable[[Array], Array],
+    world: Callable[[Floats], Floats],
     idata: Any,
     start: Mapping[str, Sequence[float]] | ArrayLike,
     goal: Goal | Mapping[str, Sequence[float | None]],
@@ -63,7 +62,7 @@ def act(
     intervals: int = 200,
     **options: Any,
 ) -> Acted:
-    """Plan, play the start of the plan, measure, and plan again, until the goal is reached.
+    """Plan, play the start of the plan, measure and replan until the goal is reached.
 
     Parameters
     ----------
@@ -103,7 +102,7 @@ def act(
     goal = goal if isinstance(goal, Goal) else Goal.of(goal)
     goal.check(scene)
     states, plans = [start_state(scene, start)], 0
-    played: list[Array] = []
+    played: list[Floats] = []
     while len(played) < intervals and not _is_reached(scene, goal, states[-1]):
         before = played[-1] if played else None
         ahead = plan(idata, states[-1], goal, actions, before=before, **options)
@@ -128,6 +127,6 @@ def act(
     )
 
 
-def _is_reached(scene: Scene, goal: Goal, state: Array) -> bool:
+def _is_reached(scene: Scene, goal: Goal, state: Floats) -> bool:
     """Return whether a state (body, 6) is within the goal's tolerances."""
     return bool(goal.shortfall(scene, state) <= 1.0)

@@ -7,15 +7,12 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.agents.revision import Revision
 from pbrl_ppl.agents.world import Task
 from pbrl_ppl.oomdp import LWR, OOLWR
 from pbrl_ppl.planning import Dynamics, TransitionModel, plan, rollout
-from pbrl_ppl.state import THETA, wrapped
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import THETA, Floats, wrapped
 
 
 class Agent(ABC):
@@ -63,10 +60,10 @@ class Agent(ABC):
     @property
     @abstractmethod
     def model(self) -> TransitionModel | None:
-        """Model to plan with; None before anything was learned."""
+        """Return the model to plan with; None before anything was learned."""
 
     @abstractmethod
-    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+    def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Observe a transition.
 
         Parameters
@@ -82,10 +79,10 @@ class Agent(ABC):
 
     @property
     def estimates(self) -> Mapping[str, float]:
-        """Current estimates of physical parameters by label; none by default."""
+        """Return current estimates of physical parameters by label; none by default."""
         return {}
 
-    def act(self, state: Array) -> Array:
+    def act(self, state: Floats) -> Floats:
         """Return the next action: planned, or random without a plan.
 
         Parameters
@@ -116,8 +113,8 @@ class Agent(ABC):
         self._last = wrenches[chosen]
         return self._last.copy()
 
-    def _planned(self, model: TransitionModel, state: Array) -> Array:
-        """Return a plan's wrenches, shape (time, body, 3): the old ones if they still do."""
+    def _planned(self, model: TransitionModel, state: Floats) -> Floats:
+        """Return wrenches (time, body, 3): the last plan's if it reaches the goal."""
         task = self.task
         if len(self._ahead):
             end = rollout(model.after(self._last), state, self._ahead)[:, -1]
@@ -136,12 +133,12 @@ class PhysicsAgent(Agent):
 
     @property
     def model(self) -> Dynamics | None:
-        """Eq. 7 with the estimated parameters; None before the first estimate."""
+        """Return Eq. 7 with the estimated parameters; None before the first estimate."""
         return self._dynamics
 
     @property
     def estimates(self) -> Mapping[str, float]:
-        """Parameters by label, SI units: the mode, or of draws the nearest to their mean."""
+        """Return parameters by label, SI units: the mode, or the draw nearest to the mean."""
         if self._dynamics is None:
             return {}
         middle = self._dynamics.single()
@@ -149,8 +146,8 @@ class PhysicsAgent(Agent):
 
 
 def prediction_errors(
-    dynamics: Dynamics, state: Array, action: Array, after: Array, previous: Array | None = None
-) -> Array:
+    dynamics: Dynamics, state: Floats, action: Floats, after: Floats, previous: Floats | None = None
+) -> Floats:
     """Return the absolute errors of the mean prediction of each transition, shape (n, body, 6).
 
     Parameters
@@ -181,10 +178,10 @@ class _RegressionAgent(Agent):
 
     @property
     def model(self) -> LWR | OOLWR | None:
-        """Regression; None before it has any data."""
+        """Return the regression; None before it has any data."""
         return self._learner if self._learner.transitions else None
 
-    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+    def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Learn from a transition; arguments as for :meth:`Agent.observe`."""
         self._learner.observe(state, action, next_state)
 
@@ -270,8 +267,8 @@ class TrueModelAgent(Agent):
 
     @property
     def model(self) -> Dynamics:
-        """True dynamics."""
+        """Return the true dynamics."""
         return self._dynamics
 
-    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+    def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Do nothing: there is nothing to learn."""

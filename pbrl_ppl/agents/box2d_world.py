@@ -9,12 +9,12 @@ from collections.abc import Callable, Mapping
 from typing import Any, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.agents.world import Task, World
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.physics import scenery
 from pbrl_ppl.scene import WORLD
+from pbrl_ppl.state import Floats
 
 try:
     with warnings.catch_warnings():  # its generated wrapper warns on import under newer Pythons
@@ -25,7 +25,6 @@ except ImportError as error:  # an optional dependency
         f"Box2D world: {error}; install Box2D: pip install 'pbrl_ppl[agents]'"
     ) from None
 
-Array = NDArray[np.float64]
 
 #: Box2D's tolerances are compiled in: nothing bounces below 1 length unit per second, and overlaps
 #: up to 0.005 units remain. With the centimetre as unit they are 1 cm/s and 0.05 mm.
@@ -83,7 +82,7 @@ class Box2DWorld(World):
         sigma: float = 0.0,
         spread: float = 0.0,
         step: float = 0.001,
-        acting: Callable[[Array], Array] | None = None,
+        acting: Callable[[Floats], Floats] | None = None,
     ) -> None:
         scene = task.scene
         if not 0 < step <= scene.time_step:
@@ -117,11 +116,11 @@ class Box2DWorld(World):
 
     @property
     def description(self) -> str:
-        """Engine, true parameters and ``acting``, as JSON."""
+        """Return engine, true parameters and ``acting``, as JSON."""
         acting = {} if self._acting is None else {"acting": repr(self._acting)}
         return json.dumps(json.loads(super().description) | acting)
 
-    def _play(self, state: Array, action: Array) -> Array:
+    def _play(self, state: Floats, action: Floats) -> Floats:
         action = action if self._acting is None else self._acting(action)
         engine, rigid = self._engine(state)
         step = self.task.scene.time_step / self._steps
@@ -136,7 +135,7 @@ class Box2DWorld(World):
         ]
         return np.array(after) / [_CM, _CM, 1.0, _CM, _CM, 1.0]
 
-    def _engine(self, state: Array) -> tuple[Any, list[Any]]:
+    def _engine(self, state: Floats) -> tuple[Any, list[Any]]:
         """Return a Box2D world in a state, and its moving bodies."""
         scene = self.task.scene
         listener = _Products()
@@ -176,7 +175,7 @@ class Box2DWorld(World):
             )  # fmt: skip
         return engine, rigid
 
-    def _kick(self, rigid: list[Any], action: Array, step: float) -> None:
+    def _kick(self, rigid: list[Any], action: Floats, step: float) -> None:
         """Apply the wrenches and the floor's friction on the wheels to the velocities."""
         scene = self.task.scene
         bodies = zip(rigid, action, self._values, scene.moving, strict=True)
@@ -196,7 +195,7 @@ class Box2DWorld(World):
 
 
 class _Products(Box2D.b2ContactListener):
-    """Takes products for friction and restitution; Box2D's default is the root and the maximum."""
+    """Contact listener that multiplies frictions and restitutions, as the package's engine does."""
 
     def PreSolve(self, contact: Any, manifold: Any) -> None:
         pair = contact.fixtureA.userData, contact.fixtureB.userData

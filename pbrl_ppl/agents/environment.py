@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.agents.experiment import AnyWorld, check_state
 from pbrl_ppl.errors import EpisodeError
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, Floats
 
 try:
     import gymnasium
@@ -19,10 +18,8 @@ except ImportError as error:  # an optional dependency
         f"environment: {error}; install Gymnasium: pip install 'pbrl_ppl[agents]'"
     ) from None
 
-Array = NDArray[np.float64]
 
-
-class Environment(gymnasium.Env[Array, np.int64]):
+class Environment(gymnasium.Env[Floats, np.int64]):
     """World as a ``gymnasium.Env``.
 
     An action is the index of one of the task's actions, which are wrenches in the bodies' frames.
@@ -76,12 +73,12 @@ class Environment(gymnasium.Env[Array, np.int64]):
         shape = (len(world.task.scene.moving), len(STATE))
         self.observation_space = spaces.Box(-np.inf, np.inf, shape, np.float64)
         self.action_space = spaces.Discrete(len(world.task.actions.actions))
-        self._state: Array | None = None
+        self._state: Floats | None = None
         self._taken = 0
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    ) -> tuple[Floats, dict[str, Any]]:
         """Go back to the start.
 
         Parameters
@@ -105,7 +102,7 @@ class Environment(gymnasium.Env[Array, np.int64]):
         self._taken = 0
         return self._state.copy(), {"state": self._state.copy(), "bumped": False}
 
-    def step(self, action: np.int64) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.int64) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
         """Hold an action over one sampling interval.
 
         Parameters

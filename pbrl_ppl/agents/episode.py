@@ -9,15 +9,12 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Floats
 
 _KIND = "episode"
 #: Variables of an episode, and their dimensions.
@@ -151,7 +148,7 @@ class Episode:
             differ = (name for name, value in fields if value != vars(scene).get(name))
             raise EpisodeError(
                 f"{path}: this is an episode of another scene ({', '.join(differ)} differ); give"
-                " its own scene, or another folder"
+                " the episode's scene, or another folder"
             )
         return episode
 
@@ -167,40 +164,40 @@ class Episode:
 
     @property
     def scene(self) -> Scene:
-        """Scene of the episode."""
+        """Return the scene of the episode."""
         return Scene.from_toml(self.dataset.attrs["scene"])
 
     @property
     def agent(self) -> str:
-        """Name of the agent."""
+        """Return the name of the agent."""
         return str(self.dataset.attrs["agent"])
 
     @property
     def seed(self) -> int:
-        """Seed of the world and the agent."""
+        """Return the seed of the world and the agent."""
         return int(self.dataset.attrs["seed"])
 
     @property
     def reached(self) -> bool:
-        """Whether the goal was reached."""
+        """Return whether the goal was reached."""
         return bool(self.dataset.attrs["reached"])
 
     @property
     def steps(self) -> int:
-        """Number of actions."""
+        """Return the number of actions."""
         return int(self.dataset.sizes["interval"])
 
     @property
     def bumps(self) -> int:
-        """Number of intervals in which a body touched a wall or another body."""
+        """Return the number of intervals in which a body touched a wall or another body."""
         return int(self.dataset["bumped"].sum())
 
     @property
     def added(self) -> list[dict[str, Any]]:
-        """Effects added to the model and kept: ``effect``, ``body`` and ``transitions`` before."""
+        """Return the added effects: ``effect``, ``body``, and ``transitions`` before."""
         return list(json.loads(self.dataset.attrs.get("added", "[]")))
 
-    def rewards(self, steps: int) -> Array:
+    def rewards(self, steps: int) -> Floats:
         """Return the rewards at the start and so many steps, shape (steps + 1,), m.
 
         The last reward is repeated after the end of the episode.

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import Agent
 from pbrl_ppl.agents.episode import VARIABLES, Episode
@@ -20,9 +19,7 @@ from pbrl_ppl.agents.processes import processes, processors
 from pbrl_ppl.agents.world import Outcome, Task
 from pbrl_ppl.errors import EpisodeError
 from pbrl_ppl.posterior import save_posterior
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 #: Makes an agent from a seed.
 MakeAgent = Callable[[int], Agent]
@@ -38,12 +35,12 @@ class AnyWorld(Protocol):
 
     @property
     def task(self) -> Task:
-        """Scene, goal and actions."""
+        """Return scene, goal and actions."""
 
-    def reset(self, seed: int) -> Array:
+    def reset(self, seed: int) -> Floats:
         """Go back to the start and return the state, shape (body, 6), SI units."""
 
-    def step(self, action: Array) -> Outcome:
+    def step(self, action: Floats) -> Outcome:
         """Hold an action, shape (body, 3), over one sampling interval."""
 
 
@@ -277,7 +274,7 @@ def _run_and_save(make: MakeAgent, world: AnyWorld, seed: int, steps: int, path:
 
 
 def _stored(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
-    """Return the episode of a file, after a check that it belongs to this experiment."""
+    """Return the episode of a file; check seed, noise, limit, world and start."""
     episode = Episode.load(path, world.task.scene)
     expected = {"seed": seed, "sigma": world.sigma, "limit": steps}
     for name, value in expected.items():
@@ -301,7 +298,7 @@ def _description(world: AnyWorld) -> str:
     return str(getattr(world, "description", ""))
 
 
-def check_state(task: Task, given: Any, method: str) -> Array:
+def check_state(task: Task, given: Any, method: str) -> Floats:
     """Return a state that a world's method returned, shape (body, 6), after a check.
 
     Raises

@@ -7,7 +7,6 @@ from typing import Any, ClassVar, final
 
 import numpy as np
 import pandas as pd
-from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import PhysicsAgent, prediction_errors
 from pbrl_ppl.agents.world import Task
@@ -22,8 +21,7 @@ from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Draws of the paper's schedule: 5000 iterations, 1000 burn-in, thinning 10, one chain.
 _DRAWS = 400
@@ -85,7 +83,7 @@ class LibraryAgent(PhysicsAgent):
         self.method = method
         scene = task.scene
         if any(body.effects or body.kinematic for body in scene.bodies):
-            raise FitError("PBRL: the scene has effects or a kinematic body, which no set is for")
+            raise FitError("PBRL: no library is for effects or kinematic bodies; take PBRLAgent")
         self.library, self.fits = library, 0
         self._layout = build_layout(scene)
         self._table = library.table(self._layout, scene)
@@ -99,15 +97,17 @@ class LibraryAgent(PhysicsAgent):
             for i, a in enumerate(names)
             for b in names[i + 1 :]
         }
-        self._seen: dict[str, list[tuple[Array, Array, Array]]] = {key: [] for key in scene.owners}
+        self._seen: dict[str, list[tuple[Floats, Floats, Floats]]] = {
+            key: [] for key in scene.owners
+        }
         self._fitted = dict.fromkeys(scene.owners, 0)
 
     @property
     def probabilities(self) -> pd.DataFrame:
-        """Posterior probabilities: one row per body or class, one column per set."""
+        """Return posterior probabilities: one row per body or class, one column per set."""
         return pd.DataFrame(self._probability, index=list(self.library.names)).T
 
-    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+    def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Store a transition of each body that it informs; see :meth:`Agent.observe`."""
         moved = action.any(axis=1) | state[:, 3:].any(axis=1) | (next_state != state).any(axis=1)
         names = [body.name for body in self.task.scene.moving]
@@ -142,12 +142,12 @@ class LibraryAgent(PhysicsAgent):
         dynamics = Dynamics(scene, self._phi(build_layout(scene)), threads=1)
         return bool((prediction_errors(dynamics, state, action, after) > _NEGLIGIBLE).any())
 
-    def _data(self, name: str) -> tuple[Array, Array, Array]:
+    def _data(self, name: str) -> tuple[Floats, Floats, Floats]:
         """Return states, wrenches and next states of a body or class."""
         state, action, after = (np.array(each) for each in zip(*self._seen[name], strict=True))
         return state, action, after
 
-    def _phi(self, layout: Layout) -> Array:
+    def _phi(self, layout: Layout) -> Floats:
         """Return the chosen parameters in a layout's order."""
         known = {
             label: self._table[i, self._choice[label.partition("[")[2].rstrip("]")]]

@@ -9,7 +9,6 @@ from itertools import combinations
 from typing import Any, ClassVar, final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.agents.agent import PhysicsAgent, prediction_errors
 from pbrl_ppl.agents.revision import select_effects
@@ -24,8 +23,7 @@ from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit, physics_model
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Prediction errors up to this (SI units) carry no information: they are the engine's.
 _NEGLIGIBLE = 1e-4
@@ -111,11 +109,11 @@ class PBRLAgent(PhysicsAgent):
         self._noise, self.revise = sigma, revise
         self._catalogue = tuple(catalogue)
         self._declared = attach(task.scene, effects, self._catalogue)
-        self._transitions: list[tuple[Array, Array, Array]] = []
+        self._transitions: list[tuple[Floats, Floats, Floats]] = []
         self._sigma = np.empty(0)
         self.fits = self._fitted = self.looks = self._looked = 0
 
-    def observe(self, state: Array, action: Array, next_state: Array) -> None:
+    def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
         """Store a transition; arguments as for :meth:`Agent.observe`."""
         self._transitions.append((state, action, next_state))
 
@@ -138,7 +136,7 @@ class PBRLAgent(PhysicsAgent):
     def _grown(self, since: int) -> bool:
         return len(self._transitions) >= (1.0 + self.growth) * since
 
-    def _data(self) -> tuple[Array, Array, Array]:
+    def _data(self) -> tuple[Floats, Floats, Floats]:
         """Return states, inputs as in `pbrl_ppl.state.INPUT`, and next states."""
         state, action, after = (np.array(each) for each in zip(*self._transitions, strict=True))
         before = np.concatenate([np.zeros_like(action[:1]), action[:-1]])
@@ -196,7 +194,7 @@ class PBRLAgent(PhysicsAgent):
         extra = tuple(each for each in effects if each.body in inside)
         extra = extra[len(attach(part, (), self._catalogue)) :]
 
-        def fitted(rows: Any, initial: Array | None = None) -> Mode:
+        def fitted(rows: Any, initial: Floats | None = None) -> Mode:
             start, acting, end = (each[rows][:, moved] for each in (state, inputs, after))
             history = from_segments(part, start, acting[:, None], end[:, None])
             problem = physics_model(part, history, extra, sigma=self._noise).problem

@@ -51,7 +51,7 @@ def processes(workers: int | None = None) -> Iterator[Executor]:
             child.terminate()
         if isinstance(error, BrokenProcessPool):
             raise EpisodeError(
-                "a process ended before its call: what it said is above, or it was short of memory"
+                "a process ended before its call: see its output above, or it was short of memory"
                 " (give fewer workers). Calls must be of functions in a module, and a script must"
                 ' make them under if __name__ == "__main__":, for each process imports it'
             ) from None

@@ -18,10 +18,11 @@ from pbrl_ppl.criticism import (
     inseparable,
     rank_candidates,
     twins,
+    with_effects,
 )
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, find_mode
-from pbrl_ppl.parameters import inside, prior_slopes
+from pbrl_ppl.parameters import prior_slopes
 
 #: Returns the mode of a model with these effects.
 Search = Callable[[tuple[Attached, ...]], Mode]
@@ -66,12 +67,12 @@ class Revision:
 
     @property
     def effect(self) -> str:
-        """Name of the effect."""
+        """Return the name of the effect."""
         return self.attached.effect.name
 
     @property
     def body(self) -> str:
-        """Name of the body."""
+        """Return the name of the body."""
         return self.attached.body
 
 
@@ -117,7 +118,9 @@ def select_effects(
     mode, found = search((*declared, *(each.attached for each in added))), added
     for each in added:
         others = tuple(other for other in found if other is not each)
-        lacking = _without(mode, each.attached)
+        kept = tuple(one for one in mode.problem.physics.effects if one != each.attached)
+        problem, phi = with_effects(mode, kept)
+        lacking = find_mode(problem, initial=phi)
         better = step.addition(lacking, {each.attached: mode})
         if better is not None and better.revision.attached != each.attached:
             found, mode = (*others, better.revision), better.mode
@@ -259,20 +262,10 @@ def _p_value_of_share(mode: Mode, signature: Signature, share: float) -> float:
 
 def _fit_with(mode: Mode, signature: Signature, *, estimate: bool = True) -> Mode:
     """Return the mode with the candidate, from the score's estimate or its prior's centre."""
-    attached, old = signature.attached, mode.problem
-    problem = old.with_physics(effects=(*old.physics.effects, attached))
-    phi = problem.layout.from_layout(old.layout, mode.phi)
-    if estimate:
-        places = [problem.layout.labels.index(label) for label in attached.labels]
-        phi[places] = list(signature.candidate.estimate.values())
-    return find_mode(problem, initial=inside(problem.layout.priors, phi))
-
-
-def _without(mode: Mode, attached: Attached) -> Mode:
-    """Return the mode of the model without an effect, from the mode with it."""
-    kept = tuple(each for each in mode.problem.physics.effects if each != attached)
-    problem = mode.problem.with_physics(effects=kept)
-    return find_mode(problem, initial=problem.layout.from_layout(mode.problem.layout, mode.phi))
+    attached = signature.attached
+    sizes = {attached: np.array(list(signature.candidate.estimate.values()))} if estimate else {}
+    problem, phi = with_effects(mode, (*mode.problem.physics.effects, attached), sizes)
+    return find_mode(problem, initial=phi)
 
 
 def _score(mode: Mode, signature: Signature, floor: float) -> float:

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.errors import EpisodeError, GoalError
 from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import ActionSet, Dynamics, Goal, start_state
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Largest difference of an action from one of the set, for rounding (N and N m).
 _ROUNDING = 1e-9
@@ -23,7 +21,7 @@ _ROUNDING = 1e-9
 
 @dataclass(frozen=True)
 class Task:
-    """What an agent is given: a scene, a goal, and actions; not the dynamics.
+    """Scene, goal and actions of an agent; the dynamics are unknown to it.
 
     Attributes
     ----------
@@ -60,30 +58,30 @@ class Task:
         if self.actions.intervals(self.scene) != (1,):
             raise GoalError(
                 f"task: actions last {self.actions.durations} s, expected one sampling interval of"
-                f" {self.scene.time_step:g} s; an agent chooses anew after each"
+                f" {self.scene.time_step:g} s; an agent chooses an action for each"
             )
         start_state(self.scene, {})
 
     @property
-    def start(self) -> Array:
-        """State at which an episode begins, shape (body, 6), SI units."""
+    def start(self) -> Floats:
+        """Return the state at which an episode begins, shape (body, 6), SI units."""
         return start_state(self.scene, {})
 
-    def reward(self, state: Array) -> float:
+    def reward(self, state: Floats) -> float:
         """Return minus the L2 distance of the bodies from their goal (m), as in section 5."""
         return -float(self.goal.distance(self.scene, state))
 
-    def reached(self, state: Array) -> bool:
+    def reached(self, state: Floats) -> bool:
         """Return whether a state (body, 6) is within the goal's tolerances."""
         return bool(self.goal.shortfall(self.scene, state) <= 1.0)
 
-    def wrenches(self, state: Array) -> Array:
+    def wrenches(self, state: Floats) -> Floats:
         """Return all actions in a state (body, 6), shape (action, body, 3), world frame, N, N m."""
         count = len(self.actions.actions)
         heading = np.repeat(state[None, :, 2], count, axis=0)
         return self.actions.wrenches(self.scene, np.arange(count), heading)
 
-    def check_action(self, state: Array, action: Array) -> None:
+    def check_action(self, state: Floats, action: Floats) -> None:
         """Check that an action is one of the set in this state.
 
         Raises
@@ -123,8 +121,8 @@ class Outcome:
         Whether the goal is reached, which ends the episode.
     """
 
-    state: Array
-    observed: Array
+    state: Floats
+    observed: Floats
     reward: float
     bumped: bool
     reached: bool
@@ -195,12 +193,12 @@ class World:
 
     @property
     def description(self) -> str:
-        """Engine and true parameters, those of effects included, as JSON for an episode's file."""
+        """Return engine and true parameters, those of effects too, as JSON for episode files."""
         truth = self._truth
         values = dict(zip(truth.layout.labels, truth.phi[0].tolist(), strict=True))
         return json.dumps({"engine": type(self).__name__, **values})
 
-    def reset(self, seed: int) -> Array:
+    def reset(self, seed: int) -> Floats:
         """Go back to the start; the seed is that of the noise and the start.
 
         Returns
@@ -219,7 +217,7 @@ class World:
         self._state, self._last = start_state(self.task.scene, state), self._truth.before
         return self._state.copy()
 
-    def step(self, action: Array) -> Outcome:
+    def step(self, action: Floats) -> Outcome:
         """Hold an action over one sampling interval.
 
         Parameters
@@ -246,7 +244,7 @@ class World:
             reached=self.task.reached(state),
         )
 
-    def _play(self, state: Array, action: Array) -> Array:
+    def _play(self, state: Floats, action: Floats) -> Floats:
         """Return the state (body, 6) after an interval."""
         after = self._truth.step(state[None, None], action[None], self._last[None])
         return np.asarray(after[0, 0])

@@ -1,59 +1,34 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
-from pbrl_ppl.criticism.closing import close_loop
-from pbrl_ppl.criticism.criteria import DECISIVE, DEFAULT, TRIED, Criteria
-from pbrl_ppl.criticism.cross_validation import Change, gain
-from pbrl_ppl.criticism.dependence import QUANTITIES, recorded_quantities
-from pbrl_ppl.criticism.loop import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Loop, check_folder
-from pbrl_ppl.criticism.prior_check import PriorCheck, prior_predictive_check, telling_horizon
-from pbrl_ppl.criticism.ranking import Ranking, criticise
-from pbrl_ppl.criticism.remainder import learn_remainder
-from pbrl_ppl.criticism.results import (
-    Acceleration,
-    Added,
-    Candidate,
-    Errors,
-    ResidualTest,
-    Unexplained,
-)
-from pbrl_ppl.criticism.rivals import Rival, fit_rivals, kept_groups, named_effects
-from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
-from pbrl_ppl.criticism.stages import Stage
-
-__all__ = [
-    "ADEQUATE",
-    "DECISIVE",
-    "DEFAULT",
-    "NOT_CONVERGED",
-    "QUANTITIES",
-    "TRIED",
-    "UNEXPLAINED",
-    "Acceleration",
-    "Added",
-    "Candidate",
-    "Change",
-    "Criteria",
-    "Errors",
-    "Loop",
-    "PriorCheck",
-    "Ranking",
-    "ResidualTest",
-    "Rival",
-    "Signature",
-    "Stage",
-    "Unexplained",
-    "check_folder",
-    "close_loop",
-    "criticise",
-    "fit_rivals",
-    "gain",
-    "inseparable",
-    "kept_groups",
-    "learn_remainder",
-    "named_effects",
-    "prior_predictive_check",
-    "rank_candidates",
-    "recorded_quantities",
-    "telling_horizon",
-    "twins",
-]
+from .closing import close_loop as close_loop
+from .criteria import DEFAULT as DEFAULT
+from .criteria import TRIED as TRIED
+from .criteria import Criteria as Criteria
+from .cross_validation import Change as Change
+from .cross_validation import gain as gain
+from .dependence import QUANTITIES as QUANTITIES
+from .dependence import recorded_quantities as recorded_quantities
+from .loop import ADEQUATE as ADEQUATE
+from .loop import NOT_CONVERGED as NOT_CONVERGED
+from .loop import UNEXPLAINED as UNEXPLAINED
+from .loop import Loop as Loop
+from .loop import check_folder as check_folder
+from .prior_check import PriorCheck as PriorCheck
+from .prior_check import prior_predictive_check as prior_predictive_check
+from .prior_check import telling_horizon as telling_horizon
+from .ranking import Ranking as Ranking
+from .ranking import criticise as criticise
+from .refinement import with_effects as with_effects
+from .remainder import learn_remainder as learn_remainder
+from .results import Added as Added
+from .results import Candidate as Candidate
+from .results import Errors as Errors
+from .rivals import Rival as Rival
+from .rivals import fit_rivals as fit_rivals
+from .rivals import kept_groups as kept_groups
+from .rivals import named_effects as named_effects
+from .score import Signature as Signature
+from .score import inseparable as inseparable
+from .score import rank_candidates as rank_candidates
+from .score import twins as twins
+from .stages import Stage as Stage

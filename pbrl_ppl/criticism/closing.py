@@ -13,7 +13,13 @@ from threadpoolctl import threadpool_limits
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.held_out import HeldOut, example_rollout, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
-from pbrl_ppl.criticism.misfit import PRIOR, Misfit, find_misfit, with_negligible_acceleration
+from pbrl_ppl.criticism.misfit import (
+    NOTHING_RECORDED,
+    PRIOR,
+    Misfit,
+    find_misfit,
+    with_negligible_acceleration,
+)
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
 from pbrl_ppl.criticism.ranking import declared_mode
 from pbrl_ppl.criticism.recordings import checked_histories, outliers
@@ -69,7 +75,7 @@ def close_loop(
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Loop:
-    """Fit, find the residual, trace it to an effect, add it, refit, and compare on held-out data.
+    """Fit a model, add the effects that its residual shows, and compare on held-out data.
 
     Parameters
     ----------
@@ -124,14 +130,13 @@ def close_loop(
     task = _Task(scene, tuple(catalogue), seed, substeps, draws, method, criteria, say)
     if test is None:
         train, test = train.split(0.25, seed)
-        given = test
-    else:
-        given = test
-        if scene.test_is_later:  # an effect from some trajectory on still acts in the test
-            test = test.numbered(float(train.dataset["number"].max()) + 1.0)
+        numbered = test
+    else:  # an effect from some trajectory on still acts in a later test
+        after = float(train.dataset["number"].max()) + 1.0
+        numbered = test.numbered(after) if scene.test_is_later else test
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
-        return replace(_closed(task, train, test), held_out=given, catalogue=task.catalogue)
+        return replace(_closed(task, train, numbered), held_out=test, catalogue=task.catalogue)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,7 +186,7 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
     effects = attach(scene, (), task.catalogue)
     say(Stage.CHECK_PRIOR)
     prior = _prior_test(task, train, effects)
-    if not prior.passed:  # nobody wants the fit of wrong units
+    if not prior.passed:  # before the long fit: units may be wrong
         hint = "the declared prior does not explain this recording, unless a missing effect is why"
         warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
     say(Stage.FIT)
@@ -292,7 +297,7 @@ def _prior_test(
     share = float(checked.dataset["share_beyond"].max())
     sentence, *more = checked.summary
     if more:
-        sentence = f"{sentence}; so it is with {len(more)} more"
+        sentence = f"{sentence}; {len(more)} more likewise"
     return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, sentence)
 
 
@@ -366,7 +371,8 @@ def _put_together(
         verdict = NOT_CONVERGED
     added = tuple(_added(step, revised) for step in steps)
     keep_groups(revised.posterior, added)
-    noise = noise_alone(revised.mode, revised.excess)
+    first, last = declared.excess, revised.excess
+    noise = noise_alone(revised.mode, last)
     return Loop(
         scene=scene,
         verdict=verdict,
@@ -396,7 +402,13 @@ def _put_together(
             "rollout_seconds": rollout * scene.time_step,
         },
         tests=misfit.tests,
-        acceleration=_acceleration(declared.excess, revised.excess),
+        acceleration=Acceleration(
+            first.by_name(first.size),
+            last.by_name(last.size),
+            first.by_name(first.relative),
+            last.by_name(last.relative),
+            last.by_name(last.certain),
+        ),
         correlations=misfit.correlations,
         growth=misfit.growth,
         identifiability=identify(revised.posterior, mode=revised.mode),
@@ -404,36 +416,15 @@ def _put_together(
     )
 
 
-def _acceleration(before: UnexplainedAcceleration, after: UnexplainedAcceleration) -> Acceleration:
-    """Return the unexplained accelerations of both models by name."""
-
-    def named(excess: UnexplainedAcceleration, values: Any) -> dict[str, Any]:
-        return dict(zip(excess.names, values.tolist(), strict=True))
-
-    return Acceleration(
-        named(before, before.size),
-        named(after, after.size),
-        named(before, before.relative),
-        named(after, after.relative),
-        named(after, after.certain),
-    )
-
-
 def _worse(before: Errors, after: Errors) -> Unexplained:
     """Return what is unexplained where the revised model's held-out error is the larger one."""
     rise = after.normalised_rmse / before.normalised_rmse - 1.0
-    return Unexplained(
-        body="",
-        dimension="",
-        depends_on="nothing that was recorded",
-        share=0.0,
-        p_value=float("nan"),
-        sentence=(
-            "the revised model forecasts the held-out trajectories worse than the declared one: its"
-            f" error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
-            f" {before.normalised_rmse:.3g} times the noise"
-        ),
+    sentence = (
+        "the revised model forecasts the held-out trajectories worse than the declared one: its"
+        f" error is {100 * rise:.2g} % larger, {after.normalised_rmse:.3g} against"
+        f" {before.normalised_rmse:.3g} times the noise"
     )
+    return Unexplained("", "", NOTHING_RECORDED, 0.0, float("nan"), sentence)
 
 
 def _added(step: Step, revised: _Model) -> Added:

@@ -10,16 +10,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Correlations, ResidualTest
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.state import STATE, WRENCH
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 
 _WHITENESS, _COMMANDS = "whiteness", "correlation with commands"
 
@@ -37,12 +34,12 @@ class _Place(NamedTuple):
 class _Correlation:
     """Correlations and numbers of pairs, shape (lag, series, coordinate)."""
 
-    values: Array
-    pairs: Array
+    values: Floats
+    pairs: Floats
     criteria: Criteria
 
     @property
-    def enough(self) -> NDArray[np.bool_]:
+    def enough(self) -> Bools:
         """Return which were taken over enough pairs."""
         return np.asarray(self.pairs > self.criteria.residual.least_pairs)
 
@@ -52,7 +49,7 @@ class _Correlation:
         statistic = float((self.pairs * self.values**2)[self.enough].sum())
         return float(chi2.sf(statistic, max(int(self.enough.sum()), 1)))
 
-    def passes(self, p_value: float, share: Array) -> bool:
+    def passes(self, p_value: float, share: Floats) -> bool:
         """Return whether no correlation is significant and large beside the noise and the motion.
 
         ``share`` is the size of innovations over the change in a step, shape (coordinate,).
@@ -62,7 +59,7 @@ class _Correlation:
         large &= np.abs(self.values) * share > criteria.negligible
         return p_value > criteria.false_alarm or not (large & self.enough).any()
 
-    def worst(self, weights: Array) -> _Place:
+    def worst(self, weights: Floats) -> _Place:
         """Return the largest one, weighted by coordinate."""
         size = np.where(self.enough, np.abs(self.values), 0.0) * weights
         lag, series, cell = map(int, np.unravel_index(int(np.argmax(size)), size.shape))
@@ -98,7 +95,7 @@ def correlation_tests(
     few = "too few pairs of intervals"
     whiteness = ResidualTest.untested(_WHITENESS, few)
     if own.enough.any():
-        whiteness = _whiteness(own, share, cells)
+        whiteness = _test(own, own.p_value, share, cells, [])
     series, names = _commands(mode)
     values = np.zeros((0, 0, len(cells)))
     commands = ResidualTest.untested(_COMMANDS, few if names else "no command varies")
@@ -107,39 +104,34 @@ def correlation_tests(
         values = driven.values
         p_value = _regression_p_value(white, seen, number, series, criteria)
         if p_value is not None:
-            commands = _driven(driven, p_value, share, cells, names)
+            commands = _test(driven, p_value, share, cells, names)
     return (whiteness, commands), Correlations(
         tuple(cells), own.values[:, 0], own.pairs[:, 0], tuple(names), values
     )
 
 
 def _lagged(
-    white: Array,
-    seen: NDArray[np.bool_],
-    number: NDArray[np.intp],
-    series: Array | None,
-    criteria: Criteria,
+    white: Floats, seen: Bools, number: Ints, series: Floats | None, criteria: Criteria
 ) -> _Correlation:
     """Return correlations with series some intervals before, or of each coordinate with itself."""
     values, pairs = [], []
     for lag in range(1 if series is None else 0, criteria.residual.lags + 1):
         end = max(len(number) - lag, 0)
         same = number[lag:] == number[:end]
-        later, counts = white[lag:][same], seen[lag:][same]
+        later, counts = white[lag:][same][:, None], seen[lag:][same][:, None]
         if series is None:
             earlier = white[:end][same][:, None]
-            counts = (counts & seen[:end][same])[:, None]
-            later = later[:, None]
+            counts = counts & seen[:end][same][:, None]
         else:
             earlier = series[:end][same][:, :, None]
-            later, counts = later[:, None], np.broadcast_to(counts[:, None], later[:, None].shape)
-        n = np.broadcast_to(counts, np.broadcast_shapes(counts.shape, earlier.shape)).sum(axis=0)
-        values.append((later * earlier * counts).sum(axis=0) / np.maximum(n, 1))
+        products = later * earlier * counts
+        n = np.broadcast_to(counts, products.shape).sum(axis=0)
+        values.append(products.sum(axis=0) / np.maximum(n, 1))
         pairs.append(n)
     return _Correlation(np.array(values), np.array(pairs), criteria)
 
 
-def _commands(mode: Mode) -> tuple[Array, list[str]]:
+def _commands(mode: Mode) -> tuple[Floats, list[str]]:
     """Return the commands that vary, standardised, shape (transition, series), and their names."""
     segments, scene = mode.problem.segments, mode.problem.scene
     columns, names = [], []
@@ -153,26 +145,8 @@ def _commands(mode: Mode) -> tuple[Array, list[str]]:
     return np.array(columns).reshape(len(columns), segments.n).T, names
 
 
-def _whiteness(own: _Correlation, share: Array, cells: list[str]) -> ResidualTest:
-    """Return the test of innovations' correlation with earlier ones."""
-    p_value = own.p_value
-    passed = own.passes(p_value, share)
-    worst = own.worst(np.ones(len(cells)) if passed else share)
-    sentence = "errors of one interval say nothing of those of the next"
-    if not passed:
-        sentence = (
-            f"the error of {cells[worst.cell]} is correlated with itself"
-            f" {worst.lag + 1} interval{'s' * (worst.lag > 0)} later ({worst.value:.2f})"
-        )
-    return ResidualTest(_WHITENESS, p_value, abs(worst.value), passed, sentence)
-
-
 def _regression_p_value(
-    white: Array,
-    seen: NDArray[np.bool_],
-    number: NDArray[np.intp],
-    commands: Array,
-    criteria: Criteria,
+    white: Floats, seen: Bools, number: Ints, commands: Floats, criteria: Criteria
 ) -> float | None:
     """Return the p-value of the regression on commands of several lags; None if data are too few.
 
@@ -198,17 +172,23 @@ def _regression_p_value(
     return float(chi2.sf(statistic, count)) if count else None
 
 
-def _driven(
-    driven: _Correlation, p_value: float, share: Array, cells: list[str], names: list[str]
+def _test(
+    found: _Correlation, p_value: float, share: Floats, cells: list[str], names: list[str]
 ) -> ResidualTest:
-    """Return the test of innovations' correlation with commands."""
-    passed = driven.passes(p_value, share)
-    worst = driven.worst(np.ones(len(cells)) if passed else share)
-    sentence = "errors say nothing of present and past commands"
+    """Return the test of correlations with commands, or of whiteness if there are no names."""
+    passed = found.passes(p_value, share)
+    worst = found.worst(np.ones(len(cells)) if passed else share)
+    lag = worst.lag if names else worst.lag + 1
+    intervals = f"{lag} interval{'s' * (lag > 1)}"
+    if not names:
+        sentence, other = "errors of successive intervals are not correlated", "itself"
+        when = f"{intervals} later"
+    else:
+        sentence = "errors are not correlated with present and past commands"
+        other = names[worst.series].replace("_", " ")
+        when = f"{intervals} before" if lag else "of the same interval"
     if not passed:
-        lag, name = worst.lag, names[worst.series].replace("_", " ")
-        when = f"{lag} interval{'s' * (lag > 1)} before" if lag else "of the same interval"
-        sentence = (
-            f"the error of {cells[worst.cell]} is correlated with {name} {when} ({worst.value:.2f})"
-        )
-    return ResidualTest(_COMMANDS, p_value, abs(worst.value), passed, sentence)
+        error = f"the error of {cells[worst.cell]}"
+        sentence = f"{error} is correlated with {other} {when} ({worst.value:.2f})"
+    name = _COMMANDS if names else _WHITENESS
+    return ResidualTest(name, p_value, abs(worst.value), passed, sentence)

@@ -258,5 +258,5 @@ class Criteria:
 
 #: The defaults of :class:`Criteria`.
 DEFAULT = Criteria()
-#: Defaults of two thresholds that other subpackages use.
-DECISIVE, TRIED = DEFAULT.score.decisive, DEFAULT.selection.refits
+#: Candidates that are refitted in a round, at most, which other subpackages use.
+TRIED = DEFAULT.selection.refits

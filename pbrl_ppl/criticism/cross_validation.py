@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm, t, wilcoxon
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
@@ -14,9 +13,7 @@ from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.likelihood import TransitionLikelihood, robust
 from pbrl_ppl.modes import Mode, profile_sigma
 from pbrl_ppl.parameters import box, differentiate, inside, prior_residual, prior_slopes
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Bools, Floats, Ints
 
 #: A step that a bound shortens by more than this (standard deviations) is stopped by it.
 _ROUNDING = 1e-6
@@ -37,9 +34,9 @@ class LeftOut:
         Parameters and noise parameters fitted without it, shapes (fold, p) and (fold, parameter).
     """
 
-    density: Array
-    phi: Array
-    sigma: Array
+    density: Floats
+    phi: Floats
+    sigma: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +62,7 @@ class Change:
     signed_rank: float = 1.0
 
     @classmethod
-    def of(cls, gains: Array) -> Change:
+    def of(cls, gains: Floats) -> Change:
         """Sum the gains of independent folds, shape (fold,)."""
         n = len(gains)
         error = float(np.sqrt(n) * gains.std(ddof=1)) if n > 1 else np.inf
@@ -168,7 +165,7 @@ def gain(before: Mode, after: Mode, criteria: Criteria = DEFAULT) -> Change:
     return Change.of(leave_out(after, fold).density - leave_out(before, fold).density)
 
 
-def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) -> Array:
+def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) -> Floats:
     """Return sums of squared forecast errors of each fold, from the fit without it.
 
     Parameters
@@ -197,7 +194,7 @@ def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) 
     return squares
 
 
-def relative_fall(before: Array, after: Array) -> Change:
+def relative_fall(before: Floats, after: Floats) -> Change:
     """Return the share by which errors fall, from sums of squares, shape (fold, coordinate).
 
     A fold or coordinate without forecasts is NaN. To first order, half of the fall of squares.
@@ -213,8 +210,8 @@ def relative_fall(before: Array, after: Array) -> Change:
 
 
 def _linearised(
-    mode: Mode, residual: Array, scale: Array
-) -> Callable[[NDArray[np.bool_]], tuple[Array, Array, Array]]:
+    mode: Mode, residual: Floats, scale: Floats
+) -> Callable[[Bools], tuple[Floats, Floats, Floats]]:
     """Return a function that fits noise, whitened residual and Jacobian without some rows.
 
     The last two have the shapes (transition, cell) and (transition, cell, p), the Jacobian by the
@@ -231,7 +228,7 @@ def _linearised(
     nothing = np.zeros_like(noise.begin)
     still = replace(noise, begin=nothing, measured=nothing)
 
-    def without(own: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
+    def without(own: Bools) -> tuple[Floats, Floats, Floats]:
         hidden = replace(noise, seen=noise.seen & ~own[:, None], sigma=mode.sigma)
         sigma = profile_sigma(problem.along(hidden), residual, phi)
         z = noise.whiten(residual, sigma)
@@ -242,7 +239,7 @@ def _linearised(
     return without
 
 
-def _residual_slopes(mode: Mode, scale: Array) -> Array:
+def _residual_slopes(mode: Mode, scale: Floats) -> Floats:
     """Return the derivative of residuals by parameters in units of ``scale``.
 
     Shape (p, transition, cell).
@@ -254,7 +251,7 @@ def _residual_slopes(mode: Mode, scale: Array) -> Array:
     lower, upper = box(priors)
     informed = scale * np.abs(prior_slopes(priors, mode.phi)) < _INFORMED
 
-    def residual(points: Array) -> Array:
+    def residual(points: Floats) -> Floats:
         return np.nan_to_num(cells.of_residual(problem.residual(points)))
 
     # a long step of a parameter that the data do not inform would cross thresholds
@@ -264,9 +261,7 @@ def _residual_slopes(mode: Mode, scale: Array) -> Array:
     return np.ascontiguousarray(np.moveaxis(slopes, -1, 0))
 
 
-def _to_top(
-    mode: Mode, precision: Array, gradient: Array, scale: Array
-) -> tuple[Array, NDArray[np.bool_]]:
+def _to_top(mode: Mode, precision: Floats, gradient: Floats, scale: Floats) -> tuple[Floats, Bools]:
     """Return the step from a mode to the top of its Gaussian, and which parameters are free there.
 
     Precision, gradient and step are in units of ``scale``, shape (p,).

@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import rankdata
 
 from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.cross_validation import folds
-from pbrl_ppl.criticism.results import Unexplained
+from pbrl_ppl.criticism.results import ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import innovations_over_steps
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, Floats, Ints
 
-Array = NDArray[np.float64]
-
+#: Name of the test.
+DEPENDENCE = "dependence on state, command and time"
 #: Permutations a body: the smallest p-value is a fifth of the significance.
 _PERMUTATIONS = 500
 _FOLDS = 5
@@ -68,23 +66,9 @@ PRODUCTS = {
 QUANTITIES = FEATURES | {name: f"{FEATURES[a]} {FEATURES[b]}" for name, (a, b) in PRODUCTS.items()}
 
 
-@dataclass(frozen=True)
-class Dependence:
-    """Result of the test for dependence.
-
-    Parameters
-    ----------
-    tested : bool
-        Whether there were enough transitions.
-    found : Unexplained or None
-        The strongest dependence; None if none is significant.
-    """
-
-    tested: bool
-    found: Unexplained | None = None
-
-
-def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Dependence:
+def find_dependence(
+    mode: Mode, criteria: Criteria, *, seed: int = 0
+) -> tuple[ResidualTest, Unexplained | None]:
     """Test whether the innovations of a fitted model depend on state, action or time.
 
     A kernel ridge regression with one smooth term a quantity, or product of two, predicts the
@@ -102,14 +86,16 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
 
     Returns
     -------
-    Dependence
-        The strongest dependence.
+    test : ResidualTest
+        Untested with too few transitions.
+    found : Unexplained or None
+        The strongest dependence; None if none is significant.
     """
     rng = np.random.default_rng(seed)
     problem = mode.problem
     n, limits = problem.segments.n, criteria.residual
     if n < limits.least_transitions:
-        return Dependence(tested=False)
+        return ResidualTest.untested(DEPENDENCE, "too few transitions"), None
     tests = len(problem.scene.dynamic)
     permutations = _PERMUTATIONS * tests - 1
     chosen = np.sort(rng.permutation(n)[:_MOST])
@@ -138,12 +124,15 @@ def find_dependence(mode: Mode, criteria: Criteria, *, seed: int = 0) -> Depende
             continue
         if best is None or shares[at] > best.share:
             best = _describe(body.name, names[at], features, y[:, at], shares[at], p_value)
-    return Dependence(tested=True, found=best)
+    if best is None:
+        sentence = "the innovations depend on no recorded quantity"
+        return ResidualTest(DEPENDENCE, 1.0, 0.0, True, sentence), None
+    return ResidualTest(DEPENDENCE, best.p_value, best.share, False, best.sentence), best
 
 
 def _in_both_frames(
-    y: Array, dimension: NDArray[np.intp], features: Array
-) -> tuple[Array, list[str], list[int]]:
+    y: Floats, dimension: Ints, features: Floats
+) -> tuple[Floats, list[str], list[int]]:
     """Return innovations in the world frame and velocities' in the body's, names and columns."""
     names, of = [STATE[d] for d in dimension], list(range(len(dimension)))
     velocities = [names.index(name) for name in ("vx", "vy") if name in names]
@@ -156,7 +145,7 @@ def _in_both_frames(
     return np.hstack([y, turned]), [*names, "forward speed", "sideways speed"], [*of, *velocities]
 
 
-def recorded_quantities(problem: Problem, body: int) -> Array:
+def recorded_quantities(problem: Problem, body: int) -> Floats:
     """Return ``QUANTITIES`` at the start of each transition, shape (transition, quantity)."""
     segments = problem.segments
     x, y, theta, vx, vy, omega = segments.start[:, body].T
@@ -177,7 +166,7 @@ def recorded_quantities(problem: Problem, body: int) -> Array:
     return np.hstack([single, single[:, pairs].prod(axis=2)])
 
 
-def _kernels(features: Array) -> Iterator[Array]:
+def _kernels(features: Floats) -> Iterator[Floats]:
     """Yield a Gaussian kernel of each quantity's ranks, scaled to unit range, shape (n, n)."""
     ranks = (rankdata(features, axis=0) - 1) / max(len(features) - 1, 1)  # equal ones share theirs
     varies = np.ptp(features, axis=0) > 1e-9
@@ -186,7 +175,7 @@ def _kernels(features: Array) -> Iterator[Array]:
         yield np.exp(-0.5 * (difference / 0.2) ** 2) * moves / max(int(varies.sum()), 1)
 
 
-def _summed(features: Array) -> Array:
+def _summed(features: Floats) -> Floats:
     """Return the kernel of all quantities together, shape (n, n)."""
     kernel = np.zeros((len(features), len(features)))
     for term in _kernels(features):
@@ -194,7 +183,7 @@ def _summed(features: Array) -> Array:
     return kernel
 
 
-def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Generator) -> Array:
+def _cross_validated(kernel: Floats, groups: Ints, rng: np.random.Generator) -> Floats:
     """Return the matrix that predicts each transition from those of other groups."""
     smoother = np.zeros_like(kernel)
     names = rng.permutation(np.unique(groups))
@@ -205,14 +194,14 @@ def _cross_validated(kernel: Array, groups: NDArray[np.int64], rng: np.random.Ge
     return smoother
 
 
-def _explained(smoother: Array, y: Array) -> Array:
+def _explained(smoother: Floats, y: Floats) -> Floats:
     """Return the share of variance predicted, per column."""
     size = np.maximum((y**2).sum(axis=0), 1e-300)
     return np.asarray(1.0 - ((y - smoother @ y) ** 2).sum(axis=0) / size)
 
 
 def _describe(
-    body: str, dimension: str, features: Array, y: Array, share: float, p_value: float
+    body: str, dimension: str, features: Floats, y: Floats, share: float, p_value: float
 ) -> Unexplained:
     """Return the dependence with the quantity that contributes most to the regression."""
     weights = np.linalg.solve(_summed(features) + _RIDGE * np.eye(len(y)), y)
@@ -225,7 +214,7 @@ def _describe(
         share=float(share),
         p_value=min(1.0, p_value),
         sentence=(
-            f"the error of {dimension} of {body} still depends on its {name}:"
-            f" {share:.0%} of it could be predicted, and nothing in the catalogue does so"
+            f"the error of {dimension} of {body} depends on its {name}: a regression predicts"
+            f" {share:.0%} of its variance, and no effect in the catalogue does"
         ),
     )

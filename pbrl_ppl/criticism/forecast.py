@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import Problem, TrajectoryNoise
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import STATE, Bools, Floats, Ints
 
 #: Rows after which a filter's covariance has settled.
 _SETTLED = 5
@@ -31,8 +27,8 @@ class Forecast:
         State dimension of each cell, shape (cell,).
     """
 
-    error: Array
-    variance: Array
+    error: Floats
+    variance: Floats
     dimension: Ints
 
     def rmse(self) -> dict[str, float]:
@@ -43,7 +39,7 @@ class Forecast:
         """Return the same for the noise alone."""
         return self._by_dimension(np.where(np.isfinite(self.error), self.variance, np.nan))
 
-    def _by_dimension(self, square: Array) -> dict[str, float]:
+    def _by_dimension(self, square: Floats) -> dict[str, float]:
         """Return root mean squares by state dimension."""
         result = {}
         for d in np.unique(self.dimension):
@@ -59,7 +55,7 @@ def longest_forecast(problem: Problem) -> int:
     return max(1, shortest - min(_SETTLED, shortest // 2))
 
 
-def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
+def filtered_states(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     """Return the filtered states, shape (trajectory, time, body, 6), SI units."""
     noise = problem.trajectory_noise
     cells, segments = noise.cells, problem.segments
@@ -78,12 +74,12 @@ def filtered_states(problem: Problem, phi: Array, sigma: Array) -> Array:
 
 def forecast(
     problem: Problem,
-    phi: Array,
-    sigma: Array,
+    phi: Floats,
+    sigma: Floats,
     intervals: int,
     *,
-    within: NDArray[np.bool_] | None = None,
-    allowed: Array | None = None,
+    within: Bools | None = None,
+    allowed: Floats | None = None,
 ) -> Forecast:
     """Predict several intervals from filtered states all along the trajectories.
 
@@ -142,7 +138,7 @@ def forecast(
     return Forecast(error, variance + (pushed**2).sum(axis=2), cells.places % len(STATE))
 
 
-def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array:
+def _spread(noise: TrajectoryNoise, sigma: Floats, at: Ints, step: Ints) -> Floats:
     """Return the covariance of filtered states before transitions, shape (start, cell, cell)."""
     after = noise.covariance(sigma)[at - 1]
     for i in np.flatnonzero(step == 0):
@@ -150,7 +146,7 @@ def _spread(noise: TrajectoryNoise, sigma: Array, at: Ints, step: Ints) -> Array
     return after
 
 
-def _first_spread(noise: TrajectoryNoise, sigma: Array, first: int) -> Array:
+def _first_spread(noise: TrajectoryNoise, sigma: Floats, first: int) -> Floats:
     """Return the covariance of a trajectory's first filtered state, shape (cell, cell)."""
     error = noise.cells.errors(sigma)
     wide = noise.wide[first]

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import logsumexp
 
 from pbrl_ppl.criticism.forecast import filtered_states, forecast
@@ -16,9 +15,7 @@ from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.likelihood import Problem, along_trajectories, cells_of
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
-from pbrl_ppl.state import STATE, STATE_UNITS
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Length of the forecasts in the error table (s), if trajectories are as long.
 ROLLOUT_SECONDS = 1.0
@@ -73,13 +70,13 @@ class HeldOut:
         problem = mode.problem.with_data(history=history, states=None)
         return cls(mode, along_trajectories(problem, mode.phi, mode.sigma, cells))
 
-    def whitened(self, unit: HeldOut) -> Array:
+    def whitened(self, unit: HeldOut) -> Floats:
         """Return the linearised innovations in units of another model's noise."""
         physics = self.mode.problem.physics
         model = unit.problem.with_physics(effects=physics.effects, substeps=physics.substeps)
         return model.whitened(self.mode.phi, unit.mode.sigma, model.one_world)
 
-    def residuals(self, unit: HeldOut) -> dict[str, Array]:
+    def residuals(self, unit: HeldOut) -> dict[str, Floats]:
         """Return innovations in units of another model's noise, by state dimension."""
         noise = unit.problem.trajectory_noise
         z = self.whitened(unit)
@@ -108,14 +105,17 @@ class HeldOut:
         phi, sigma = parameter_draws(mode.problem, posterior)
         rng = np.random.default_rng(seed)
         chosen = rng.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
+        phi, sigma = phi[chosen], sigma[chosen]
+        residual = self.problem.residual(phi, self.problem.one_world)
+        density = self.problem.log_density(residual, sigma, phi)
         return Errors(
             one_step_rmse=forecast(self.problem, mode.phi, mode.sigma, 1).rmse(),
             rollout_rmse=forecast(self.problem, mode.phi, mode.sigma, rollout).rmse(),
             normalised_rmse=float(np.sqrt((self.whitened(unit) ** 2).sum() / seen.sum())),
-            elpd=float(_elpd(self.problem, phi[chosen], sigma[chosen]).sum()),
+            elpd=float((logsumexp(density, axis=0) - np.log(len(phi))).sum()),
         )
 
-    def noise_floor(self, sigma: Array, rollout: int) -> Errors:
+    def noise_floor(self, sigma: Floats, rollout: int) -> Errors:
         """Return the errors that measurement noise alone makes, at both ends of a forecast.
 
         ``sigma`` are the noise parameters of :func:`pbrl_ppl.criticism.unexplained.noise_alone`.
@@ -157,9 +157,3 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
         before=predicted[0],
         after=predicted[1],
     )
-
-
-def _elpd(problem: Problem, phi: Array, sigma: Array) -> Array:
-    """Return the log predictive density of each held-out transition, shape (transition,)."""
-    density = problem.log_density(problem.residual(phi, problem.one_world), sigma, phi)
-    return np.asarray(logsumexp(density, axis=0) - np.log(len(phi)))

@@ -10,9 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.remainder import learn_remainder, remainder_in_words
 from pbrl_ppl.criticism.results import (
@@ -34,8 +31,7 @@ from pbrl_ppl.files import json_values
 from pbrl_ppl.history import History, UnusedVelocity
 from pbrl_ppl.posterior import Comparison, Identifiability, save_posterior
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: The verdicts; the last one means that there is none, for the chains do not agree.
 ADEQUATE, EFFECTS_ADDED, UNEXPLAINED = "adequate", "effects-added", "unexplained"
@@ -114,8 +110,8 @@ class Loop:
     noise_floor: Errors
     posterior_before: Any
     posterior_after: Any
-    residuals_before: Mapping[str, Array]
-    residuals_after: Mapping[str, Array]
+    residuals_before: Mapping[str, Floats]
+    residuals_after: Mapping[str, Floats]
     rollout: Rollout
     rollout_horizon: int
     provenance: Mapping[str, Any]

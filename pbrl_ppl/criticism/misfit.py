@@ -5,25 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import Criteria
-from pbrl_ppl.criticism.dependence import Dependence, find_dependence
+from pbrl_ppl.criticism.dependence import DEPENDENCE, find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import UnexplainedAcceleration, noise_alone
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import Mode
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 #: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
-_NOTHING_RECORDED = "nothing that was recorded"
-DEPENDENCE = "dependence on state, command and time"
+#: What an unexplained residual depends on where no quantity predicts it.
+NOTHING_RECORDED = "nothing that was recorded"
 #: Lengths of forecasts that a picture shows, at most.
 _LENGTHS = 6
 
@@ -69,7 +66,7 @@ class Misfit:
         """Return the misfit with one more test, which is the unexplained one if no other fails."""
         unexplained = self.unexplained
         if unexplained is None and not test.passed:
-            unexplained = Unexplained("", "", _NOTHING_RECORDED, 0.0, 0.0, test.sentence)
+            unexplained = Unexplained("", "", NOTHING_RECORDED, 0.0, 0.0, test.sentence)
         return replace(self, tests=(*self.tests, test), unexplained=unexplained)
 
 
@@ -101,26 +98,15 @@ def find_misfit(
     seed : int
         Seed of the permutations.
     """
-    dependence = find_dependence(mode, excess.criteria, seed=seed)
+    of_dependence, dependence = find_dependence(mode, excess.criteria, seed=seed)
     of_correlation, correlations = correlation_tests(mode, excess.criteria)
     of_forecasts, growth = _forecasts(mode, noise_alone(mode, excess), horizon, excess.criteria)
-    tests = (_acceleration(excess), *of_correlation, of_forecasts, _dependence(dependence))
+    tests = (_acceleration(excess), *of_correlation, of_forecasts, of_dependence)
     failed = [test for test in tests if not test.passed]
     unexplained = None
     if failed:
-        unexplained = dependence.found or _located(failed[0], mode, excess)
+        unexplained = dependence or _located(failed[0], mode, excess)
     return Misfit(tests, unexplained, correlations, growth)
-
-
-def _dependence(dependence: Dependence) -> ResidualTest:
-    """Return the test of dependence on state, command and time."""
-    if not dependence.tested:
-        return ResidualTest.untested(DEPENDENCE, "too few transitions")
-    found = dependence.found
-    if found is None:
-        sentence = "the innovations depend on no recorded quantity"
-        return ResidualTest(DEPENDENCE, 1.0, 0.0, True, sentence)
-    return ResidualTest(DEPENDENCE, found.p_value, found.share, False, found.sentence)
 
 
 def _located(test: ResidualTest, mode: Mode, excess: UnexplainedAcceleration) -> Unexplained:
@@ -131,7 +117,7 @@ def _located(test: ResidualTest, mode: Mode, excess: UnexplainedAcceleration) ->
     columns = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
     size = (mode.whitened_residual[:, columns] ** 2).mean(axis=0)
     body = mode.problem.scene.moving[int(places[columns[int(np.argmax(size))]] // len(STATE))].name
-    return Unexplained(body, name, _NOTHING_RECORDED, test.size, test.p_value, test.sentence)
+    return Unexplained(body, name, NOTHING_RECORDED, test.size, test.p_value, test.sentence)
 
 
 def _acceleration(excess: UnexplainedAcceleration) -> ResidualTest:
@@ -156,7 +142,7 @@ def _acceleration(excess: UnexplainedAcceleration) -> ResidualTest:
 
 
 def _forecasts(
-    mode: Mode, sigma: Array, horizon: int, criteria: Criteria
+    mode: Mode, sigma: Floats, horizon: int, criteria: Criteria
 ) -> tuple[ResidualTest, Growth]:
     """Return the test of forecasts' errors against those of noise and a negligible acceleration."""
     noise = mode.problem.trajectory_noise
@@ -181,7 +167,7 @@ def _forecasts(
     passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
     dt = mode.problem.scene.time_step
     seconds = longest * dt
-    sentence = f"forecasts of {seconds:g} s are as good as noise lets them be"
+    sentence = f"errors of forecasts of {seconds:g} s are those of noise"
     if not passed:
         sentence = (
             f"after {seconds:g} s the error of {name} is {worst:.1f} times what noise and"

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import xarray as xr
-from numpy.typing import NDArray
 from scipy.stats import binom
 
 from pbrl_ppl.criticism.criteria import DEFAULT, PriorCriteria
@@ -18,9 +17,7 @@ from pbrl_ppl.history import History, longest_gap, measurement_noise
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.model import prior_predictive_draws
 from pbrl_ppl.posterior import HDI_PROB
-from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, wrapped
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, Floats, Ints, wrapped
 
 #: Quantiles: the ends of the interval, its quartiles and the median.
 QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
@@ -206,7 +203,7 @@ def prior_predictive_check(
     )
 
 
-def _factors(exact: Array, measured: Array) -> xr.Dataset:
+def _factors(exact: Floats, measured: Floats) -> xr.Dataset:
     """Return quantiles over draws of the ratio of measured (transition, body, state) changes."""
     seen = np.where(np.isfinite(measured), exact, 0.0)
     square = (seen**2).sum(axis=1)
@@ -237,7 +234,7 @@ def _unit(factor: xr.DataArray, criteria: PriorCriteria) -> str:
     )
 
 
-def _at(states: Array, step: NDArray[np.intp]) -> Array:
+def _at(states: Floats, step: Ints) -> Floats:
     """Return states (..., transition, H, body, state) at one step for each coordinate.
 
     ``step`` has the shape (transition, body, state), the result (..., transition, body, state).
@@ -264,7 +261,7 @@ def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -
     angle = np.tile(np.arange(len(POSE)) == THETA, len(places) // len(POSE))
     longest = int(history.dataset["n_rows"].min()) - 1
 
-    def size(steps: int, order: int) -> Array:
+    def size(steps: int, order: int) -> Floats:
         change = places
         for _ in range(order):
             change = change[:, steps:] - change[:, :-steps]
@@ -282,7 +279,7 @@ def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -
     return horizon
 
 
-def _compare(predicted: Array, measured: Array, slack: Array) -> xr.Dataset:
+def _compare(predicted: Floats, measured: Floats, slack: Floats) -> xr.Dataset:
     """Return summaries of changes (draw, transition, body, state), and (transition, body, state).
 
     Draws reach measurements within ``slack``, a share of the usual change, shape (body, state).

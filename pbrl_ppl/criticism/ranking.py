@@ -75,7 +75,7 @@ def criticise(
     criteria : Criteria
         When the engine's error is small enough.
     progress : callable, optional
-        Told the name of each stage.
+        Called with the name of each stage.
 
     Returns
     -------
@@ -107,7 +107,7 @@ def criticise(
     return Ranking(
         tuple(signature.candidate for signature in ranked),
         dict(zip(mode.problem.layout.labels, mode.phi.tolist(), strict=True)),
-        dict(zip(excess.names, excess.size.tolist(), strict=True)),
+        excess.by_name(excess.size),
         mode.problem.physics.substeps,
     )
 

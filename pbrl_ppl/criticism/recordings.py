@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
@@ -20,9 +19,7 @@ from pbrl_ppl.history import (
 from pbrl_ppl.likelihood import cells_of, check_moves
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats, Ints
 
 
 def checked_histories(
@@ -65,7 +62,11 @@ def checked_histories(
                 f"{which} history: it has a row each {step:g} s, the scene each"
                 f" {scene.time_step:g} s; load it with this scene"
             )
-    same, unused = test is train, _unused(train)
+    same = test is train
+    # a bad frame makes positions look noisy, and a measured velocity as if they predicted it
+    clear = np.flatnonzero(~bad_frames(train).any(axis=(1, 2, 3)))
+    most = 2 * len(clear) >= train.n_trajectories
+    unused = unused_velocities(train.select(clear) if most else train)
     train, test = measured_alone(train, unused), measured_alone(test, unused)
     train, bad = without_bad_frames(train)
     test, more = without_bad_frames(test)
@@ -86,17 +87,7 @@ def checked_histories(
     return train, test, unused, (*map(str, bad), *held_out)
 
 
-def _unused(history: History) -> tuple[UnusedVelocity, ...]:
-    """Return the velocities that are not used, judged without bad trajectories if few are bad.
-
-    A bad frame makes positions look noisy, and a measured velocity as if they predicted it.
-    """
-    clear = np.flatnonzero(~bad_frames(history).any(axis=(1, 2, 3)))
-    most = 2 * len(clear) >= history.n_trajectories
-    return unused_velocities(history.select(clear) if most else history)
-
-
-def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Array:
+def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
     """Return errors of single measurements that a fitted model and all others contradict.
 
     They are judged by the residual given all other measurements (auxiliary residuals), without any
@@ -141,7 +132,7 @@ def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Array:
     return found
 
 
-def _beside(size: Array, trajectory: NDArray[np.intp], row: NDArray[np.intp]) -> Array:
+def _beside(size: Floats, trajectory: Ints, row: Ints) -> Floats:
     """Return the larger residual of the rows before and after, shape of ``size``; NaN if none."""
     table = np.full((trajectory.max() + 1, row.max() + 3), np.nan)
     some = np.isfinite(size)

@@ -2,22 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
+from pbrl_ppl.effects import Attached
 from pbrl_ppl.likelihood import Problem, noise_medians, ranges
 from pbrl_ppl.modes import Mode, nearby_mode, profile_sigma, trajectory_evidence, trajectory_mode
-
-Array = NDArray[np.float64]
+from pbrl_ppl.parameters import inside
+from pbrl_ppl.state import Floats
 
 #: Correlations from row to row that are tried: errors that last two, five and twenty rows.
 _MEMORIES = (0.5, 0.8, 0.95)
+
+
+def with_effects(
+    mode: Mode,
+    effects: tuple[Attached, ...],
+    values: Mapping[Attached, Floats | float] | None = None,
+) -> tuple[Problem, Floats]:
+    """Return a mode's problem with other effects, and where a search for its mode begins.
+
+    Parameters
+    ----------
+    mode : Mode
+        A mode of the model with the effects so far.
+    effects : tuple of Attached
+        All effects of the new model.
+    values : mapping, optional
+        Where the parameters of an effect begin; by default at the mode, or the prior's centre.
+    """
+    problem = mode.problem.with_physics(effects=effects)
+    layout = problem.layout
+    phi = layout.from_layout(mode.problem.layout, mode.phi)
+    for attached, sizes in (values or {}).items():
+        phi[[layout.labels.index(label) for label in attached.labels]] = sizes
+    return problem, inside(layout.priors, phi)
 
 
 def with_enough_substeps(
@@ -31,7 +55,7 @@ def with_enough_substeps(
     """
     limits = criteria.engine
     confirmed = 0  # substeps with which smoothing began anew
-    while True:  # a better engine leaves less noise, against which its own error shows again
+    while True:  # a better engine leaves less noise, against which its error shows again
         begin = substeps = mode.problem.physics.substeps
         while shift(mode, substeps) > limits.small_shift and substeps < limits.most_substeps:
             substeps *= 2
@@ -117,7 +141,7 @@ def with_correlated_errors(mode: Mode, criteria: Criteria = DEFAULT) -> Mode | N
     cells = found.problem.trajectory_noise.cells
     data = found.problem.data
     extent = ranges(cells, data.history, data.smoothed_states)
-    white = mode.sigma[: len(cells.drifts)]  # as large as what passed for a row's own errors
+    white = mode.sigma[: len(cells.drifts)]  # as large as the measurement noise of single rows was
     most = np.maximum(criteria.negligible * extent, white)
     if (found.sigma[cells.drift_parameters] > most).any():
         return None

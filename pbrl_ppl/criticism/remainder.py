@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.cross_validation import gain
-from pbrl_ppl.criticism.rivals import likeliest_mode
+from pbrl_ppl.criticism.refinement import with_effects
+from pbrl_ppl.criticism.rivals import posterior_mode
 from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learned_remainder
@@ -26,9 +26,7 @@ from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Floats
 
 #: Transitions that the process is fitted to, at most.
 _MOST = 400
@@ -97,14 +95,16 @@ def learn_remainder(
     """
     say = progress or (lambda stage: None)
     with threadpool_limits(1, "blas"):
-        mode = likeliest_mode(posterior, tuple(catalogue))
+        mode = posterior_mode(posterior, tuple(catalogue))
         present = [attached.effect.name for attached in mode.problem.physics.effects]
         if LEARNED_REMAINDER in present:
             raise FitError("posterior: it has a learned remainder already; take one without")
         say(Stage.LEARN)
         effect = _learned(mode, body, seed, criteria)
         say(Stage.REFIT)
-        refitted = _refitted(mode, effect, body)
+        attached = effect.on(body)
+        start = with_effects(mode, (*mode.problem.physics.effects, attached), {attached: 0.0})
+        refitted = trajectory_mode(*start, mode.sigma)
         gained = gain(mode, refitted, criteria)
         if gained.total < criteria.min_elpd or not gained.certain(criteria.min_elpd_se):
             raise FitError(
@@ -126,15 +126,6 @@ def remainder_in_words(before: Any, after: Any) -> str:
         f"learned remainder, a force without a law: what a step adds unexplained to {name} falls"
         f" from {sizes[0][worst]:.2g} to {sizes[1][worst]:.2g} {unit}"
     )
-
-
-def _refitted(mode: Mode, effect: LearnedRemainder, body: str) -> Mode:
-    """Return the mode with the learned force, fitted from its zero on."""
-    effects = (*mode.problem.physics.effects, effect.on(body))
-    problem = mode.problem.with_physics(effects=effects)
-    phi = problem.layout.from_layout(mode.problem.layout, mode.phi)
-    phi[[problem.layout.labels.index(label) for label in effect.on(body).labels]] = 0.0
-    return trajectory_mode(problem, phi, mode.sigma)
 
 
 def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRemainder:
@@ -173,7 +164,7 @@ def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRem
     return learned_remainder(json.dumps(table | {"forms": block_diag(*blocks).tolist()}))
 
 
-def _process(x: Array, y: Array, seed: int, needed: float) -> tuple[float, Array] | None:
+def _process(x: Floats, y: Floats, seed: int, needed: float) -> tuple[float, Floats] | None:
     """Return the standard deviation of a force and its length scales; None if it is noise."""
     try:
         from sklearn.exceptions import ConvergenceWarning
@@ -201,7 +192,7 @@ def _process(x: Array, y: Array, seed: int, needed: float) -> tuple[float, Array
     return scale * float(np.sqrt(fitted.k1.constant_value)), np.atleast_1d(fitted.k2.length_scale)
 
 
-def residual_forces(mode: Mode, body: str) -> tuple[Array, dict[int, Array]]:
+def residual_forces(mode: Mode, body: str) -> tuple[Floats, dict[int, Floats]]:
     """Return the residual accelerations of steps as forces in a body's frame.
 
     Returns
@@ -230,11 +221,11 @@ def residual_forces(mode: Mode, body: str) -> tuple[Array, dict[int, Array]]:
     velocity = np.stack([c * vx + s * vy, c * vy - s * vx, omega], axis=1)
     declared = problem.scene.body(body)
     known = dict(declared.known)
-    mass = (
-        known["mass"] if "mass" in known else mode.phi[problem.layout.index("mass", declared.owner)]
-    )
-    mass = float(mass)
-    forces: dict[int, Array] = {}
+    if "mass" in known:
+        mass = float(known["mass"])
+    else:
+        mass = float(mode.phi[problem.layout.index("mass", declared.owner)])
+    forces: dict[int, Floats] = {}
     if places[0] is not None and places[1] is not None:
         ax, ay = added[:, places[0]], added[:, places[1]]
         forces |= {0: mass * (c * ax + s * ay), 1: mass * (c * ay - s * ax)}

@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True)
@@ -113,10 +110,10 @@ class Correlations:
     """
 
     cells: tuple[str, ...]
-    own: Array
-    pairs: Array
+    own: Floats
+    pairs: Floats
     commands: tuple[str, ...]
-    driven: Array
+    driven: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +128,7 @@ class Growth:
         Root mean square error of each state dimension, and that of noise alone, one each length.
     """
 
-    seconds: Array
+    seconds: Floats
     error: tuple[Mapping[str, float], ...]
     floor: tuple[Mapping[str, float], ...]
 
@@ -244,12 +241,12 @@ class Rollout:
     """
 
     body: str
-    time: Array
+    time: Floats
     names: tuple[str, ...]
     units: tuple[str, ...]
-    measured: Array
-    before: Array
-    after: Array
+    measured: Floats
+    before: Floats
+    after: Floats
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from pbrl_ppl.criticism.refinement import with_effects
 from pbrl_ppl.criticism.results import Added
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.criticism.selection import refitted
@@ -20,8 +20,7 @@ from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.posterior import likeliest_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Attribute of a posterior with its groups of inseparable effects.
 _GROUPS = "not_separable"
@@ -46,8 +45,8 @@ class Rival:
 
     attached: Attached
     mode: Mode
-    draws: Array
-    sigma: Array
+    draws: Floats
+    sigma: Floats
 
     @property
     def name(self) -> str:
@@ -112,7 +111,7 @@ def named_effects(
     return found
 
 
-def likeliest_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
+def posterior_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
     """Return the mode of a posterior's model, found from its draw of the highest density.
 
     Raises
@@ -136,7 +135,7 @@ def fit_rivals(
 ) -> list[Rival]:
     """Fit a model with each of several effects to the recording that a posterior holds.
 
-    The posterior's own model keeps its draws; the others are drawn from the Gaussian at the mode.
+    The posterior's model keeps its draws; the others are drawn from the Gaussian at the mode.
 
     Parameters
     ----------
@@ -156,25 +155,23 @@ def fit_rivals(
     PosteriorError
         If the posterior is of single transitions, or holds fewer draws.
     """
-    own = likeliest_mode(posterior, catalogue)
-    problem = own.problem
+    declared = posterior_mode(posterior, catalogue)
+    problem = declared.problem
     phi, sigma = parameter_draws(problem, posterior)
     if not 1 <= draws <= len(phi):
         raise PosteriorError(f"posterior: {draws} draws were asked for, expected 1 to {len(phi)}")
     rng = np.random.default_rng(seed)
     present = [one for one in problem.physics.effects if one in effects]
-    base = own
+    base = declared
     if present:
         others = tuple(one for one in problem.physics.effects if one not in effects)
-        without = problem.with_physics(effects=others)
-        begin = without.layout.from_layout(problem.layout, own.phi)
-        base = trajectory_mode(without, begin, own.sigma)
+        base = trajectory_mode(*with_effects(declared, others), declared.sigma)
     noise = np.median(sigma, axis=0)
     found = []
     for attached in effects:
         if present == [attached]:
             chosen = phi[rng.choice(len(phi), draws, replace=False)]
-            found.append(Rival(attached, own, chosen, noise))
+            found.append(Rival(attached, declared, chosen, noise))
             continue
         (signature,) = rank_candidates(base, [attached])
         mode = refitted(base, signature)

@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pbrl_ppl.criticism.criteria import ScoreCriteria
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.modes import Mode
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Grid points that are simulated in one call.
 _AT_ONCE = 8
@@ -34,8 +32,8 @@ class Look:
         The parameter of each column; empty for a whole change.
     """
 
-    values: Array
-    signature: Array
+    values: Floats
+    signature: Floats
     columns: tuple[int, ...]
 
 
@@ -65,7 +63,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
     own = [labels.index(label) for label in candidate.labels]  # places in the wider vector
     null = np.array(effect.null)
 
-    def whitened(points: Array) -> Array:
+    def whitened(points: Floats) -> Floats:
         phi = np.zeros((len(points), wide.layout.size))
         phi[:, declared] = mode.phi
         phi[:, own] = points
@@ -95,10 +93,10 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
 
 
 def _points(
-    proposed: Array, free: Array, null: Array, steps: tuple[Array, Array]
-) -> tuple[Array, list[tuple[Array, tuple[int, ...], list[int]]]]:
+    proposed: Floats, free: Floats, null: Floats, steps: tuple[Floats, Floats]
+) -> tuple[Floats, list[tuple[Floats, tuple[int, ...], list[int]]]]:
     """Return points to simulate, and each grid point's values, free columns and rows of points."""
-    points: list[Array] = []
+    points: list[Floats] = []
     plan = []
     for row, unknown in zip(proposed, free, strict=True):
         values = np.where(unknown, null, row)
@@ -115,30 +113,10 @@ def _points(
     return np.array(points), plan
 
 
-def detection_limits(
-    effect: Effect, unit: Array, tried: int, criteria: ScoreCriteria
-) -> dict[str, float]:
-    """Return the smallest detectable size of each parameter, the others at their null values.
-
-    Parameters
-    ----------
-    effect : Effect
-        The effect.
-    unit : ndarray
-        Change of the prediction by one unit of each parameter, in units of noise, shape (q,).
-    tried : int
-        Number of tests that the p-value is corrected for.
-    criteria : ScoreCriteria
-        P-value and power of the limit.
-    """
-    sizes = _sizes(unit, tried, criteria)
-    return dict(zip((p.name for p in effect.parameters), sizes, strict=True))
-
-
 def detection_limits_of_scan(
     effect: Effect,
     looks: Sequence[Look],
-    units: Sequence[Array],
+    units: Sequence[Floats],
     candidates: int,
     criteria: ScoreCriteria,
 ) -> dict[str, float]:
@@ -172,7 +150,9 @@ def detection_limits_of_scan(
         seen = [values[0] for values, unit in whole if unit[0] >= _needed(tried, criteria)]
         found[names[0]] = float(min(seen, key=lambda value: abs(value - null), default=np.inf))
     for look, unit in zip(looks, units, strict=True):
-        for column, size in zip(look.columns, _sizes(unit, tried, criteria), strict=False):
+        for column, size in zip(
+            look.columns, detectable_sizes(unit, tried, criteria), strict=False
+        ):
             found[names[column]] = min(found.get(names[column], np.inf), size)
     return found
 
@@ -189,7 +169,17 @@ def _needed(tried: int, criteria: ScoreCriteria) -> float:
     return float(norm.isf(criteria.detection_p / 2 / tried) + norm.ppf(criteria.detection_power))
 
 
-def _sizes(unit: Array, tried: int, criteria: ScoreCriteria) -> list[float]:
-    """Return the detectable size of each column."""
+def detectable_sizes(unit: Floats, tried: int, criteria: ScoreCriteria) -> list[float]:
+    """Return the smallest detectable size of each column, the others at their null values.
+
+    Parameters
+    ----------
+    unit : ndarray
+        Change of the prediction by one unit of each column, in units of noise, shape (column,).
+    tried : int
+        Number of tests that the p-value is corrected for.
+    criteria : ScoreCriteria
+        P-value and power of the limit.
+    """
     with np.errstate(divide="ignore"):
         return [float(size) for size in _needed(tried, criteria) / unit]

@@ -7,18 +7,16 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.scan import caps, detection_limits, detection_limits_of_scan, looks
+from pbrl_ppl.criticism.scan import caps, detectable_sizes, detection_limits_of_scan, looks
 from pbrl_ppl.effects import Attached, Noise
+from pbrl_ppl.likelihood import TrajectoryLikelihood
 from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import prior_residual, prior_slopes
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import Floats, Ints
 
 #: Decimals of a p-value's logarithm: effects that are the same physics differ by rounding.
 _EQUAL = 3
@@ -45,8 +43,8 @@ class Signature:
     attached: Attached
     candidate: Candidate
     log_p: float
-    basis: Array
-    direction: Array
+    basis: Floats
+    direction: Floats
 
 
 def rank_candidates(
@@ -100,7 +98,7 @@ def rank_candidates(
     return sorted(map(score, candidates), key=order)
 
 
-def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Array, list[Array]]:
+def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Floats, list[Floats]]:
     """Return residual, Jacobian and every candidate's signature, with the prior as further rows.
 
     Returns
@@ -129,7 +127,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Array, Arra
     lower, upper = (bound[new] for bound in wide.layout.bounds)
     begin = np.array([1e-3 * min(wide.layout.priors[place].sigma, 1.0) for place in new])
 
-    def predict(points: Array) -> Array:
+    def predict(points: Floats) -> Floats:
         phi = np.tile(null, (len(points), 1))
         phi[:, new] = points
         return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
@@ -150,10 +148,10 @@ class _Evidence:
     statistic: float
     log_p: float
     share: float
-    size: Array
-    basis: Array
-    direction: Array
-    unit: Array
+    size: Floats
+    basis: Floats
+    direction: Floats
+    unit: Floats
 
 
 def _none(n: int) -> _Evidence:
@@ -177,12 +175,12 @@ class _Test:
         Which signatures are absorbed.
     """
 
-    q: Array
-    residual: Array
+    q: Floats
+    residual: Floats
     candidates: int
     criteria: Criteria
 
-    def evidence(self, signature: Array, sides: Ints, scales: Array) -> _Evidence:
+    def evidence(self, signature: Floats, sides: Ints, scales: Floats) -> _Evidence:
         """Return the score test of a signature.
 
         Parameters
@@ -231,20 +229,21 @@ def _sides(attached: Attached) -> Ints:
     return np.array([int(null == low) - int(null == high) for null, low, high in supports])
 
 
-def _scales(attached: Attached) -> Array:
+def _scales(attached: Attached) -> Floats:
     """Return the typical sizes of an effect's parameters under their priors."""
     return np.array([parameter.prior.sigma for parameter in attached.effect.parameters])
 
 
 def _signature(
-    attached: Attached, evidence: _Evidence, values: Array, n_looks: int, test: _Test
+    attached: Attached, evidence: _Evidence, values: Floats, n_looks: int, test: _Test
 ) -> Signature:
     """Return a candidate's signature, its p-value corrected for grid points and candidates."""
     effect, limits = attached.effect, {}
-    if effect.scan is None:
-        limits = detection_limits(effect, evidence.unit, test.candidates, test.criteria.score)
-    log_p = min(0.0, evidence.log_p + np.log(max(1, n_looks)))
     names = [parameter.name for parameter in effect.parameters]
+    if effect.scan is None:
+        sizes = detectable_sizes(evidence.unit, test.candidates, test.criteria.score)
+        limits = dict(zip(names, sizes, strict=True))
+    log_p = min(0.0, evidence.log_p + np.log(max(1, n_looks)))
     candidate = Candidate(
         effect=effect.name,
         body=attached.body,
@@ -300,12 +299,13 @@ def _tail_score(mode: Mode, attached: Attached, test: _Test) -> Signature:
     (z^4 - 2 z^2 - 1) / 4; without its projection on sigma's score it is the fourth Hermite
     polynomial over 4, of variance 3/2.
     """
-    noise = mode.problem.trajectory_noise
-    seen = mode.problem.observations.measured if noise is None else noise.seen
+    problem = mode.problem
+    along = isinstance(problem.likelihood, TrajectoryLikelihood)
+    seen = problem.trajectory_noise.seen if along else problem.observations.measured
     whitened = test.residual[: seen.size].reshape(seen.shape)
     # coordinates that never move have no noise, and would make all others look heavy-tailed
     loud = seen & (np.abs(whitened).max(axis=0) > test.criteria.score.visible)
-    z = whitened[loud] if mode.problem.nu(mode.phi) is None else np.zeros(0)
+    z = whitened[loud] if problem.nu(mode.phi) is None else np.zeros(0)
     z = z / max(float(np.sqrt(np.mean(z**2))), 1e-300) if len(z) else z
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0

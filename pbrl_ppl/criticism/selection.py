@@ -6,7 +6,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import Criteria
@@ -20,16 +19,15 @@ from pbrl_ppl.criticism.cross_validation import (
 )
 from pbrl_ppl.criticism.forecast import longest_forecast
 from pbrl_ppl.criticism.recordings import outliers
-from pbrl_ppl.criticism.refinement import with_enough_substeps
+from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, trajectory_evidence, trajectory_mode
-from pbrl_ppl.parameters import inside, prior_residual, prior_slopes
+from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,7 +232,9 @@ class Selection:
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
         """Drop effects that later ones have made unnecessary; sort the rest by their gain."""
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
-            without = self._without(mode, step.signature.attached)
+            effects = mode.problem.physics.effects
+            kept = tuple(each for each in effects if each != step.signature.attached)
+            without = trajectory_mode(*with_effects(mode, kept), mode.sigma)
             gains = _gains(without, mode, self.criteria)
             if why := self._uncertain(without, mode, *gains):
                 self._note(step.signature, f"needless beside later ones: {why}")
@@ -256,13 +256,6 @@ class Selection:
         """Record the decision on a candidate."""
         self.why[_key(signature)] = why
 
-    def _without(self, mode: Mode, effect: Attached) -> Mode:
-        """Return the mode refitted without an effect."""
-        kept = tuple(attached for attached in mode.problem.physics.effects if attached != effect)
-        problem = mode.problem.with_physics(effects=kept)
-        phi = problem.layout.from_layout(mode.problem.layout, mode.phi)
-        return trajectory_mode(problem, phi, mode.sigma)
-
 
 def refitted(mode: Mode, signature: Signature) -> Mode:
     """Return the mode with a candidate in the model, under the same noise structure."""
@@ -272,11 +265,7 @@ def refitted(mode: Mode, signature: Signature) -> Mode:
     if isinstance(stage, Structure) and stage.rod is None:  # bodies collide with it
         return structure_mode(mode, attached, estimate)
     effects = (*mode.problem.physics.effects, attached)
-    problem = mode.problem.with_physics(effects=effects)
-    layout = problem.layout
-    phi = layout.from_layout(mode.problem.layout, mode.phi)
-    phi[[layout.labels.index(label) for label in attached.labels]] = estimate
-    return trajectory_mode(problem, inside(layout.priors, phi), mode.sigma)
+    return trajectory_mode(*with_effects(mode, effects, {attached: estimate}), mode.sigma)
 
 
 def _key(signature: Signature) -> tuple[str, str]:
@@ -338,7 +327,7 @@ def _informed(mode: Mode, attached: Attached, informed: float) -> int:
     return int(narrow.sum())
 
 
-def _width_over_prior(mode: Mode) -> Array:
+def _width_over_prior(mode: Mode) -> Floats:
     """Return posterior standard deviations in units of the prior's, shape (p,)."""
     slopes = prior_slopes(mode.problem.layout.priors, mode.phi)
     return np.asarray(np.sqrt(np.diag(mode.covariance)) * np.abs(slopes))

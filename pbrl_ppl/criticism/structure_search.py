@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.parameters import inside
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: A body stops within a step of where it touches: with fewer of them places come out far off.
 _SUBSTEPS = 40
@@ -29,7 +27,7 @@ _PLACES, _ROUNDS = 4, 3
 _BETTER = 2.0
 
 
-def structure_mode(mode: Mode, candidate: Attached, estimate: Array) -> Mode:
+def structure_mode(mode: Mode, candidate: Attached, estimate: Floats) -> Mode:
     """Fit a model with a structure that bodies collide with.
 
     Derivatives across a collision mislead an optimiser, and the noise that fits without the
@@ -64,7 +62,7 @@ def structure_mode(mode: Mode, candidate: Attached, estimate: Array) -> Mode:
         looks = candidate.effect.scan(problem.scene, problem.data.history, body)
         guesses = np.vstack([guesses, looks[np.isfinite(looks).all(axis=1)]])
 
-    def fitted(problem: Problem, phi: Array, place: Array, sigma: Array) -> Mode:
+    def fitted(problem: Problem, phi: Floats, place: Floats, sigma: Floats) -> Mode:
         start = phi.copy()
         start[own] = place
         return trajectory_mode(problem, inside(layout.priors, start), sigma)
@@ -83,12 +81,12 @@ def structure_mode(mode: Mode, candidate: Attached, estimate: Array) -> Mode:
 
 
 def _places(
-    problem: Problem, phi: Array, sigma: Array, own: list[int], guesses: Array
-) -> list[Array]:
+    problem: Problem, phi: Floats, sigma: Floats, own: list[int], guesses: Floats
+) -> list[Floats]:
     """Improve guesses of some parameters, the others held; return distinct ones, best first."""
     lower, upper = (bound[own] for bound in problem.layout.bounds)
 
-    def loss(values: Array) -> float:
+    def loss(values: Floats) -> float:
         if np.any(values <= lower) or np.any(values >= upper):
             return np.inf
         here = phi.copy()
@@ -99,7 +97,7 @@ def _places(
 
     losses = [loss(guess) for guess in guesses]
     side = _SIDE * min(problem.layout.priors[place].sigma for place in own)
-    found: list[tuple[float, Array]] = []
+    found: list[tuple[float, Floats]] = []
     for i in np.argsort(losses)[:_GUESSES]:
         best = minimize(
             loss,

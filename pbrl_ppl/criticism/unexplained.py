@@ -4,17 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.likelihood import bodies_acceleration
 from pbrl_ppl.modes import NOTHING, Mode, profile_sigma
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import STATE, Bools, Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,30 +37,34 @@ class UnexplainedAcceleration:
     """
 
     names: tuple[str, ...]
-    size: Array
-    relative: Array
-    p_value: Array
-    numerical: Array
+    size: Floats
+    relative: Floats
+    p_value: Floats
+    numerical: Floats
     criteria: Criteria = DEFAULT
 
+    def by_name(self, values: Floats | Bools) -> dict[str, Any]:
+        """Return values of the velocities, shape (velocity,), by name."""
+        return dict(zip(self.names, values.tolist(), strict=True))
+
     @property
-    def certain(self) -> NDArray[np.bool_]:
+    def certain(self) -> Bools:
         """Return which are significant."""
         return np.asarray(self.p_value * len(self.names) < self.criteria.false_alarm)
 
     @property
-    def beyond_engine(self) -> NDArray[np.bool_]:
+    def beyond_engine(self) -> Bools:
         """Return which are larger than the engine's numerical error."""
         return np.asarray(self.size > self.criteria.engine.error_factor * self.numerical)
 
     @property
-    def matters(self) -> NDArray[np.bool_]:
+    def matters(self) -> Bools:
         """Return which are significant, beyond the engine's error, and not negligible."""
         large = self.relative >= self.criteria.negligible
         return np.asarray(self.remains & large)
 
     @property
-    def remains(self) -> NDArray[np.bool_]:
+    def remains(self) -> Bools:
         """Return which are significant and beyond the engine's error, negligible or not."""
         return np.asarray(self.certain & self.beyond_engine)
 
@@ -89,7 +91,7 @@ def unexplained_acceleration(mode: Mode, criteria: Criteria = DEFAULT) -> Unexpl
     )
 
 
-def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Array:
+def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
     """Return noise parameters without accelerations that are not significant, shape (parameter,).
 
     Few data do not tell measurement noise from process noise: the mode gives all to one of them.
@@ -109,13 +111,13 @@ def without_acceleration(mode: Mode) -> Mode:
     return replace(mode, sigma=_without(mode, places, mode.problem.residual(mode.phi)))
 
 
-def _without(mode: Mode, places: Iterable[int], residual: Array) -> Array:
+def _without(mode: Mode, places: Iterable[int], residual: Floats) -> Floats:
     """Return the noise parameters that are best if those at some places are next to nothing."""
     held = {place: NOTHING * mode.problem.noise_prior[0][place] for place in places}
     return profile_sigma(mode.problem, residual, mode.phi, held)
 
 
-def innovations_over_steps(mode: Mode) -> Array:
+def innovations_over_steps(mode: Mode) -> Floats:
     """Return the typical innovations over the change in a step, shape (coordinate,)."""
     noise, segments = mode.problem.trajectory_noise, mode.problem.segments
     cells, dt = noise.cells, mode.problem.scene.time_step
@@ -127,7 +129,7 @@ def innovations_over_steps(mode: Mode) -> Array:
     return np.asarray(np.median(noise.scale(mode.sigma), axis=0) / np.maximum(step, 1e-300))
 
 
-def _numerical(mode: Mode) -> Array:
+def _numerical(mode: Mode) -> Floats:
     """Return the rms change of accelerations if the substeps are doubled, shape (velocity,)."""
     problem, cells = mode.problem, mode.problem.trajectory_noise.cells
     finer = problem.with_physics(substeps=2 * problem.physics.substeps)
@@ -137,7 +139,7 @@ def _numerical(mode: Mode) -> Array:
     return np.array([np.sqrt(square[dimension == d].mean()) for d in cells.rates])
 
 
-def _p_values(mode: Mode) -> Array:
+def _p_values(mode: Mode) -> Floats:
     """Return p-values of the likelihood ratio of each acceleration against none.
 
     The other noises are free. At the bound of a variance: half a chi-squared with one degree.
@@ -145,7 +147,7 @@ def _p_values(mode: Mode) -> Array:
     problem = mode.problem
     residual = problem.residual(mode.phi)
 
-    def best(sigma: Array) -> float:
+    def best(sigma: Floats) -> float:
         return float(problem.log_density(residual, sigma, mode.phi).sum())
 
     here = best(mode.sigma)

@@ -1,17 +1,10 @@
 """Object-oriented baselines: relations, conditions, LWR and OO-LWR."""
 
-from pbrl_ppl.oomdp.contacts import SectorContacts
-from pbrl_ppl.oomdp.lwr import LWR, OOLWR
-from pbrl_ppl.oomdp.regression import Regression
-from pbrl_ppl.oomdp.relations import Attributes, Condition, Pushed, Relation
-
-__all__ = [
-    "LWR",
-    "OOLWR",
-    "Attributes",
-    "Condition",
-    "Pushed",
-    "Regression",
-    "Relation",
-    "SectorContacts",
-]
+from .contacts import SectorContacts as SectorContacts
+from .lwr import LWR as LWR
+from .lwr import OOLWR as OOLWR
+from .regression import Regression as Regression
+from .relations import Attributes as Attributes
+from .relations import Condition as Condition
+from .relations import Pushed as Pushed
+from .relations import Relation as Relation

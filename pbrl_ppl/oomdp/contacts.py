@@ -8,13 +8,14 @@ from typing import final
 import numpy as np
 
 from pbrl_ppl.errors import FitError, HistoryError
-from pbrl_ppl.oomdp.relations import Array, Condition, Flags, condition
+from pbrl_ppl.oomdp.relations import Condition, condition
 from pbrl_ppl.physics import Scenery, circles, scenery
 from pbrl_ppl.scene import WORLD, Scene
+from pbrl_ppl.state import Bools, Floats
 
 #: A convex part of a solid: corners (k, 2) counter-clockwise, and a radius about them; one corner
 #: is a circle, two are a wall.
-Part = tuple[Array, float]
+Part = tuple[Floats, float]
 
 
 @final
@@ -101,13 +102,13 @@ class SectorContacts:
         )
 
     @property
-    def directions(self) -> Array:
-        """Directions of the rays in the body's frame, sector by sector, shape (ray, 2)."""
+    def directions(self) -> Floats:
+        """Return the rays' directions in the body's frame, sector by sector, shape (ray, 2)."""
         middle = np.arange(self.sectors * self.rays) + 0.5 * (1 - self.rays)
         angle = 2 * np.pi * middle / (self.sectors * self.rays)
         return np.stack([np.cos(angle), np.sin(angle)], axis=-1)
 
-    def of(self, scene: Scene, states: Array, wrenches: Array | None = None) -> Flags:
+    def of(self, scene: Scene, states: Floats, wrenches: Floats | None = None) -> Bools:
         """Return the predicates contact_theta(obj) of every moving body.
 
         Parameters
@@ -156,7 +157,7 @@ class SectorContacts:
                     flags[at, body, obj] |= self._sectors(world, body, other, poses[at])
         return flags
 
-    def conditions(self, scene: Scene, states: Array) -> list[list[Condition]]:
+    def conditions(self, scene: Scene, states: Floats) -> list[list[Condition]]:
         """Return the contact predicates that hold, for each state a list over moving bodies.
 
         Parameters and errors are those of :meth:`of`.
@@ -164,7 +165,7 @@ class SectorContacts:
         labels, flags = self.labels(scene), self.of(scene, states)
         return [[condition(body.ravel(), labels) for body in state] for state in flags]
 
-    def _sectors(self, world: Scenery, body: int, other: int, poses: Array) -> Flags:
+    def _sectors(self, world: Scenery, body: int, other: int, poses: Floats) -> Bools:
         """Return which sectors of a body are in contact with another solid, shape (n, sector)."""
         rays = self.directions[None]
         insides = [spans(part, np.zeros((1, 2)), rays) for part in world.solids[body].parts]
@@ -181,7 +182,7 @@ class SectorContacts:
         return np.asarray(touched.reshape(-1, self.sectors, self.rays).any(axis=-1))
 
 
-def spans(part: Part, origins: Array, directions: Array) -> Array:
+def spans(part: Part, origins: Floats, directions: Floats) -> Floats:
     """Return the distances at which rays enter and leave a convex part.
 
     Parameters
@@ -219,7 +220,7 @@ def spans(part: Part, origins: Array, directions: Array) -> Array:
     return np.stack([np.where(hit, enter, np.inf), np.where(hit, leave, -np.inf)], axis=-1)
 
 
-def _circle(arm: Array, directions: Array, radius: float) -> tuple[Array, Array]:
+def _circle(arm: Floats, directions: Floats, radius: float) -> tuple[Floats, Floats]:
     """Return distances to a circle from origins at these positions from its centre."""
     ahead = np.einsum("nrc,nc->nr", directions, arm)
     square = ahead**2 - ((arm**2).sum(axis=-1) - radius**2)[:, None]
@@ -227,7 +228,7 @@ def _circle(arm: Array, directions: Array, radius: float) -> tuple[Array, Array]
     return -ahead - half, -ahead + half
 
 
-def _segment(ends: Array, origins: Array, directions: Array) -> tuple[Array, Array]:
+def _segment(ends: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats]:
     """Return the distance to a wall, twice."""
     edge, arm = ends[1] - ends[0], ends[0] - origins
     across = directions[..., 0] * edge[1] - directions[..., 1] * edge[0]
@@ -238,7 +239,7 @@ def _segment(ends: Array, origins: Array, directions: Array) -> tuple[Array, Arr
     return at, at
 
 
-def _polygon(corners: Array, origins: Array, directions: Array) -> tuple[Array, Array]:
+def _polygon(corners: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats]:
     """Return the last entry and the first exit among the edges (Cyrus and Beck's clipping)."""
     enter = np.full(directions.shape[:2], -np.inf)
     leave = -enter
@@ -254,7 +255,7 @@ def _polygon(corners: Array, origins: Array, directions: Array) -> tuple[Array, 
     return enter, leave
 
 
-def turned(vectors: Array, angle: Array) -> Array:
+def turned(vectors: Floats, angle: Floats) -> Floats:
     """Return vectors (..., 2) turned by angles that broadcast with their leading axes."""
     c, s = np.cos(angle), np.sin(angle)
     x, y = vectors[..., 0], vectors[..., 1]

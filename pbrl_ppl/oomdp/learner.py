@@ -11,9 +11,9 @@ from numpy.typing import ArrayLike
 from pbrl_ppl.errors import FitError, HistoryError, SimulationError
 from pbrl_ppl.history import History, check_start
 from pbrl_ppl.oomdp.contacts import turned
-from pbrl_ppl.oomdp.regression import Array, Experience, Flags
+from pbrl_ppl.oomdp.regression import Experience
 from pbrl_ppl.scene import Scene, nearest
-from pbrl_ppl.state import STATE, THETA, WRENCH, wrapped
+from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, wrapped
 
 #: Positions and speeds beyond this (SI units) are of extrapolations that have diverged.
 _DIVERGED = 1e6
@@ -83,7 +83,7 @@ class Learner(ABC):
         self.transitions = 0
 
     @abstractmethod
-    def predicates(self, states: Array, wrenches: Array) -> Flags:
+    def predicates(self, states: Floats, wrenches: Floats) -> Bools:
         """Return predicates of moving bodies in states (n, body, 6) under wrenches (n, body, 3).
 
         Shape (n, body, predicate).
@@ -132,7 +132,7 @@ class Learner(ABC):
         if len({len(values) for values in arrays}) > 1:
             raise HistoryError(
                 f"observe: got {', '.join(str(len(values)) for values in arrays)} states, actions"
-                " and next states, expected as many of each"
+                " and next states, expected equal numbers"
             )
         begin, wrench, after = arrays
         flags = self.predicates(begin, wrench)
@@ -176,23 +176,23 @@ class Learner(ABC):
 
     @property
     def draws(self) -> int:
-        """Number of draws: 1, a point estimate."""
+        """Return the number of draws: 1, a point estimate."""
         return 1
 
     @property
-    def before(self) -> Array:
-        """Wrench before the first interval: zeros, shape (body, 3)."""
+    def before(self) -> Floats:
+        """Return the wrench before the first interval: zeros, shape (body, 3)."""
         return np.zeros((len(self.scene.moving), len(WRENCH)))
 
     def single(self) -> Self:
         """Return itself."""
         return self
 
-    def after(self, before: Array) -> Self:
+    def after(self, before: Floats) -> Self:
         """Return itself: the model has no memory of wrenches."""
         return self
 
-    def noisy(self, states: Array, rng: np.random.Generator) -> Array:
+    def noisy(self, states: Floats, rng: np.random.Generator) -> Floats:
         """Raise an error: the regression has no noise model.
 
         Raises
@@ -202,7 +202,7 @@ class Learner(ABC):
         """
         raise FitError("noise: LWR predicts a mean alone; plan without noise")
 
-    def acceleration(self, body: str, force: float, torque: float) -> tuple[Array, Array]:
+    def acceleration(self, body: str, force: float, torque: float) -> tuple[Floats, Floats]:
         """Return the acceleration of a body under a push, shape (1,) each, m/s^2 and rad/s^2.
 
         From a linear fit to the transitions in its commonest condition, at the heading with the
@@ -219,7 +219,7 @@ class Learner(ABC):
         angular = force * np.hypot(*gains[:2, 2]) + torque * abs(gains[2, 2])
         return np.array([linear]), np.array([angular])
 
-    def step(self, states: Array, wrenches: Array, previous: Array | None = None) -> Array:
+    def step(self, states: Floats, wrenches: Floats, previous: Floats | None = None) -> Floats:
         """Return the states after one sampling interval (Eqs. 5 and 6).
 
         Parameters
@@ -284,7 +284,7 @@ class Learner(ABC):
             )
         return dict(zip(names, self._experience.values(), strict=True))[body]
 
-    def _inputs(self, states: Array, wrenches: Array) -> Array:
+    def _inputs(self, states: Floats, wrenches: Floats) -> Floats:
         """Return regression inputs X of states (n, 6) and wrenches (n, 3) of one body.
 
         Velocity and wrench in the body's frame, shape (n, 6), if pose-invariant (Eq. 6); otherwise
@@ -301,7 +301,7 @@ class Learner(ABC):
             raise FitError("LWR: nothing was observed yet; observe() a transition, or learn() some")
 
 
-def _turned(triples: Array, angle: Array) -> Array:
+def _turned(triples: Floats, angle: Floats) -> Floats:
     """Return planar vectors, each followed by a value that stays, (n, 3 k), turned by angles."""
     split = triples.reshape(len(triples), triples.shape[1] // 3, 3)
     planar = turned(split[..., :2], angle[:, None])

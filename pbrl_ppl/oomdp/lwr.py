@@ -12,9 +12,9 @@ import numpy as np
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.oomdp.contacts import SectorContacts
 from pbrl_ppl.oomdp.learner import Learner
-from pbrl_ppl.oomdp.regression import Array, Flags
 from pbrl_ppl.oomdp.relations import Attributes, Condition, Relation, condition
 from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import Bools, Floats
 
 
 @final
@@ -76,7 +76,7 @@ class LWR(Learner):
             standardise=standardise, pose_invariant=pose_invariant, share_classes=False,
         )  # fmt: skip
 
-    def predicates(self, states: Array, wrenches: Array) -> Flags:
+    def predicates(self, states: Floats, wrenches: Floats) -> Bools:
         """Return no predicates, shape (n, body, 0)."""
         return np.zeros((*states.shape[:2], 0), dtype=bool)
 
@@ -160,7 +160,7 @@ class OOLWR(Learner):
                     " the attribute"
                 )
 
-    def predicates(self, states: Array, wrenches: Array) -> Flags:
+    def predicates(self, states: Floats, wrenches: Floats) -> Bools:
         """Return predicates in the order of :attr:`labels`, shape (n, body, predicate)."""
         flags = [np.zeros((*states.shape[:2], 0), dtype=bool)]
         for relation in self.relations:

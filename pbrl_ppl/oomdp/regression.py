@@ -8,13 +8,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from pbrl_ppl.state import Bools, Floats, Ints
+
 #: Predicates of a condition, one flag each.
 Key = tuple[bool, ...]
 
@@ -61,13 +60,13 @@ class Regression:
 
     def __init__(
         self,
-        x: Array,
-        y: Array,
+        x: Floats,
+        y: Floats,
         *,
         neighbours: int = 1000,
         bandwidth: float = 1.5,
         ridge: float = 1e-3,
-        scale: Array | None = None,
+        scale: Floats | None = None,
     ) -> None:
         self.scale = np.ones(x.shape[1]) if scale is None else scale
         self.neighbours, self.bandwidth, self.ridge = neighbours, bandwidth, ridge
@@ -79,13 +78,13 @@ class Regression:
         columns = np.concatenate([self._x, y], axis=1)
         self._products = np.einsum("ni,nj->nij", self._x, columns).reshape(len(x), -1)
 
-    def __call__(self, queries: Array) -> Array:
+    def __call__(self, queries: Floats) -> Floats:
         """Return predictions, shape (m, q), at queries of shape (m, p)."""
         size = max(1, _WEIGHTS // len(self._x))
         parts = np.array_split(queries / self.scale, max(1, -(-len(queries) // size)))
         return np.concatenate([self._predict(part) for part in parts])
 
-    def _predict(self, at: Array) -> Array:
+    def _predict(self, at: Floats) -> Floats:
         n, p = at.shape
         products = (self._weights(at) @ self._products).reshape(n, p, self._products.shape[1] // p)
         square, cross = products[..., :p], products[..., p:]
@@ -97,7 +96,7 @@ class Regression:
         beta = np.linalg.solve(square + added * np.eye(p), cross + added * self._everywhere)
         return np.asarray(np.einsum("mp,mpq->mq", at, beta))
 
-    def _weights(self, at: Array) -> Array | csr_array:
+    def _weights(self, at: Floats) -> Floats | csr_array:
         """Return weights of the training inputs relative to the nearest's, shape (m, n).
 
         The factor cancels; without it all weights vanish for a query far from the data.
@@ -128,13 +127,13 @@ class Experience:
 
     def __init__(self, *, standardise: bool, options: Mapping[str, Any]) -> None:
         self._standardise, self._options = standardise, options
-        self._x: list[Array] = []
-        self._y: list[Array] = []
+        self._x: list[Floats] = []
+        self._y: list[Floats] = []
         self._rows: dict[Key, list[int]] = {}
         self._count = 0
         self._models: dict[Key, Regression] = {}
 
-    def add(self, x: Array, y: Array, flags: Flags) -> None:
+    def add(self, x: Floats, y: Floats, flags: Bools) -> None:
         """Add inputs (n, p), outputs (n, q) and predicates (n, ...)."""
         for key, rows in grouped(flags).items():
             self._rows.setdefault(key, []).extend((rows + self._count).tolist())
@@ -145,10 +144,10 @@ class Experience:
 
     @property
     def counts(self) -> dict[Key, int]:
-        """Number of transitions in each observed condition."""
+        """Return the number of transitions in each observed condition."""
         return {key: len(rows) for key, rows in self._rows.items()}
 
-    def predict(self, x: Array, flags: Flags) -> Array:
+    def predict(self, x: Floats, flags: Bools) -> Floats:
         """Return predictions (n, q) at inputs (n, p), predicates (n, ...); NaN if unobserved."""
         out = np.full((len(x), self._y[0].shape[1]), np.nan)
         for key, rows in grouped(flags).items():
@@ -156,7 +155,7 @@ class Experience:
                 out[rows] = self._model(key)(x[rows])
         return out
 
-    def gains(self) -> Array:
+    def gains(self) -> Floats:
         """Return the linear fit of outputs by inputs in the commonest condition, shape (p, q)."""
         x, y = self._joined()
         most = max(self._rows.values(), key=len)
@@ -172,12 +171,12 @@ class Experience:
             self._models[key] = Regression(x[rows], y[rows], scale=scale, **self._options)
         return self._models[key]
 
-    def _joined(self) -> tuple[Array, Array]:
+    def _joined(self) -> tuple[Floats, Floats]:
         self._x, self._y = [np.concatenate(self._x)], [np.concatenate(self._y)]
         return self._x[0], self._y[0]
 
 
-def grouped(flags: Flags) -> dict[Key, NDArray[np.intp]]:
+def grouped(flags: Bools) -> dict[Key, Ints]:
     """Return the rows of predicates (n, ...) that agree, by their flags.
 
     Examples

@@ -8,12 +8,9 @@ from itertools import compress
 from typing import Protocol, final, runtime_checkable
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.scene import Scene
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
+from pbrl_ppl.state import Bools, Floats
 
 #: Cond(s, a) of a body: the labels of the predicates that hold.
 Condition = frozenset[str]
@@ -26,7 +23,7 @@ class Relation(Protocol):
     def labels(self, scene: Scene) -> tuple[str, ...]:
         """Return the names of the predicates of one body, in the order of the flags."""
 
-    def of(self, scene: Scene, states: Array, wrenches: Array) -> Flags:
+    def of(self, scene: Scene, states: Floats, wrenches: Floats) -> Bools:
         """Return which predicates hold.
 
         Parameters
@@ -63,7 +60,7 @@ class Pushed:
         """Return ``pushed``."""
         return ("pushed",)
 
-    def of(self, scene: Scene, states: Array, wrenches: Array) -> Flags:
+    def of(self, scene: Scene, states: Floats, wrenches: Floats) -> Bools:
         """Return whether each body is pushed, shape (n, body, 1); see :class:`Relation`."""
         return np.asarray(wrenches.any(axis=-1, keepdims=True))
 
@@ -89,7 +86,7 @@ class Attributes:
         """Return the attributes of the moving bodies, sorted."""
         return tuple(sorted({name for body in scene.moving for name in body.attributes}))
 
-    def of(self, scene: Scene, states: Array, wrenches: Array) -> Flags:
+    def of(self, scene: Scene, states: Floats, wrenches: Floats) -> Bools:
         """Return the attributes that hold, shape (n, body, attribute); see :class:`Relation`."""
         labels = self.labels(scene)
         has = [[name in body.attributes for name in labels] for body in scene.moving]
@@ -97,6 +94,6 @@ class Attributes:
         return np.repeat(flags[None], len(states), axis=0)
 
 
-def condition(flags: Sequence[bool] | Flags, labels: Sequence[str]) -> Condition:
+def condition(flags: Sequence[bool] | Bools, labels: Sequence[str]) -> Condition:
     """Return a body's condition, from one flag per label."""
     return frozenset(compress(labels, flags))

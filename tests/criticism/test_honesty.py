@@ -259,7 +259,7 @@ def test_dependence_of_many_bodies_can_be_significant() -> None:
             frame["force_x"] *= 0.5
         frames.append(frame)
     mode = fitted(scene, pd.concat(frames).sort_values(["trajectory", "step"], kind="stable"))
-    found = find_dependence(mode, DEFAULT, seed=1).found
+    _, found = find_dependence(mode, DEFAULT, seed=1)
     assert found is not None
     assert found.body == "puck3"
     assert found.p_value <= 0.01
@@ -267,12 +267,12 @@ def test_dependence_of_many_bodies_can_be_significant() -> None:
 
 def test_dependence_within_a_single_trajectory_is_tested() -> None:
     frame = Disc(1, 120, FINE).frame(np.random.default_rng(1))
-    clean = find_dependence(fitted(FINE, frame), DEFAULT, seed=1)
-    assert clean.tested and clean.found is None
+    test, found = find_dependence(fitted(FINE, frame), DEFAULT, seed=1)
+    assert test.tested and found is None
     frame["force_x"] *= 0.5
-    assert find_dependence(fitted(FINE, frame), DEFAULT, seed=1).found is not None
+    assert find_dependence(fitted(FINE, frame), DEFAULT, seed=1)[1] is not None
 
 
 def test_dependence_in_few_transitions_is_not_tested() -> None:
     mode = Disc(2, 5, FINE).mode(np.random.default_rng(1))
-    assert not find_dependence(mode, DEFAULT).tested
+    assert not find_dependence(mode, DEFAULT)[0].tested
