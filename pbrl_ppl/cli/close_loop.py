@@ -154,7 +154,7 @@ def close_loop(
         source = report.Source(
             str(scene), str(train), str(test or ""), options.command_line(context)
         )
-        loop.save(output, overwrite, page=report.loop_page(loop, source))
+        loop.save(output, overwrite, page=report.render(loop, source))
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
     if as_json:
         print_json(loop.to_dict() | {"report": output / "report.html"} | remainder)
@@ -171,7 +171,7 @@ def _remainder(
 ) -> dict[str, dict[str, Any]]:
     """Learn a force for the residual and save it with the results, or return why there is none."""
     from pbrl_ppl.errors import FitError
-    from pbrl_ppl.report import loop_page
+    from pbrl_ppl.report import render
 
     path = folder / "remainder.nc"
     path.unlink(missing_ok=True)  # of an earlier run
@@ -180,7 +180,7 @@ def _remainder(
     except FitError as error:
         return {"learned_remainder": {"words": str(error), "posterior": None}}
     progress("writing the report with it")
-    loop.save(folder, overwrite=True, page=loop_page(loop, source))
+    loop.save(folder, overwrite=True, page=render(loop, source))
     return {"learned_remainder": {"words": loop.remainder_words, "posterior": path}}
 
 

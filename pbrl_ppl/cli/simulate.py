@@ -13,14 +13,10 @@ from pbrl_ppl.cli.terminal import check_file, interruptible, print_json, stages
 from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from pbrl_ppl.history import History
     from pbrl_ppl.parameters import Layout
     from pbrl_ppl.scene import Scene
-
-    Array = NDArray[np.float64]
+    from pbrl_ppl.state import Floats
 
 
 def simulate(
@@ -88,7 +84,7 @@ def simulate(
 
 def _parameters(
     source: Path, values: Mapping[str, float], draws: int | None, seed: int
-) -> tuple[Scene, Layout, Array, int]:
+) -> tuple[Scene, Layout, Floats, int]:
     """Return the scene, and parameter vectors, shape (draw, p), from a posterior or options."""
     import numpy as np
 
@@ -115,7 +111,7 @@ def _parameters(
     return scene, layout, phi, substeps
 
 
-def _set(layout: Layout, phi: Array, values: Mapping[str, float]) -> None:
+def _set(layout: Layout, phi: Floats, values: Mapping[str, float]) -> None:
     """Put values into parameter vectors, in place: by label, or for all bodies that have one."""
     import numpy as np
 
@@ -140,7 +136,7 @@ def _bare(label: str) -> str:
 
 
 def _simulated(
-    scene: Scene, layout: Layout, phi: Array, substeps: int, recorded: History
+    scene: Scene, layout: Layout, phi: Floats, substeps: int, recorded: History
 ) -> list[Any]:
     """Return simulated states, shape (trajectory, time, body, 6), for each draw."""
     import numpy as np

@@ -10,7 +10,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 from scipy.stats import chi2, gaussian_kde
 
 from pbrl_ppl.criticism import Loop
@@ -19,6 +18,7 @@ from pbrl_ppl.posterior import scalars
 from pbrl_ppl.report.evidence import Evidence, Law, bin_means
 from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, legend
 from pbrl_ppl.report.words import plain
+from pbrl_ppl.state import Floats
 
 #: Candidates are significant below this corrected p-value.
 _LEVEL = 0.01
@@ -28,17 +28,17 @@ HARDLY = 0.01
 MOST_CANDIDATES, MOST_ADDED = 20, 12
 
 
-def plot_candidates(findings: Loop, width: float = WIDE) -> Figure:
+def plot_candidates(loop: Loop, width: float = WIDE) -> Figure:
     """Plot the score statistic of the candidates, best on top, with the threshold of each."""
-    added = {(addition.effect, addition.body) for addition in findings.added}
+    added = {(addition.effect, addition.body) for addition in loop.added}
     shown = [
         candidate
-        for place, candidate in enumerate(findings.candidates)
+        for place, candidate in enumerate(loop.candidates)
         if place < MOST_CANDIDATES or (candidate.effect, candidate.body) in added
     ]
     figure, (axes,) = blank_figure(width, 0.9 + 0.3 * max(len(shown), 3), 1, 1, grid="x")
     several = len({candidate.body for candidate in shown}) > 1
-    total = max(len(findings.candidates), 1)
+    total = max(len(loop.candidates), 1)
     thresholds = [
         float(chi2.isf(_LEVEL / (total * max(candidate.looks, 1)), candidate.dof))
         for candidate in shown
@@ -85,18 +85,18 @@ def plot_candidates(findings: Loop, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_added(findings: Loop, width: float = WIDE) -> Figure:
+def plot_added(loop: Loop, width: float = WIDE) -> Figure:
     """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
     shown = [
         (added, name, estimate)
-        for added in findings.added
+        for added in loop.added
         for name, estimate in added.parameters.items()
     ][:MOST_ADDED]
     columns = min(max(len(shown), 1), 2)
     rows = max(-(-len(shown) // columns), 1)
     width = width if columns > 1 else min(width, 5.0)
     figure, panels = blank_figure(width, 2.6 * rows, rows, columns, "x", count=len(shown))
-    draws = scalars(findings.posterior_after)
+    draws = scalars(loop.posterior_after)
     nulls = {(effect.name, p.name): p.null for effect in catalogue for p in effect.parameters}
     for axes, (added, name, estimate) in zip(panels, shown, strict=False):
         low, high = estimate.hdi
@@ -142,8 +142,6 @@ def _mark_null(axes: Axes, null: float, mean: float, sd: float, top: float) -> N
     )
 
 
-Array = NDArray[np.float64]
-
 #: Bars of measured numbers in one panel, at most.
 _MOST_BARS = 12
 
@@ -173,7 +171,7 @@ def _by_cell(axes: Axes, evidence: Evidence) -> None:
     axes.set_xlabel("gain in all (nats)")
 
 
-def _along(axes: Axes, x: Array, gains: Array, label: str) -> None:
+def _along(axes: Axes, x: Floats, gains: Floats, label: str) -> None:
     """Draw the mean gain of transitions in bins of a quantity, with two standard errors."""
     bins = bin_means(x, gains)
     error = 2 * np.nan_to_num(bins.error)

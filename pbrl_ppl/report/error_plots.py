@@ -9,28 +9,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, UNITS, WIDE, blank_figure, legend
+from pbrl_ppl.state import Floats, Ints
 
-Array = NDArray[np.float64]
 
-
-def plot_residuals(findings: Loop, width: float = WIDE) -> Figure:
+def plot_residuals(loop: Loop, width: float = WIDE) -> Figure:
     """Plot held-out residuals of each state dimension in units of noise, before and after."""
-    names = list(findings.residuals_before)
+    names = list(loop.residuals_before)
     figure, (axes,) = blank_figure(width, 3.6, 1, 1)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
     axes.axhspan(-edge, edge, color=BAND, zorder=0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
-    shown = [(findings.residuals_before, BEFORE, "before", -0.18)]
-    if findings.added:
-        shown.append((findings.residuals_after, AFTER, "after", 0.18))
+    shown = [(loop.residuals_before, BEFORE, "before", -0.18)]
+    if loop.added:
+        shown.append((loop.residuals_after, AFTER, "after", 0.18))
     else:
-        shown = [(findings.residuals_before, AFTER, "declared model", 0.0)]
+        shown = [(loop.residuals_before, AFTER, "declared model", 0.0)]
     largest = 0.0
     for residuals, colour, _, shift in shown:
         for place, name in enumerate(names):
@@ -59,24 +57,24 @@ def plot_residuals(findings: Loop, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_errors(findings: Loop, width: float = WIDE) -> Figure:
+def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
     """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
     kinds = [
         ("one_step_rmse", "one step ahead"),
-        ("rollout_rmse", f"{findings.rollout_horizon} steps ahead"),
+        ("rollout_rmse", f"{loop.rollout_horizon} steps ahead"),
     ]
-    kinds = [(kind, title) for kind, title in kinds if getattr(findings.before, kind)]
-    names = [list(getattr(findings.before, kind)) for kind, _ in kinds]
+    kinds = [(kind, title) for kind, title in kinds if getattr(loop.before, kind)]
+    names = [list(getattr(loop.before, kind)) for kind, _ in kinds]
     height = 1.2 + 0.42 * max((len(states) for states in names), default=1)
     figure, panels = blank_figure(width, height, 1, max(len(kinds), 1), grid="x")
     for axes, (kind, title), dims in zip(panels, kinds, names, strict=False):
         before, after, floor = (
-            getattr(e, kind) for e in (findings.before, findings.after, findings.noise_floor)
+            getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor)
         )
         has_floor = all(np.isfinite(floor.get(d, np.nan)) and floor[d] > 0 for d in dims)
         scale = floor if has_floor else before
         bars = [(before, BEFORE, -0.19), (after, AFTER, 0.19)]
-        if not findings.added:
+        if not loop.added:
             bars = [(before, AFTER, 0.0)]
         for values, colour, shift in bars:
             for place, dim in enumerate(dims):
@@ -99,25 +97,25 @@ def plot_errors(findings: Loop, width: float = WIDE) -> Figure:
         axes.set_xlim(left=0.0)
         axes.set_title(title, fontsize=10)
         axes.set_xlabel("error / noise floor" if has_floor else "error / error before")
-    labels = ["before", "after"] if findings.added else ["declared model"]
-    colours = [BEFORE, AFTER] if findings.added else [AFTER]
+    labels = ["before", "after"] if loop.added else ["declared model"]
+    colours = [BEFORE, AFTER] if loop.added else [AFTER]
     handles = [Patch(color=c, label=n) for c, n in zip(colours, labels, strict=True)]
     legend(figure, handles)
     return figure
 
 
-def plot_rollout(findings: Loop, width: float = WIDE) -> Figure:
+def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
     """Plot one held-out trajectory: measured, and predicted before and after."""
-    rollout = findings.rollout
+    rollout = loop.rollout
     count = len(rollout.names)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
     figure, panels = blank_figure(width, 0.8 + 1.9 * rows, rows, columns, count=count)
-    lines: list[tuple[Array, str, Literal["-", "--"], str]] = [
+    lines: list[tuple[Floats, str, Literal["-", "--"], str]] = [
         (rollout.before, BEFORE, "--", "before"),
         (rollout.after, AFTER, "-", "after"),
     ]
-    if not findings.added:
+    if not loop.added:
         lines = [(rollout.before, AFTER, "-", "predicted by the declared model")]
     for place, (name, unit) in enumerate(zip(rollout.names, rollout.units, strict=True)):
         axes = panels[place]
@@ -140,7 +138,7 @@ def plot_rollout(findings: Loop, width: float = WIDE) -> Figure:
     return figure
 
 
-def unwrap(angle: Array) -> Array:
+def unwrap(angle: Floats) -> Floats:
     """Return angles (rad) without jumps of a turn, shape (time,); NaN stays NaN."""
     result = np.array(angle, dtype=float)
     seen = np.isfinite(result)
@@ -148,7 +146,7 @@ def unwrap(angle: Array) -> Array:
     return result
 
 
-def _beside(line: Array, measured: Array) -> Array:
+def _beside(line: Floats, measured: Floats) -> Floats:
     """Shift a line by whole turns so that it starts beside the measurement."""
     both = np.flatnonzero(np.isfinite(line) & np.isfinite(measured))
     if not both.size:
@@ -163,9 +161,9 @@ _CHANCE = 0.01
 _NAMED = 4
 
 
-def plot_correlations(findings: Loop, width: float = WIDE) -> Figure:
+def plot_correlations(loop: Loop, width: float = WIDE) -> Figure:
     """Plot correlations of errors with earlier errors and with commands."""
-    found = findings.correlations
+    found = loop.correlations
     figure, axes = blank_figure(width, 3.2, 1, 2 if found.commands else 1)
     lags = np.arange(1, len(found.own) + 1)
     _plot_correlations(axes[0], lags, found.own, found.pairs, list(found.cells))
@@ -187,7 +185,7 @@ def plot_correlations(findings: Loop, width: float = WIDE) -> Figure:
 
 
 def _plot_correlations(
-    axes: Axes, lags: NDArray[np.intp], values: Array, pairs: Array, names: list[str]
+    axes: Axes, lags: Ints, values: Floats, pairs: Floats, names: list[str]
 ) -> None:
     """Draw correlations over lags; name those that leave the band of noise alone."""
     edge = norm.isf(_CHANCE / 2 / max(values.size, 1)) / np.sqrt(np.maximum(pairs, 1)).min()
@@ -206,9 +204,9 @@ def _plot_correlations(
     axes.set_xticks(lags)
 
 
-def plot_growth(findings: Loop, width: float = WIDE) -> Figure:
+def plot_growth(loop: Loop, width: float = WIDE) -> Figure:
     """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
-    growth = findings.growth
+    growth = loop.growth
     names = [name for name in growth.floor[-1] if growth.floor[-1][name] > 0]
     figure, (axes,) = blank_figure(width, 3.2, 1, 1)
     axes.axhline(1.0, color="black", linewidth=0.8)

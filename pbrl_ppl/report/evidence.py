@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,16 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
-from pbrl_ppl.effects import Effect
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import group, problem_of
 from pbrl_ppl.report.motion import likeliest
 from pbrl_ppl.report.style import acceleration_unit
 from pbrl_ppl.report.words import depends_on_records
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import STATE, Bools, Floats, Ints
 
 #: Bins of a quantity, each with as many transitions, and the fewest transitions that a bin has.
 _BINS, _LEAST = 10, 8
@@ -54,19 +49,19 @@ class Evidence:
         Command on the body (N, N, N m), shape (transition, 3).
     """
 
-    nats: Array
+    nats: Floats
     bodies: tuple[str, ...]
     dimensions: tuple[str, ...]
     body: str
-    speed: Array
-    position: Array
-    time: Array
-    touching: NDArray[np.bool_]
+    speed: Floats
+    position: Floats
+    time: Floats
+    touching: Bools
     trajectory: NDArray[np.str_]
-    wrench: Array
+    wrench: Floats
 
     @property
-    def by_transition(self) -> Array:
+    def by_transition(self) -> Floats:
         """Gain of each transition (nats), shape (transition,)."""
         return np.asarray(self.nats.sum(axis=1))
 
@@ -105,21 +100,20 @@ class Evidence:
         return order[: int(np.searchsorted(total, share * total[-1])) + 1]
 
 
-def find_evidence(findings: Loop, effects: Iterable[Effect]) -> Evidence | None:
+def find_evidence(loop: Loop) -> Evidence | None:
     """Return the gain of the revised model by measured number.
 
     None where nothing was added, or a posterior does not hold its recording.
     """
-    if not findings.added or not recorded(findings.posterior_before, findings.posterior_after):
+    if not loop.added or not recorded(loop.posterior_before, loop.posterior_after):
         return None
-    effects = tuple(effects)
-    after = problem_of(findings.posterior_after, effects)
-    before = problem_of(findings.posterior_before, effects)
-    nats = _log_density(after, findings.posterior_after)
-    nats = nats - _log_density(before, findings.posterior_before)
+    after = problem_of(loop.posterior_after, loop.catalogue)
+    before = problem_of(loop.posterior_before, loop.catalogue)
+    nats = _log_density(after, loop.posterior_after)
+    nats = nats - _log_density(before, loop.posterior_before)
     noise, segments = after.trajectory_noise, after.segments
     moving = [body.name for body in after.scene.moving]
-    body = findings.added[0].body
+    body = loop.added[0].body
     index = moving.index(body)
     states = segments.start[:, index]
     labels = after.data.history.dataset["trajectory"].to_numpy().astype(str)
@@ -146,7 +140,7 @@ def recorded(*posteriors: object) -> bool:
     return True
 
 
-def _log_density(problem: Problem, posterior: Any) -> Array:
+def _log_density(problem: Problem, posterior: Any) -> Floats:
     """Return the log-likelihood of each measured number given those before it."""
     phi, sigma = likeliest(problem, posterior)
     noise = problem.trajectory_noise
@@ -171,12 +165,12 @@ class Bins:
     """
 
     which: Ints
-    centre: Array
-    mean: Array
-    error: Array
+    centre: Floats
+    mean: Floats
+    error: Floats
 
 
-def bin_means(x: Array, y: Array) -> Bins:
+def bin_means(x: Floats, y: Floats) -> Bins:
     """Return the means of y in bins of x; equal values of x share a bin."""
     wanted = int(np.clip(len(x) // _LEAST, 1, _BINS))
     edges = np.unique(np.quantile(x, np.linspace(0, 1, wanted + 1)[1:-1]))
@@ -207,7 +201,7 @@ class ResidualForce:
     """
 
     dimension: str
-    values: Array
+    values: Floats
     name: str
     unit: str
 
@@ -217,7 +211,7 @@ class Curve:
     """A simple curve: its formula, its values at the sorted x, the share of variance explained."""
 
     form: str
-    values: Array
+    values: Floats
     share: float
 
 
@@ -244,13 +238,13 @@ class Law:
     residual: ResidualForce
     quantity: str
     unit: str
-    x: Array
+    x: Floats
     bins: Bins
     share: float
     curve: Curve
 
 
-def find_laws(findings: Loop, effects: Iterable[Effect], most: int = 3) -> list[Law]:
+def find_laws(loop: Loop, most: int = 3) -> list[Law]:
     """Return residual forces against the quantity that they depend on, and others like it.
 
     The residual force is what each step adds to the smoothed states beyond the model, over the time
@@ -259,13 +253,13 @@ def find_laws(findings: Loop, effects: Iterable[Effect], most: int = 3) -> list[
     Empty where the test of dependence passed, no body is named, or the posterior does not hold
     its recording.
     """
-    remains = findings.unexplained
-    if remains is None or not remains.body or not depends_on_records(findings):
+    remains = loop.unexplained
+    if remains is None or not remains.body or not depends_on_records(loop):
         return []
-    if not recorded(findings.posterior_after):
+    if not recorded(loop.posterior_after):
         return []
-    problem = problem_of(findings.posterior_after, tuple(effects))
-    phi, _ = likeliest(problem, findings.posterior_after)
+    problem = problem_of(loop.posterior_after, loop.catalogue)
+    phi, _ = likeliest(problem, loop.posterior_after)
     body = [moving.name for moving in problem.scene.moving].index(remains.body)
     residual = _residual_force(problem, phi, body, remains.dimension)
     if residual is None:
@@ -284,14 +278,14 @@ def find_laws(findings: Loop, effects: Iterable[Effect], most: int = 3) -> list[
 
 
 def _residual_force(
-    problem: Problem, phi: Array, body: int, dimension: str
+    problem: Problem, phi: Floats, body: int, dimension: str
 ) -> ResidualForce | None:
     """Return what steps add to a velocity of a body over the time step, times its inertia."""
     cells = problem.trajectory_noise.cells
     added = cells.of_residual(problem.residual(phi)) / problem.scene.time_step
     column = {int(place): i for i, place in enumerate(cells.places)}
 
-    def acceleration(name: str) -> Array | None:
+    def acceleration(name: str) -> Floats | None:
         place = body * len(STATE) + STATE.index(name)
         return added[:, column[place]] if place in column else None
 
@@ -319,7 +313,7 @@ def _residual_force(
     return ResidualForce(dimension, float(mass) * values, "residual force", "N")
 
 
-def _law(residual: ResidualForce, quantity: str, unit: str, x: Array) -> Law:
+def _law(residual: ResidualForce, quantity: str, unit: str, x: Floats) -> Law:
     """Return the means in bins of a quantity, and the simplest curve that follows them."""
     y, bins = residual.values, bin_means(x, residual.values)
     total = float(((y - y.mean()) ** 2).sum())
@@ -329,7 +323,7 @@ def _law(residual: ResidualForce, quantity: str, unit: str, x: Array) -> Law:
     return Law(residual, quantity, unit, x, bins, share, _simplest(x, y))
 
 
-def _simplest(x: Array, y: Array) -> Curve:
+def _simplest(x: Floats, y: Floats) -> Curve:
     """Return the curve of a few that has the best information criterion (BIC)."""
     one, order = np.ones_like(x), np.argsort(x)
     forms = {

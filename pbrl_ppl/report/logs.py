@@ -26,7 +26,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ManifestError, PbrlError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.history import History
-from pbrl_ppl.report.write import loop_page
+from pbrl_ppl.report.report import render
 from pbrl_ppl.scene import Scene, nearest
 
 _NEEDED, _OPTIONAL = ("name", "scene", "train"), ("test", "kind")
@@ -189,7 +189,7 @@ class LoopWithPage:
 
     def save(self, folder: Path) -> None:
         """Write the loop's files and its report."""
-        self.loop.save(folder, page=loop_page(self.loop))
+        self.loop.save(folder, page=render(self.loop))
 
 
 def close_log(log: Log, settings: Settings) -> LoopWithPage:

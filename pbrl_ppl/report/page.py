@@ -30,7 +30,7 @@ Cell = str | tuple[str, str]
 
 @dataclass(frozen=True)
 class Source:
-    """Where findings come from, for a reader who wants to reproduce them.
+    """Where results come from, for a reader who wants to reproduce them.
 
     Parameters
     ----------

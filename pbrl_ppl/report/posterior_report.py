@@ -46,9 +46,9 @@ from pbrl_ppl.report.posterior_tables import (
     sampler_in_words,
     width_table,
 )
-from pbrl_ppl.report.report import recorded_poses
 from pbrl_ppl.report.scene_plots import plot_recording
 from pbrl_ppl.report.words import plain
+from pbrl_ppl.state import Floats
 
 #: Fewest draws for diagnostics of chains, densities and cross-validation.
 LEAST_DRAWS = 100
@@ -146,6 +146,17 @@ def render_posterior(
         origin=_origin(posterior),
         scene_toml=scene.to_toml(),
     )
+
+
+def recorded_poses(posterior: Any) -> Floats | None:
+    """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
+    if "scene" not in posterior.attrs:
+        return None
+    given = group(posterior, "constant_data")
+    if "recorded_start" in given:
+        return np.asarray(given["recorded_start"].to_numpy()[..., :3])
+    # single transitions: the start of each, in order
+    return np.asarray(given["start"].to_numpy()[None, ..., :3])
 
 
 def _or_why(compute: Callable[[], Any], name: str, missing: dict[str, str]) -> Any:

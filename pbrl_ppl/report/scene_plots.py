@@ -11,14 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
-from numpy.typing import NDArray
 
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.planning import Goal, Plan
 from pbrl_ppl.report.style import NARROW, WIDE, blank_figure, legend
 from pbrl_ppl.scene import Body, Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Okabe and Ito's colours, one a moving body, in turn; what is static is grey.
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
@@ -30,7 +28,7 @@ _SHOWN = 12
 
 
 def draw_scene(
-    axes: Axes, scene: Scene, states: Array, *, names: bool = False, faded: bool = False
+    axes: Axes, scene: Scene, states: Floats, *, names: bool = False, faded: bool = False
 ) -> None:
     """Draw walls, and bodies at one state each.
 
@@ -71,7 +69,7 @@ def draw_scene(
     axes.set(xlabel="x (m)", ylabel="y (m)")
 
 
-def draw_motion(axes: Axes, scene: Scene, states: Array) -> None:
+def draw_motion(axes: Axes, scene: Scene, states: Floats) -> None:
     """Draw bodies where they end, dashed where they began, and the tracks of those that moved.
 
     Parameters
@@ -90,7 +88,7 @@ def draw_motion(axes: Axes, scene: Scene, states: Array) -> None:
 
 
 def plot_recording(
-    scene: Scene, poses: Array, held_out: Array | None = None, width: float = WIDE
+    scene: Scene, poses: Floats, held_out: Floats | None = None, width: float = WIDE
 ) -> Figure:
     """Draw a scene from above, with the bodies' recorded paths.
 
@@ -157,7 +155,7 @@ def _colour(index: int) -> str:
     return _COLOURS[index % len(_COLOURS)]
 
 
-def _outline(body: Body, pose: Array, **how: Any) -> Patch:
+def _outline(body: Body, pose: Floats, **how: Any) -> Patch:
     """Return a body's outline at a pose (x, y, theta)."""
     corners = body.shape.outline
     if corners is None:
