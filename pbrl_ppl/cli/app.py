@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated
 
 import typer
 
+from pbrl_ppl import __version__
 from pbrl_ppl.cli.calibrate import calibrate
 from pbrl_ppl.cli.check import check, criticise
 from pbrl_ppl.cli.close_loop import close_loop
@@ -93,10 +93,7 @@ def _options_of(argv: Sequence[str]) -> set[str]:
 
 def _show_version(value: bool) -> None:
     if value:
-        try:
-            typer.echo(f"pbrl-ppl {version('pbrl_ppl')}")
-        except PackageNotFoundError:
-            typer.echo("pbrl-ppl (not installed)")
+        typer.echo(f"pbrl-ppl {__version__}")
         raise typer.Exit
 
 

@@ -20,7 +20,7 @@ from pbrl_ppl.cli.terminal import (
     UNDECIDED,
     check_can_make,
     interruptible,
-    print_json,
+    print_result,
     stages,
 )
 from pbrl_ppl.errors import OutputError
@@ -113,10 +113,9 @@ def close_loop(
     if many is not None:
         if not (scene is train is test is None):
             raise typer.BadParameter("SCENE, TRAIN and --test are in the manifest, with --many")
-        if trim:
-            raise typer.BadParameter("--trim is for one log; leave it, or --many")
-        if learn_remainder:
-            raise typer.BadParameter("--learn-remainder is for one log; leave it, or --many")
+        for name, given in (("--trim", trim), ("--learn-remainder", learn_remainder)):
+            if given:
+                raise typer.BadParameter(f"{name} is for one log; leave it, or --many")
         _close_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
@@ -143,12 +142,7 @@ def close_loop(
 
         criticism.check_folder(output, overwrite)
         loop = criticism.close_loop(
-            declared,
-            *histories,
-            seed=seed,
-            draws=draws,
-            method=method.value,
-            progress=progress,
+            declared, *histories, seed=seed, draws=draws, method=method.value, progress=progress
         )
         progress("writing the report")
         source = report.Source(
@@ -156,12 +150,12 @@ def close_loop(
         )
         loop.save(output, overwrite, page=report.render(loop, source))
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
-    if as_json:
-        print_json(loop.to_dict() | {"report": output / "report.html"} | remainder)
-    else:
-        words = remainder["learned_remainder"]["words"] if remainder else ""
-        for line in report.in_brief(loop, output, words):
-            typer.echo(line)
+    words = remainder["learned_remainder"]["words"] if remainder else ""
+    print_result(
+        as_json,
+        loop.to_dict() | {"report": output / "report.html"} | remainder,
+        report.in_brief(loop, output, words),
+    )
     if loop.verdict == criticism.NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
 
@@ -212,16 +206,17 @@ def _close_many(
                 source=report.Source(command=command),
                 **settings,
             )
-    if as_json:
-        print_json({"page": output / "index.html", "logs": loops.rows})
-        if loops.failed:
-            raise typer.Exit(FAILED)
-        return
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
-    for (effect, body), found in effects.groupby(["effect", "body"], sort=False):
-        typer.echo(f"{effect}[{body}]: {', '.join(found['name'])}")
-    typer.echo(report.in_words(loops.rows))
-    typer.echo(f"page: {output / 'index.html'}")
+    found = [
+        f"{effect}[{body}]: {', '.join(each['name'])}"
+        for (effect, body), each in effects.groupby(["effect", "body"], sort=False)
+    ]
+    page = output / "index.html"
+    print_result(
+        as_json,
+        {"page": page, "logs": loops.rows},
+        [*found, report.in_words(loops.rows), f"page: {page}"],
+    )
     if loops.failed:
         raise typer.Exit(FAILED)
 
@@ -270,15 +265,7 @@ class OneProcessEach(ThreadPoolExecutor):
 
     A process that dies, out of memory for instance, does not take others with it, as in a pool; its
     call is tried once more. PyMC's threads do not survive a fork, so processes are spawned.
-
-    Parameters
-    ----------
-    jobs : int
-        Processes at a time.
     """
-
-    def __init__(self, jobs: int) -> None:
-        super().__init__(jobs)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Schedule a call that can be pickled."""

@@ -151,6 +151,14 @@ def print_json(contents: Mapping[str, Any]) -> None:
     typer.echo(json.dumps(json_values(contents), indent=1, allow_nan=False))
 
 
+def print_result(as_json: bool, contents: Mapping[str, Any], lines: Iterable[str]) -> None:
+    """Print the result of a command: one JSON object, or lines of text."""
+    if as_json:
+        print_json(contents)
+    else:
+        typer.echo("\n".join(lines))
+
+
 def print_table(title: str | None, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a table; its first column, and those whose name begins with <, are text."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)

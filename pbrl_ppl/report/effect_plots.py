@@ -16,7 +16,7 @@ from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import scalars
 from pbrl_ppl.report.evidence import Evidence, Law, bin_means
-from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, legend
+from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, label, legend
 from pbrl_ppl.report.words import plain
 from pbrl_ppl.state import Floats
 
@@ -31,11 +31,8 @@ MOST_CANDIDATES, MOST_ADDED = 20, 12
 def plot_candidates(loop: Loop, width: float = WIDE) -> Figure:
     """Plot the score statistic of the candidates, best on top, with the threshold of each."""
     added = {(addition.effect, addition.body) for addition in loop.added}
-    shown = [
-        candidate
-        for place, candidate in enumerate(loop.candidates)
-        if place < MOST_CANDIDATES or (candidate.effect, candidate.body) in added
-    ]
+    rest = (c for c in loop.candidates[MOST_CANDIDATES:] if (c.effect, c.body) in added)
+    shown = [*loop.candidates[:MOST_CANDIDATES], *rest]
     figure, (axes,) = blank_figure(width, 0.9 + 0.3 * max(len(shown), 3), 1, 1, grid="x")
     several = len({candidate.body for candidate in shown}) > 1
     total = max(len(loop.candidates), 1)
@@ -47,30 +44,17 @@ def plot_candidates(loop: Loop, width: float = WIDE) -> Figure:
         hardly = candidate.identifiable < HARDLY
         is_added = (candidate.effect, candidate.body) in added
         axes.barh(
-            place,
-            candidate.statistic,
-            height=0.7,
-            color=AFTER if is_added else PLAIN,
-            edgecolor="white",
-            hatch="////" if hardly else None,
-        )
+            place, candidate.statistic, height=0.7, color=AFTER if is_added else PLAIN,
+            edgecolor="white", hatch="////" if hardly else None,
+        )  # fmt: skip
         axes.plot([threshold] * 2, [place - 0.45, place + 0.45], color=BEFORE, linewidth=2)
-        axes.annotate(
-            f"{candidate.statistic:.3g}{', hardly identifiable' if hardly else ''}",
-            (candidate.statistic, place),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5},
-        )
+        text = f"{candidate.statistic:.3g}{', hardly identifiable' if hardly else ''}"
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+        label(axes, text, (candidate.statistic, place), va="center", bbox=box)
     if shown and max(candidate.statistic for candidate in shown) > 12 * max(thresholds):
         axes.set_xscale("asinh", linear_width=5.0)
-    labels = [
-        f"{plain(candidate.effect)}{f' · {candidate.body}' if several else ''}"
-        for candidate in shown
-    ]
-    axes.set_yticks(range(len(shown)), labels)
+    names = [f"{plain(c.effect)}{f' · {c.body}' if several else ''}" for c in shown]
+    axes.set_yticks(range(len(shown)), names)
     axes.margins(x=0.1)
     axes.set_xlim(left=0.0)
     axes.invert_yaxis()
@@ -127,19 +111,12 @@ def _mark_null(axes: Axes, null: float, mean: float, sd: float, top: float) -> N
     """Draw a line at the value that means no effect, or an arrow where that is far away."""
     if abs(null - mean) < 25 * sd:
         axes.axvline(null, color="black", linestyle="--", linewidth=1.2)
-        axes.annotate(
-            "no effect", (null, 1.05 * top), xytext=(3, 0), textcoords="offset points", fontsize=8
-        )
+        label(axes, "no effect", (null, 1.05 * top), xytext=(3, 0))
         return
-    side = -1 if null < mean else 1
-    text = f"← no effect ({null:g})" if side < 0 else f"no effect ({null:g}) →"
-    axes.annotate(
-        text,
-        (0.02 if side < 0 else 0.98, 0.93),
-        xycoords="axes fraction",
-        ha="left" if side < 0 else "right",
-        fontsize=8,
-    )
+    text, x, side = f"no effect ({null:g}) →", 0.98, "right"
+    if null < mean:
+        text, x, side = f"← no effect ({null:g})", 0.02, "left"
+    axes.annotate(text, (x, 0.93), xycoords="axes fraction", ha=side, fontsize=8)
 
 
 #: Bars of measured numbers in one panel, at most.
@@ -219,10 +196,8 @@ def _shares(axes: Axes, evidence: Evidence) -> None:
     axes.plot([0, 100], [0, 100], color=PLAIN, linestyle=":", linewidth=1)
     count = len(evidence.carriers())
     axes.plot([100 * count / len(held)], [80], "o", color=BEFORE)
-    axes.annotate(
-        f"{count} transitions\nhold 80 %", (100 * count / len(held), 80), xytext=(8, -24),
-        textcoords="offset points", fontsize=8,
-    )  # fmt: skip
+    text = f"{count} transitions\nhold 80 %"
+    label(axes, text, (100 * count / len(held), 80), xytext=(8, -24))
     axes.set_title("by transition", fontsize=10)
     axes.set(xlabel="transitions, most telling first (%)", ylabel="share of the gains (%)")
 

@@ -131,13 +131,12 @@ def find_evidence(loop: Loop) -> Evidence | None:
     )
 
 
-def recorded(*posteriors: object) -> bool:
+def recorded(*posteriors: Any) -> bool:
     """Return whether posteriors hold their recording, of whole trajectories."""
-    for posterior in posteriors:
-        attrs = getattr(posterior, "attrs", {})
-        if "scene" not in attrs or "smoothed" not in group(posterior, "constant_data"):
-            return False
-    return True
+    return all(
+        "scene" in posterior.attrs and "smoothed" in group(posterior, "constant_data")
+        for posterior in posteriors
+    )
 
 
 def _log_density(problem: Problem, posterior: Any) -> Floats:

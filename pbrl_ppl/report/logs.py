@@ -15,10 +15,10 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from pbrl_ppl import __version__
 from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.effects import Effect
@@ -222,11 +222,7 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
         if path is not None and path.is_file():
             content = path.read_bytes()
         digest.update(hashlib.sha256(content).digest() if path else b"none")
-    try:
-        installed = version("pbrl_ppl")
-    except PackageNotFoundError:
-        installed = "not installed"
-    contents = [settings.to_dict(), installed]
+    contents = [settings.to_dict(), __version__]
     digest.update(json.dumps(contents, sort_keys=True, default=dict).encode())
     return digest.hexdigest()
 

@@ -105,7 +105,8 @@ def test_motions_are_those_of_the_recording_worst_first() -> None:
         assert (low < motion.measured[..., :2].min(axis=(0, 1))).all()
         assert (high > motion.measured[..., :2].max(axis=(0, 1))).all()
     # y that was not measured is left out of the picture
-    measured = np.where(np.arange(3) == 1, np.nan, motions[0].measured)
+    measured = motions[0].measured.copy()
+    measured[10, 0, 1] = np.nan
     gap = animation(findings, [replace(motions[0], measured=measured)])["motions"][0]
     assert gap["measured"][10][0][1] is None and gap["before"][10][0][1] is not None
 
