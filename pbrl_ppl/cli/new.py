@@ -13,8 +13,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.scene_text import HINGE, SHAPES, hinge, outline, outlines, scene_text, wall
-from pbrl_ppl.cli.scene_text import bodies as parts
+from pbrl_ppl.cli.scene_text import (
+    HINGE,
+    SHAPES,
+    body_texts,
+    hinge,
+    outline,
+    outlines,
+    scene_text,
+    wall,
+)
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
 from pbrl_ppl.errors import HistoryError, OutputError, SceneError
 from pbrl_ppl.files import write_text
@@ -208,17 +216,15 @@ def new(
                 found = None if history is None else recorded(history, names, measures, [*shapes])
                 reading = _reading(found, columns, units)
                 answers = _asked(shapes, wheels, kinematic, side, time_step, history, found)
-                texts = parts(
+                texts = body_texts(
                     answers.shapes, answers.names, wheels=answers.wheels,
                     kinematic=kinematic or [], known=known or [], effects=declare or [],
                 )  # fmt: skip
                 text = scene_text(
-                    texts,
-                    side=answers.side,
-                    time_step=answers.time_step,
+                    texts, side=answers.side, time_step=answers.time_step,
                     hinges=[hinge(each, answers.names) for each in hinges or []],
                     walls=[wall(each) for each in walls or []],
-                )
+                )  # fmt: skip
                 written = [scene]
                 _write(scene, text)
         except typer.Abort:  # Ctrl-C at a question
