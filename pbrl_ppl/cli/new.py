@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
@@ -26,6 +27,7 @@ from pbrl_ppl.cli.scene_text import (
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
 from pbrl_ppl.errors import HistoryError, OutputError, SceneError
 from pbrl_ppl.files import write_text
+from pbrl_ppl.scene import Body, Scene, Shape, nearest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -78,11 +80,9 @@ def recorded(
     HistoryError
         If it cannot be read, names no body, or its times do not rise.
     """
-    import numpy as np
     import pandas as pd
 
     from pbrl_ppl.history import as_history, read_table
-    from pbrl_ppl.scene import Body, Scene, Shape
 
     frame = read_table(path, columns)
     names = _names(frame, columns) or list(given)
@@ -255,8 +255,6 @@ def _reading(
 
 def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
     """Copy a model's scene, and its recordings beside it."""
-    from pbrl_ppl.scene import nearest
-
     folder = next((path for path in _MODELS if path.is_dir()), None)
     if folder is None:
         raise OutputError("--from: the models are not installed with this package; clone it")
@@ -278,7 +276,6 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
 def _write(path: Path, text: str) -> None:
     """Write a scene whole or not at all, if it is valid."""
     from pbrl_ppl.effects import attach
-    from pbrl_ppl.scene import Scene
 
     attach(Scene.from_toml(text))  # whether declared effects exist too
     write_text(path, text)

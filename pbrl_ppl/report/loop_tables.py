@@ -90,30 +90,27 @@ def error_tables(loop: Loop) -> list[Table]:
         )
         if before:
             rows = [
-                _row(loop, name, before[name], after.get(name), floor.get(name), UNITS[name])
+                _row(loop, name, (before[name], after.get(name), floor.get(name)), UNITS[name])
                 for name in before
             ]
             caption = f"{title} (root mean square error)"
             tables.append(_before_after(loop, caption, "State dimension", rows, "Unit"))
+    errors = (loop.before, loop.after, loop.noise_floor)
+    nrmse, elpd = [each.normalised_rmse for each in errors], [each.elpd for each in errors]
     rows = [
-        _row(
-            loop, "Error in units of the noise", loop.before.normalised_rmse,
-            loop.after.normalised_rmse, loop.noise_floor.normalised_rmse,
-        ),
-        _row(
-            loop, "Log predictive density in nats (more is better)", loop.before.elpd,
-            loop.after.elpd, loop.noise_floor.elpd, digits=4,
-        ),
-    ]  # fmt: skip
+        _row(loop, "Error in units of the noise", nrmse),
+        _row(loop, "Log predictive density in nats (more is better)", elpd, digits=4),
+    ]
     tables.append(_before_after(loop, "Overall", "Measure", rows))
     return tables
 
 
 def _row(
-    loop: Loop, name: str, before: Any, after: Any, floor: Any, *unit: str, digits: int = 3
+    loop: Loop, name: str, errors: Sequence[Any], *unit: str, digits: int = 3
 ) -> tuple[str, ...]:
-    both = [before, after] if loop.added else [before]
-    return (name, *(number(value, digits) for value in (*both, floor)), *unit)
+    """Return the row of an error before, after and of the noise; without after if none is added."""
+    shown = errors if loop.added else (errors[0], errors[2])
+    return (name, *(number(value, digits) for value in shown), *unit)
 
 
 def models_of(loop: Loop) -> tuple[str, ...]:

@@ -155,19 +155,14 @@ def _trace(draws: xr.Dataset, width: float) -> Figure:
             axes.yaxis.label.set_fontsize(9)
         return figure
     columns = 1 if count == 1 or width <= NARROW else 2
+    size = (width, 0.6 + 1.7 * -(-count // columns))
+    trace = {"alpha": 0.5, "width": 0.5}
     collection = az.plot_trace(
         draws,
         backend="matplotlib",
-        visuals={
-            "title": {"size": 9},
-            "xlabel": {"size": 8},
-            "trace": {"alpha": 0.5, "width": 0.5},
-        },
+        visuals={"title": {"size": 9}, "xlabel": {"size": 8}, "trace": trace},
         col_wrap=columns,
-        figure_kwargs={
-            "figsize": (width, 0.6 + 1.7 * -(-count // columns)),
-            "layout": "constrained",
-        },
+        figure_kwargs={"figsize": size, "layout": "constrained"},
     )
     result: Figure = collection.viz["figure"].item()
     plt.close(result)  # ArviZ 1.x registers it with pyplot, which would never release it

@@ -51,15 +51,10 @@ def draw_scene(
         if body.static and body.pose is not None:
             axes.add_patch(_outline(body, np.array(body.pose), color=_STATIC))
     for i, (body, state) in enumerate(zip(scene.moving, states, strict=True)):
-        how: dict[str, Any] = {
-            "facecolor": _colour(i),
-            "edgecolor": "black",
-            "linewidth": 0.8,
-            "zorder": 2,
-        }
+        how: dict[str, Any] = {"facecolor": _colour(i), "edgecolor": "black", "zorder": 2}
         if faded:
-            how |= {"facecolor": "none", "edgecolor": _colour(i), "linestyle": "--", "zorder": 1}
-        axes.add_patch(_outline(body, state[:3], **how))
+            how = {"facecolor": "none", "edgecolor": _colour(i), "linestyle": "--", "zorder": 1}
+        axes.add_patch(_outline(body, state[:3], linewidth=0.8, **how))
         if names:
             axes.annotate(
                 body.name, state[:2], ha="center", va="center", fontsize=8, zorder=4,
@@ -144,11 +139,8 @@ def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
     for place, target in zip(goal.places(scene), goal.targets, strict=True):
         if target.x is None or target.y is None:
             continue
-        colour = _colour(place)
-        circle = Circle(
-            (target.x, target.y), target.tolerance, fill=False, color=colour, hatch="////"
-        )
-        axes.add_patch(circle)
+        how: dict[str, Any] = {"fill": False, "color": _colour(place), "hatch": "////"}
+        axes.add_patch(Circle((target.x, target.y), target.tolerance, **how))
 
 
 def _colour(index: int) -> str:
