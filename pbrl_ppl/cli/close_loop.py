@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Method(StrEnum):
-    """How posteriors are drawn."""
+    """Samplers of the loop's posteriors."""
 
     METROPOLIS = "metropolis"
     LAPLACE = "laplace"

@@ -38,7 +38,7 @@ _EVEN = 0.01
 
 @dataclass(frozen=True)
 class Recorded:
-    """Names of the bodies in a recording, and its time steps.
+    """Bodies and time steps of a recording.
 
     Parameters
     ----------

@@ -194,7 +194,7 @@ def starts_of(given: list[str] | None, bodies: Sequence[str]) -> dict[str, list[
 
 @dataclass(frozen=True)
 class Reading:
-    """How histories are read: the values of ``--columns``, ``--units`` and others.
+    """Settings for reading histories: the values of ``--columns``, ``--units`` and others.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ class Reading:
         )
 
     def trimmed(self, history: History, scene: Scene, path: Path) -> History:
-        """Return the history without the rows that ``trim`` is about, or warn of them."""
+        """Return the history without strange rows at trajectory ends, or warn of them."""
         if self.trim is None:
             return history
         from pbrl_ppl.history import strange_ends, trimmed
@@ -258,7 +258,7 @@ def load(
     noise: list[str] | None = None,
     substeps: int | None = None,
 ) -> tuple[Scene, list[History]]:
-    """Read a scene, with what options change of it, and histories of it.
+    """Read a scene, change it as options say, and read its histories.
 
     Warns where velocities and changes of positions differ by the factor of a unit.
     """

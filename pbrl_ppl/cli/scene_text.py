@@ -273,7 +273,7 @@ def body_texts(
 
 
 def _check_named(option: str, name: str, known: Sequence[str]) -> None:
-    """Refuse a name that no body has."""
+    """Raise if no body has this name."""
     if name not in known:
         raise SceneError(
             f"{option}: there is no body {name!r}, only {', '.join(known)}{nearest(name, known)}"

@@ -110,7 +110,7 @@ def _parameters(
 
 
 def _set(layout: Layout, phi: Floats, values: Mapping[str, float]) -> None:
-    """Put values into parameter vectors, in place: by label, or for all bodies that have one."""
+    """Set values in parameter vectors, in place: by label, or by name for all bodies."""
     from pbrl_ppl.scene import nearest
 
     for name, value in values.items():

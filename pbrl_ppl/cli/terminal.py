@@ -52,7 +52,7 @@ def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
 
 
 class Stage:
-    """The present stage and the time elapsed, as a status line that is drawn again and again."""
+    """Status line with the present stage and the time elapsed."""
 
     def __init__(self) -> None:
         self.name, self._begin = "starting", time.monotonic()
@@ -175,12 +175,12 @@ def print_table(title: str | None, columns: Sequence[str], rows: Iterable[Sequen
 
 
 def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
-    """Refuse a file that has the wrong ending, exists already, or cannot be written.
+    """Raise if a file has the wrong ending, exists already, or cannot be written.
 
     Raises
     ------
     OutputError
-        Says which.
+        Says which of these it is.
     """
     if path.suffix not in endings:
         raise OutputError(f"{path}: expected a name that ends in {' or '.join(endings)}")
@@ -200,7 +200,7 @@ def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
 
 
 def check_can_make(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written: it is tried, and nothing stays.
+    """Raise if a folder cannot be made or written; leave no trace of the attempt.
 
     Raises
     ------

@@ -23,16 +23,16 @@ from pbrl_ppl.report.words import (
 
 
 def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
-    """Summarise loop in about ten lines.
+    """Return a summary of a closed loop in about ten lines.
 
     Parameters
     ----------
     loop : Loop
-        What was found.
+        Result of :func:`pbrl_ppl.close_loop`.
     folder : str or pathlib.Path
-        Where the results are, to name in commands.
+        Folder of the results, to name in commands.
     remainder : str
-        What a learned remainder does, or why there is none, where one was asked for.
+        What a learned remainder does, or why there is none; empty if none was requested.
     """
     left, folder = loop.unexplained, Path(folder)
     lines = [f"Verdict: {loop.verdict}. {verdict_in_words(loop)}"]
@@ -48,7 +48,7 @@ def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
 
 
 def _effect(added: Added) -> str:
-    """Write the sizes of an effect with their intervals, and what it cannot be told from."""
+    """Write the sizes of an effect with their intervals, and the effects confounded with it."""
     sizes = []
     for name, e in added.parameters.items():
         digits = digits_of(*e.hdi)

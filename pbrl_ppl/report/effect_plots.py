@@ -13,7 +13,6 @@ from matplotlib.patches import Patch
 from scipy.stats import chi2, gaussian_kde
 
 from pbrl_ppl.criticism import Loop
-from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import scalars
 from pbrl_ppl.report.evidence import Evidence, Law, bin_means
 from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, label, legend
@@ -81,7 +80,7 @@ def plot_added(loop: Loop, width: float = WIDE) -> Figure:
     width = width if columns > 1 else min(width, 5.0)
     figure, panels = blank_figure(width, 2.6 * rows, rows, columns, "x", count=len(shown))
     draws = scalars(loop.posterior_after)
-    nulls = {(effect.name, p.name): p.null for effect in catalogue for p in effect.parameters}
+    nulls = {(effect.name, p.name): p.null for effect in loop.catalogue for p in effect.parameters}
     for axes, (added, name, estimate) in zip(panels, shown, strict=False):
         low, high = estimate.hdi
         variable = f"{added.effect}_{name}[{added.body}]"

@@ -152,7 +152,7 @@ def unwrap(angle: Floats) -> Floats:
 
 
 def _beside(line: Floats, measured: Floats) -> Floats:
-    """Shift a line by whole turns so that it starts beside the measurement."""
+    """Return a line of angles, moved by whole turns to start beside the measurement."""
     both = np.flatnonzero(np.isfinite(line) & np.isfinite(measured))
     if not both.size:
         return line

@@ -24,17 +24,17 @@ _SMALLEST_SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Evidence for the added effects, by measured number of the fitted recording.
+    """Log-likelihood that the added effects gain, by measured number of the fitted recording.
 
     Parameters
     ----------
     nats : ndarray
         Log-likelihood that each measured number gains given those before it, shape (transition,
-        cell), each model with its own noise, at its likeliest draw.
+        coordinate), each model with its noise, at its draw of highest likelihood.
     bodies, dimensions : tuple of str
         Body and state dimension of each observed coordinate (cell).
     body : str
-        Body of the first added effect, which ``speed`` and ``position`` are of.
+        Body of the first added effect, to which ``speed`` and ``position`` belong.
     speed : ndarray
         Speed of the body at the transition's start (m/s), shape (transition,).
     position : ndarray
@@ -196,7 +196,7 @@ class ResidualForce:
     values : ndarray
         Of each transition, in ``unit``, shape (transition,).
     name, unit : str
-        What the values are.
+        Name and unit of the values.
     """
 
     dimension: str
@@ -221,9 +221,9 @@ class Law:
     Parameters
     ----------
     residual : ResidualForce
-        What is explained.
+        The residual force.
     quantity, unit : str
-        What it depends on.
+        The quantity that it depends on.
     x : ndarray
         That quantity at each transition, shape (transition,).
     bins : Bins
@@ -244,10 +244,10 @@ class Law:
 
 
 def find_laws(loop: Loop, most: int = 3) -> list[Law]:
-    """Return residual forces against the quantity that they depend on, and others like it.
+    """Return the residual force against the quantity that it depends on, then against others.
 
-    The residual force is what each step adds to the smoothed states beyond the model, over the time
-    step, times the body's posterior mean mass or moment.
+    The residual force is the process noise that each step adds to the smoothed states, over the
+    time step, times the body's mass or moment of inertia at the likeliest draw.
 
     Empty where the test of dependence passed, no body is named, or the posterior does not hold
     its recording.
@@ -279,7 +279,7 @@ def find_laws(loop: Loop, most: int = 3) -> list[Law]:
 def _residual_force(
     problem: Problem, phi: Floats, body: int, dimension: str
 ) -> ResidualForce | None:
-    """Return what steps add to a velocity of a body over the time step, times its inertia."""
+    """Return the process noise of a body's velocity over the time step, times its inertia."""
     cells = problem.trajectory_noise.cells
     added = cells.of_residual(problem.residual(phi)) / problem.scene.time_step
     column = {int(place): i for i, place in enumerate(cells.places)}

@@ -41,11 +41,11 @@ class Log:
     Parameters
     ----------
     name : str
-        Of its folder.
+        Name of its folder.
     scene, train : Path
-        The declared scene, and what is fitted.
+        The declared scene, and the history to fit.
     test : Path, optional
-        What errors are measured on; a quarter of the trajectories of ``train`` without it.
+        The held-out history; by default a quarter of the trajectories of ``train``.
     kind : str
         Robots of one kind share hyper-parameters; empty for none.
     """
@@ -68,7 +68,7 @@ def read_manifest(path: str | Path) -> tuple[Log, ...]:
     Returns
     -------
     tuple of Log
-        In the file's order, with absolute paths. Whether these files are there is not looked at.
+        In the file's order, with absolute paths, whether or not these files exist.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def read_manifest(path: str | Path) -> tuple[Log, ...]:
         raise ManifestError(f"{where}: it has no rows; expected one a log")
     seen: set[str] = set()
     for log in logs:
-        # some file systems do not tell capitals
+        # some file systems ignore case
         if log.name.lower() in seen:
             raise ManifestError(f'{where}: the name "{log.name}" is there twice; expected one each')
         seen.add(log.name.lower())
@@ -228,7 +228,7 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
 
 
 def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) -> dict[str, Any]:
-    """Close the loop on one log, unless that was done; errors go into a file.
+    """Close the loop on one log unless it is finished; write an error into a file.
 
     Files are written elsewhere and renamed into the log's folder, ``report.json`` last, so that a
     worker may die at any moment.
@@ -236,15 +236,15 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
     Parameters
     ----------
     log : Log
-        Which.
+        The log.
     folder : Path
-        Of all logs.
+        Folder of all logs.
     settings : Settings
-        Of all logs.
+        Settings of all logs.
     inputs : str
-        As of :func:`inputs_sha256`.
+        Hash of the inputs, from :func:`inputs_sha256`.
     run : callable
-        :func:`close_log`, or another.
+        Closes the loop, such as :func:`close_log`.
 
     Returns
     -------
@@ -252,7 +252,7 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
         Row of the log, see :func:`row_of`.
     """
     with _ONE:
-        # on a cluster, a result that was lost with its worker is asked for again
+        # a cluster repeats a task whose result was lost with its worker
         if row := row_of(log, folder, inputs):
             return row
         place, begin = folder / log.name, time.monotonic()
@@ -343,4 +343,4 @@ def row_of(log: Log, folder: Path, inputs: str) -> dict[str, Any] | None:
             "warnings": about["warnings"],
         }
     except (OSError, ValueError, KeyError, TypeError):
-        return None  # none, or not one of these: it is made anew
+        return None  # missing, or of another kind: the log is run again

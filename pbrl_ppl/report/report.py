@@ -38,15 +38,9 @@ from pbrl_ppl.report.loop_tables import (
 )
 from pbrl_ppl.report.motion import animation, held_out_motions
 from pbrl_ppl.report.page import Source, render_page
-from pbrl_ppl.report.posterior_plots import most_interesting, plot_rank, plot_trace, summary
+from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace
 from pbrl_ppl.report.posterior_report import recorded_poses, render_posterior
-from pbrl_ppl.report.posterior_tables import (
-    STATISTICS,
-    parameter_table,
-    posterior_rows,
-    sampler_in_words,
-    width_table,
-)
+from pbrl_ppl.report.posterior_tables import parameter_section
 from pbrl_ppl.report.scene_plots import plot_recording
 from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import (
@@ -106,20 +100,8 @@ def render(loop: Loop, source: Source | None = None) -> str:
     source : Source, optional
         Names of the files, and the command that makes the page again.
     """
-    effects, held_out = loop.catalogue, loop.held_out
-    table = summary(loop.posterior_after)
-    parameters = most_interesting(
-        table,
-        (f"{e.effect}_{name}[{e.body}]" for e in loop.added for name in e.parameters),
-    )
-    units = {
-        f"{added.effect}_{name}": e.unit
-        for added in loop.added
-        for name, e in added.parameters.items()
-    }
-    rows = posterior_rows(
-        table, effects, units, method=str(loop.posterior_after.attrs.get("method", ""))
-    )
+    added = [f"{e.effect}_{name}[{e.body}]" for e in loop.added for name in e.parameters]
+    section = parameter_section(loop.posterior_after, loop.catalogue, loop.identifiability, added)
     evidence = find_evidence(loop) if accepted(loop) else None
     laws = find_laws(loop)
     poses = recorded_poses(loop.posterior_before)
@@ -129,11 +111,12 @@ def render(loop: Loop, source: Source | None = None) -> str:
         "residuals": partial(plot_residuals, loop),
         "correlations": partial(plot_correlations, loop),
         "growth": partial(plot_growth, loop),
-        "trace": partial(plot_trace, loop.posterior_after, parameters),
-        "rank": partial(plot_rank, loop.posterior_after, parameters),
+        "trace": partial(plot_trace, loop.posterior_after, section["shown"]),
+        "rank": partial(plot_rank, loop.posterior_after, section["shown"]),
     }
     if poses is not None:
-        later = None if held_out is None else held_out.dataset["start"].to_numpy()[..., :3]
+        test = loop.held_out
+        later = None if test is None else test.dataset["start"].to_numpy()[..., :3]
         pictures["scene"] = partial(plot_recording, loop.scene, poses, later)
     if evidence is not None:
         pictures["evidence"] = partial(plot_evidence, evidence)
@@ -143,7 +126,6 @@ def render(loop: Loop, source: Source | None = None) -> str:
         pictures["candidates"] = partial(plot_candidates, loop)
     if accepted(loop):
         pictures["added"] = partial(plot_added, loop)
-    known = loop.identifiability
     return render_page(
         "report.html.jinja",
         pictures,
@@ -166,15 +148,7 @@ def render(loop: Loop, source: Source | None = None) -> str:
         acceleration=acceleration_table(loop),
         tests=residual_test_table(loop),
         candidates=candidate_table(loop),
-        posterior=parameter_table(rows, "Posterior of all parameters"),
-        count=len(rows),
-        bad=[row for row in rows if row["failed"]],
-        sampled=sampler_in_words(rows),
-        widths=known
-        and width_table(loop.posterior_after, known, {row["label"]: row["unit"] for row in rows}),
-        shown=parameters,
         hardly=HARDLY,
         most=MOST_CANDIDATES,
-        meanings={row["label"]: row["meaning"] for row in rows if row["meaning"]},
-        statistics=STATISTICS,
+        **section,
     )

@@ -35,7 +35,7 @@ def draw_scene(
     Parameters
     ----------
     axes : Axes
-        Drawn on; its aspect becomes equal.
+        Axes to draw on; their aspect becomes equal.
     scene : Scene
         Shapes and walls.
     states : ndarray
@@ -92,10 +92,10 @@ def plot_recording(
     scene : Scene
         Shapes and walls.
     poses : ndarray
-        x, y, theta (m, m, rad) that were fitted, shape (trajectory, time, body, 3 or more); NaN
-        where there are none.
+        x, y, theta (m, m, rad) of the fitted recording, shape (trajectory, time, body, 3 or more);
+        NaN where not measured.
     held_out : ndarray, optional
-        Those that were not.
+        The same of the held-out recording.
     width : float
         Of the figure (inches).
     """
@@ -130,7 +130,7 @@ def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
     Parameters
     ----------
     axes : Axes
-        Drawn on.
+        Axes to draw on.
     scene : Scene
         Orders the bodies.
     goal : Goal
@@ -166,7 +166,7 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
     path : str or Path
         Ends in ``.gif``; written whole or not at all.
     frames : int
-        Pictures a second at most; a plan is shown at the speed that it has.
+        Pictures a second at most; the plan is shown at its real speed.
 
     Raises
     ------

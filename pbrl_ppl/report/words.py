@@ -17,14 +17,14 @@ from pbrl_ppl.criticism import (
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-#: A p-value below this is beyond what the asymptotic distribution of a statistic can say.
+#: The asymptotic distribution of a statistic is not accurate below this p-value.
 _SMALLEST_P = 1e-16
-#: A held-out error of more than this many times the noise is not what an adequate model has.
+#: A held-out error above this many times the noise needs an explanation.
 _TOO_LARGE = 1.5
 
 
 def verdict_in_words(loop: Loop) -> str:
-    """Return the verdict in a sentence or two, for a reader who knows no statistics."""
+    """Return the verdict in a sentence or two, for a reader without statistics."""
     found = joined(
         f"{added.sentence.rstrip('.')} ({plain(added.effect)}) on the {plain(added.body)}"
         for added in loop.added
@@ -53,7 +53,7 @@ def verdict_in_words(loop: Loop) -> str:
 
 
 def _adequate(loop: Loop) -> str:
-    """Return how adequate the model is: what passed, and which negligible misfit is significant."""
+    """Describe an adequate model: the tests that passed, and negligible but significant misfit."""
     tested = sum(test.tested for test in loop.tests)
     passed = f"the declared model passes all {tested} tests of its residual"
     if untested := [test.name for test in loop.tests if not test.tested]:
@@ -83,7 +83,7 @@ def significant_acceleration(loop: Loop) -> float:
 
 
 def accepted(loop: Loop) -> tuple[Added, ...]:
-    """Return the added effects that the verdict stands for: none where it is another."""
+    """Return the added effects if the verdict accepts them, or none."""
     stands = loop.verdict not in (UNEXPLAINED, NOT_CONVERGED)
     return loop.added if stands else ()
 
@@ -95,7 +95,7 @@ def depends_on_records(loop: Loop) -> bool:
 
 
 def error_in_words(loop: Loop) -> str:
-    """Return what a held-out error means, where it alone would contradict the verdict."""
+    """Explain a held-out error that seems to contradict the verdict; empty if none does."""
     model, after = "revised" if loop.added else "declared", loop.after.normalised_rmse
     if loop.unexplained is not None or significant_acceleration(loop):
         return (
