@@ -33,7 +33,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "report": (report, "pbrl-ppl report cart.nc"),
     "update": (update, "pbrl-ppl update cart.nc since.csv -o new.nc"),
     "plan": (plan, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv"),
-    "simulate": (simulate, "pbrl-ppl simulate cart.nc plan.csv -o foreseen.csv --draws 20"),
+    "simulate": (simulate, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20"),
     "calibrate": (calibrate, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4"),
     "doctor": (doctor, "pbrl-ppl doctor --json"),
 }

@@ -193,8 +193,8 @@ def new(
 ) -> None:
     """Write a commented scene, from options or from a few questions; or copy a model.
 
-    What is not given and is needed is asked for, if there is a terminal to ask at. All options of
-    bodies, hinges and walls can be repeated. Models to copy: apartment, namo, pendulum and
+    Asks at a terminal for what the options leave open. All options of bodies, hinges and walls can
+    be repeated. Models to copy: apartment, namo, pendulum and
     shopping_cart; recordings that a model has go beside the scene.
     """
     described = (
@@ -236,7 +236,7 @@ def new(
             typer.echo(f"wrote {path}")
         log = history or (written[-1] if len(written) > 1 else None)
         command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv"), *reading]
-        begin = "next" if log else "next, with a recording of your own"
+        begin = "next" if log else "next, with your recording"
         typer.echo(f"{begin}: {shlex.join(command)}")
 
 

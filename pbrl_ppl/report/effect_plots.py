@@ -198,7 +198,7 @@ def _shares(axes: Axes, evidence: Evidence) -> None:
     text = f"{count} transitions\nhold 80 %"
     label(axes, text, (100 * count / len(held), 80), xytext=(8, -24))
     axes.set_title("by transition", fontsize=10)
-    axes.set(xlabel="transitions, most telling first (%)", ylabel="share of the gains (%)")
+    axes.set(xlabel="transitions, largest gain first (%)", ylabel="share of the gains (%)")
 
 
 def plot_laws(laws: Sequence[Law], width: float = WIDE) -> Figure:

@@ -31,8 +31,8 @@ class Evidence:
     nats : ndarray
         Log-likelihood that each measured number gains given those before it, shape (transition,
         coordinate), each model with its noise, at its draw of highest likelihood.
-    bodies, dimensions : tuple of str
-        Body and state dimension of each observed coordinate (cell).
+    names : tuple of str
+        Names of the observed coordinates: dimension and, with several bodies, body.
     body : str
         Body of the first added effect, to which ``speed`` and ``position`` belong.
     speed : ndarray
@@ -50,8 +50,7 @@ class Evidence:
     """
 
     nats: Floats
-    bodies: tuple[str, ...]
-    dimensions: tuple[str, ...]
+    names: tuple[str, ...]
     body: str
     speed: Floats
     position: Floats
@@ -64,13 +63,6 @@ class Evidence:
     def by_transition(self) -> Floats:
         """Gain of each transition (nats), shape (transition,)."""
         return np.asarray(self.nats.sum(axis=1))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the observed coordinates: dimension and, of several bodies, body."""
-        if len(set(self.bodies)) == 1:
-            return self.dimensions
-        return tuple(f"{d} of {body}" for d, body in zip(self.dimensions, self.bodies, strict=True))
 
     @property
     def by_cell(self) -> dict[str, float]:
@@ -115,12 +107,16 @@ def find_evidence(loop: Loop) -> Evidence | None:
     moving = [body.name for body in after.scene.moving]
     body = loop.added[0].body
     index = moving.index(body)
+    places = np.divmod(noise.cells.places, len(STATE))
+    seen = set(places[0].tolist())
     states = segments.start[:, index]
     labels = after.data.history.dataset["trajectory"].to_numpy().astype(str)
     return Evidence(
         nats=nats,
-        bodies=tuple(moving[place // len(STATE)] for place in noise.cells.places),
-        dimensions=tuple(STATE[place % len(STATE)] for place in noise.cells.places),
+        names=tuple(
+            STATE[cell] if len(seen) == 1 else f"{STATE[cell]} of {moving[which]}"
+            for which, cell in zip(*places, strict=True)
+        ),
         body=body,
         speed=np.hypot(states[:, 3], states[:, 4]),
         position=states[:, :2],
@@ -247,7 +243,7 @@ def find_laws(loop: Loop, most: int = 3) -> list[Law]:
     """Return the residual force against the quantity that it depends on, then against others.
 
     The residual force is the process noise that each step adds to the smoothed states, over the
-    time step, times the body's mass or moment of inertia at the likeliest draw.
+    time step, times the body's mass or moment of inertia at the draw of highest likelihood.
 
     Empty where the test of dependence passed, no body is named, or the posterior does not hold
     its recording.

@@ -50,7 +50,10 @@ def likeliest(problem: Problem, posterior: Any) -> tuple[Floats, Floats]:
 
 
 def held_out_motions(loop: Loop) -> list[Motion]:
-    """Predict held-out trajectories with the likeliest draws, the worst predicted before first."""
+    """Return predictions of held-out trajectories, those worst predicted by the old model first.
+
+    Each posterior predicts with its draw of highest likelihood.
+    """
     if loop.held_out is None:
         return []
     before = after = _predicted(loop.posterior_before, loop.held_out, loop.catalogue)

@@ -314,7 +314,7 @@ def coverage(posterior: Any) -> dict[str, Coverage]:
 
 
 def pareto_k(posterior: Any) -> tuple[Floats, float, str]:
-    """Return Pareto k, the threshold above which it is bad, and what is left out at a time.
+    """Return Pareto k, the threshold above which it is bad, and the unit left out at a time.
 
     Raises
     ------

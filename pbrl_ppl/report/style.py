@@ -77,7 +77,7 @@ def legend(figure: Figure, handles: Sequence[Any]) -> None:
 
 
 def label(axes: Axes, text: str, at: tuple[float, float], **options: Any) -> None:
-    """Write a label beside a point of the data, a few points to its right unless told where."""
+    """Write a label beside a point of the data, by default 4 points to its right."""
     how: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "fontsize": 8}
     axes.annotate(text, at, **how | options)
 
