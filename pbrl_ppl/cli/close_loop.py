@@ -230,11 +230,8 @@ def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
     elif jobs == 1:
         yield None
     else:
-        pool = OneProcessEach(jobs)
-        try:
+        with OneProcessEach(jobs) as pool:  # close_loop_many cancels what has not begun
             yield pool
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
