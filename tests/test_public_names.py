@@ -32,3 +32,12 @@ def test_import_is_quick() -> None:
     assert not {"pymc", "arviz", "numpy", "pbrl_ppl.scene"} & at_once
     assert "pbrl_ppl.scene" in with_scene
     assert not {"pymc", "arviz"} & with_scene
+
+
+@pytest.mark.parametrize("first", ["pbrl_ppl.close_loop", "import pbrl_ppl.planning"])
+def test_the_core_loads_neither_pymc_nor_matplotlib(first) -> None:
+    """The main call and planning load PyMC and matplotlib where they need them, not before."""
+    code = f"import sys, pbrl_ppl; {first}; print(*sys.modules)"
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "pbrl_ppl.likelihood" in said.stdout.split()
+    assert not {"pymc", "pytensor", "arviz", "matplotlib"} & set(said.stdout.split())

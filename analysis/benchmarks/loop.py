@@ -26,7 +26,7 @@ from pbrl_ppl.effects import candidates
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import find_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.report import loop_page
+from pbrl_ppl.report import render
 
 sys.path.insert(0, str(Path(__file__).parent))
 from engine import MODELS
@@ -48,7 +48,7 @@ def closed(scene_file: Path, folder: Path) -> tuple[float, pp.Loop]:
         scene = pp.Scene.load(scene_file)
         train, test = (pp.History.load(folder / f"{name}.csv", scene) for name in ("train", "test"))
         found = pp.close_loop(scene, train, test, seed=1)
-        found.save(Path(out) / "loop", page=loop_page(found))
+        found.save(Path(out) / "loop", page=render(found))
     return time.perf_counter() - begin, found
 
 

@@ -4,6 +4,4 @@ Imports of the package stand inside the functions: PyMC takes seconds to load, a
 mistyped path should not wait for it.
 """
 
-from pbrl_ppl.cli.app import main
-
-__all__ = ["main"]
+from pbrl_ppl.cli.app import main as main

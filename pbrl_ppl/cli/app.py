@@ -5,11 +5,11 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Callable, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from typing import Annotated
 
 import typer
 
+from pbrl_ppl import __version__
 from pbrl_ppl.cli.calibrate import calibrate
 from pbrl_ppl.cli.check import check, criticise
 from pbrl_ppl.cli.close_loop import close_loop
@@ -33,7 +33,7 @@ COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
     "report": (report, "pbrl-ppl report cart.nc"),
     "update": (update, "pbrl-ppl update cart.nc since.csv -o new.nc"),
     "plan": (plan, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv"),
-    "simulate": (simulate, "pbrl-ppl simulate cart.nc plan.csv -o foreseen.csv --draws 20"),
+    "simulate": (simulate, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20"),
     "calibrate": (calibrate, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4"),
     "doctor": (doctor, "pbrl-ppl doctor --json"),
 }
@@ -93,10 +93,7 @@ def _options_of(argv: Sequence[str]) -> set[str]:
 
 def _show_version(value: bool) -> None:
     if value:
-        try:
-            typer.echo(f"pbrl-ppl {version('pbrl_ppl')}")
-        except PackageNotFoundError:
-            typer.echo("pbrl-ppl (not installed)")
+        typer.echo(f"pbrl-ppl {__version__}")
         raise typer.Exit
 
 

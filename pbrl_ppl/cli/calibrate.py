@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_json
+from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -67,12 +67,15 @@ def calibrate(
         write_atomically(output / "table.csv", result.table().to_csv)
         picture = report.png(report.plot_calibration(result))
         write_atomically(output / "ranks.png", lambda to: to.write_bytes(picture))
-    if as_json:
-        table = {name: row.to_dict() for name, row in result.table().iterrows()}
-        print_json({"passed": result.passed, "parameters": table, "picture": output / "ranks.png"})
-    else:
-        typer.echo(_calibrated(result))
-        typer.echo(f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}")
+    table = {name: row.to_dict() for name, row in result.table().iterrows()}
+    print_result(
+        as_json,
+        {"passed": result.passed, "parameters": table, "picture": output / "ranks.png"},
+        [
+            _calibrated(result),
+            f"{'passed' if result.passed else 'failed'}: {output / 'ranks.png'}",
+        ],
+    )
     if not result.passed:
         raise typer.Exit(FAILED)
 

@@ -20,7 +20,7 @@ from pbrl_ppl.cli.terminal import (
     UNDECIDED,
     check_can_make,
     interruptible,
-    print_json,
+    print_result,
     stages,
 )
 from pbrl_ppl.errors import OutputError
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 
 class Method(StrEnum):
-    """How posteriors are drawn."""
+    """Samplers of the loop's posteriors."""
 
     METROPOLIS = "metropolis"
     LAPLACE = "laplace"
@@ -113,10 +113,9 @@ def close_loop(
     if many is not None:
         if not (scene is train is test is None):
             raise typer.BadParameter("SCENE, TRAIN and --test are in the manifest, with --many")
-        if trim:
-            raise typer.BadParameter("--trim is for one log; leave it, or --many")
-        if learn_remainder:
-            raise typer.BadParameter("--learn-remainder is for one log; leave it, or --many")
+        for name, given in (("--trim", trim), ("--learn-remainder", learn_remainder)):
+            if given:
+                raise typer.BadParameter(f"{name} is for one log; leave it, or --many")
         _close_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
@@ -143,25 +142,20 @@ def close_loop(
 
         criticism.check_folder(output, overwrite)
         loop = criticism.close_loop(
-            declared,
-            *histories,
-            seed=seed,
-            draws=draws,
-            method=method.value,
-            progress=progress,
+            declared, *histories, seed=seed, draws=draws, method=method.value, progress=progress
         )
         progress("writing the report")
         source = report.Source(
             str(scene), str(train), str(test or ""), options.command_line(context)
         )
-        loop.save(output, overwrite, page=report.loop_page(loop, source))
+        loop.save(output, overwrite, page=report.render(loop, source))
         remainder = _remainder(loop, output, source, seed, progress) if learn_remainder else {}
-    if as_json:
-        print_json(loop.to_dict() | {"report": output / "report.html"} | remainder)
-    else:
-        words = remainder["learned_remainder"]["words"] if remainder else ""
-        for line in report.in_brief(loop, output, words):
-            typer.echo(line)
+    words = remainder["learned_remainder"]["words"] if remainder else ""
+    print_result(
+        as_json,
+        loop.to_dict() | {"report": output / "report.html"} | remainder,
+        report.in_brief(loop, output, words),
+    )
     if loop.verdict == criticism.NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
 
@@ -171,7 +165,7 @@ def _remainder(
 ) -> dict[str, dict[str, Any]]:
     """Learn a force for the residual and save it with the results, or return why there is none."""
     from pbrl_ppl.errors import FitError
-    from pbrl_ppl.report import loop_page
+    from pbrl_ppl.report import render
 
     path = folder / "remainder.nc"
     path.unlink(missing_ok=True)  # of an earlier run
@@ -180,7 +174,7 @@ def _remainder(
     except FitError as error:
         return {"learned_remainder": {"words": str(error), "posterior": None}}
     progress("writing the report with it")
-    loop.save(folder, overwrite=True, page=loop_page(loop, source))
+    loop.save(folder, overwrite=True, page=render(loop, source))
     return {"learned_remainder": {"words": loop.remainder_words, "posterior": path}}
 
 
@@ -212,16 +206,17 @@ def _close_many(
                 source=report.Source(command=command),
                 **settings,
             )
-    if as_json:
-        print_json({"page": output / "index.html", "logs": loops.rows})
-        if loops.failed:
-            raise typer.Exit(FAILED)
-        return
     effects = loops.effects().drop_duplicates(["name", "effect", "body"])
-    for (effect, body), found in effects.groupby(["effect", "body"], sort=False):
-        typer.echo(f"{effect}[{body}]: {', '.join(found['name'])}")
-    typer.echo(report.in_words(loops.rows))
-    typer.echo(f"page: {output / 'index.html'}")
+    found = [
+        f"{effect}[{body}]: {', '.join(each['name'])}"
+        for (effect, body), each in effects.groupby(["effect", "body"], sort=False)
+    ]
+    page = output / "index.html"
+    print_result(
+        as_json,
+        {"page": page, "logs": loops.rows},
+        [*found, report.in_words(loops.rows), f"page: {page}"],
+    )
     if loops.failed:
         raise typer.Exit(FAILED)
 
@@ -235,11 +230,8 @@ def _executor(jobs: int, scheduler: str | None) -> Iterator[Executor | None]:
     elif jobs == 1:
         yield None
     else:
-        pool = OneProcessEach(jobs)
-        try:
+        with OneProcessEach(jobs) as pool:  # close_loop_many cancels what has not begun
             yield pool
-        finally:
-            pool.shutdown(wait=True, cancel_futures=True)
 
 
 @contextmanager
@@ -270,15 +262,7 @@ class OneProcessEach(ThreadPoolExecutor):
 
     A process that dies, out of memory for instance, does not take others with it, as in a pool; its
     call is tried once more. PyMC's threads do not survive a fork, so processes are spawned.
-
-    Parameters
-    ----------
-    jobs : int
-        Processes at a time.
     """
-
-    def __init__(self, jobs: int) -> None:
-        super().__init__(jobs)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Schedule a call that can be pickled."""

@@ -9,10 +9,11 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.terminal import FAILED, interruptible, print_json, stages
+from pbrl_ppl.cli.terminal import FAILED, interruptible, print_result, stages
 
 #: The compiled and the plain path agree to rounding.
 _AGREE = 1e-9
@@ -41,10 +42,7 @@ def doctor(as_json: options.AsJson = False, quiet: options.Quiet = False) -> Non
         }
         found["package"] = str(Path(__file__).parents[1])
     wrong = found["engine"]["difference"] > _AGREE
-    if as_json:
-        print_json(found | {"ok": not wrong})
-    else:
-        _print(found)
+    print_result(as_json, found | {"ok": not wrong}, _lines(found))
     if wrong:
         typer.echo("error: the compiled engine loop is wrong here; please report this", err=True)
         raise typer.Exit(FAILED)
@@ -59,8 +57,6 @@ def _processors() -> int:
 
 def _engine() -> dict[str, Any]:
     """Return the engine loop's kind, its difference from the plain loop, and its speed."""
-    import numpy as np
-
     from pbrl_ppl.physics import Physics, calls
     from pbrl_ppl.scene import Body, Scene, Shape, Wall
 
@@ -82,16 +78,15 @@ def _engine() -> dict[str, Any]:
     }
 
 
-def _print(found: dict[str, Any]) -> None:
-    for name, version in found["versions"].items():
-        typer.echo(f"{name:12} {version}")
-    typer.echo(f"{'platform':12} {found['platform']}")
+def _lines(found: dict[str, Any]) -> list[str]:
+    """Return what was found as lines of text."""
     engine = found["engine"]
     slow = "" if engine["path"] == "compiled" else ": a Python loop, slow; no compiled one here"
-    typer.echo(
-        f"{'engine':12} {engine['path']}{slow}, {engine['microseconds_per_transition']:.1f} us a"
-        f" transition, {engine['difference']:.1g} from the plain loop"
-    )
-    threads = ", ".join(f"{number} {name}" for name, number in found["threads"].items())
-    typer.echo(f"{'threads':12} {threads}")
-    typer.echo(f"{'package':12} {found['package']}")
+    shown = found["versions"] | {
+        "platform": found["platform"],
+        "engine": f"{engine['path']}{slow}, {engine['microseconds_per_transition']:.1f} us a"
+        f" transition, {engine['difference']:.1g} from the plain loop",
+        "threads": ", ".join(f"{number} {name}" for name, number in found["threads"].items()),
+        "package": found["package"],
+    }
+    return [f"{name:12} {text}" for name, text in shown.items()]

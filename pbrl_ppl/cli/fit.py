@@ -18,6 +18,7 @@ from pbrl_ppl.cli.terminal import (
     check_file,
     interruptible,
     print_json,
+    print_result,
     print_table,
     stages,
 )
@@ -226,13 +227,14 @@ def update(
         save_posterior(idata, output)
         (*_, last) = json.loads(idata.attrs["updates"])
     converged = not any(issubclass(category, ConvergenceWarning) for category in caught)
-    if as_json:
-        print_json(last | {"posterior": output, "converged": converged})
-    else:
-        typer.echo(
+    print_result(
+        as_json,
+        last | {"posterior": output, "converged": converged},
+        [
             f"{last['did']}: {last['transitions']} transitions, the weights worth"
-            f" {last['share']:.0%} of the draws"
-        )
-        typer.echo(f"posterior: {output}")
+            f" {last['share']:.0%} of the draws",
+            f"posterior: {output}",
+        ],
+    )
     if not converged:
         raise typer.Exit(UNDECIDED)

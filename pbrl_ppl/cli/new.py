@@ -10,14 +10,24 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
+import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.scene_text import HINGE, SHAPES, hinge, outline, outlines, scene_text, wall
-from pbrl_ppl.cli.scene_text import bodies as parts
+from pbrl_ppl.cli.scene_text import (
+    HINGE,
+    SHAPES,
+    body_texts,
+    hinge,
+    outline,
+    outlines,
+    scene_text,
+    wall,
+)
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
 from pbrl_ppl.errors import HistoryError, OutputError, SceneError
 from pbrl_ppl.files import write_text
+from pbrl_ppl.scene import Body, Scene, Shape, nearest
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -28,7 +38,7 @@ _EVEN = 0.01
 
 @dataclass(frozen=True)
 class Recorded:
-    """Names of the bodies in a recording, and its time steps.
+    """Bodies and time steps of a recording.
 
     Parameters
     ----------
@@ -70,11 +80,9 @@ def recorded(
     HistoryError
         If it cannot be read, names no body, or its times do not rise.
     """
-    import numpy as np
     import pandas as pd
 
     from pbrl_ppl.history import as_history, read_table
-    from pbrl_ppl.scene import Body, Scene, Shape
 
     frame = read_table(path, columns)
     names = _names(frame, columns) or list(given)
@@ -185,8 +193,8 @@ def new(
 ) -> None:
     """Write a commented scene, from options or from a few questions; or copy a model.
 
-    What is not given and is needed is asked for, if there is a terminal to ask at. All options of
-    bodies, hinges and walls can be repeated. Models to copy: apartment, namo, pendulum and
+    Asks at a terminal for what the options leave open. All options of bodies, hinges and walls can
+    be repeated. Models to copy: apartment, namo, pendulum and
     shopping_cart; recordings that a model has go beside the scene.
     """
     described = (
@@ -208,17 +216,15 @@ def new(
                 found = None if history is None else recorded(history, names, measures, [*shapes])
                 reading = _reading(found, columns, units)
                 answers = _asked(shapes, wheels, kinematic, side, time_step, history, found)
-                texts = parts(
+                texts = body_texts(
                     answers.shapes, answers.names, wheels=answers.wheels,
                     kinematic=kinematic or [], known=known or [], effects=declare or [],
                 )  # fmt: skip
                 text = scene_text(
-                    texts,
-                    side=answers.side,
-                    time_step=answers.time_step,
+                    texts, side=answers.side, time_step=answers.time_step,
                     hinges=[hinge(each, answers.names) for each in hinges or []],
                     walls=[wall(each) for each in walls or []],
-                )
+                )  # fmt: skip
                 written = [scene]
                 _write(scene, text)
         except typer.Abort:  # Ctrl-C at a question
@@ -230,7 +236,7 @@ def new(
             typer.echo(f"wrote {path}")
         log = history or (written[-1] if len(written) > 1 else None)
         command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv"), *reading]
-        begin = "next" if log else "next, with a recording of your own"
+        begin = "next" if log else "next, with your recording"
         typer.echo(f"{begin}: {shlex.join(command)}")
 
 
@@ -249,8 +255,6 @@ def _reading(
 
 def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
     """Copy a model's scene, and its recordings beside it."""
-    from pbrl_ppl.scene import nearest
-
     folder = next((path for path in _MODELS if path.is_dir()), None)
     if folder is None:
         raise OutputError("--from: the models are not installed with this package; clone it")
@@ -272,7 +276,6 @@ def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
 def _write(path: Path, text: str) -> None:
     """Write a scene whole or not at all, if it is valid."""
     from pbrl_ppl.effects import attach
-    from pbrl_ppl.scene import Scene
 
     attach(Scene.from_toml(text))  # whether declared effects exist too
     write_text(path, text)

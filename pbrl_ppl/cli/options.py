@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import shlex
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
 
@@ -16,6 +16,8 @@ from pbrl_ppl.errors import GoalError
 if TYPE_CHECKING:
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
+
+T = TypeVar("T")
 
 #: Trajectory ends that one warning names, at most.
 _MOST_ENDS = 4
@@ -114,23 +116,9 @@ def command_line(context: typer.Context) -> str:
     return shlex.join([*words, *options])
 
 
-def _bad_pair(text: str, option: str, example: str) -> typer.BadParameter:
-    message = f"{text!r} is not NAME=VALUE, such as {example}"
-    return typer.BadParameter(message, param_hint=option)
-
-
 def named_numbers(given: list[str] | None, option: str, example: str) -> dict[str, float]:
     """Return numbers by name from options such as ``x=0.002``."""
-    numbers = {}
-    for item in given or []:
-        name, _, value = item.rpartition("=")
-        try:
-            numbers[name.strip()] = float(value)
-        except ValueError:
-            name = ""
-        if not name.strip():
-            raise _bad_pair(item, option, example)
-    return numbers
+    return dict(_pairs(given, option, example, float))
 
 
 def noise_of(given: list[str] | None) -> dict[str, float]:
@@ -140,27 +128,35 @@ def noise_of(given: list[str] | None) -> dict[str, float]:
 
 def columns_of(given: list[str] | None) -> dict[str, str | float]:
     """Return column names, or numbers, from options such as ``x=pos_x,force_x=0``."""
-    columns: dict[str, str | float] = {}
-    for name, value in _pairs(given, "--columns", "x=pos_x"):
-        try:
-            columns[name] = float(value)
-        except ValueError:
-            columns[name] = value
-    return columns
+    return dict(_pairs(given, "--columns", "x=pos_x", _number_or_name))
+
+
+def _number_or_name(text: str) -> str | float:
+    try:
+        return float(text)
+    except ValueError:
+        return text
 
 
 def units_of(given: list[str] | None) -> dict[str, str]:
     """Return units from options such as ``x=mm,theta=deg``."""
-    return dict(_pairs(given, "--units", "x=mm"))
+    return dict(_pairs(given, "--units", "x=mm", str))
 
 
-def _pairs(given: list[str] | None, option: str, example: str) -> list[tuple[str, str]]:
+def _pairs(
+    given: list[str] | None, option: str, example: str, kind: Callable[[str], T]
+) -> list[tuple[str, T]]:
+    """Return names and values from ``NAME=VALUE,...``."""
     pairs = []
     for item in ",".join(given).split(",") if given else ():
-        name, equals, value = (part.strip() for part in item.partition("="))
-        if not (name and equals and value):
-            raise _bad_pair(item, option, example)
-        pairs.append((name, value))
+        name, _, value = (part.strip() for part in item.partition("="))
+        try:
+            if not (name and value):
+                raise ValueError
+            pairs.append((name, kind(value)))
+        except ValueError:
+            message = f"{item!r} is not NAME=VALUE, such as {example}"
+            raise typer.BadParameter(message, param_hint=option) from None
     return pairs
 
 
@@ -198,7 +194,7 @@ def starts_of(given: list[str] | None, bodies: Sequence[str]) -> dict[str, list[
 
 @dataclass(frozen=True)
 class Reading:
-    """How histories are read: the values of ``--columns``, ``--units`` and others.
+    """Settings for reading histories: the values of ``--columns``, ``--units`` and others.
 
     Parameters
     ----------
@@ -237,7 +233,7 @@ class Reading:
         )
 
     def trimmed(self, history: History, scene: Scene, path: Path) -> History:
-        """Return the history without the rows that ``trim`` is about, or warn of them."""
+        """Return the history without strange rows at trajectory ends, or warn of them."""
         if self.trim is None:
             return history
         from pbrl_ppl.history import strange_ends, trimmed
@@ -262,7 +258,7 @@ def load(
     noise: list[str] | None = None,
     substeps: int | None = None,
 ) -> tuple[Scene, list[History]]:
-    """Read a scene, with what options change of it, and histories of it.
+    """Read a scene, change it as options say, and read its histories.
 
     Warns where velocities and changes of positions differ by the factor of a unit.
     """

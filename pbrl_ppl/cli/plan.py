@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.terminal import FAILED, check_file, interruptible, print_json, stages
+from pbrl_ppl.cli.terminal import FAILED, check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import GoalError
 
 
@@ -110,19 +110,17 @@ def plan(
 
             animate_plan(result, animate)
     written = [path for path in (output, animate) if path is not None]
-    if as_json:
-        print_json(
-            {
-                "reached": result.reached,
-                "duration": result.duration,
-                "words": result.in_words(),
-                "written": written,
-            }
-        )
-    else:
-        typer.echo(result.in_words())
-        for path in written:
-            typer.echo(f"plan: {path}")
+    words = result.in_words()
+    print_result(
+        as_json,
+        {
+            "reached": result.reached,
+            "duration": result.duration,
+            "words": words,
+            "written": written,
+        },
+        [words, *(f"plan: {path}" for path in written)],
+    )
     if not result.reached:
         raise typer.Exit(FAILED)
 
@@ -185,35 +183,24 @@ def suggest(
         starts = options.starts_of(start, bodies)
         allowed = _bounds(bounds, bodies) if bounds else None
         result = suggest_actions(
-            idata,
-            starts,
-            allowed if actions is None else ActionSet.load(actions),
-            effects=effect,
-            steps=steps,
-            hold=hold,
-            draws=draws,
-            seed=seed,
-            progress=progress,
-        )
+            idata, starts, allowed if actions is None else ActionSet.load(actions),
+            effects=effect, steps=steps, hold=hold, draws=draws, seed=seed, progress=progress,
+        )  # fmt: skip
         result.to_csv(output)
-    if as_json:
-        names = [str(name) for name in result.separation["true"].values]
-        print_json(
-            {
-                "effects": names,
-                "expected_log_bayes_factor": result.expected,
-                "separation": result.separation.values,
-                "at_random": result.at_random,
-                "decisive": result.decisive,
-                "meeting": result.meeting,
-                "sentences": result.sentences,
-                "written": [output],
-            }
-        )
-    else:
-        for sentence in result.sentences:
-            typer.echo(sentence)
-        typer.echo(f"experiment: {output}")
+    print_result(
+        as_json,
+        {
+            "effects": [str(name) for name in result.separation["true"].values],
+            "expected_log_bayes_factor": result.expected,
+            "separation": result.separation.values,
+            "at_random": result.at_random,
+            "decisive": result.decisive,
+            "meeting": result.meeting,
+            "sentences": result.sentences,
+            "written": [output],
+        },
+        [*result.sentences, f"experiment: {output}"],
+    )
     if not result.decisive:
         raise typer.Exit(FAILED)
 

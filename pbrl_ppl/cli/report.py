@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.terminal import check_file, interruptible, print_json, stages
+from pbrl_ppl.cli.terminal import check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.files import write_text
 
@@ -41,7 +41,4 @@ def report(
         except PosteriorError as error:
             raise PosteriorError(f"{posterior}: {error}") from error
         write_text(page, text)
-    if as_json:
-        print_json({"report": page})
-    else:
-        typer.echo(f"report: {page}")
+    print_result(as_json, {"report": page}, [f"report: {page}"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene import WORLD, nearest
@@ -88,108 +87,35 @@ _NO_JOINT = """
 """
 
 
-@dataclass(frozen=True)
-class BodyText:
-    """A body of a new scene.
-
-    Parameters
-    ----------
-    name, shape : str
-        The shape as TOML.
-    wheel, kinematic : bool
-        Whether it has a wheel; whether it follows its recorded path.
-    known : mapping of str to float
-        Parameters that are given (SI units).
-    effects : tuple of str
-        Declared from the start.
-    """
-
-    name: str
-    shape: str
-    wheel: bool = False
-    kinematic: bool = False
-    known: Mapping[str, float] = field(default_factory=dict)
-    effects: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True)
-class HingeText:
-    """A hinge of two bodies, or of one and ``"world"``, and where it holds each (m)."""
-
-    bodies: tuple[str, str]
-    anchors: tuple[tuple[float, float], tuple[float, float]]
-
-
 def scene_text(
-    bodies: Iterable[BodyText],
+    bodies: Mapping[str, str],
     *,
     side: bool,
     time_step: float,
-    hinges: Iterable[HingeText] = (),
-    walls: Iterable[tuple[Sequence[float], Sequence[float]]] = (),
+    hinges: Sequence[str] = (),
+    walls: Sequence[str] = (),
 ) -> str:
     """Return a commented scene as TOML.
 
     Parameters
     ----------
-    bodies : iterable of BodyText
-        At least one.
+    bodies : mapping of str to str
+        Text of each by name, as of :func:`body_texts`; at least one.
     side : bool
         Whether it is seen from the side.
     time_step : float
         Between rows of the history (s).
-    hinges : iterable of HingeText
-        All joints; without one, a comment says how to declare one.
-    walls : iterable of tuple
-        Both ends of each (m); as with hinges.
-
-    Examples
-    --------
-    >>> cart = BodyText("cart", '{ kind = "box", size = [0.9, 0.55] }', True)
-    >>> from pbrl_ppl.scene import Scene
-    >>> Scene.from_toml(scene_text([cart], side=False, time_step=0.1)).moving[0].wheel
-    True
+    hinges, walls : sequence of str
+        Text of each; without one, a comment says how to declare one.
     """
-    names = []
-    parts = [_HEAD, _SIDE if side else _TOP, _CLOCK.format(time_step=time_step)]
-    for body in bodies:
-        names.append(_quoted(body.name))
-        parts.append(_body(body))
-    edges = [_WALL.format(start=numbers(start), end=numbers(end)) for start, end in walls]
-    joints = [_hinge(each) for each in hinges]
-    parts += [*(edges or [_NO_WALL]), *(joints or [_NO_JOINT.format(name=names[0])])]
-    return "".join(parts)
+    parts = [_HEAD, _SIDE if side else _TOP, _CLOCK.format(time_step=time_step), *bodies.values()]
+    no_joint = _NO_JOINT.format(name=_quoted(next(iter(bodies))))
+    return "".join([*parts, *(walls or [_NO_WALL]), *(hinges or [no_joint])])
 
 
-def numbers(values: Sequence[float]) -> str:
+def _numbers(values: Sequence[float]) -> str:
     """Return numbers as TOML."""
     return f"[{', '.join(map(repr, values))}]"
-
-
-def _body(body: BodyText) -> str:
-    parts = [_SHAPE.format(name=_quoted(body.name), shape=body.shape)]
-    parts.append(_KINEMATIC if body.kinematic else _WHEEL.format(wheel=str(body.wheel).lower()))
-    if body.known:
-        known = ", ".join(f"{_key(name)} = {value!r}" for name, value in body.known.items())
-        parts.append(_KNOWN.format(known=f"{{ {known} }}"))
-    elif not body.kinematic:
-        parts.append(_NOT_KNOWN)
-    if not body.kinematic:
-        parts.append(_PRIOR)
-    if body.effects:
-        listed = ", ".join(map(_quoted, body.effects))
-        parts.append(_EFFECTS.format(effects=f"[{listed}]"))
-    elif not body.kinematic:
-        parts.append(_NO_EFFECTS)
-    return "".join(parts)
-
-
-def _hinge(hinge: HingeText) -> str:
-    frames = ["in the world" if name == "world" else f"in {name}'s frame" for name in hinge.bodies]
-    (a, b), (anchor_a, anchor_b) = map(_quoted, hinge.bodies), map(numbers, hinge.anchors)
-    return _HINGE.format(
-        a=a, b=b, anchor_a=anchor_a, anchor_b=anchor_b, in_a=frames[0], in_b=frames[1]
-    )
 
 
 def _quoted(name: str) -> str:
@@ -217,11 +143,11 @@ def outline(text: str) -> tuple[str, str]:
     sizes = _floats(rest.split("x"))
     corners = [_floats(corner.split(",")) for corner in rest.split("/")]
     if name and kind == "box" and len(sizes) == 2:
-        return name, f'{{ kind = "box", size = {numbers(sizes)} }}'
+        return name, f'{{ kind = "box", size = {_numbers(sizes)} }}'
     if name and kind == "circle" and len(sizes) == 1:
         return name, f'{{ kind = "circle", radius = {sizes[0]!r} }}'
     if name and kind == "polygon" and all(len(corner) == 2 for corner in corners):
-        listed = ", ".join(map(numbers, corners))
+        listed = ", ".join(map(_numbers, corners))
         return name, f'{{ kind = "polygon", vertices = [{listed}] }}'
     raise SceneError(f"--body: {text!r} is not NAME=SHAPE with a shape such as {SHAPES}")
 
@@ -236,50 +162,58 @@ def outlines(given: Iterable[str]) -> dict[str, str]:
     return shapes
 
 
-def hinge(text: str, names: Sequence[str]) -> HingeText:
-    """Return a hinge from ``BODY@X,Y`` (to the world's origin) or ``BODY@X,Y=OTHER@X,Y``.
+def hinge(text: str, names: Sequence[str]) -> str:
+    """Return a hinge as TOML from ``BODY@X,Y`` (to the world's origin) or ``BODY@X,Y=OTHER@X,Y``.
 
     Examples
     --------
-    >>> hinge("arm@0,0.15", ["arm"])
-    HingeText(bodies=('arm', 'world'), anchors=((0.0, 0.15), (0.0, 0.0)))
+    >>> print(hinge("arm@0,0.15", ["arm"]))
+    <BLANKLINE>
+    [[joint]]
+    kind = "hinge"             # or "distance", a rod
+    bodies = ["arm", "world"]
+    anchor_a = [0.0, 0.15]     # in arm's frame, m
+    anchor_b = [0.0, 0.0]      # in the world, m
+    <BLANKLINE>
     """
     ends = [*text.split("="), f"{WORLD}@0,0"][:2] if text.count("=") < 2 else []
-    bodies, anchors = [], []
+    joined, anchors = [], []
     for end in ends:
         name, _, point = end.rpartition("@")
         anchor = _floats(point.split(","))
         if name and len(anchor) == 2:
-            bodies.append(name)
-            anchors.append((anchor[0], anchor[1]))
-    if len(bodies) != 2:
+            joined.append(name)
+            anchors.append(_numbers(anchor))
+    if len(joined) != 2:
         raise SceneError(
             f"--hinge: {text!r} is not BODY@X,Y, or two of them with = between, such as {HINGE};"
-            " points in the body's own frame, m"
+            " points in the body's frame, m"
         )
-    for name in bodies:
-        check_named("--hinge", name, [*names, WORLD])
-    return HingeText((bodies[0], bodies[1]), (anchors[0], anchors[1]))
+    for name in joined:
+        _check_named("--hinge", name, [*names, WORLD])
+    a, b = map(_quoted, joined)
+    in_a, in_b = ("in the world" if name == WORLD else f"in {name}'s frame" for name in joined)
+    return _HINGE.format(a=a, b=b, anchor_a=anchors[0], anchor_b=anchors[1], in_a=in_a, in_b=in_b)
 
 
-def wall(text: str) -> tuple[list[float], list[float]]:
-    """Return two points of the world (m) from ``X,Y/X,Y``."""
+def wall(text: str) -> str:
+    """Return a wall as TOML from ``X,Y/X,Y``, two points of the world (m)."""
     ends = [_floats(end.split(",")) for end in text.split("/")]
     if [len(end) for end in ends] != [2, 2]:
         raise SceneError(f"--wall: {text!r} is not X,Y/X,Y, two points such as -2,-1/2,-1, in m")
-    return ends[0], ends[1]
+    return _WALL.format(start=_numbers(ends[0]), end=_numbers(ends[1]))
 
 
-def bodies(
+def body_texts(
     shapes: Mapping[str, str],
     names: Sequence[str],
     *,
-    wheels: Iterable[str],
-    kinematic: Iterable[str],
+    wheels: Sequence[str],
+    kinematic: Sequence[str],
     known: Iterable[str],
     effects: Iterable[str],
-) -> list[BodyText]:
-    """Return the bodies in order, with the options of each.
+) -> dict[str, str]:
+    """Return the bodies as TOML by name, in order, with the options of each.
 
     Parameters
     ----------
@@ -287,15 +221,22 @@ def bodies(
         By name, as TOML.
     names : sequence of str
         Of the bodies, in order.
-    wheels, kinematic : iterable of str
-        Names.
+    wheels, kinematic : sequence of str
+        Names of the bodies that have a wheel, and of those that follow their recorded path.
     known, effects : iterable of str
-        ``NAME.PARAMETER=VALUE`` and ``NAME=EFFECT,...``.
+        ``NAME.PARAMETER=VALUE`` (SI units) and ``NAME=EFFECT,...``.
+
+    Examples
+    --------
+    >>> from pbrl_ppl.scene import Scene
+    >>> shapes = dict([outline("cart=box:0.9x0.55")])
+    >>> cart = body_texts(shapes, ["cart"], wheels=["cart"], kinematic=(), known=(), effects=())
+    >>> Scene.from_toml(scene_text(cart, side=False, time_step=0.1)).moving[0].wheel
+    True
     """
-    wheeled, led = list(wheels), list(kinematic)
-    for option, listed in (("--wheel", wheeled), ("--kinematic", led)):
-        for name in listed:
-            check_named(option, name, names)
+    for option, given in (("--wheel", wheels), ("--kinematic", kinematic)):
+        for name in given:
+            _check_named(option, name, names)
     values: dict[str, dict[str, float]] = {name: {} for name in names}
     for text in known:
         place, _, number = text.rpartition("=")
@@ -303,25 +244,36 @@ def bodies(
         value = _floats([number])
         if not (name and parameter and value):
             raise SceneError(f"--known: {text!r} is not BODY.PARAMETER=VALUE, such as arm.mass=0.5")
-        check_named("--known", name, names)
+        _check_named("--known", name, names)
         values[name][parameter] = value[0]
     declared: dict[str, list[str]] = {name: [] for name in names}
     for text in effects:
         name, _, listing = text.rpartition("=")
         if not (name and all(listing.split(","))):
             raise SceneError(f"--declare: {text!r} is not BODY=EFFECT, such as arm=inertia_scale")
-        check_named("--declare", name, names)
-        declared[name] += listing.split(",")
-    return [
-        BodyText(
-            name, shapes[name], name in wheeled, name in led, values[name], tuple(declared[name])
-        )
-        for name in names
-    ]
+        _check_named("--declare", name, names)
+        declared[name] += map(_quoted, listing.split(","))
+    texts = {}
+    for name in names:
+        path = name in kinematic
+        parts = [
+            _SHAPE.format(name=_quoted(name), shape=shapes[name]),
+            _KINEMATIC if path else _WHEEL.format(wheel=str(name in wheels).lower()),
+            "" if path else _NOT_KNOWN,
+            "" if path else _PRIOR,
+            "" if path else _NO_EFFECTS,
+        ]
+        if values[name]:
+            listed = ", ".join(f"{_key(key)} = {value!r}" for key, value in values[name].items())
+            parts[2] = _KNOWN.format(known=f"{{ {listed} }}")
+        if declared[name]:
+            parts[4] = _EFFECTS.format(effects=f"[{', '.join(declared[name])}]")
+        texts[name] = "".join(parts)
+    return texts
 
 
-def check_named(option: str, name: str, known: Sequence[str]) -> None:
-    """Refuse a name that no body has."""
+def _check_named(option: str, name: str, known: Sequence[str]) -> None:
+    """Raise if no body has this name."""
     if name not in known:
         raise SceneError(
             f"{option}: there is no body {name!r}, only {', '.join(known)}{nearest(name, known)}"

@@ -6,21 +6,18 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
-from pbrl_ppl.cli.terminal import check_file, interruptible, print_json, stages
+from pbrl_ppl.cli.terminal import check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError
+from pbrl_ppl.state import STATE, Floats
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
     from pbrl_ppl.history import History
     from pbrl_ppl.parameters import Layout
     from pbrl_ppl.scene import Scene
-
-    Array = NDArray[np.float64]
 
 
 def simulate(
@@ -70,28 +67,25 @@ def simulate(
         scene.replace(noise=errors)  # raises where the noise is invalid
         recorded = reading.history(history, scene)
         progress("simulating")
-        simulated = _simulated(scene, layout, phi, substeps, recorded)
+        simulated = _simulated(scene, phi, substeps, recorded)
         result = _history(recorded, simulated, errors, seed, labelled=draws is not None)
         result.save(output)
-    if as_json:
-        print_json(
-            {
-                "history": output,
-                "trajectories": result.n_trajectories,
-                "transitions": result.n_transitions,
-                "parameters": dict(zip(layout.labels, phi.T, strict=True)),
-            }
-        )
-    else:
-        typer.echo(f"history: {output} ({result.n_trajectories} trajectories)")
+    print_result(
+        as_json,
+        {
+            "history": output,
+            "trajectories": result.n_trajectories,
+            "transitions": result.n_transitions,
+            "parameters": dict(zip(layout.labels, phi.T, strict=True)),
+        },
+        [f"history: {output} ({result.n_trajectories} trajectories)"],
+    )
 
 
 def _parameters(
     source: Path, values: Mapping[str, float], draws: int | None, seed: int
-) -> tuple[Scene, Layout, Array, int]:
+) -> tuple[Scene, Layout, Floats, int]:
     """Return the scene, and parameter vectors, shape (draw, p), from a posterior or options."""
-    import numpy as np
-
     if source.suffix == ".nc":
         from pbrl_ppl.planning import Dynamics
         from pbrl_ppl.posterior import load_posterior
@@ -115,10 +109,8 @@ def _parameters(
     return scene, layout, phi, substeps
 
 
-def _set(layout: Layout, phi: Array, values: Mapping[str, float]) -> None:
-    """Put values into parameter vectors, in place: by label, or for all bodies that have one."""
-    import numpy as np
-
+def _set(layout: Layout, phi: Floats, values: Mapping[str, float]) -> None:
+    """Set values in parameter vectors, in place: by label, or by name for all bodies."""
     from pbrl_ppl.scene import nearest
 
     for name, value in values.items():
@@ -139,12 +131,8 @@ def _bare(label: str) -> str:
     return label.partition("[")[0]
 
 
-def _simulated(
-    scene: Scene, layout: Layout, phi: Array, substeps: int, recorded: History
-) -> list[Any]:
+def _simulated(scene: Scene, phi: Floats, substeps: int, recorded: History) -> list[Any]:
     """Return simulated states, shape (trajectory, time, body, 6), for each draw."""
-    import numpy as np
-
     from pbrl_ppl.effects import attach
     from pbrl_ppl.physics import Physics, check_history
 
@@ -186,11 +174,9 @@ def _history(
     recorded: History, states: list[Any], errors: Mapping[str, float], seed: int, labelled: bool
 ) -> History:
     """Return a history of simulated states with measurement noise; labels may name the draw."""
-    import numpy as np
     import xarray as xr
 
     from pbrl_ppl.history import History
-    from pbrl_ppl.state import STATE
 
     rng = np.random.default_rng(seed)
     spread = np.array([errors.get(name, 0.0) for name in STATE])

@@ -52,7 +52,7 @@ def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
 
 
 class Stage:
-    """The present stage and the time elapsed, as a status line that is drawn again and again."""
+    """Status line with the present stage and the time elapsed."""
 
     def __init__(self) -> None:
         self.name, self._begin = "starting", time.monotonic()
@@ -151,6 +151,14 @@ def print_json(contents: Mapping[str, Any]) -> None:
     typer.echo(json.dumps(json_values(contents), indent=1, allow_nan=False))
 
 
+def print_result(as_json: bool, contents: Mapping[str, Any], lines: Iterable[str]) -> None:
+    """Print the result of a command: one JSON object, or lines of text."""
+    if as_json:
+        print_json(contents)
+    else:
+        typer.echo("\n".join(lines))
+
+
 def print_table(title: str | None, columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print a table; its first column, and those whose name begins with <, are text."""
     table = Table(title=title, title_justify="left", box=None, pad_edge=False)
@@ -167,12 +175,12 @@ def print_table(title: str | None, columns: Sequence[str], rows: Iterable[Sequen
 
 
 def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
-    """Refuse a file that has the wrong ending, exists already, or cannot be written.
+    """Raise if a file has the wrong ending, exists already, or cannot be written.
 
     Raises
     ------
     OutputError
-        Says which.
+        Says which of these it is.
     """
     if path.suffix not in endings:
         raise OutputError(f"{path}: expected a name that ends in {' or '.join(endings)}")
@@ -192,7 +200,7 @@ def check_file(path: Path, endings: tuple[str, ...], overwrite: bool) -> None:
 
 
 def check_can_make(folder: Path) -> None:
-    """Refuse a folder that cannot be made or written: it is tried, and nothing stays.
+    """Raise if a folder cannot be made or written; leave no trace of the attempt.
 
     Raises
     ------

@@ -48,12 +48,10 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ConvergenceWarning, PriorWarning
 from pbrl_ppl.history import History, without_measurements
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, try_effect
 from pbrl_ppl.posterior import compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
-from pbrl_ppl.sampling import fit
 from pbrl_ppl.scene import Scene
 
 #: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
@@ -288,6 +286,8 @@ def _prior_test(
     held: Mapping[str, float] | None = None,
 ) -> ResidualTest:
     """Test whether the prior, with some parameters held, could have made the data."""
+    from pbrl_ppl.model import build_model  # PyMC takes seconds to load
+
     horizon = telling_horizon(train, task.criteria.prior)
     problem = Problem.of(Physics(task.scene, effects, threads=2), train, horizon=horizon)
     checked = prior_predictive_check(
@@ -315,6 +315,9 @@ def _too_much_remains(
 
 def _posterior(task: _Task, mode: Mode) -> Any:
     """Sample a mode's model, with more draws if the chains have not converged."""
+    from pbrl_ppl.model import build_model  # PyMC takes seconds to load
+    from pbrl_ppl.sampling import fit
+
     # one thread a chain: more would wait for each other
     mode = replace(mode, problem=mode.problem.with_physics(threads=1))
     model = build_model(mode.problem)

@@ -15,7 +15,6 @@ from pbrl_ppl.criticism.criteria import DEFAULT, PriorCriteria
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.history import History, longest_gap, measurement_noise
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.model import prior_predictive_draws
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, Floats, Ints, wrapped
 
@@ -159,6 +158,8 @@ def prior_predictive_check(
     measured = _at(observations.values, last)
     measured = observations.wrapped(measured - first)
     names = [block.name for block in problem.layout.blocks]
+    from pbrl_ppl.model import prior_predictive_draws  # PyMC takes seconds to load
+
     drawn = prior_predictive_draws(model, names, draws, int(rng.integers(2**31)))
     phi = problem.layout.to_vectors(drawn, draws)
     for label, value in (held or {}).items():

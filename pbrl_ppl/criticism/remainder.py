@@ -21,11 +21,9 @@ from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, LearnedRemainder, learne
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import ACCELERATION
-from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.posterior import group
-from pbrl_ppl.sampling import fit
 from pbrl_ppl.state import STATE, Floats
 
 #: Transitions that the process is fitted to, at most.
@@ -111,6 +109,9 @@ def learn_remainder(
                 f"nothing to learn: a force on {body} that follows its velocity does not help on"
                 " trajectories that were left out"
             )
+        from pbrl_ppl.model import build_model  # PyMC takes seconds to load
+        from pbrl_ppl.sampling import fit
+
         model = build_model(refitted.problem.with_physics(threads=1))
         return fit(model, method="laplace", seed=seed, draws=draws, start=refitted, progress=False)
 

@@ -6,50 +6,29 @@
 import sys
 from types import ModuleType
 
-from pbrl_ppl.report.brief import in_brief
-from pbrl_ppl.report.check_plots import plot_calibration, plot_prior_check
-from pbrl_ppl.report.effect_plots import plot_candidates
-from pbrl_ppl.report.error_plots import plot_errors, plot_rollout
-from pbrl_ppl.report.logs import Log, read_manifest
-from pbrl_ppl.report.many import ManyLoops, close_loop_many
-from pbrl_ppl.report.many_page import in_words
-from pbrl_ppl.report.page import Source
-from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace, summary
-from pbrl_ppl.report.posterior_report import render_posterior
-from pbrl_ppl.report.scene_plots import (
-    animate_plan,
-    draw_goal,
-    draw_motion,
-    draw_scene,
-)
-from pbrl_ppl.report.style import png
-from pbrl_ppl.report.write import loop_page, report
-
-__all__ = [
-    "Log",
-    "ManyLoops",
-    "Source",
-    "animate_plan",
-    "close_loop_many",
-    "draw_goal",
-    "draw_motion",
-    "draw_scene",
-    "in_brief",
-    "in_words",
-    "loop_page",
-    "plot_calibration",
-    "plot_candidates",
-    "plot_errors",
-    "plot_prior_check",
-    "plot_rank",
-    "plot_rollout",
-    "plot_trace",
-    "png",
-    "read_manifest",
-    "render_posterior",
-    "report",
-    "summary",
-]
+from pbrl_ppl.report.brief import in_brief as in_brief
+from pbrl_ppl.report.check_plots import plot_calibration as plot_calibration
+from pbrl_ppl.report.check_plots import plot_prior_check as plot_prior_check
+from pbrl_ppl.report.effect_plots import plot_candidates as plot_candidates
+from pbrl_ppl.report.error_plots import plot_errors as plot_errors
+from pbrl_ppl.report.error_plots import plot_rollout as plot_rollout
+from pbrl_ppl.report.logs import Log as Log
+from pbrl_ppl.report.logs import read_manifest as read_manifest
+from pbrl_ppl.report.many import ManyLoops as ManyLoops
+from pbrl_ppl.report.many import close_loop_many as close_loop_many
+from pbrl_ppl.report.many_page import in_words as in_words
+from pbrl_ppl.report.page import Source as Source
+from pbrl_ppl.report.posterior_plots import plot_rank as plot_rank
+from pbrl_ppl.report.posterior_plots import plot_trace as plot_trace
+from pbrl_ppl.report.posterior_plots import summary as summary
+from pbrl_ppl.report.posterior_report import render_posterior as render_posterior
+from pbrl_ppl.report.report import render as render
+from pbrl_ppl.report.report import report as report
+from pbrl_ppl.report.scene_plots import animate_plan as animate_plan
+from pbrl_ppl.report.scene_plots import draw_goal as draw_goal
+from pbrl_ppl.report.scene_plots import draw_motion as draw_motion
+from pbrl_ppl.report.scene_plots import draw_scene as draw_scene
+from pbrl_ppl.report.style import png as png
 
 
 class _Report(ModuleType):

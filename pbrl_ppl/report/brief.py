@@ -22,33 +22,33 @@ from pbrl_ppl.report.words import (
 )
 
 
-def in_brief(findings: Loop, folder: str | Path, remainder: str = "") -> list[str]:
-    """Summarise findings in about ten lines.
+def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
+    """Return a summary of a closed loop in about ten lines.
 
     Parameters
     ----------
-    findings : Loop
-        What was found.
+    loop : Loop
+        Result of :func:`pbrl_ppl.close_loop`.
     folder : str or pathlib.Path
-        Where the results are, to name in commands.
+        Folder of the results, to name in commands.
     remainder : str
-        What a learned remainder does, or why there is none, where one was asked for.
+        What a learned remainder does, or why there is none; empty if none was requested.
     """
-    left, folder = findings.unexplained, Path(folder)
-    lines = [f"Verdict: {findings.verdict}. {verdict_in_words(findings)}"]
-    lines += [_effect(added) for added in accepted(findings)]
-    lines += _errors(findings)
+    left, folder = loop.unexplained, Path(folder)
+    lines = [f"Verdict: {loop.verdict}. {verdict_in_words(loop)}"]
+    lines += [_effect(added) for added in accepted(loop)]
+    lines += _errors(loop)
     if left is not None and left.body:
         lines.append(f"Where: {left.dimension} of the {plain(left.body)}.")
-    lines += [f"Left out: {words}"] if (words := left_out_in_words(findings)) else []
+    lines += [f"Left out: {words}"] if (words := left_out_in_words(loop)) else []
     lines += [f"Remainder: {remainder}"] if remainder else []
-    lines.append(f"Next: {_next(findings, folder, bool(remainder))}")
+    lines.append(f"Next: {_next(loop, folder, bool(remainder))}")
     lines.append(f"Report: {folder / 'report.html'}; posteriors before.nc and after.nc beside it.")
     return lines
 
 
 def _effect(added: Added) -> str:
-    """Write the sizes of an effect with their intervals, and what it cannot be told from."""
+    """Write the sizes of an effect with their intervals, and the effects confounded with it."""
     sizes = []
     for name, e in added.parameters.items():
         digits = digits_of(*e.hdi)
@@ -63,12 +63,12 @@ def _effect(added: Added) -> str:
     return text
 
 
-def _errors(findings: Loop) -> list[str]:
+def _errors(loop: Loop) -> list[str]:
     """Write the held-out errors, before and after if something was added."""
-    before, after, floor = findings.before, findings.after, findings.noise_floor
+    before, after, floor = loop.before, loop.after, loop.noise_floor
 
     def both(one: float, two: float) -> str:
-        return f"{number(one)} -> {number(two)}" if findings.added else number(one)
+        return f"{number(one)} -> {number(two)}" if loop.added else number(one)
 
     text = f"Held-out error: {both(before.normalised_rmse, after.normalised_rmse)} times the noise"
     far = {
@@ -77,34 +77,34 @@ def _errors(findings: Loop) -> list[str]:
     }
     if far:
         name = max(far, key=far.__getitem__)
-        seconds = findings.rollout_horizon * findings.scene.time_step
+        seconds = loop.rollout_horizon * loop.scene.time_step
         text += (
             f"; of {name} {number(seconds)} s ahead"
             f" {both(before.rollout_rmse[name], after.rollout_rmse.get(name, np.nan))}"
             f" {UNITS[name]} (noise floor {number(floor.rollout_rmse.get(name))})"
         )
-    note = error_in_words(findings)
+    note = error_in_words(loop)
     return [f"{text}.", *([f"  {note}"] if note else [])]
 
 
-def _next(findings: Loop, folder: Path, tried: bool) -> str:
+def _next(loop: Loop, folder: Path, tried: bool) -> str:
     """Return what to do next."""
-    left = findings.unexplained
-    if findings.verdict == NOT_CONVERGED:
+    left = loop.unexplained
+    if loop.verdict == NOT_CONVERGED:
         return "close the loop again with more --draws, or with tighter priors in the scene."
-    if left is not None and depends_on_records(findings):
-        learn = findings.verdict == UNEXPLAINED and not tried
+    if left is not None and depends_on_records(loop):
+        learn = loop.verdict == UNEXPLAINED and not tried
         return (
             f"open the report, which plots the residual against {left.depends_on}; write an effect"
             f" for it{', or close the loop again with --learn-remainder' if learn else ''}."
         )
-    if findings.verdict == UNEXPLAINED:
+    if loop.verdict == UNEXPLAINED:
         return "open the report; record more quantities, or longer."
-    if any(added.not_separable_from for added in findings.added):
+    if any(added.not_separable_from for added in loop.added):
         return (
             f"pbrl-ppl suggest {folder / 'after.nc'} -o next.csv: a recording that tells these"
             " effects apart."
         )
-    if findings.verdict == ADEQUATE:
+    if loop.verdict == ADEQUATE:
         return "open the report for the detection limit of each effect."
     return "open the report; plan and update with the posterior after.nc."

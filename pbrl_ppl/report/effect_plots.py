@@ -10,15 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 from scipy.stats import chi2, gaussian_kde
 
 from pbrl_ppl.criticism import Loop
-from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import scalars
 from pbrl_ppl.report.evidence import Evidence, Law, bin_means
-from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, legend
+from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, label, legend
 from pbrl_ppl.report.words import plain
+from pbrl_ppl.state import Floats
 
 #: Candidates are significant below this corrected p-value.
 _LEVEL = 0.01
@@ -28,17 +27,14 @@ HARDLY = 0.01
 MOST_CANDIDATES, MOST_ADDED = 20, 12
 
 
-def plot_candidates(findings: Loop, width: float = WIDE) -> Figure:
+def plot_candidates(loop: Loop, width: float = WIDE) -> Figure:
     """Plot the score statistic of the candidates, best on top, with the threshold of each."""
-    added = {(addition.effect, addition.body) for addition in findings.added}
-    shown = [
-        candidate
-        for place, candidate in enumerate(findings.candidates)
-        if place < MOST_CANDIDATES or (candidate.effect, candidate.body) in added
-    ]
+    added = {(addition.effect, addition.body) for addition in loop.added}
+    rest = (c for c in loop.candidates[MOST_CANDIDATES:] if (c.effect, c.body) in added)
+    shown = [*loop.candidates[:MOST_CANDIDATES], *rest]
     figure, (axes,) = blank_figure(width, 0.9 + 0.3 * max(len(shown), 3), 1, 1, grid="x")
     several = len({candidate.body for candidate in shown}) > 1
-    total = max(len(findings.candidates), 1)
+    total = max(len(loop.candidates), 1)
     thresholds = [
         float(chi2.isf(_LEVEL / (total * max(candidate.looks, 1)), candidate.dof))
         for candidate in shown
@@ -47,30 +43,17 @@ def plot_candidates(findings: Loop, width: float = WIDE) -> Figure:
         hardly = candidate.identifiable < HARDLY
         is_added = (candidate.effect, candidate.body) in added
         axes.barh(
-            place,
-            candidate.statistic,
-            height=0.7,
-            color=AFTER if is_added else PLAIN,
-            edgecolor="white",
-            hatch="////" if hardly else None,
-        )
+            place, candidate.statistic, height=0.7, color=AFTER if is_added else PLAIN,
+            edgecolor="white", hatch="////" if hardly else None,
+        )  # fmt: skip
         axes.plot([threshold] * 2, [place - 0.45, place + 0.45], color=BEFORE, linewidth=2)
-        axes.annotate(
-            f"{candidate.statistic:.3g}{', hardly identifiable' if hardly else ''}",
-            (candidate.statistic, place),
-            xytext=(4, 0),
-            textcoords="offset points",
-            va="center",
-            fontsize=8,
-            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5},
-        )
+        text = f"{candidate.statistic:.3g}{', hardly identifiable' if hardly else ''}"
+        box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 0.5}
+        label(axes, text, (candidate.statistic, place), va="center", bbox=box)
     if shown and max(candidate.statistic for candidate in shown) > 12 * max(thresholds):
         axes.set_xscale("asinh", linear_width=5.0)
-    labels = [
-        f"{plain(candidate.effect)}{f' · {candidate.body}' if several else ''}"
-        for candidate in shown
-    ]
-    axes.set_yticks(range(len(shown)), labels)
+    names = [f"{plain(c.effect)}{f' · {c.body}' if several else ''}" for c in shown]
+    axes.set_yticks(range(len(shown)), names)
     axes.margins(x=0.1)
     axes.set_xlim(left=0.0)
     axes.invert_yaxis()
@@ -85,19 +68,19 @@ def plot_candidates(findings: Loop, width: float = WIDE) -> Figure:
     return figure
 
 
-def plot_added(findings: Loop, width: float = WIDE) -> Figure:
+def plot_added(loop: Loop, width: float = WIDE) -> Figure:
     """Plot the posterior of the added effects' parameters, and the values that mean no effect."""
     shown = [
         (added, name, estimate)
-        for added in findings.added
+        for added in loop.added
         for name, estimate in added.parameters.items()
     ][:MOST_ADDED]
     columns = min(max(len(shown), 1), 2)
     rows = max(-(-len(shown) // columns), 1)
     width = width if columns > 1 else min(width, 5.0)
     figure, panels = blank_figure(width, 2.6 * rows, rows, columns, "x", count=len(shown))
-    draws = scalars(findings.posterior_after)
-    nulls = {(effect.name, p.name): p.null for effect in catalogue for p in effect.parameters}
+    draws = scalars(loop.posterior_after)
+    nulls = {(effect.name, p.name): p.null for effect in loop.catalogue for p in effect.parameters}
     for axes, (added, name, estimate) in zip(panels, shown, strict=False):
         low, high = estimate.hdi
         variable = f"{added.effect}_{name}[{added.body}]"
@@ -127,22 +110,13 @@ def _mark_null(axes: Axes, null: float, mean: float, sd: float, top: float) -> N
     """Draw a line at the value that means no effect, or an arrow where that is far away."""
     if abs(null - mean) < 25 * sd:
         axes.axvline(null, color="black", linestyle="--", linewidth=1.2)
-        axes.annotate(
-            "no effect", (null, 1.05 * top), xytext=(3, 0), textcoords="offset points", fontsize=8
-        )
+        label(axes, "no effect", (null, 1.05 * top), xytext=(3, 0))
         return
-    side = -1 if null < mean else 1
-    text = f"← no effect ({null:g})" if side < 0 else f"no effect ({null:g}) →"
-    axes.annotate(
-        text,
-        (0.02 if side < 0 else 0.98, 0.93),
-        xycoords="axes fraction",
-        ha="left" if side < 0 else "right",
-        fontsize=8,
-    )
+    text, x, side = f"no effect ({null:g}) →", 0.98, "right"
+    if null < mean:
+        text, x, side = f"← no effect ({null:g})", 0.02, "left"
+    axes.annotate(text, (x, 0.93), xycoords="axes fraction", ha=side, fontsize=8)
 
-
-Array = NDArray[np.float64]
 
 #: Bars of measured numbers in one panel, at most.
 _MOST_BARS = 12
@@ -173,7 +147,7 @@ def _by_cell(axes: Axes, evidence: Evidence) -> None:
     axes.set_xlabel("gain in all (nats)")
 
 
-def _along(axes: Axes, x: Array, gains: Array, label: str) -> None:
+def _along(axes: Axes, x: Floats, gains: Floats, label: str) -> None:
     """Draw the mean gain of transitions in bins of a quantity, with two standard errors."""
     bins = bin_means(x, gains)
     error = 2 * np.nan_to_num(bins.error)
@@ -221,12 +195,10 @@ def _shares(axes: Axes, evidence: Evidence) -> None:
     axes.plot([0, 100], [0, 100], color=PLAIN, linestyle=":", linewidth=1)
     count = len(evidence.carriers())
     axes.plot([100 * count / len(held)], [80], "o", color=BEFORE)
-    axes.annotate(
-        f"{count} transitions\nhold 80 %", (100 * count / len(held), 80), xytext=(8, -24),
-        textcoords="offset points", fontsize=8,
-    )  # fmt: skip
+    text = f"{count} transitions\nhold 80 %"
+    label(axes, text, (100 * count / len(held), 80), xytext=(8, -24))
     axes.set_title("by transition", fontsize=10)
-    axes.set(xlabel="transitions, most telling first (%)", ylabel="share of the gains (%)")
+    axes.set(xlabel="transitions, largest gain first (%)", ylabel="share of the gains (%)")
 
 
 def plot_laws(laws: Sequence[Law], width: float = WIDE) -> Figure:

@@ -2,37 +2,51 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 from scipy.stats import norm
 
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.posterior import HDI_PROB
-from pbrl_ppl.report.style import AFTER, BAND, BEFORE, PLAIN, UNITS, WIDE, blank_figure, legend
+from pbrl_ppl.report.style import (
+    AFTER,
+    BAND,
+    BEFORE,
+    PLAIN,
+    UNITS,
+    WIDE,
+    blank_figure,
+    label,
+    legend,
+)
+from pbrl_ppl.state import Floats, Ints
 
-Array = NDArray[np.float64]
+T = TypeVar("T")
 
 
-def plot_residuals(findings: Loop, width: float = WIDE) -> Figure:
+def _models(loop: Loop, before: T, after: T) -> list[tuple[str, T, str]]:
+    """Return name, values and colour of the models to show: one, or before and after."""
+    if not loop.added:
+        return [("declared model", before, AFTER)]
+    return [("before", before, BEFORE), ("after", after, AFTER)]
+
+
+def plot_residuals(loop: Loop, width: float = WIDE) -> Figure:
     """Plot held-out residuals of each state dimension in units of noise, before and after."""
-    names = list(findings.residuals_before)
+    names = list(loop.residuals_before)
     figure, (axes,) = blank_figure(width, 3.6, 1, 1)
     edge = float(norm.ppf(0.5 + HDI_PROB / 2))
     axes.axhspan(-edge, edge, color=BAND, zorder=0)
     axes.axhline(0.0, color="black", linewidth=0.8, zorder=1)
-    shown = [(findings.residuals_before, BEFORE, "before", -0.18)]
-    if findings.added:
-        shown.append((findings.residuals_after, AFTER, "after", 0.18))
-    else:
-        shown = [(findings.residuals_before, AFTER, "declared model", 0.0)]
+    models = _models(loop, loop.residuals_before, loop.residuals_after)
     largest = 0.0
-    for residuals, colour, _, shift in shown:
+    for i, (_, residuals, colour) in enumerate(models):
+        shift = 0.36 * (i - (len(models) - 1) / 2)
         for place, name in enumerate(names):
             values = np.asarray(residuals[name], dtype=float)
             values = values[np.isfinite(values)]
@@ -53,94 +67,83 @@ def plot_residuals(findings: Loop, width: float = WIDE) -> Figure:
         axes.set_yticks([], minor=True)
     axes.set_xticks(range(len(names)), names)
     axes.set_ylabel("residual / noise")
-    handles: list[Any] = [Line2D([], [], color=c, linewidth=3, label=n) for _, c, n, _ in shown]
+    handles: list[Any] = [Line2D([], [], color=c, linewidth=3, label=n) for n, _, c in models]
     handles.append(Patch(color=BAND, label=f"noise alone, {100 * HDI_PROB:.0f} %"))
     legend(figure, handles)
     return figure
 
 
-def plot_errors(findings: Loop, width: float = WIDE) -> Figure:
+def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
     """Plot held-out errors one step ahead and at the end of a rollout, before and after."""
-    kinds = [
-        ("one_step_rmse", "one step ahead"),
-        ("rollout_rmse", f"{findings.rollout_horizon} steps ahead"),
-    ]
-    kinds = [(kind, title) for kind, title in kinds if getattr(findings.before, kind)]
-    names = [list(getattr(findings.before, kind)) for kind, _ in kinds]
-    height = 1.2 + 0.42 * max((len(states) for states in names), default=1)
+    titles = {
+        "one_step_rmse": "one step ahead",
+        "rollout_rmse": f"{loop.rollout_horizon} steps ahead",
+    }
+    kinds = [kind for kind in titles if getattr(loop.before, kind)]
+    height = 1.2 + 0.42 * max((len(getattr(loop.before, kind)) for kind in kinds), default=1)
     figure, panels = blank_figure(width, height, 1, max(len(kinds), 1), grid="x")
-    for axes, (kind, title), dims in zip(panels, kinds, names, strict=False):
+    for axes, kind in zip(panels, kinds, strict=False):
         before, after, floor = (
-            getattr(e, kind) for e in (findings.before, findings.after, findings.noise_floor)
+            getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor)
         )
-        has_floor = all(np.isfinite(floor.get(d, np.nan)) and floor[d] > 0 for d in dims)
+        has_floor = all(np.isfinite(floor.get(d, np.nan)) and floor[d] > 0 for d in before)
         scale = floor if has_floor else before
-        bars = [(before, BEFORE, -0.19), (after, AFTER, 0.19)]
-        if not findings.added:
-            bars = [(before, AFTER, 0.0)]
-        for values, colour, shift in bars:
-            for place, dim in enumerate(dims):
+        models = _models(loop, before, after)
+        for i, (_, values, colour) in enumerate(models):
+            for place, dim in enumerate(before):
                 value = values.get(dim, np.nan)
                 if not np.isfinite(value) or not scale[dim] > 0:
                     continue
-                axes.barh(place + shift, value / scale[dim], height=0.36, color=colour)
-                axes.annotate(
-                    f"{value:.3g} {UNITS.get(dim, '')}",
-                    (value / scale[dim], place + shift),
-                    xytext=(3, 0),
-                    textcoords="offset points",
-                    va="center",
-                    fontsize=7.5,
-                )
+                at = (value / scale[dim], place + 0.38 * (i - (len(models) - 1) / 2))
+                axes.barh(at[1], at[0], height=0.36, color=colour)
+                text = f"{value:.3g} {UNITS.get(dim, '')}"
+                label(axes, text, at, xytext=(3, 0), va="center", fontsize=7.5)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
-        axes.set_yticks(range(len(dims)), dims)
+        axes.set_yticks(range(len(before)), list(before))
         axes.invert_yaxis()
         axes.margins(x=0.3)
         axes.set_xlim(left=0.0)
-        axes.set_title(title, fontsize=10)
+        axes.set_title(titles[kind], fontsize=10)
         axes.set_xlabel("error / noise floor" if has_floor else "error / error before")
-    labels = ["before", "after"] if findings.added else ["declared model"]
-    colours = [BEFORE, AFTER] if findings.added else [AFTER]
-    handles = [Patch(color=c, label=n) for c, n in zip(colours, labels, strict=True)]
-    legend(figure, handles)
+    legend(figure, [Patch(color=colour, label=name) for name, _, colour in _models(loop, 0, 0)])
     return figure
 
 
-def plot_rollout(findings: Loop, width: float = WIDE) -> Figure:
+def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
     """Plot one held-out trajectory: measured, and predicted before and after."""
-    rollout = findings.rollout
+    rollout = loop.rollout
     count = len(rollout.names)
     columns = 1 if count == 1 else 2
     rows = -(-count // columns)
     figure, panels = blank_figure(width, 0.8 + 1.9 * rows, rows, columns, count=count)
-    lines: list[tuple[Array, str, Literal["-", "--"], str]] = [
-        (rollout.before, BEFORE, "--", "before"),
-        (rollout.after, AFTER, "-", "after"),
-    ]
-    if not findings.added:
-        lines = [(rollout.before, AFTER, "-", "predicted by the declared model")]
+    models = _models(loop, rollout.before, rollout.after)
+    both: tuple[Literal["--", "-"], ...] = ("--", "-")
+    styles = both[-len(models) :]
     for place, (name, unit) in enumerate(zip(rollout.names, rollout.units, strict=True)):
         axes = panels[place]
         measured = rollout.measured[:, place]
         if unit == "rad":
             measured = unwrap(measured)
         axes.plot(rollout.time, measured, "o", color="black", markersize=2.5)
-        for values, colour, style, _ in lines:
+        for (_, values, colour), style in zip(models, styles, strict=True):
             line = values[:, place]
             if unit == "rad":
                 line = _beside(unwrap(line), measured)
-            axes.plot(rollout.time, line, style, color=colour, linewidth=1.6)
+            axes.plot(rollout.time, line, linestyle=style, color=colour, linewidth=1.6)
         axes.set_ylabel(f"{name} ({unit})")
         if place >= count - columns:
             axes.set_xlabel("time (s)")
-    handles = [Line2D([], [], color="black", marker="o", linestyle="", markersize=3)]
-    handles += [Line2D([], [], color=c, linestyle=s) for _, c, s, _ in lines]
-    names = ["measured", *(name for *_, name in lines)]
-    legend(figure, handles, names)
+    dots: dict[str, Any] = {"marker": "o", "linestyle": "", "markersize": 3}
+    handles = [Line2D([], [], color="black", label="measured", **dots)]
+    handles += [
+        Line2D([], [], color=colour, linestyle=style, label=name)
+        for (name, _, colour), style in zip(models, styles, strict=True)
+    ]
+    legend(figure, handles)
     return figure
 
 
-def unwrap(angle: Array) -> Array:
+def unwrap(angle: Floats) -> Floats:
     """Return angles (rad) without jumps of a turn, shape (time,); NaN stays NaN."""
     result = np.array(angle, dtype=float)
     seen = np.isfinite(result)
@@ -148,8 +151,8 @@ def unwrap(angle: Array) -> Array:
     return result
 
 
-def _beside(line: Array, measured: Array) -> Array:
-    """Shift a line by whole turns so that it starts beside the measurement."""
+def _beside(line: Floats, measured: Floats) -> Floats:
+    """Return a line of angles, moved by whole turns to start beside the measurement."""
     both = np.flatnonzero(np.isfinite(line) & np.isfinite(measured))
     if not both.size:
         return line
@@ -163,9 +166,9 @@ _CHANCE = 0.01
 _NAMED = 4
 
 
-def plot_correlations(findings: Loop, width: float = WIDE) -> Figure:
+def plot_correlations(loop: Loop, width: float = WIDE) -> Figure:
     """Plot correlations of errors with earlier errors and with commands."""
-    found = findings.correlations
+    found = loop.correlations
     figure, axes = blank_figure(width, 3.2, 1, 2 if found.commands else 1)
     lags = np.arange(1, len(found.own) + 1)
     _plot_correlations(axes[0], lags, found.own, found.pairs, list(found.cells))
@@ -187,7 +190,7 @@ def plot_correlations(findings: Loop, width: float = WIDE) -> Figure:
 
 
 def _plot_correlations(
-    axes: Axes, lags: NDArray[np.intp], values: Array, pairs: Array, names: list[str]
+    axes: Axes, lags: Ints, values: Floats, pairs: Floats, names: list[str]
 ) -> None:
     """Draw correlations over lags; name those that leave the band of noise alone."""
     edge = norm.isf(_CHANCE / 2 / max(values.size, 1)) / np.sqrt(np.maximum(pairs, 1)).min()
@@ -206,9 +209,9 @@ def _plot_correlations(
     axes.set_xticks(lags)
 
 
-def plot_growth(findings: Loop, width: float = WIDE) -> Figure:
+def plot_growth(loop: Loop, width: float = WIDE) -> Figure:
     """Plot errors of forecasts over their length, as multiples of the error from noise alone."""
-    growth = findings.growth
+    growth = loop.growth
     names = [name for name in growth.floor[-1] if growth.floor[-1][name] > 0]
     figure, (axes,) = blank_figure(width, 3.2, 1, 1)
     axes.axhline(1.0, color="black", linewidth=0.8)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,16 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
-from pbrl_ppl.effects import Effect
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import group, problem_of
 from pbrl_ppl.report.motion import likeliest
 from pbrl_ppl.report.style import acceleration_unit
 from pbrl_ppl.report.words import depends_on_records
-from pbrl_ppl.state import STATE
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.intp]
+from pbrl_ppl.state import STATE, Bools, Floats, Ints
 
 #: Bins of a quantity, each with as many transitions, and the fewest transitions that a bin has.
 _BINS, _LEAST = 10, 8
@@ -29,17 +24,17 @@ _SMALLEST_SHARE = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """Evidence for the added effects, by measured number of the fitted recording.
+    """Log-likelihood that the added effects gain, by measured number of the fitted recording.
 
     Parameters
     ----------
     nats : ndarray
         Log-likelihood that each measured number gains given those before it, shape (transition,
-        cell), each model with its own noise, at its likeliest draw.
-    bodies, dimensions : tuple of str
-        Body and state dimension of each observed coordinate (cell).
+        coordinate), each model with its noise, at its draw of highest likelihood.
+    names : tuple of str
+        Names of the observed coordinates: dimension and, with several bodies, body.
     body : str
-        Body of the first added effect, which ``speed`` and ``position`` are of.
+        Body of the first added effect, to which ``speed`` and ``position`` belong.
     speed : ndarray
         Speed of the body at the transition's start (m/s), shape (transition,).
     position : ndarray
@@ -54,28 +49,20 @@ class Evidence:
         Command on the body (N, N, N m), shape (transition, 3).
     """
 
-    nats: Array
-    bodies: tuple[str, ...]
-    dimensions: tuple[str, ...]
+    nats: Floats
+    names: tuple[str, ...]
     body: str
-    speed: Array
-    position: Array
-    time: Array
-    touching: NDArray[np.bool_]
+    speed: Floats
+    position: Floats
+    time: Floats
+    touching: Bools
     trajectory: NDArray[np.str_]
-    wrench: Array
+    wrench: Floats
 
     @property
-    def by_transition(self) -> Array:
+    def by_transition(self) -> Floats:
         """Gain of each transition (nats), shape (transition,)."""
         return np.asarray(self.nats.sum(axis=1))
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the observed coordinates: dimension and, of several bodies, body."""
-        if len(set(self.bodies)) == 1:
-            return self.dimensions
-        return tuple(f"{d} of {body}" for d, body in zip(self.dimensions, self.bodies, strict=True))
 
     @property
     def by_cell(self) -> dict[str, float]:
@@ -105,28 +92,31 @@ class Evidence:
         return order[: int(np.searchsorted(total, share * total[-1])) + 1]
 
 
-def find_evidence(findings: Loop, effects: Iterable[Effect]) -> Evidence | None:
+def find_evidence(loop: Loop) -> Evidence | None:
     """Return the gain of the revised model by measured number.
 
     None where nothing was added, or a posterior does not hold its recording.
     """
-    if not findings.added or not recorded(findings.posterior_before, findings.posterior_after):
+    if not loop.added or not recorded(loop.posterior_before, loop.posterior_after):
         return None
-    effects = tuple(effects)
-    after = problem_of(findings.posterior_after, effects)
-    before = problem_of(findings.posterior_before, effects)
-    nats = _log_density(after, findings.posterior_after)
-    nats = nats - _log_density(before, findings.posterior_before)
+    after = problem_of(loop.posterior_after, loop.catalogue)
+    before = problem_of(loop.posterior_before, loop.catalogue)
+    nats = _log_density(after, loop.posterior_after)
+    nats = nats - _log_density(before, loop.posterior_before)
     noise, segments = after.trajectory_noise, after.segments
     moving = [body.name for body in after.scene.moving]
-    body = findings.added[0].body
+    body = loop.added[0].body
     index = moving.index(body)
+    places = np.divmod(noise.cells.places, len(STATE))
+    seen = set(places[0].tolist())
     states = segments.start[:, index]
     labels = after.data.history.dataset["trajectory"].to_numpy().astype(str)
     return Evidence(
         nats=nats,
-        bodies=tuple(moving[place // len(STATE)] for place in noise.cells.places),
-        dimensions=tuple(STATE[place % len(STATE)] for place in noise.cells.places),
+        names=tuple(
+            STATE[cell] if len(seen) == 1 else f"{STATE[cell]} of {moving[which]}"
+            for which, cell in zip(*places, strict=True)
+        ),
         body=body,
         speed=np.hypot(states[:, 3], states[:, 4]),
         position=states[:, :2],
@@ -137,16 +127,15 @@ def find_evidence(findings: Loop, effects: Iterable[Effect]) -> Evidence | None:
     )
 
 
-def recorded(*posteriors: object) -> bool:
+def recorded(*posteriors: Any) -> bool:
     """Return whether posteriors hold their recording, of whole trajectories."""
-    for posterior in posteriors:
-        attrs = getattr(posterior, "attrs", {})
-        if "scene" not in attrs or "smoothed" not in group(posterior, "constant_data"):
-            return False
-    return True
+    return all(
+        "scene" in posterior.attrs and "smoothed" in group(posterior, "constant_data")
+        for posterior in posteriors
+    )
 
 
-def _log_density(problem: Problem, posterior: Any) -> Array:
+def _log_density(problem: Problem, posterior: Any) -> Floats:
     """Return the log-likelihood of each measured number given those before it."""
     phi, sigma = likeliest(problem, posterior)
     noise = problem.trajectory_noise
@@ -171,12 +160,12 @@ class Bins:
     """
 
     which: Ints
-    centre: Array
-    mean: Array
-    error: Array
+    centre: Floats
+    mean: Floats
+    error: Floats
 
 
-def bin_means(x: Array, y: Array) -> Bins:
+def bin_means(x: Floats, y: Floats) -> Bins:
     """Return the means of y in bins of x; equal values of x share a bin."""
     wanted = int(np.clip(len(x) // _LEAST, 1, _BINS))
     edges = np.unique(np.quantile(x, np.linspace(0, 1, wanted + 1)[1:-1]))
@@ -203,11 +192,11 @@ class ResidualForce:
     values : ndarray
         Of each transition, in ``unit``, shape (transition,).
     name, unit : str
-        What the values are.
+        Name and unit of the values.
     """
 
     dimension: str
-    values: Array
+    values: Floats
     name: str
     unit: str
 
@@ -217,7 +206,7 @@ class Curve:
     """A simple curve: its formula, its values at the sorted x, the share of variance explained."""
 
     form: str
-    values: Array
+    values: Floats
     share: float
 
 
@@ -228,9 +217,9 @@ class Law:
     Parameters
     ----------
     residual : ResidualForce
-        What is explained.
+        The residual force.
     quantity, unit : str
-        What it depends on.
+        The quantity that it depends on.
     x : ndarray
         That quantity at each transition, shape (transition,).
     bins : Bins
@@ -244,28 +233,28 @@ class Law:
     residual: ResidualForce
     quantity: str
     unit: str
-    x: Array
+    x: Floats
     bins: Bins
     share: float
     curve: Curve
 
 
-def find_laws(findings: Loop, effects: Iterable[Effect], most: int = 3) -> list[Law]:
-    """Return residual forces against the quantity that they depend on, and others like it.
+def find_laws(loop: Loop, most: int = 3) -> list[Law]:
+    """Return the residual force against the quantity that it depends on, then against others.
 
-    The residual force is what each step adds to the smoothed states beyond the model, over the time
-    step, times the body's posterior mean mass or moment.
+    The residual force is the process noise that each step adds to the smoothed states, over the
+    time step, times the body's mass or moment of inertia at the draw of highest likelihood.
 
     Empty where the test of dependence passed, no body is named, or the posterior does not hold
     its recording.
     """
-    remains = findings.unexplained
-    if remains is None or not remains.body or not depends_on_records(findings):
+    remains = loop.unexplained
+    if remains is None or not remains.body or not depends_on_records(loop):
         return []
-    if not recorded(findings.posterior_after):
+    if not recorded(loop.posterior_after):
         return []
-    problem = problem_of(findings.posterior_after, tuple(effects))
-    phi, _ = likeliest(problem, findings.posterior_after)
+    problem = problem_of(loop.posterior_after, loop.catalogue)
+    phi, _ = likeliest(problem, loop.posterior_after)
     body = [moving.name for moving in problem.scene.moving].index(remains.body)
     residual = _residual_force(problem, phi, body, remains.dimension)
     if residual is None:
@@ -284,14 +273,14 @@ def find_laws(findings: Loop, effects: Iterable[Effect], most: int = 3) -> list[
 
 
 def _residual_force(
-    problem: Problem, phi: Array, body: int, dimension: str
+    problem: Problem, phi: Floats, body: int, dimension: str
 ) -> ResidualForce | None:
-    """Return what steps add to a velocity of a body over the time step, times its inertia."""
+    """Return the process noise of a body's velocity over the time step, times its inertia."""
     cells = problem.trajectory_noise.cells
     added = cells.of_residual(problem.residual(phi)) / problem.scene.time_step
     column = {int(place): i for i, place in enumerate(cells.places)}
 
-    def acceleration(name: str) -> Array | None:
+    def acceleration(name: str) -> Floats | None:
         place = body * len(STATE) + STATE.index(name)
         return added[:, column[place]] if place in column else None
 
@@ -319,7 +308,7 @@ def _residual_force(
     return ResidualForce(dimension, float(mass) * values, "residual force", "N")
 
 
-def _law(residual: ResidualForce, quantity: str, unit: str, x: Array) -> Law:
+def _law(residual: ResidualForce, quantity: str, unit: str, x: Floats) -> Law:
     """Return the means in bins of a quantity, and the simplest curve that follows them."""
     y, bins = residual.values, bin_means(x, residual.values)
     total = float(((y - y.mean()) ** 2).sum())
@@ -329,7 +318,7 @@ def _law(residual: ResidualForce, quantity: str, unit: str, x: Array) -> Law:
     return Law(residual, quantity, unit, x, bins, share, _simplest(x, y))
 
 
-def _simplest(x: Array, y: Array) -> Curve:
+def _simplest(x: Floats, y: Floats) -> Curve:
     """Return the curve of a few that has the best information criterion (BIC)."""
     one, order = np.ones_like(x), np.argsort(x)
     forms = {

@@ -15,10 +15,10 @@ import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+from pbrl_ppl import __version__
 from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.loop import FILES
 from pbrl_ppl.effects import Effect
@@ -26,7 +26,7 @@ from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ManifestError, PbrlError
 from pbrl_ppl.files import write_text
 from pbrl_ppl.history import History
-from pbrl_ppl.report.write import loop_page
+from pbrl_ppl.report.report import render
 from pbrl_ppl.scene import Scene, nearest
 
 _NEEDED, _OPTIONAL = ("name", "scene", "train"), ("test", "kind")
@@ -41,11 +41,11 @@ class Log:
     Parameters
     ----------
     name : str
-        Of its folder.
+        Name of its folder.
     scene, train : Path
-        The declared scene, and what is fitted.
+        The declared scene, and the history to fit.
     test : Path, optional
-        What errors are measured on; a quarter of the trajectories of ``train`` without it.
+        The held-out history; by default a quarter of the trajectories of ``train``.
     kind : str
         Robots of one kind share hyper-parameters; empty for none.
     """
@@ -68,7 +68,7 @@ def read_manifest(path: str | Path) -> tuple[Log, ...]:
     Returns
     -------
     tuple of Log
-        In the file's order, with absolute paths. Whether these files are there is not looked at.
+        In the file's order, with absolute paths, whether or not these files exist.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def read_manifest(path: str | Path) -> tuple[Log, ...]:
         raise ManifestError(f"{where}: it has no rows; expected one a log")
     seen: set[str] = set()
     for log in logs:
-        # some file systems do not tell capitals
+        # some file systems ignore case
         if log.name.lower() in seen:
             raise ManifestError(f'{where}: the name "{log.name}" is there twice; expected one each')
         seen.add(log.name.lower())
@@ -189,7 +189,7 @@ class LoopWithPage:
 
     def save(self, folder: Path) -> None:
         """Write the loop's files and its report."""
-        self.loop.save(folder, page=loop_page(self.loop))
+        self.loop.save(folder, page=render(self.loop))
 
 
 def close_log(log: Log, settings: Settings) -> LoopWithPage:
@@ -222,17 +222,13 @@ def inputs_sha256(log: Log, settings: Settings) -> str:
         if path is not None and path.is_file():
             content = path.read_bytes()
         digest.update(hashlib.sha256(content).digest() if path else b"none")
-    try:
-        installed = version("pbrl_ppl")
-    except PackageNotFoundError:
-        installed = "not installed"
-    contents = [settings.to_dict(), installed]
+    contents = [settings.to_dict(), __version__]
     digest.update(json.dumps(contents, sort_keys=True, default=dict).encode())
     return digest.hexdigest()
 
 
 def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) -> dict[str, Any]:
-    """Close the loop on one log, unless that was done; errors go into a file.
+    """Close the loop on one log unless it is finished; write an error into a file.
 
     Files are written elsewhere and renamed into the log's folder, ``report.json`` last, so that a
     worker may die at any moment.
@@ -240,15 +236,15 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
     Parameters
     ----------
     log : Log
-        Which.
+        The log.
     folder : Path
-        Of all logs.
+        Folder of all logs.
     settings : Settings
-        Of all logs.
+        Settings of all logs.
     inputs : str
-        As of :func:`inputs_sha256`.
+        Hash of the inputs, from :func:`inputs_sha256`.
     run : callable
-        :func:`close_log`, or another.
+        Closes the loop, such as :func:`close_log`.
 
     Returns
     -------
@@ -256,7 +252,7 @@ def settle(log: Log, folder: Path, settings: Settings, inputs: str, run: Run) ->
         Row of the log, see :func:`row_of`.
     """
     with _ONE:
-        # on a cluster, a result that was lost with its worker is asked for again
+        # a cluster repeats a task whose result was lost with its worker
         if row := row_of(log, folder, inputs):
             return row
         place, begin = folder / log.name, time.monotonic()
@@ -347,4 +343,4 @@ def row_of(log: Log, folder: Path, inputs: str) -> dict[str, Any] | None:
             "warnings": about["warnings"],
         }
     except (OSError, ValueError, KeyError, TypeError):
-        return None  # none, or not one of these: it is made anew
+        return None  # missing, or of another kind: the log is run again

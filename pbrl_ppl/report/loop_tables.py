@@ -7,59 +7,40 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import Candidate, Loop
-from pbrl_ppl.effects import Effect, Sensor
+from pbrl_ppl.effects import Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import Comparison
 from pbrl_ppl.report.evidence import Evidence
 from pbrl_ppl.report.page import Table
 from pbrl_ppl.report.style import UNITS, acceleration_unit
 from pbrl_ppl.report.words import chance, number, percent, plain, quantity
-from pbrl_ppl.state import STATE
+from pbrl_ppl.state import STATE, Floats
 
 #: A size is plausible if the effect's prior has more than this probability beyond it.
 _IMPLAUSIBLE = 1e-3
 _DRAWS = 20_000
 
 
-def measured_parameters(
-    candidate: Candidate, findings: Loop, effects: Iterable[Effect]
-) -> tuple[str, ...]:
-    """Return a candidate's parameters without those of state dimensions that were not measured.
-
-    Parameters
-    ----------
-    candidate : Candidate
-        Of the findings.
-    findings : Loop
-        Their residuals name the state dimensions that were measured.
-    effects : iterable of Effect
-        Where the candidate's name is looked up.
-    """
-    effect = next((each for each in effects if each.name == candidate.effect), None)
+def measured_parameters(candidate: Candidate, loop: Loop) -> tuple[str, ...]:
+    """Return a candidate's parameters without those of state dimensions that were not measured."""
+    effect = next((each for each in loop.catalogue if each.name == candidate.effect), None)
     names = tuple(candidate.units)
     if effect is None or not isinstance(effect.stage, Sensor):
         return names
-    return tuple(name for name in names if name not in STATE or name in findings.residuals_after)
+    return tuple(name for name in names if name not in STATE or name in loop.residuals_after)
 
 
-def limits_in_words(candidate: Candidate, findings: Loop, effects: Iterable[Effect]) -> str:
+def limits_in_words(candidate: Candidate, loop: Loop) -> str:
     """Return the detection limit of each parameter as text; empty where there is none.
 
     A limit beyond what the effect's prior allows is left out: no plausible size would be found.
-
-    Parameters
-    ----------
-    candidate, findings, effects
-        As of :func:`measured_parameters`.
     """
-    effects = tuple(effects)
-    effect = next((each for each in effects if each.name == candidate.effect), None)
+    effect = next((each for each in loop.catalogue if each.name == candidate.effect), None)
     priors = {} if effect is None else {each.name: each for each in effect.parameters}
     limits = {}
-    for name in measured_parameters(candidate, findings, effects):
+    for name in measured_parameters(candidate, loop):
         if name not in candidate.detectable:
             continue
         size, unit = candidate.detectable[name], candidate.units[name]
@@ -87,7 +68,7 @@ def _plausible(prior: Prior, null: float, size: float, caps: bool) -> bool:
 
 
 @cache
-def _draws(prior: Prior) -> NDArray[np.float64]:
+def _draws(prior: Prior) -> Floats:
     return prior.sample(np.random.default_rng(0), _DRAWS)
 
 
@@ -95,56 +76,52 @@ def _draws(prior: Prior) -> NDArray[np.float64]:
 _CARRIERS = 8
 
 
-def error_tables(findings: Loop) -> list[Table]:
+def error_tables(loop: Loop) -> list[Table]:
     """Tabulate the held-out errors, one interval and a rollout ahead, and overall."""
     tables = []
-    seconds = findings.rollout_horizon * findings.scene.time_step
+    seconds = loop.rollout_horizon * loop.scene.time_step
     kinds = [
-        ("one_step_rmse", f"One interval ahead, {findings.scene.time_step:g} s"),
-        ("rollout_rmse", f"{findings.rollout_horizon} intervals ahead, {number(seconds)} s"),
+        ("one_step_rmse", f"One interval ahead, {loop.scene.time_step:g} s"),
+        ("rollout_rmse", f"{loop.rollout_horizon} intervals ahead, {number(seconds)} s"),
     ]
     for kind, title in kinds:
         before, after, floor = (
-            getattr(errors, kind)
-            for errors in (findings.before, findings.after, findings.noise_floor)
+            getattr(errors, kind) for errors in (loop.before, loop.after, loop.noise_floor)
         )
         if before:
             rows = [
-                _row(findings, name, before[name], after.get(name), floor.get(name), UNITS[name])
+                _row(loop, name, (before[name], after.get(name), floor.get(name)), UNITS[name])
                 for name in before
             ]
             caption = f"{title} (root mean square error)"
-            tables.append(_before_after(findings, caption, "State dimension", rows, "Unit"))
+            tables.append(_before_after(loop, caption, "State dimension", rows, "Unit"))
+    errors = (loop.before, loop.after, loop.noise_floor)
+    nrmse, elpd = [each.normalised_rmse for each in errors], [each.elpd for each in errors]
     rows = [
-        _row(
-            findings, "Error in units of the noise", findings.before.normalised_rmse,
-            findings.after.normalised_rmse, findings.noise_floor.normalised_rmse,
-        ),
-        _row(
-            findings, "Log predictive density in nats (more is better)", findings.before.elpd,
-            findings.after.elpd, findings.noise_floor.elpd, digits=4,
-        ),
-    ]  # fmt: skip
-    tables.append(_before_after(findings, "Overall", "Measure", rows))
+        _row(loop, "Error in units of the noise", nrmse),
+        _row(loop, "Log predictive density in nats (more is better)", elpd, digits=4),
+    ]
+    tables.append(_before_after(loop, "Overall", "Measure", rows))
     return tables
 
 
 def _row(
-    findings: Loop, name: str, before: Any, after: Any, floor: Any, *unit: str, digits: int = 3
+    loop: Loop, name: str, errors: Sequence[Any], *unit: str, digits: int = 3
 ) -> tuple[str, ...]:
-    both = [before, after] if findings.added else [before]
-    return (name, *(number(value, digits) for value in (*both, floor)), *unit)
+    """Return the row of an error before, after and of the noise; without after if none is added."""
+    shown = errors if loop.added else (errors[0], errors[2])
+    return (name, *(number(value, digits) for value in shown), *unit)
 
 
-def models_of(findings: Loop) -> tuple[str, ...]:
+def models_of(loop: Loop) -> tuple[str, ...]:
     """Return the heads of the columns of one model, or of two."""
-    return ("Before", "After") if findings.added else ("Declared model",)
+    return ("Before", "After") if loop.added else ("Declared model",)
 
 
 def _before_after(
-    findings: Loop, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
+    loop: Loop, caption: str, name: str, rows: list[tuple[str, ...]], *last: str
 ) -> Table:
-    columns = (name, *models_of(findings), "Noise floor", *last)
+    columns = (name, *models_of(loop), "Noise floor", *last)
     return Table(caption, columns, rows, words=(len(columns) - 1,) if last else ())
 
 
@@ -171,14 +148,14 @@ def loo_table(loo: Comparison, columns: Sequence[str]) -> Table:
     return Table(f"{loo.method} (az.loo)", ("Measure", *columns), rows)
 
 
-def acceleration_table(findings: Loop) -> Table:
+def acceleration_table(loop: Loop) -> Table:
     """Tabulate the unexplained acceleration and its share of the bodies' acceleration."""
-    left = findings.acceleration
+    left = loop.acceleration
     rows = []
     for name, before in left.before.items():
         shares = [left.relative_before[name], left.relative_after[name]]
         values = [before, left.after[name]]
-        if not findings.added:
+        if not loop.added:
             shares, values = shares[1:], values[:1]
         rows.append(
             (
@@ -189,8 +166,8 @@ def acceleration_table(findings: Loop) -> Table:
                 "yes" if left.certain_after.get(name) else "no",
             )
         )
-    both = models_of(findings)
-    shared = ("Before, share", "After, share") if findings.added else ("Share",)
+    both = models_of(loop)
+    shared = ("Before, share", "After, share") if loop.added else ("Share",)
     return Table(
         "Unexplained acceleration (standard deviation in an interval)",
         ("Velocity", *both, *shared, "Unit", "Significant"),
@@ -199,9 +176,9 @@ def acceleration_table(findings: Loop) -> Table:
     )
 
 
-def residual_test_table(findings: Loop) -> Table:
+def residual_test_table(loop: Loop) -> Table:
     """Tabulate the tests of the model's residual."""
-    which = "revised" if findings.added else "declared"
+    which = "revised" if loop.added else "declared"
     return Table(
         f"Tests of the {which} model's residual, on the recordings that it was fitted to",
         ("Test", "Result", "p", "Passed"),
@@ -212,17 +189,16 @@ def residual_test_table(findings: Loop) -> Table:
                 chance(test.p_value),
                 ("yes" if test.passed else "no") if test.tested else "not tested",
             )
-            for test in findings.tests
+            for test in loop.tests
         ],
         words=(1, 3),
-        marks=["" if test.passed else "bad" for test in findings.tests],
+        marks=["" if test.passed else "bad" for test in loop.tests],
     )
 
 
-def candidate_table(findings: Loop, effects: Iterable[Effect]) -> Table:
+def candidate_table(loop: Loop) -> Table:
     """Tabulate the candidates of the first round."""
-    effects = tuple(effects)
-    added = {(each.effect, each.body) for each in findings.added}
+    added = {(each.effect, each.body) for each in loop.added}
     return Table(
         "Candidates of the first round, best first",
         ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
@@ -233,16 +209,16 @@ def candidate_table(findings: Loop, effects: Iterable[Effect]) -> Table:
                 number(candidate.statistic),
                 str(candidate.dof),
                 chance(candidate.p_value),
-                _estimates(candidate, measured_parameters(candidate, findings, effects)),
+                _estimates(candidate, measured_parameters(candidate, loop)),
                 percent(candidate.identifiable),
-                limits_in_words(candidate, findings, effects) or "–",
+                limits_in_words(candidate, loop) or "–",
                 candidate.why or "–",
             )
-            for candidate in findings.candidates
+            for candidate in loop.candidates
         ],
         words=(4, 6, 7),
         marks=[
-            "added" if (each.effect, each.body) in added else "" for each in findings.candidates
+            "added" if (each.effect, each.body) in added else "" for each in loop.candidates
         ],
     )  # fmt: skip
 

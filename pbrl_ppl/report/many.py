@@ -188,10 +188,9 @@ def close_loop_many(
             rows[log.name] = row
             tell(f"{len(rows)}/{len(logs)} {_row_in_words(row)}")
             write(_ordered(logs, rows), {}, {})
-    pooled, not_pooled = _pooled(logs, rows, folder)
-    ordered = _ordered(logs, rows)
-    write(ordered, pooled, not_pooled)
-    return ManyLoops(folder, ordered, pooled, not_pooled)
+    found = _ordered(logs, rows), *_pooled(logs, rows, folder)
+    write(*found)
+    return ManyLoops(folder, *found)
 
 
 def _row_in_words(row: Mapping[str, Any]) -> str:
@@ -224,26 +223,23 @@ def _ordered(logs: Iterable[Log], rows: Mapping[str, Any]) -> tuple[Mapping[str,
 def _opened(folder: Path) -> Path:
     """Make the folder of many logs, or check that it is one."""
     check_folder(folder, overwrite=True)
+    summary = folder / _SUMMARY
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        summary = folder / _SUMMARY
-        if not summary.is_file() and any(folder.iterdir()):
-            raise OutputError(
-                f"output folder {folder}: it has content that is not of many logs; choose another"
-            )
-        if summary.is_file() and json.loads(summary.read_text("utf-8"))["contents"] != _KIND:
-            raise KeyError("contents")
+        ours = not any(folder.iterdir())
+        if summary.is_file():
+            ours = json.loads(summary.read_text("utf-8"))["contents"] == _KIND
     except (ValueError, KeyError, TypeError):
-        raise OutputError(
-            f"output folder {folder}: its {_SUMMARY} is not of many logs; choose another"
-        ) from None
-    except OutputError:
-        raise
+        ours = False
     except OSError as error:
         raise OutputError(
             f"output folder {folder}: it cannot be made or written ({error.strerror}); choose"
             " another path"
         ) from error
+    if not ours:
+        raise OutputError(
+            f"output folder {folder}: it has content that is not of many logs; choose another"
+        )
     return folder.absolute()
 
 

@@ -42,10 +42,8 @@ def summary_table(rows: Iterable[Row]) -> pd.DataFrame:
 def effect_table(rows: Iterable[Row]) -> pd.DataFrame:
     """Return one row a log, effect and parameter, with its estimate and 94 % interval."""
     table = [
-        {"name": row["name"], "kind": row["kind"], "effect": added["effect"],
-         "body": added["body"], "parameter": name, "mean": each["mean"], "sd": each["sd"],
-         "low": each["hdi"][0], "high": each["hdi"][1], "unit": each["unit"],
-         "p_value": added["p_value"]}
+        (row["name"], row["kind"], added["effect"], added["body"], name, each["mean"], each["sd"],
+         *each["hdi"], each["unit"], added["p_value"])
         for row in rows
         for added in row.get("effects", ())
         for name, each in added["parameters"].items()

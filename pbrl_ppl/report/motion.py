@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import Effect
@@ -15,9 +14,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import likeliest_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
-from pbrl_ppl.state import wrapped
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats, wrapped
 
 #: Motions in one page, and their rows in all, at most; the declared model's worst come first.
 MOST, _MOST_ROWS = 6, 3000
@@ -39,41 +36,30 @@ class Motion:
     """
 
     name: str
-    time: Array
-    measured: Array
-    before: Array
-    after: Array
+    time: Floats
+    measured: Floats
+    before: Floats
+    after: Floats
 
 
-def likeliest(problem: Problem, posterior: Any) -> tuple[Array, Array]:
+def likeliest(problem: Problem, posterior: Any) -> tuple[Floats, Floats]:
     """Return the draw of highest likelihood: phi, shape (p,), and the noise parameters."""
     best = likeliest_draw(posterior)
     phi, sigma = parameter_draws(problem, posterior)
     return phi[best], sigma[best]
 
 
-def held_out_motions(
-    findings: Loop, held_out: History | None, effects: Iterable[Effect]
-) -> list[Motion]:
-    """Play held-out trajectories under the likeliest draws before and after, worst before first.
+def held_out_motions(loop: Loop) -> list[Motion]:
+    """Return predictions of held-out trajectories, those worst predicted by the old model first.
 
-    Parameters
-    ----------
-    findings : Loop
-        With posteriors as files have them.
-    held_out : History or None
-        Without it, the findings' one trajectory of one body, if its whole pose was measured.
-    effects : iterable of Effect
-        Where effects are looked up.
+    Each posterior predicts with its draw of highest likelihood.
     """
-    if held_out is None:
-        return _of_rollout(findings)
-    effects = tuple(effects)
-    before = _played(findings.posterior_before, held_out, effects)
-    after = before
-    if findings.posterior_after is not findings.posterior_before:
-        after = _played(findings.posterior_after, held_out, effects)
-    dataset = held_out.dataset
+    if loop.held_out is None:
+        return []
+    before = after = _predicted(loop.posterior_before, loop.held_out, loop.catalogue)
+    if loop.posterior_after is not loop.posterior_before:
+        after = _predicted(loop.posterior_after, loop.held_out, loop.catalogue)
+    dataset = loop.held_out.dataset
     known, rows = dataset["start"].to_numpy()[..., :3], dataset["n_rows"].to_numpy()
     labels = [str(label) for label in dataset["trajectory"].to_numpy()]
     motions = []
@@ -83,33 +69,31 @@ def held_out_motions(
         motions.append(
             Motion(
                 labels[trajectory],
-                np.arange(length, dtype=float) * findings.scene.time_step,
+                np.arange(length, dtype=float) * loop.scene.time_step,
                 known[trajectory, step:end],
                 first[:length],
                 after[trajectory, step][:length],
             )
         )
     shown: list[Motion] = []
-    for motion in sorted(motions, key=lambda each: -distance(findings.scene, each, each.before)):
+    for motion in sorted(motions, key=lambda each: -distance(loop.scene, each, each.before)):
         if shown and sum(len(each.time) for each in [*shown, motion]) > _MOST_ROWS:
             break
         shown.append(motion)
     return shown[:MOST]
 
 
-def distance(scene: Scene, motion: Motion, predicted: Array) -> float:
+def distance(scene: Scene, motion: Motion, predicted: Floats) -> float:
     """Return the root mean square distance (m) of outlines from the measured ones."""
     reach = np.array([body.shape.bounding_radius for body in scene.moving])
-    if len(reach) != motion.measured.shape[1]:  # one body of several
-        reach = np.array([reach.max()])
     off = predicted - motion.measured
     square = off[..., 0] ** 2 + off[..., 1] ** 2 + (reach * wrapped(off[..., 2])) ** 2
     return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else 0.0
 
 
-def _played(
+def _predicted(
     posterior: Any, history: History, effects: Sequence[Effect]
-) -> dict[tuple[int, int], Array]:
+) -> dict[tuple[int, int], Floats]:
     """Return the poses that a posterior predicts, by trajectory and starting step."""
     problem = problem_of(posterior, effects)
     phi, _ = likeliest(problem, posterior)
@@ -122,35 +106,20 @@ def _played(
     return dict(zip(keys, states, strict=True))
 
 
-def _of_rollout(findings: Loop) -> list[Motion]:
-    """Return the one trajectory that the findings hold."""
-    rollout = findings.rollout
-    if not {"x", "y", "theta"} <= set(rollout.names):
-        return []
-    pose = [rollout.names.index(name) for name in ("x", "y", "theta")]
-    measured, before, after = (
-        values[:, None, pose] for values in (rollout.measured, rollout.before, rollout.after)
-    )
-    return [Motion("held out", rollout.time, measured, before, after)]
-
-
-def animation(findings: Loop, motions: Sequence[Motion]) -> dict[str, Any] | None:
+def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, Any] | None:
     """Return what the page's script draws, as JSON values; None where there is no motion.
 
     Lengths are in m with five digits, angles in rad.
     """
     if not motions:
         return None
-    scene = findings.scene
-    bodies = list(scene.moving)
-    if len(bodies) != motions[0].measured.shape[1]:
-        bodies = [body for body in bodies if body.name == findings.rollout.body]
-    reach = max(body.shape.bounding_radius for body in bodies)
+    scene = loop.scene
+    reach = max(body.shape.bounding_radius for body in scene.moving)
     return {
-        "models": ["before", "after"] if findings.added else ["before"],
+        "models": ["before", "after"] if loop.added else ["before"],
         "bodies": [
             {"name": body.name, "outline": _outline(body.shape), "radius": body.shape.radius}
-            for body in bodies
+            for body in scene.moving
         ],
         "static": [
             {"outline": _outline(body.shape), "radius": body.shape.radius, "pose": list(body.pose)}
@@ -192,7 +161,7 @@ def _outline(shape: Any) -> list[list[float]] | None:
     return None if shape.outline is None else [list(map(float, point)) for point in shape.outline]
 
 
-def _rounded(values: Array) -> Any:
+def _rounded(values: Floats) -> Any:
     """Return nested lists of five decimals, with None for NaN."""
     plain = np.round(values, 5).astype(object)
     return np.where(np.isfinite(values), plain, np.array(None)).tolist()

@@ -24,20 +24,20 @@ from pbrl_ppl.report.words import (
     quantity,
 )
 
-#: What a cell of a table shows, and what is written small beside it.
+#: Text of a cell of a table, or text and a small note beside it.
 Cell = str | tuple[str, str]
 
 
 @dataclass(frozen=True)
 class Source:
-    """Where findings come from, for a reader who wants to reproduce them.
+    """Files and command behind a page, for a reader who wants to reproduce it.
 
     Parameters
     ----------
     scene, train, test : str
         Names of the files, empty where there are none.
     command : str
-        What makes the page again, at a shell or in Python.
+        Command that makes the page again, at a shell or in Python.
     """
 
     scene: str = ""
@@ -84,7 +84,7 @@ class Table:
 def render_page(
     template: str, pictures: Mapping[str, Callable[[float], Figure]], **values: Any
 ) -> str:
-    """Fill a template; pictures are drawn twice, for a page and for a telephone.
+    """Render a template; pictures are drawn twice, for a page and for a telephone.
 
     Parameters
     ----------
@@ -93,7 +93,7 @@ def render_page(
     pictures : dict of str to callable
         Draws a picture at a width (inches).
     **values : object
-        What the template shows.
+        Values that the template shows.
     """
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("pbrl_ppl", "report"),

@@ -14,7 +14,6 @@ from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 from scipy.stats import gaussian_kde, rankdata
 
 from pbrl_ppl.errors import PosteriorError
@@ -31,6 +30,7 @@ from pbrl_ppl.posterior import (
     separate,
 )
 from pbrl_ppl.report.style import AFTER, BAND, BEFORE, NARROW, PLAIN, WIDE, blank_figure, legend
+from pbrl_ppl.state import Floats
 
 #: Parameters in one picture, at most; the report's tables show all.
 MOST_PARAMETERS = 6
@@ -155,26 +155,19 @@ def _trace(draws: xr.Dataset, width: float) -> Figure:
             axes.yaxis.label.set_fontsize(9)
         return figure
     columns = 1 if count == 1 or width <= NARROW else 2
+    size = (width, 0.6 + 1.7 * -(-count // columns))
+    trace = {"alpha": 0.5, "width": 0.5}
     collection = az.plot_trace(
         draws,
         backend="matplotlib",
-        visuals={
-            "title": {"size": 9},
-            "xlabel": {"size": 8},
-            "trace": {"alpha": 0.5, "width": 0.5},
-        },
+        visuals={"title": {"size": 9}, "xlabel": {"size": 8}, "trace": trace},
         col_wrap=columns,
-        figure_kwargs={
-            "figsize": (width, 0.6 + 1.7 * -(-count // columns)),
-            "layout": "constrained",
-        },
+        figure_kwargs={"figsize": size, "layout": "constrained"},
     )
     result: Figure = collection.viz["figure"].item()
     plt.close(result)  # ArviZ 1.x registers it with pyplot, which would never release it
     return result
 
-
-Array = NDArray[np.float64]
 
 #: Parameters in a picture of pairs, and beside their priors, at most.
 MOST_PAIRS, MOST_PRIORS = 4, 12
@@ -320,8 +313,8 @@ def coverage(posterior: Any) -> dict[str, Coverage]:
     return result
 
 
-def pareto_k(posterior: Any) -> tuple[Array, float, str]:
-    """Return Pareto k, the threshold above which it is bad, and what is left out at a time.
+def pareto_k(posterior: Any) -> tuple[Floats, float, str]:
+    """Return Pareto k, the threshold above which it is bad, and the unit left out at a time.
 
     Raises
     ------
@@ -337,7 +330,7 @@ def pareto_k(posterior: Any) -> tuple[Array, float, str]:
     return np.asarray(loo.pareto_k, dtype=float).ravel(), float(loo.good_k), left_out(posterior)
 
 
-def plot_pareto(k: Array, good: float, unit: str, width: float = WIDE) -> Figure:
+def plot_pareto(k: Floats, good: float, unit: str, width: float = WIDE) -> Figure:
     """Plot Pareto k of every unit left out, and the threshold above which LOO is unreliable."""
     figure, (axes,) = blank_figure(width, 2.8, 1, 1)
     high = ~(k <= good)
@@ -356,7 +349,7 @@ def prior_draws(posterior: Any) -> xr.Dataset:
     return scalars(from_groups({"posterior": group(posterior, "prior")}, {}))
 
 
-def _correlations(draws: xr.Dataset, names: Sequence[str]) -> Array:
+def _correlations(draws: xr.Dataset, names: Sequence[str]) -> Floats:
     """Return rank correlations, shape (parameter, parameter)."""
     table = pd.DataFrame({name: draws[name].to_numpy().ravel() for name in names})
     return np.asarray(table.corr("spearman"))

@@ -29,7 +29,6 @@ from pbrl_ppl.report.posterior_plots import (
     Coverage,
     coverage,
     most_dependent,
-    most_interesting,
     pareto_k,
     plot_pairs,
     plot_pareto,
@@ -37,18 +36,11 @@ from pbrl_ppl.report.posterior_plots import (
     plot_prior,
     plot_rank,
     plot_trace,
-    summary,
 )
-from pbrl_ppl.report.posterior_tables import (
-    STATISTICS,
-    parameter_table,
-    posterior_rows,
-    sampler_in_words,
-    width_table,
-)
-from pbrl_ppl.report.report import recorded_poses
+from pbrl_ppl.report.posterior_tables import parameter_section
 from pbrl_ppl.report.scene_plots import plot_recording
 from pbrl_ppl.report.words import plain
+from pbrl_ppl.state import Floats
 
 #: Fewest draws for diagnostics of chains, densities and cross-validation.
 LEAST_DRAWS = 100
@@ -93,20 +85,19 @@ def render_posterior(
             f"posterior: it has {sizes['chain'] * sizes['draw']} draws, a report needs at least"
             f" {LEAST_DRAWS}; fit with a method that draws, and more draws"
         )
-    table = summary(posterior)
-    rows = posterior_rows(table, effects, method=str(posterior.attrs.get("method", "")))
-    shown, pairs = most_interesting(table), most_dependent(posterior)
-    moving = [row["label"] for row in rows if row["sd"] > 0]
-    priors = (moving or [row["label"] for row in rows])[:MOST_PRIORS]
+    pairs, draws = most_dependent(posterior), scalars(posterior)
+    moving = [str(name) for name, values in draws.items() if float(values.max() - values.min()) > 0]
+    priors = (moving or list(map(str, draws)))[:MOST_PRIORS]
     missing: dict[str, str] = {}
     known = _or_why(lambda: identify(posterior, effects=effects), "identifiability", missing)
+    section = parameter_section(posterior, effects, known)
     covered = _or_why(lambda: coverage(posterior), "predictions", missing)
     k = _or_why(lambda: pareto_k(posterior), "loo", missing)
     compared = None if k is None else compare(posterior, posterior)
     pictures: dict[str, Callable[[float], Figure]] = {
         "prior": partial(plot_prior, posterior, priors),
-        "trace": partial(plot_trace, posterior, shown),
-        "rank": partial(plot_rank, posterior, shown),
+        "trace": partial(plot_trace, posterior, section["shown"]),
+        "rank": partial(plot_rank, posterior, section["shown"]),
     }
     if pairs:
         pictures["pairs"] = partial(plot_pairs, posterior, pairs)
@@ -117,39 +108,42 @@ def render_posterior(
     poses = recorded_poses(posterior)
     if poses is not None and np.isfinite(poses[..., :2]).any():
         pictures["scene"] = partial(plot_recording, scene, poses, None)
-    units = {row["label"]: row["unit"] for row in rows}
     return render_page(
         "posterior.html.jinja",
         pictures,
         bodies=[body.name for body in scene.moving],
         headline=_headline(posterior, known),
-        sampled=sampler_in_words(rows),
-        bad=[row for row in rows if row["failed"]],
         sentences=() if known is None else known.sentences,
         predicts=_predicts(covered, missing),
         warnings=_warned(posterior, known is not None),
         about=_about(posterior),
-        posterior=parameter_table(rows, "Posterior of all parameters"),
-        count=len(rows),
         has_prior="prior" in groups(posterior),
         shown_priors=priors,
         pairs=pairs,
-        widths=known and width_table(posterior, known, units),
-        shown=shown,
         covered=covered and _coverage_table(covered),
         loo=compared and loo_table(compared, ["Value"]),
         missing=missing,
-        meanings={row["label"]: row["meaning"] for row in rows if row["meaning"]},
-        statistics=STATISTICS,
         source=source or Source(command="render_posterior(pp.load_posterior(...))"),
         refit=_refit(posterior),
         origin=_origin(posterior),
         scene_toml=scene.to_toml(),
+        **section,
     )
 
 
+def recorded_poses(posterior: Any) -> Floats | None:
+    """Return the recorded poses that a posterior holds, shape (trajectory, time, body, 3)."""
+    if "scene" not in posterior.attrs:
+        return None
+    given = group(posterior, "constant_data")
+    if "recorded_start" in given:
+        return np.asarray(given["recorded_start"].to_numpy()[..., :3])
+    # single transitions: the start of each, in order
+    return np.asarray(given["start"].to_numpy()[None, ..., :3])
+
+
 def _or_why(compute: Callable[[], Any], name: str, missing: dict[str, str]) -> Any:
-    """Return what is computed, or None, and keep the reason for the page."""
+    """Return the result of a computation; if it fails, None, and note the reason for the page."""
     try:
         return compute()
     except PbrlError as error:
@@ -248,7 +242,7 @@ def _refit(posterior: Any) -> str:
 
 
 def _origin(posterior: Any) -> dict[str, str]:
-    """Return the attributes that say where a posterior comes from."""
+    """Return the attributes on a posterior's origin: seed, data, method, versions."""
     attrs = posterior.attrs
     names = ("seed", "data_sha256", "method", "substeps", "horizon", "updates")
     origin = {name: str(attrs[name]) for name in names if name in attrs}

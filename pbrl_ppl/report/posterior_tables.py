@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +12,7 @@ from pbrl_ppl.effects import Effect
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
 from pbrl_ppl.posterior import Identifiability, interval, scalars
 from pbrl_ppl.report.page import Table
-from pbrl_ppl.report.posterior_plots import prior_draws
+from pbrl_ppl.report.posterior_plots import most_interesting, prior_draws, summary
 from pbrl_ppl.report.style import UNITS, acceleration_unit
 from pbrl_ppl.report.words import digits_of, number, plain
 
@@ -61,7 +61,7 @@ STATISTICS = {
 
 
 def meaning(label: str, effects: Iterable[Effect]) -> str:
-    """Return what a parameter such as ``mass[cart]`` is, in a few words; empty if unknown."""
+    """Return the meaning of a parameter such as ``mass[cart]`` in words; empty if unknown."""
     name = label.partition("[")[0]
     if name in PARAMETERS:
         return PARAMETERS[name]
@@ -84,20 +84,47 @@ _DATA = {
 }
 
 
-def posterior_rows(
-    table: pd.DataFrame,
+def parameter_section(
+    posterior: Any,
     effects: Iterable[Effect],
-    units: Mapping[str, str] | None = None,
-    *,
-    method: str = "",
-) -> list[dict[str, Any]]:
-    """Return a row per parameter: its summary, unit, meaning, and what is wrong with its chains.
+    known: Identifiability | None,
+    added: Iterable[str] = (),
+) -> dict[str, Any]:
+    """Return what a page shows of a posterior's parameters and of its sampler.
 
-    Draws of Laplace's approximation are independent, and there are no chains to compare.
+    Parameters
+    ----------
+    posterior : InferenceData or DataTree
+        With a group ``posterior``.
+    effects : iterable of Effect
+        Where the names of its effects are looked up.
+    known : Identifiability or None
+        What the data inform, if that could be computed.
+    added : iterable of str
+        Labels of parameters to show first.
     """
-    chains = method != "laplace"
-    effects = tuple(effects)
-    known = {**BODY_PARAMETERS, **JOINT_ANCHORS, **(units or {})}
+    table = summary(posterior)
+    # draws of Laplace's approximation are independent: there are no chains to compare
+    chains = posterior.attrs.get("method") != "laplace"
+    rows = _posterior_rows(table, tuple(effects), chains)
+    return {
+        "posterior": _parameter_table(rows),
+        "count": len(rows),
+        "bad": [row for row in rows if row["failed"]],
+        "sampled": _sampler_in_words(rows),
+        "widths": known
+        and _width_table(posterior, known, {row["label"]: row["unit"] for row in rows}),
+        "shown": most_interesting(table, added),
+        "meanings": {row["label"]: row["meaning"] for row in rows if row["meaning"]},
+        "statistics": STATISTICS,
+    }
+
+
+def _posterior_rows(
+    table: pd.DataFrame, effects: Sequence[Effect], chains: bool
+) -> list[dict[str, Any]]:
+    """Return a row per parameter: its summary, unit, meaning, and what is wrong with its chains."""
+    known = {**BODY_PARAMETERS, **JOINT_ANCHORS}
     known |= {effect.variable(p): p.unit for effect in effects for p in effect.parameters}
     rows = []
     for label, values in table.iterrows():
@@ -128,10 +155,10 @@ def posterior_rows(
     return rows
 
 
-def parameter_table(rows: list[dict[str, Any]], caption: str) -> Table:
+def _parameter_table(rows: list[dict[str, Any]]) -> Table:
     """Tabulate the posterior of all parameters, in their units."""
     return Table(
-        caption,
+        "Posterior of all parameters",
         ("Parameter", "Mean", "sd", "94 % interval", "Unit", "R-hat", "ESS bulk", "ESS tail"),
         [
             (
@@ -158,14 +185,14 @@ def _span(low: float, high: float) -> str:
 
 
 class SamplerResult(NamedTuple):
-    """Whether the sampler worked: in a word, and in full."""
+    """Verdict on the sampler: in a word, and in a sentence."""
 
     word: str
     sentence: str
 
 
-def sampler_in_words(rows: list[dict[str, Any]]) -> SamplerResult:
-    """Return whether the sampler worked, by the worst of its diagnostics."""
+def _sampler_in_words(rows: list[dict[str, Any]]) -> SamplerResult:
+    """Return the verdict on the sampler, by the worst of its diagnostics."""
     if not all(row["chains"] for row in rows):
         return SamplerResult(
             "No chains.", "Independent draws of Laplace's approximation: as good as that is."
@@ -193,7 +220,7 @@ def sampler_in_words(rows: list[dict[str, Any]]) -> SamplerResult:
     return SamplerResult("Yes.", f"The chains agree and are long enough. {found}")
 
 
-def width_table(posterior: Any, known: Identifiability, units: Mapping[str, str]) -> Table:
+def _width_table(posterior: Any, known: Identifiability, units: Mapping[str, str]) -> Table:
     """Tabulate the intervals of each parameter before and after the data."""
     before, after = prior_draws(posterior), scalars(posterior)
 

@@ -11,14 +11,12 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch, Polygon
-from numpy.typing import NDArray
 
 from pbrl_ppl.files import write_atomically
 from pbrl_ppl.planning import Goal, Plan
 from pbrl_ppl.report.style import NARROW, WIDE, blank_figure, legend
 from pbrl_ppl.scene import Body, Scene
-
-Array = NDArray[np.float64]
+from pbrl_ppl.state import Floats
 
 #: Okabe and Ito's colours, one a moving body, in turn; what is static is grey.
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
@@ -30,14 +28,14 @@ _SHOWN = 12
 
 
 def draw_scene(
-    axes: Axes, scene: Scene, states: Array, *, names: bool = False, faded: bool = False
+    axes: Axes, scene: Scene, states: Floats, *, names: bool = False, faded: bool = False
 ) -> None:
     """Draw walls, and bodies at one state each.
 
     Parameters
     ----------
     axes : Axes
-        Drawn on; its aspect becomes equal.
+        Axes to draw on; their aspect becomes equal.
     scene : Scene
         Shapes and walls.
     states : ndarray
@@ -53,15 +51,10 @@ def draw_scene(
         if body.static and body.pose is not None:
             axes.add_patch(_outline(body, np.array(body.pose), color=_STATIC))
     for i, (body, state) in enumerate(zip(scene.moving, states, strict=True)):
-        how: dict[str, Any] = {
-            "facecolor": _colour(i),
-            "edgecolor": "black",
-            "linewidth": 0.8,
-            "zorder": 2,
-        }
+        how: dict[str, Any] = {"facecolor": _colour(i), "edgecolor": "black", "zorder": 2}
         if faded:
-            how |= {"facecolor": "none", "edgecolor": _colour(i), "linestyle": "--", "zorder": 1}
-        axes.add_patch(_outline(body, state[:3], **how))
+            how = {"facecolor": "none", "edgecolor": _colour(i), "linestyle": "--", "zorder": 1}
+        axes.add_patch(_outline(body, state[:3], linewidth=0.8, **how))
         if names:
             axes.annotate(
                 body.name, state[:2], ha="center", va="center", fontsize=8, zorder=4,
@@ -71,7 +64,7 @@ def draw_scene(
     axes.set(xlabel="x (m)", ylabel="y (m)")
 
 
-def draw_motion(axes: Axes, scene: Scene, states: Array) -> None:
+def draw_motion(axes: Axes, scene: Scene, states: Floats) -> None:
     """Draw bodies where they end, dashed where they began, and the tracks of those that moved.
 
     Parameters
@@ -90,7 +83,7 @@ def draw_motion(axes: Axes, scene: Scene, states: Array) -> None:
 
 
 def plot_recording(
-    scene: Scene, poses: Array, held_out: Array | None = None, width: float = WIDE
+    scene: Scene, poses: Floats, held_out: Floats | None = None, width: float = WIDE
 ) -> Figure:
     """Draw a scene from above, with the bodies' recorded paths.
 
@@ -99,10 +92,10 @@ def plot_recording(
     scene : Scene
         Shapes and walls.
     poses : ndarray
-        x, y, theta (m, m, rad) that were fitted, shape (trajectory, time, body, 3 or more); NaN
-        where there are none.
+        x, y, theta (m, m, rad) of the fitted recording, shape (trajectory, time, body, 3 or more);
+        NaN where not measured.
     held_out : ndarray, optional
-        Those that were not.
+        The same of the held-out recording.
     width : float
         Of the figure (inches).
     """
@@ -137,7 +130,7 @@ def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
     Parameters
     ----------
     axes : Axes
-        Drawn on.
+        Axes to draw on.
     scene : Scene
         Orders the bodies.
     goal : Goal
@@ -146,18 +139,15 @@ def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
     for place, target in zip(goal.places(scene), goal.targets, strict=True):
         if target.x is None or target.y is None:
             continue
-        colour = _colour(place)
-        circle = Circle(
-            (target.x, target.y), target.tolerance, fill=False, color=colour, hatch="////"
-        )
-        axes.add_patch(circle)
+        how: dict[str, Any] = {"fill": False, "color": _colour(place), "hatch": "////"}
+        axes.add_patch(Circle((target.x, target.y), target.tolerance, **how))
 
 
 def _colour(index: int) -> str:
     return _COLOURS[index % len(_COLOURS)]
 
 
-def _outline(body: Body, pose: Array, **how: Any) -> Patch:
+def _outline(body: Body, pose: Floats, **how: Any) -> Patch:
     """Return a body's outline at a pose (x, y, theta)."""
     corners = body.shape.outline
     if corners is None:
@@ -176,7 +166,7 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
     path : str or Path
         Ends in ``.gif``; written whole or not at all.
     frames : int
-        Pictures a second at most; a plan is shown at the speed that it has.
+        Pictures a second at most; the plan is shown at its real speed.
 
     Raises
     ------

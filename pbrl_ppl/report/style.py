@@ -67,17 +67,19 @@ def blank_figure(
     return figure, panels
 
 
-def legend(figure: Figure, handles: Sequence[Any], labels: Sequence[str] | None = None) -> None:
+def legend(figure: Figure, handles: Sequence[Any]) -> None:
     """Put a legend above all panels, in as many columns as there is room for."""
-    names = [handle.get_label() for handle in handles] if labels is None else list(labels)
+    wide = figure.get_figwidth() > NARROW
     figure.legend(
-        handles,
-        names,
-        loc="outside upper center",
-        ncols=len(names) if figure.get_figwidth() > NARROW else min(2, len(names)),
-        frameon=False,
-        fontsize="medium" if figure.get_figwidth() > NARROW else "small",
-    )
+        handles=handles, loc="outside upper center", frameon=False,
+        fontsize="medium" if wide else "small", ncols=len(handles) if wide else 2,
+    )  # fmt: skip
+
+
+def label(axes: Axes, text: str, at: tuple[float, float], **options: Any) -> None:
+    """Write a label beside a point of the data, by default 4 points to its right."""
+    how: dict[str, Any] = {"xytext": (4, 0), "textcoords": "offset points", "fontsize": 8}
+    axes.annotate(text, at, **how | options)
 
 
 def png(figure: Figure) -> bytes:

@@ -17,54 +17,54 @@ from pbrl_ppl.criticism import (
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
 
-#: A p-value below this is beyond what the asymptotic distribution of a statistic can say.
+#: The asymptotic distribution of a statistic is not accurate below this p-value.
 _SMALLEST_P = 1e-16
-#: A held-out error of more than this many times the noise is not what an adequate model has.
+#: A held-out error above this many times the noise needs an explanation.
 _TOO_LARGE = 1.5
 
 
-def verdict_in_words(findings: Loop) -> str:
-    """Return the verdict in a sentence or two, for a reader who knows no statistics."""
+def verdict_in_words(loop: Loop) -> str:
+    """Return the verdict in a sentence or two, for a reader without statistics."""
     found = joined(
         f"{added.sentence.rstrip('.')} ({plain(added.effect)}) on the {plain(added.body)}"
-        for added in findings.added
+        for added in loop.added
     )
-    left = findings.unexplained
+    left = loop.unexplained
     rest = "a pattern remains in the errors" if left is None else left.sentence.rstrip(".")
-    if findings.verdict == NOT_CONVERGED:
+    if loop.verdict == NOT_CONVERGED:
         return (
             "No verdict: the chains have not converged. Take more draws (--draws), or give the"
             " parameters tighter priors."
         )
-    if findings.verdict == ADEQUATE:
-        return _adequate(findings)
-    if findings.verdict == UNEXPLAINED and not found:
+    if loop.verdict == ADEQUATE:
+        return _adequate(loop)
+    if loop.verdict == UNEXPLAINED and not found:
         return f"Something is missing that no effect in the catalogue explains: {rest}."
-    if findings.verdict == UNEXPLAINED:
+    if loop.verdict == UNEXPLAINED:
         return (
             "Something is missing that no effect in the catalogue explains. The nearest that it has"
             f" is {found}; with that added, {rest}."
         )
     if left is not None:
         return f"Something was missing: {found}. A pattern remains that nothing explains: {rest}."
-    if len(findings.added) > 1:
-        return f"{len(findings.added)} things were missing: {found}."
+    if len(loop.added) > 1:
+        return f"{len(loop.added)} things were missing: {found}."
     return f"Something was missing: {found}."
 
 
-def _adequate(findings: Loop) -> str:
-    """Return how adequate the model is: what passed, and which negligible misfit is significant."""
-    tested = sum(test.tested for test in findings.tests)
+def _adequate(loop: Loop) -> str:
+    """Describe an adequate model: the tests that passed, and negligible but significant misfit."""
+    tested = sum(test.tested for test in loop.tests)
     passed = f"the declared model passes all {tested} tests of its residual"
-    if untested := [test.name for test in findings.tests if not test.tested]:
+    if untested := [test.name for test in loop.tests if not test.tested]:
         passed += f" that these data can fail (not {joined(untested, 'nor')})"
     # beside what was added the table of candidates has them
     small = "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
-        f" less than {100 * findings.criteria.negligible:g} %."
-        for one in findings.small
+        f" less than {100 * loop.criteria.negligible:g} %."
+        for one in loop.small
     )
-    remains = significant_acceleration(findings)
+    remains = significant_acceleration(loop)
     if remains > 0:
         return (
             f"Adequate to {percent(remains)} of the bodies' acceleration: {passed}. An acceleration"
@@ -75,34 +75,34 @@ def _adequate(findings: Loop) -> str:
     return f"{missing} found missing: {passed}.{small}"
 
 
-def significant_acceleration(findings: Loop) -> float:
+def significant_acceleration(loop: Loop) -> float:
     """Return the largest significant unexplained acceleration over that of the bodies, or 0."""
-    left = findings.acceleration
+    left = loop.acceleration
     sizes = (left.relative_after[name] for name, sure in left.certain_after.items() if sure)
     return max(sizes, default=0.0)
 
 
-def accepted(findings: Loop) -> tuple[Added, ...]:
-    """Return the added effects that the verdict stands for: none where it is another."""
-    stands = findings.verdict not in (UNEXPLAINED, NOT_CONVERGED)
-    return findings.added if stands else ()
+def accepted(loop: Loop) -> tuple[Added, ...]:
+    """Return the added effects if the verdict accepts them, or none."""
+    stands = loop.verdict not in (UNEXPLAINED, NOT_CONVERGED)
+    return loop.added if stands else ()
 
 
-def depends_on_records(findings: Loop) -> bool:
+def depends_on_records(loop: Loop) -> bool:
     """Return whether the residual depends on a recorded quantity: the dependence test failed."""
-    left = findings.unexplained
+    left = loop.unexplained
     return left is not None and not left.depends_on.startswith("nothing")
 
 
-def error_in_words(findings: Loop) -> str:
-    """Return what a held-out error means, where it alone would contradict the verdict."""
-    model, after = "revised" if findings.added else "declared", findings.after.normalised_rmse
-    if findings.unexplained is not None or significant_acceleration(findings):
+def error_in_words(loop: Loop) -> str:
+    """Explain a held-out error that seems to contradict the verdict; empty if none does."""
+    model, after = "revised" if loop.added else "declared", loop.after.normalised_rmse
+    if loop.unexplained is not None or significant_acceleration(loop):
         return (
             f"The unit is the noise fitted with the {model} model, which takes up what that leaves"
             " unexplained: an error of 1.00 does not mean that nothing is missing."
         )
-    if after > _TOO_LARGE and findings.verdict != NOT_CONVERGED:
+    if after > _TOO_LARGE and loop.verdict != NOT_CONVERGED:
         return (
             "The verdict is of the fitted recordings alone: the held-out ones differ from the"
             f" {model} model by {number(after)} times the noise (another load, wear, calibration?)."
@@ -110,22 +110,20 @@ def error_in_words(findings: Loop) -> str:
     return ""
 
 
-def rejected_in_words(findings: Loop) -> str:
+def rejected_in_words(loop: Loop) -> str:
     """Return why the leading significant candidates were not added."""
-    present = {(added.effect, added.body) for added in findings.added}
+    present = {(added.effect, added.body) for added in loop.added}
     reasons = [
         f"{plain(one.effect)} on the {plain(one.body)} ({one.why})"
-        for one in findings.candidates
-        if one.why
-        and one.p_value < findings.criteria.try_p
-        and (one.effect, one.body) not in present
+        for one in loop.candidates
+        if one.why and one.p_value < loop.criteria.try_p and (one.effect, one.body) not in present
     ]
     return f"Not added: {'; '.join(reasons[:TRIED])}." if reasons else ""
 
 
-def left_out_in_words(findings: Loop) -> str:
+def left_out_in_words(loop: Loop) -> str:
     """Return which bad frames were left out of the histories, the first few one by one."""
-    first, more = findings.bad_frames[:TRIED], len(findings.bad_frames) - TRIED
+    first, more = loop.bad_frames[:TRIED], len(loop.bad_frames) - TRIED
     rest = f"; and {more} more (report.json lists them)" if more > 0 else ""
     return f"{'; '.join(first)}{rest}." if first else ""
 

@@ -16,7 +16,6 @@ from pbrl_ppl import criticism
 from pbrl_ppl.cli import main, terminal
 from pbrl_ppl.criticism.loop import FILES, Loop
 from pbrl_ppl.errors import ConvergenceWarning, HistoryError
-from pbrl_ppl.report import write as loop_module
 from tests.helpers.made_up import made_up
 from tests.helpers.places import ROOT
 
@@ -59,7 +58,7 @@ def calls(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Any, Any, Any, dict[str
         return made_up()
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
-    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
+    monkeypatch.setattr("pbrl_ppl.report.render", lambda *args, **options: "a page")
     return seen
 
 
@@ -256,7 +255,7 @@ def test_warnings_are_one_line(
         return made_up()
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
-    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
+    monkeypatch.setattr("pbrl_ppl.report.render", lambda *args, **options: "a page")
     assert main(["close-loop", "scene.toml", "train.csv", "-o", "out", "-q"]) == 0
     assert capsys.readouterr().err.strip() == "warning: w_y did not converge"
 

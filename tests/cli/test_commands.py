@@ -224,7 +224,7 @@ def test_new_copies_a_model_with_its_recordings(capsys: pytest.CaptureFixture[st
     assert main(["new", "--from", "pendulum", "--overwrite"]) == 0
     assert "next: pbrl-ppl check scene.toml train.csv" in capsys.readouterr().out
     assert main(["new", "b.toml", "--from", "apartment"]) == 0  # no recording comes with it
-    assert "next, with a recording of your own: pbrl-ppl check" in capsys.readouterr().out
+    assert "next, with your recording: pbrl-ppl check" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("puck")

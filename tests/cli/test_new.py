@@ -11,7 +11,6 @@ import pytest
 from pbrl_ppl import criticism
 from pbrl_ppl.cli import main
 from pbrl_ppl.criticism import Loop
-from pbrl_ppl.report import write as loop_module
 from pbrl_ppl.scene import Scene
 from tests.helpers.made_up import made_up
 from tests.helpers.places import MODELS, ROOT
@@ -63,7 +62,7 @@ def test_three_commands_from_a_raw_table_to_a_verdict(
         return made_up()
 
     monkeypatch.setattr(criticism, "close_loop", close_loop)
-    monkeypatch.setattr(loop_module, "render", lambda *args, **options: "a page")
+    monkeypatch.setattr("pbrl_ppl.report.render", lambda *args, **options: "a page")
     known = "--known arm.mass=0.5 --declare arm=inertia_scale"
     assert run(f"new --history swing.csv {COLUMNS} {UNITS} {PENDULUM} {known}") == 0
     said = capsys.readouterr().out

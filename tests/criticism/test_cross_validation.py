@@ -13,6 +13,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories, log_prior
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.modes.laplace import Peak, finish
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.scene import Scene
 from tests.helpers.free_puck import DISC, Disc
 

@@ -392,8 +392,8 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
         warnings.warn("the chains have not converged", ConvergenceWarning, stacklevel=1)
         return SimpleNamespace(attrs={"max_rhat": 1.02, "min_ess": 350.0})
 
-    monkeypatch.setattr(loop_module, "fit", rough)
-    monkeypatch.setattr(loop_module, "build_model", lambda problem: problem)
+    monkeypatch.setattr("pbrl_ppl.sampling.fit", rough)
+    monkeypatch.setattr("pbrl_ppl.model.build_model", lambda problem: problem)
     mode = _Mode(SimpleNamespace(with_physics=lambda threads: None))
     task = SimpleNamespace(method=method, seed=1, draws=None, criteria=DEFAULT, say=print)
     with warnings.catch_warnings(record=True) as caught:

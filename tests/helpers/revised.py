@@ -28,14 +28,19 @@ def recordings() -> tuple[History, History]:
 @cache
 def revised() -> Loop:
     """Findings as made up, with the posteriors of a puck without drag and with it."""
-    train, _ = recordings()
+    train, test = recordings()
     drag = [effect for effect in catalogue if effect.name == "linear_drag"]
     models = (physics_model(DISC, train, e, trajectories=True) for e in ((), drag))
     before, after = (fit(m, method="laplace", seed=1, draws=100, progress=False) for m in models)
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
     added = Added("linear_drag", "puck", "a drag", 99.0, 1e-9, {"coefficient": size}, (), 9.0, 1.0)
     return replace(
-        made_up(), scene=DISC, added=(added,), posterior_before=before, posterior_after=after
+        made_up(),
+        scene=DISC,
+        added=(added,),
+        posterior_before=before,
+        posterior_after=after,
+        held_out=test,
     )
 
 
@@ -49,4 +54,5 @@ def unexplained() -> Loop:
         unexplained=left,
         posterior_before=before,
         posterior_after=before,
+        held_out=revised().held_out,
     )

@@ -7,7 +7,6 @@ import pytest
 
 from pbrl_ppl.criticism.dependence import FEATURES, PRODUCTS
 from pbrl_ppl.criticism.results import Unexplained
-from pbrl_ppl.effects import catalogue
 from pbrl_ppl.posterior import compare
 from pbrl_ppl.report.effect_plots import plot_evidence, plot_laws
 from pbrl_ppl.report.evidence import bin_means, find_evidence, find_laws
@@ -20,7 +19,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarn
 
 def test_evidence_adds_up_and_is_where_the_drag_is() -> None:
     findings = revised()
-    evidence = find_evidence(findings, catalogue)
+    evidence = find_evidence(findings)
     gain = compare(findings.posterior_before, findings.posterior_after).elpd_difference
     assert evidence.nats.shape == (72, 6)
     assert evidence.nats.sum() == pytest.approx(gain, rel=0.1)  # of likeliest draws, not left out
@@ -39,14 +38,14 @@ def test_evidence_adds_up_and_is_where_the_drag_is() -> None:
 
 
 def test_no_evidence_where_nothing_was_added_or_recorded() -> None:
-    assert find_evidence(unexplained(), catalogue) is None
-    assert find_evidence(made_up(), catalogue) is None
-    assert find_laws(revised(), catalogue) == []
-    assert find_laws(made_up("unexplained"), catalogue) == []
+    assert find_evidence(unexplained()) is None
+    assert find_evidence(made_up()) is None
+    assert find_laws(revised()) == []
+    assert find_laws(made_up("unexplained")) == []
 
 
 def test_the_law_that_is_wanted_is_the_drag() -> None:
-    laws = find_laws(unexplained(), catalogue)
+    laws = find_laws(unexplained())
     first = laws[0]
     assert (first.quantity, first.residual.dimension, first.residual.unit) == (
         "velocity x",
@@ -61,15 +60,15 @@ def test_the_law_that_is_wanted_is_the_drag() -> None:
     # where the test of dependence passed, or names another quantity, nothing speaks against it
     left = Unexplained("puck", "y", "nothing that was recorded", 0.5, 0.001, "y is off")
     for other in (left, replace(left, body=""), replace(left, depends_on="colour")):
-        assert find_laws(replace(unexplained(), unexplained=other), catalogue) == []
+        assert find_laws(replace(unexplained(), unexplained=other)) == []
     named = replace(left, depends_on="velocity y")
-    others = find_laws(replace(unexplained(), unexplained=named), catalogue)
+    others = find_laws(replace(unexplained(), unexplained=named))
     assert (others[0].quantity, others[0].residual.dimension) == ("velocity y", "vy")
 
 
 def test_a_law_may_follow_whatever_an_error_may_depend_on() -> None:
     left = replace(unexplained().unexplained, depends_on="position x × velocity x")
-    laws = find_laws(replace(unexplained(), unexplained=left), catalogue, most=100)
+    laws = find_laws(replace(unexplained(), unexplained=left), most=100)
     named = {law.quantity: law for law in laws}
     assert set(named) <= {*FEATURES, *PRODUCTS}
     x, v = (named[name].x for name in ("position x", "velocity x"))
@@ -86,7 +85,7 @@ def test_bins_hold_about_as_many_and_equal_values_share_one() -> None:
 
 def test_motions_are_those_of_the_recording_worst_first() -> None:
     findings, (_, test) = revised(), recordings()
-    motions = held_out_motions(findings, test, catalogue)
+    motions = held_out_motions(findings)
     before = [distance(findings.scene, motion, motion.before) for motion in motions]
     after = [distance(findings.scene, motion, motion.after) for motion in motions]
     assert len(motions) == 6 and before == sorted(before, reverse=True)
@@ -105,12 +104,13 @@ def test_motions_are_those_of_the_recording_worst_first() -> None:
         low, high = np.array(drawn["box"])
         assert (low < motion.measured[..., :2].min(axis=(0, 1))).all()
         assert (high > motion.measured[..., :2].max(axis=(0, 1))).all()
+    # y that was not measured is left out of the picture
+    measured = motions[0].measured.copy()
+    measured[10, 0, 1] = np.nan
+    gap = animation(findings, [replace(motions[0], measured=measured)])["motions"][0]
+    assert gap["measured"][10][0][1] is None and gap["before"][10][0][1] is not None
 
 
-def test_without_a_recording_the_findings_own_trajectory_is_played() -> None:
-    (motion,) = held_out_motions(made_up(), None, catalogue)
-    assert motion.before.shape == (31, 1, 3)
-    rollout = made_up().rollout
-    blind = replace(made_up(), rollout=replace(rollout, names=("q", *rollout.names[1:])))
-    assert held_out_motions(blind, None, catalogue) == []
-    assert animation(blind, []) is None
+def test_without_held_out_trajectories_nothing_is_played() -> None:
+    assert held_out_motions(made_up()) == []
+    assert animation(made_up(), []) is None

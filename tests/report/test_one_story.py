@@ -150,14 +150,14 @@ def test_limits_of_what_was_not_measured_are_left_out() -> None:
     blind = replace(findings, residuals_after=seen)
     bias = candidate("sensor_bias", x=0.01, y=0.01, theta=0.02, vx=0.3, vy=0.3, omega=0.1)
     positions = "x 0.0100 m, y 0.0100 m, theta 0.0200 rad"
-    assert limits_in_words(bias, blind, catalogue) == positions
+    assert limits_in_words(bias, blind) == positions
     velocities = "vx 0.300 m/s, vy 0.300 m/s, omega 0.100 rad/s"
-    assert limits_in_words(bias, findings, catalogue) == f"{positions}, {velocities}"
+    assert limits_in_words(bias, findings) == f"{positions}, {velocities}"
     text = text_of(replace(blind, candidates=(bias,)))
     assert "x 0.250 m, y 0.250 m, theta 0.250 rad 100 %" in text  # estimates too
     # a coordinate of another effect is no measurement
     offset = candidate("com_offset", x=0.01, y=0.02)
-    kept = limits_in_words(offset, replace(findings, residuals_after={}), catalogue)
+    kept = limits_in_words(offset, replace(findings, residuals_after={}))
     assert kept == "x 0.0100 m, y 0.0200 m"
 
 
@@ -165,7 +165,7 @@ def test_limits_beyond_the_prior_are_no_limits() -> None:
     findings = made_up()
 
     def said(one: Candidate) -> str:
-        return limits_in_words(one, findings, catalogue)
+        return limits_in_words(one, findings)
 
     # normal, sigma 20 N: 99.9 % are within 3.29 sigma, 65.8 N
     assert said(candidate("constant_force", force_x=60.0, force_y=116317.0)) == (
@@ -180,16 +180,16 @@ def test_limits_beyond_the_prior_are_no_limits() -> None:
     assert said(candidate("saturation", True, limit=8.0)) == "limit up to 8.00 N"
     assert said(candidate("saturation", True, limit=0.1)) == "no plausible size"
     # of an effect that is looked up nowhere the size alone is known
-    assert limits_in_words(candidate("dead_zone", threshold=1e4), findings, ()) == (
-        "threshold 10,000 N"
-    )
+    assert limits_in_words(
+        candidate("dead_zone", threshold=1e4), replace(findings, catalogue=())
+    ) == ("threshold 10,000 N")
     own = Effect(
         "dead_zone", (EffectParameter("threshold", "N", Prior("half_normal", sigma=1e5)),), "",
         "", catalogue[0].stage,
     )  # fmt: skip
-    assert limits_in_words(candidate("dead_zone", threshold=1e4), findings, [own]) == (
-        "threshold 10,000 N"
-    )
+    assert limits_in_words(
+        candidate("dead_zone", threshold=1e4), replace(findings, catalogue=(own,))
+    ) == ("threshold 10,000 N")
 
 
 def test_gains_name_what_changed() -> None:

@@ -14,7 +14,7 @@ from pbrl_ppl.report import render_posterior
 from pbrl_ppl.report.report import render
 from tests.helpers.fleet import many_page
 from tests.helpers.html import Page, stands_alone
-from tests.helpers.revised import recordings, revised
+from tests.helpers.revised import revised
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 pytestmark = [
@@ -44,7 +44,7 @@ def browser() -> Iterator[Any]:
 def files(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
     pages = {
-        "loop": render(revised(), recordings()[1]),
+        "loop": render(revised()),
         "posterior": render_posterior(revised().posterior_after),
         "many": many_page(folder / "logs")[0],
     }

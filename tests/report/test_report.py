@@ -20,16 +20,15 @@ from pbrl_ppl.parameters import BODY_PARAMETERS
 from pbrl_ppl.posterior.cross_validation import Comparison, LeaveOneOut
 from pbrl_ppl.posterior.identifiability import Direction, Identifiability, Width
 from pbrl_ppl.report import page as page_module
-from pbrl_ppl.report import write as write_module
 from pbrl_ppl.report.error_plots import plot_rollout, unwrap
 from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.posterior_tables import PARAMETERS
 from pbrl_ppl.report.report import render
 from pbrl_ppl.report.words import number, rejected_in_words, verdict_in_words
-from pbrl_ppl.report.write import loop_page
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
+from tests.helpers.revised import revised, unexplained
 
 
 @pytest.fixture
@@ -46,14 +45,21 @@ def page(verdict: str) -> Page:
 @pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("verdict", ["adequate", "effects-added", "unexplained"])
 def test_page_stands_alone(verdict: str) -> None:
-    stands_alone(html := render(made_up(verdict)), pictures=9 if verdict == "effects-added" else 8)
-    motion = Page(html).motion
-    assert motion["models"] == (["before", "after"] if verdict == "effects-added" else ["before"])
-    (played,) = motion["motions"]
-    assert np.shape(played["measured"]) == (31, 1, 3) == np.shape(played["before"])
-    assert played["measured"][10][0][1] is None  # it was not measured there
-    assert played["time"] == sorted(played["time"])
-    assert (played["distance"][0] > 0.2) == (verdict == "effects-added")
+    stands_alone(render(made_up(verdict)), pictures=9 if verdict == "effects-added" else 8)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
+def test_page_plays_the_held_out_motions() -> None:
+    for loop, models in ((revised(), ["before", "after"]), (unexplained(), ["before"])):
+        stands_alone(html := render(loop), pictures=11 if len(models) == 2 else 10)
+        motion = Page(html).motion
+        assert motion["models"] == models
+        assert len(motion["motions"]) == 6
+        for played in motion["motions"]:
+            assert np.shape(played["measured"]) == (13, 1, 3) == np.shape(played["before"])
+            assert played["time"] == sorted(played["time"])
+        assert motion["motions"][0]["distance"][0] > 0.2
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -231,7 +237,8 @@ def test_names_from_files_are_escaped() -> None:
     findings = made_up("unexplained")
     remains = replace(findings.unexplained, body="<script>alert(1)</script>", sentence="a<b>&")
     html = render(replace(findings, unexplained=remains))
-    assert Page(html).tags.count("script") == 2  # the motion's data, and what plays them
+    assert Page(html).tags.count("script") == 1  # it opens details in print
+    assert "<" not in page_module._data({"name": "</script><script>alert(1)"})
     assert "a<b>&" in Page(html).text
 
 
@@ -337,7 +344,7 @@ def test_loop_says_what_it_found() -> None:
 def test_save_writes_the_contract(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "out"
     loop = made_up()
-    assert loop.save(folder, page=loop_page(loop)) == folder
+    assert loop.save(folder, page=render(loop)) == folder
     assert sorted(p.name for p in folder.iterdir()) == sorted(FILES)
     assert [p.name for p in tmp_path.iterdir()] == ["new"]
     got = json.loads((folder / "report.json").read_text())
@@ -446,10 +453,10 @@ def test_folder_that_cannot_be(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         made_up().save(tmp_path / "new")
 
 
-def test_report_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(write_module, "render", lambda *args, **options: "a page")
+@pytest.mark.usefixtures("undrawn")
+def test_report_alone(tmp_path: Path) -> None:
     path = pp.report(made_up(), tmp_path / "report.html")
-    assert path.read_text() == "a page"
+    assert path.read_text(encoding="utf-8") == render(made_up())
     for place in (tmp_path, tmp_path / "none" / "report.html"):
         with pytest.raises(OutputError, match="cannot be written"):
             pp.report(made_up(), place)
