@@ -109,11 +109,12 @@ def rooms() -> dict[str, str]:
 
 def commands() -> str:
     """Return the page of all commands with their arguments and options."""
-    from pbrl_ppl.cli.app import COMMANDS, app
+    from pbrl_ppl.cli.app import app
+    from pbrl_ppl.cli.commands import commands
 
     text = ["# Commands", "", app.info.epilog or ""]
     made = typer.main.get_command(app).commands
-    for name, (_, example) in COMMANDS.items():
+    for name, example in ((each.name, each.example) for each in commands()):
         text += ["", f"## pbrl-ppl {name}", "", made[name].help or "", "", f"    {example}", ""]
         text += ["| argument or option | |", "|---|---|"]
         for each in made[name].params:

@@ -4,39 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 
 import typer
 
 from pbrl_ppl import __version__
-from pbrl_ppl.cli.calibrate import calibrate
-from pbrl_ppl.cli.check import check, criticise
-from pbrl_ppl.cli.close_loop import close_loop
-from pbrl_ppl.cli.doctor import doctor
-from pbrl_ppl.cli.fit import fit, update
-from pbrl_ppl.cli.new import new
-from pbrl_ppl.cli.plan import plan, suggest
-from pbrl_ppl.cli.report import report
-from pbrl_ppl.cli.simulate import simulate
+from pbrl_ppl.cli.commands import commands
 from pbrl_ppl.cli.terminal import BAD_INPUT, in_options, interrupted, warnings_in_a_line
 from pbrl_ppl.errors import PbrlError
-
-#: The commands, in the order of use, and an example of each for its help.
-COMMANDS: dict[str, tuple[Callable[..., None], str]] = {
-    "new": (new, "pbrl-ppl new scene.toml --history train.csv --body cart=box:0.9x0.55"),
-    "check": (check, "pbrl-ppl check scene.toml train.csv"),
-    "fit": (fit, "pbrl-ppl fit scene.toml train.csv -o cart.nc"),
-    "criticise": (criticise, "pbrl-ppl criticise scene.toml train.csv"),
-    "close-loop": (close_loop, "pbrl-ppl close-loop scene.toml train.csv -o report/"),
-    "suggest": (suggest, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv"),
-    "report": (report, "pbrl-ppl report cart.nc"),
-    "update": (update, "pbrl-ppl update cart.nc since.csv -o new.nc"),
-    "plan": (plan, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv"),
-    "simulate": (simulate, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20"),
-    "calibrate": (calibrate, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4"),
-    "doctor": (doctor, "pbrl-ppl doctor --json"),
-}
 
 app = typer.Typer(
     name="pbrl-ppl",
@@ -48,8 +24,8 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-for name, (command, example) in COMMANDS.items():
-    app.command(name, epilog=f"Example: {example}")(command)
+for each in commands():
+    app.command(each.name, epilog=f"Example: {each.example}")(each.function)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

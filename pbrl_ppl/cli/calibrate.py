@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result
 
 if TYPE_CHECKING:
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.sampling import Calibration
 
 
+@command("calibrate", 11, "pbrl-ppl calibrate scene.toml train.csv -o ranks/ --jobs 4")
 def calibrate(
     scene: options.SceneFile,
     history: Annotated[

@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import interruptible, print_json, print_table, stages
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
 
 
+@command("check", 2, "pbrl-ppl check scene.toml train.csv")
 def check(
     scene: options.SceneFile,
     history: options.HistoryFile,
@@ -122,6 +124,7 @@ def _missing_table(missing: dict[str, dict[str, int]], rows: int) -> Table:
     return table
 
 
+@command("criticise", 4, "pbrl-ppl criticise scene.toml train.csv")
 def criticise(
     scene: options.SceneFile,
     history: options.HistoryFile,

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import (
     FAILED,
     UNDECIDED,
@@ -37,6 +38,7 @@ class Method(StrEnum):
     LAPLACE = "laplace"
 
 
+@command("close-loop", 5, "pbrl-ppl close-loop scene.toml train.csv -o report/")
 def close_loop(
     context: typer.Context,
     output: Annotated[

@@ -13,12 +13,14 @@ import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import FAILED, interruptible, print_result, stages
 
 #: The compiled and the plain path agree to rounding.
 _AGREE = 1e-9
 
 
+@command("doctor", 12, "pbrl-ppl doctor --json")
 def doctor(as_json: options.AsJson = False, quiet: options.Quiet = False) -> None:
     """Report versions, whether the compiled engine loop works, and the number of threads.
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import (
     INTERRUPTED,
     UNDECIDED,
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
+@command("fit", 3, "pbrl-ppl fit scene.toml train.csv -o cart.nc")
 def fit(
     scene: options.SceneFile,
     history: options.HistoryFile,
@@ -174,6 +176,7 @@ def _rows(table: pd.DataFrame) -> list[list[str]]:
     ]
 
 
+@command("update", 8, "pbrl-ppl update cart.nc since.csv -o new.nc")
 def update(
     posterior: Annotated[
         Path, typer.Argument(metavar="POSTERIOR", help="Posterior file (.nc); it has the scene.")

@@ -14,6 +14,7 @@ import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.scene_text import (
     HINGE,
     SHAPES,
@@ -132,6 +133,7 @@ def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]
 _MODELS = (Path(__file__).parents[1] / "models", Path(__file__).parents[2] / "models")
 
 
+@command("new", 1, "pbrl-ppl new scene.toml --history train.csv --body cart=box:0.9x0.55")
 def new(
     scene: Annotated[Path, typer.Argument(metavar="SCENE", help="The file to write.")] = Path(
         "scene.toml"

@@ -9,10 +9,12 @@ from typing import Annotated, Any
 import typer
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import FAILED, check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import GoalError
 
 
+@command("plan", 9, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
 def plan(
     posterior: options.PosteriorFile,
     start: options.Starts = None,
@@ -125,6 +127,7 @@ def plan(
         raise typer.Exit(FAILED)
 
 
+@command("suggest", 6, "pbrl-ppl suggest report/after.nc --start 0,0,0 -o next.csv")
 def suggest(
     posterior: Annotated[
         Path,

@@ -8,11 +8,13 @@ from typing import Annotated
 import typer
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.files import write_text
 
 
+@command("report", 7, "pbrl-ppl report cart.nc")
 def report(
     context: typer.Context,
     posterior: options.PosteriorFile,

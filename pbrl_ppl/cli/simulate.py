@@ -10,6 +10,7 @@ import numpy as np
 import typer
 
 from pbrl_ppl.cli import options
+from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import HistoryError, ParameterError, PosteriorError, SimulationError
 from pbrl_ppl.state import STATE, Floats
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from pbrl_ppl.scene import Scene
 
 
+@command("simulate", 10, "pbrl-ppl simulate cart.nc plan.csv -o predicted.csv --draws 20")
 def simulate(
     source: Annotated[
         Path,

@@ -19,7 +19,8 @@ import typer
 
 from pbrl_ppl import criticism, sampling
 from pbrl_ppl.cli import main
-from pbrl_ppl.cli.app import COMMANDS, _options_of, app
+from pbrl_ppl.cli.app import _options_of, app
+from pbrl_ppl.cli.commands import commands
 from pbrl_ppl.cli.scene_text import _HEAD
 from pbrl_ppl.cli.terminal import warnings_in_a_line
 from pbrl_ppl.errors import BoundWarning, ConvergenceWarning, FitError
@@ -78,12 +79,15 @@ def message(capsys: pytest.CaptureFixture[str], *argv: str) -> str:
     return captured.err
 
 
+NAMES = [each.name for each in commands()]
+
+
 # what all have alike
 
 
 def test_every_help_has_an_example_that_parses() -> None:
     group = typer.main.get_command(app)
-    assert set(group.commands) >= set(COMMANDS)
+    assert set(group.commands) >= set(NAMES)
     for name, command in group.commands.items():
         assert command.epilog and command.epilog.startswith("Example: pbrl-ppl "), name
         words = shlex.split(command.epilog.removeprefix("Example: "))
@@ -95,14 +99,14 @@ def test_options_are_alike() -> None:
     """All can be quiet and answer in JSON; what is random has a seed."""
     for name, command in typer.main.get_command(app).commands.items():
         options = {option for parameter in command.params for option in parameter.opts}
-        if name in COMMANDS:
+        if name in NAMES:
             assert {"--json", "--quiet"} <= options, name
         if "--draws" in options:
             assert "--seed" in options, name
     drawing = {"check", "fit", "close-loop", "plan", "suggest", "simulate", "calibrate"}
-    commands = typer.main.get_command(app).commands
+    group = typer.main.get_command(app).commands
     assert {
-        name for name in COMMANDS if any("--draws" in each.opts for each in commands[name].params)
+        name for name in NAMES if any("--draws" in each.opts for each in group[name].params)
     } == drawing
 
 
