@@ -38,7 +38,7 @@ def inputs(op: SimulatorOp, n: int = 12, horizon: int = 2) -> tuple[np.ndarray, 
 
 
 def expected(op: SimulatorOp, *values: np.ndarray) -> np.ndarray:
-    return Simulator(op.physics.changed(substeps=op.physics.substeps))(*values)
+    return Simulator(op.physics)(*values)  # with worlds of its own
 
 
 def compiled(op: SimulatorOp, mode: str | None):
@@ -295,3 +295,22 @@ def test_every_catalogue_effect_compiles_into_the_op() -> None:
     _, start, actions = inputs(make())
     got = op(phi, start, actions).eval()
     np.testing.assert_array_equal(got, expected(op, phi, start, actions))
+
+
+# -- one engine ------------------------------------------------------------------------------------
+
+
+def test_an_engine_can_be_forced() -> None:
+    op = make()
+    values = inputs(op)
+    values[1][..., 0] -= 20.0  # far from the wall
+    chipmunk, fast = (SimulatorOp(op.physics, engine=e) for e in ("chipmunk", "contact-free"))
+    assert chipmunk != op and chipmunk == SimulatorOp(op.physics, engine="chipmunk")
+    np.testing.assert_array_equal(fast.predict(*values), op.predict(*values))
+    np.testing.assert_allclose(chipmunk.predict(*values), op.predict(*values), atol=1e-11)
+
+
+def test_ops_of_one_physics_share_its_worlds() -> None:
+    op = make()
+    other = SimulatorOp(op.physics)
+    assert other.physics.simulator is op.physics.simulator

@@ -242,3 +242,19 @@ def test_calls_at_the_same_time_do_not_disturb_each_other() -> None:
         [sys.executable, "-c", CODE], cwd=ROOT, timeout=60, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
+
+
+def test_chipmunk_alone_agrees(case) -> None:
+    name, sim, phi, start, actions, expected = case
+    got = like(sim, engine="chipmunk")(phi, start, actions)
+    np.testing.assert_allclose(got, expected, rtol=TOLERANCE[name], atol=TOLERANCE[name])
+
+
+def test_the_fast_path_alone_refuses_contacts() -> None:
+    sim, start, actions = CASES["free"]()
+    phi = proposals(sim.physics.layout, 3)
+    alone = like(sim, engine="contact-free")
+    np.testing.assert_array_equal(alone(phi, start, actions), sim(phi, start, actions))
+    sim, start, actions = CASES["walls"]()
+    with pytest.raises(SimulationError, match="have contacts"):
+        like(sim, engine="contact-free")(proposals(sim.physics.layout, 1), start, actions)
