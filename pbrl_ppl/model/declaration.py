@@ -41,18 +41,23 @@ class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
     ----------
     problem : Problem
         Data, physics, likelihood and prior, which samplers evaluate in numpy.
+    mode : Mode, optional
+        The mode that whole trajectories are linearised at, where a fit may begin.
     """
 
-    def __init__(self, problem: Problem) -> None:
+    def __init__(self, problem: Problem, mode: Any = None) -> None:
         super().__init__(coords=_coords(problem))
-        self.problem = problem
+        self.problem, self.mode = problem, mode
 
 
-def build_model(problem: Problem) -> PhysicsModel:
-    """Declare the pm.Model of a problem; see :func:`pbrl_ppl.physics_model`."""
+def build_model(problem: Problem, mode: Any = None) -> PhysicsModel:
+    """Declare the pm.Model of a problem; see :func:`pbrl_ppl.physics_model`.
+
+    ``mode`` is that of :class:`PhysicsModel`.
+    """
     observations, segments, physics = problem.observations, problem.segments, problem.physics
     sensitivity = problem.likelihood.sensitivity
-    model = PhysicsModel(problem)
+    model = PhysicsModel(problem, mode)
     with model:
         start = pm.Data("start", segments.start, dims=("transition", "body", "full_state"))
         actions = pm.Data("actions", problem.inputs, dims=("transition", "step", "body", "wrench"))

@@ -125,8 +125,7 @@ def physics_model(
         else:  # the mode that is reached from the given one
             mode = following(trajectory_mode(problem, around.phi))
         problem = mode.problem
-    model = build_model(problem)
-    model.mode = mode
+    model = build_model(problem, mode)
     if mode is not None:  # chains of pm.sample begin there
         for name, value in problem.named(mode.phi, mode.sigma).items():
             model.set_initval(model[name], value)

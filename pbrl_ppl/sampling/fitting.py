@@ -179,7 +179,7 @@ def fit(
         trace = sampled(model, *from_posterior(problem, resume))
         point = stored_mode(problem, resume)
     else:
-        held: Mode | None = getattr(model, "mode", None)  # of physics_model
+        held: Mode | None = model.mode
         whole = isinstance(problem.likelihood, TrajectoryLikelihood)
         search = find_trajectory_mode if whole else find_mode
         mode = start or held or search(problem, seed=seed)
