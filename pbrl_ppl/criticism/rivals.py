@@ -18,7 +18,7 @@ from pbrl_ppl.effects import Attached, Effect, Noise
 from pbrl_ppl.errors import EffectError, PosteriorError
 from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import Mode, trajectory_mode
-from pbrl_ppl.posterior import likeliest_draw, parameter_draws, problem_of
+from pbrl_ppl.posterior import best_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -126,7 +126,7 @@ def posterior_mode(posterior: Any, catalogue: Iterable[Effect]) -> Mode:
             " process noise; take after.nc of close_loop, or fit with trajectories=True"
         )
     phi, sigma = parameter_draws(problem, posterior)
-    best = likeliest_draw(posterior)
+    best = best_draw(posterior)
     return trajectory_mode(problem, phi[best], sigma[best])
 
 

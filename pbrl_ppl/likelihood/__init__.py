@@ -1,8 +1,8 @@
 """Likelihoods in numpy: data, noise, Eq. 11, whole trajectories and the log-posterior."""
 
 from .cells import ACCELERATION as ACCELERATION
+from .cells import CONTACT as CONTACT
 from .cells import DRIFT as DRIFT
-from .cells import JOLT as JOLT
 from .cells import Cells as Cells
 from .cells import cells_of as cells_of
 from .cells import check_moves as check_moves

@@ -17,7 +17,7 @@ from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
 #: Variable of the process noise: the unexplained acceleration.
 ACCELERATION = "unexplained_acceleration"
 #: Variable of the process noise that contacts add.
-JOLT = "contact_acceleration"
+CONTACT = "contact_acceleration"
 #: Variable of measurement noise that is correlated from row to row, as of a tracker.
 DRIFT = "correlated_error"
 
@@ -41,7 +41,7 @@ class Cells:
         velocity, shape (push, cell).
     pushed : ndarray of int
         Place of the noise parameter that scales each row, shape (push,).
-    sensors, rates, jolts, drifts : tuple of int
+    sensors, rates, contacts, drifts : tuple of int
         State dimensions of the noise parameters: measurement noise, unexplained accelerations,
         accelerations that contacts add, correlated measurement noise.
     memory : float
@@ -56,17 +56,20 @@ class Cells:
     pushed: Ints
     sensors: tuple[int, ...]
     rates: tuple[int, ...]
-    jolts: tuple[int, ...] = ()
+    contacts: tuple[int, ...] = ()
     drifts: tuple[int, ...] = ()
     memory: float = 0.0
 
     @property
     def variables(self) -> dict[str, tuple[str, ...]]:
         """Noise variables with their state dimensions, in the order of sigma."""
-        own = {
-            "sigma": self.sensors, ACCELERATION: self.rates, JOLT: self.jolts, DRIFT: self.drifts,
-        }  # fmt: skip
-        return {name: tuple(STATE[d] for d in about) for name, about in own.items() if about}
+        dimensions = {
+            "sigma": self.sensors,
+            ACCELERATION: self.rates,
+            CONTACT: self.contacts,
+            DRIFT: self.drifts,
+        }
+        return {name: tuple(STATE[d] for d in own) for name, own in dimensions.items() if own}
 
     @property
     def accelerations(self) -> range:
@@ -76,7 +79,7 @@ class Cells:
     @property
     def drift_parameters(self) -> range:
         """Places of the noise parameters of correlated measurement noise."""
-        first = len(self.sensors) + len(self.rates) + len(self.jolts)
+        first = len(self.sensors) + len(self.rates) + len(self.contacts)
         return range(first, first + len(self.drifts))
 
     def drifting(self, memory: float) -> Cells:
@@ -232,8 +235,8 @@ def cells_of(scene: Scene, history: History) -> Cells:
     dt = scene.time_step
     ways = first_states(history)
     begin, end = (s.reshape(-1, *s.shape[2:]) for s in (ways[:, :-1], ways[:, 1:]))
-    jolted = bool(touching(scene, begin, end).any())
-    kinds = product(range(1 + jolted), range(len(scene.moving)))
+    touched = bool(touching(scene, begin, end).any())
+    kinds = product(range(1 + touched), range(len(scene.moving)))
     for kind, b in kinds:
         for j, d in enumerate(rates):
             if free[b, d] and not still[b, d]:
@@ -252,7 +255,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
         np.array(pushed, dtype=np.intp),
         tuple(int(d) for d in sensors),
         tuple(int(d) for d in rates),
-        tuple(int(d) for d in rates) if jolted else (),
+        tuple(int(d) for d in rates) if touched else (),
     )
 
 

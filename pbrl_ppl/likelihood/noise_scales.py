@@ -11,7 +11,7 @@ from pbrl_ppl.state import STATE, THETA, Floats
 
 #: Medians of the log-normal priors of errors of measuring and of contact accelerations, as shares
 #: of what the states do in a step, and their log-scale.
-SENSOR_SHARE, JOLT_SHARE, SPREAD = 0.1, 0.1, 2.0
+SENSOR_SHARE, CONTACT_SHARE, SPREAD = 0.1, 0.1, 2.0
 #: An unexplained acceleration is larger than this share of the bodies' acceleration with so much
 #: probability: physics is nearly deterministic, and a random force follows whatever is smooth.
 ACCELERATION_SHARE, ACCELERATION_CHANCE = 0.1, 0.01
@@ -35,9 +35,9 @@ def noise_medians(cells: Cells, history: History, states: Floats) -> Floats:
     dt = float(history.dataset.attrs["time_step"])
     sensors = SENSOR_SHARE * seen[list(cells.sensors)]
     steps = ACCELERATION_SHARE * _MEDIAN * _vectors(each, cells.rates) / dt
-    jolts = JOLT_SHARE * each[list(cells.jolts)] / dt
+    contacts = CONTACT_SHARE * each[list(cells.contacts)] / dt
     drifts = DRIFT_SHARE * _MEDIAN * ranges(cells, history, states)
-    return np.asarray(np.maximum(np.concatenate([sensors, steps, jolts, drifts]), 1e-9))
+    return np.asarray(np.maximum(np.concatenate([sensors, steps, contacts, drifts]), 1e-9))
 
 
 def ranges(cells: Cells, history: History, states: Floats) -> Floats:

@@ -59,7 +59,7 @@ def along_trajectories(
     """
     history = problem.data.history
     states = first_states(history)
-    states = foreseen(problem.on(replace(problem.data, horizon=1, states=states)), phi)
+    states = with_predicted_gaps(problem.on(replace(problem.data, horizon=1, states=states)), phi)
     given = cells is not None
     if cells is None:
         cells = cells_of(problem.scene, history)
@@ -111,7 +111,9 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # diverged: keep the last linearisation
         problem = replace(problem, data=replace(problem.data, states=states))
-        problem = replace(problem, data=replace(problem.data, states=foreseen(problem, phi)))
+        problem = replace(
+            problem, data=replace(problem.data, states=with_predicted_gaps(problem, phi))
+        )
         problem = problem.along(_sloped(problem, cells, phi, sigma, spread))
         shown = after[noise.seen.any(axis=1)]
         if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
@@ -148,7 +150,7 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     return problem.along(replace(noise, sensitivity=follow))
 
 
-def foreseen(problem: Problem, phi: Floats) -> Floats:
+def with_predicted_gaps(problem: Problem, phi: Floats) -> Floats:
     """Return linearised states, with unobserved rows predicted from the row before.
 
     Interpolation between rows that are far apart would miss contacts.
@@ -205,7 +207,7 @@ def _guess(problem: Problem, cells: Cells, phi: Floats) -> Floats:
     }
     dt = problem.scene.time_step
     guess = [by_dimension[d] / np.sqrt(2) for d in cells.sensors]
-    guess += [by_dimension[d] / np.sqrt(2) / dt for d in (*cells.rates, *cells.jolts)]
+    guess += [by_dimension[d] / np.sqrt(2) / dt for d in (*cells.rates, *cells.contacts)]
     guess += [by_dimension[d] / np.sqrt(2) for d in cells.drifts]
     return np.maximum(guess, problem.noise_prior[0] * 0.01)
 
@@ -277,7 +279,7 @@ def linearised(problem: Problem, cells: Cells, slope: Floats, sigma: Floats) -> 
 def _touching(problem: Problem, cells: Cells) -> Bools:
     """Return the mask of transitions with contact, shape (transition,)."""
     segments, states = problem.segments, problem.data.smoothed_states
-    if not cells.jolts:
+    if not cells.contacts:
         return np.zeros(segments.n, dtype=bool)
     trajectory, step = segments.trajectory, segments.step
     return touching(problem.scene, states[trajectory, step], states[trajectory, step + 1])

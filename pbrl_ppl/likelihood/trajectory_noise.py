@@ -241,7 +241,7 @@ class TrajectoryNoise:
         end, begin = every[..., : residual.shape[1]]
         return end, np.where(self.first[:, None] & ~(self.wide > 0), begin, 0.0)
 
-    def foreseen(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+    def predictive(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return the one-step predictive mean and covariance of each measurement, as deviations.
 
         Parameters
@@ -279,7 +279,7 @@ class TrajectoryNoise:
         sigma : ndarray
             Noise parameters, shape (parameter,).
         """
-        mean, covariance = self.foreseen(self.cells.of_residual(linearised - predicted), sigma)
+        mean, covariance = self.predictive(self.cells.of_residual(linearised - predicted), sigma)
         factor = np.linalg.cholesky(covariance)
         drawn = mean + np.einsum("kab,kb->ka", factor, rng.standard_normal(mean.shape))
         result = linearised.copy()

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.likelihood import (
     ACCELERATION,
+    CONTACT,
     DRIFT,
-    JOLT,
     Likelihood,
     Observations,
     Problem,
@@ -30,7 +30,7 @@ from pbrl_ppl.state import INPUT, STATE
 
 #: Dimensions of the noise variables along trajectories.
 _NOISE_DIMS = {
-    "sigma": "sensor", ACCELERATION: "velocity", JOLT: "velocity", DRIFT: "position",
+    "sigma": "sensor", ACCELERATION: "velocity", CONTACT: "velocity", DRIFT: "position",
 }  # fmt: skip
 
 

@@ -13,7 +13,7 @@ from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, estimate_sigma
 from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, gaussian_profile
 from pbrl_ppl.modes.threads import one_blas_thread
-from pbrl_ppl.parameters import box, inside, likeliest, prior_draws
+from pbrl_ppl.parameters import box, inside, most_probable_wheels, prior_draws
 from pbrl_ppl.state import Floats
 
 #: Transitions used to tell basins apart, and how many of the best are searched with all data; with
@@ -148,7 +148,7 @@ def _distinct(problem: Problem, found: list[Peak]) -> list[Peak]:
     Equivalent wheels and uninformed directions are connected; mirror images are not: they predict
     the same, but points between them do not.
     """
-    folded = likeliest(problem.layout, np.array([peak.phi for peak in found]))
+    folded = most_probable_wheels(problem.layout, np.array([peak.phi for peak in found]))
     z = problem.whitened(folded, found[0].sigma)
     z = np.nan_to_num(z, nan=FAR_OFF)
     kept: dict[int, Floats] = {}

@@ -21,6 +21,6 @@ from .wheel_symmetry import evened as evened
 from .wheel_symmetry import fold_draws as fold_draws
 from .wheel_symmetry import fold_wheels as fold_wheels
 from .wheel_symmetry import gathered as gathered
-from .wheel_symmetry import likeliest as likeliest
+from .wheel_symmetry import most_probable_wheels as most_probable_wheels
 from .wheel_symmetry import redescribed as redescribed
 from .wheel_symmetry import wheels as wheels

@@ -161,7 +161,7 @@ def fold_wheels(layout: Layout, phi: Floats) -> Floats:
     return phi
 
 
-def likeliest(layout: Layout, phi: Floats) -> Floats:
+def most_probable_wheels(layout: Layout, phi: Floats) -> Floats:
     """Return each wheel in its most probable description; ties go as in `fold_wheels`.
 
     Parameters

@@ -36,6 +36,7 @@ from .record import scene_of as scene_of
 from .record import vectors as vectors
 from .store import DATATREE as DATATREE
 from .store import HDI_PROB as HDI_PROB
+from .store import best_draw as best_draw
 from .store import convergence as convergence
 from .store import draws as draws
 from .store import from_groups as from_groups
@@ -43,7 +44,6 @@ from .store import group as group
 from .store import groups as groups
 from .store import interval as interval
 from .store import labelled_draws as labelled_draws
-from .store import likeliest_draw as likeliest_draw
 from .store import load_posterior as load_posterior
 from .store import save_posterior as save_posterior
 from .store import scalars as scalars

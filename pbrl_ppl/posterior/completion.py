@@ -19,8 +19,8 @@ from pbrl_ppl.errors import (
 )
 from pbrl_ppl.likelihood import (
     ACCELERATION,
+    CONTACT,
     DRIFT,
-    JOLT,
     Problem,
     TrajectoryLikelihood,
     exponential,
@@ -418,7 +418,7 @@ def _with_units(problem: Problem, posterior: xr.Dataset) -> xr.Dataset:
     units = {block.name: block.unit for block in problem.layout.blocks}
     units["sigma"] = "the unit of each state dimension"
     if isinstance(problem.likelihood, TrajectoryLikelihood):
-        units |= dict.fromkeys((ACCELERATION, JOLT), "m/s^2, of omega rad/s^2")
+        units |= dict.fromkeys((ACCELERATION, CONTACT), "m/s^2, of omega rad/s^2")
         units[DRIFT] = "the unit of each position"
     for name in units.keys() & set(posterior.data_vars):
         posterior[str(name)].attrs["units"] = units[str(name)]

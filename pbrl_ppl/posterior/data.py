@@ -26,7 +26,7 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, vectors
-from pbrl_ppl.posterior.store import from_groups, group, groups, likeliest_draw
+from pbrl_ppl.posterior.store import best_draw, from_groups, group, groups
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import INPUT, STATE
 
@@ -140,9 +140,9 @@ def problem_of(
     stored = with_recording(problem, given, record.data_sha256)
     if not other or isinstance(stored.likelihood, TransitionLikelihood):
         return stored
-    # linearised at the posterior's likeliest draw
+    # linearised at the posterior's best draw
     phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
-    best = likeliest_draw(idata)
+    best = best_draw(idata)
     problem = along_trajectories(problem, phi[best], sigma[best], stored.trajectory_noise.cells)
     return with_sensitivity(problem, phi[best], sigma[best])
 

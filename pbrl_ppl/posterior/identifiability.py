@@ -15,7 +15,7 @@ from pbrl_ppl.modes import Mode, posterior_steps
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
-from pbrl_ppl.posterior.store import group, labelled_draws, likeliest_draw
+from pbrl_ppl.posterior.store import best_draw, group, labelled_draws
 from pbrl_ppl.state import STATE, Floats
 
 INFORMED, WEAK, PRIOR_ONLY = "informed", "weak", "prior only"
@@ -310,14 +310,14 @@ def _sparse(rows: Floats) -> Floats:
 
 
 def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Floats, Floats]:
-    """Return the layout, the likeliest draw, and the whitened residual's derivative there."""
+    """Return the layout, the best draw, and the whitened residual's derivative there."""
     record = PosteriorRecord.of(idata)
     physics = Physics(record.scene, record.attached(effects), record.substeps, threads=2)
     layout = physics.layout
     data, measured = group(idata, "constant_data"), group(idata, "observed_data")["next_state"]
     columns = tuple(STATE.index(name) for name in record.measured)
     observations = Observations(measured.to_numpy(), columns)
-    best = likeliest_draw(idata)
+    best = best_draw(idata)
     draws = labelled_draws(idata)
     phi = inside(layout.priors, np.array([draws[label][best] for label in layout.labels]))
     stated = dict.fromkeys(observations.names, np.inf) | dict(record.scene.noise)

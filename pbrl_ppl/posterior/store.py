@@ -50,7 +50,7 @@ def groups(idata: Any) -> dict[str, xr.Dataset]:
     return {name: idata[name] for name in idata.groups()}
 
 
-def likeliest_draw(idata: Any) -> int:
+def best_draw(idata: Any) -> int:
     """Return the index of the draw of highest likelihood, in the order of :func:`draws`."""
     likelihood = group(idata, "log_likelihood")["next_state"].sum("transition")
     return int(likelihood.transpose("chain", "draw").to_numpy().argmax())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import group, problem_of
-from pbrl_ppl.report.motion import likeliest
+from pbrl_ppl.report.motion import best_vectors
 from pbrl_ppl.report.style import acceleration_unit
 from pbrl_ppl.report.words import depends_on_records
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
@@ -137,7 +137,7 @@ def recorded(*posteriors: Any) -> bool:
 
 def _log_density(problem: Problem, posterior: Any) -> Floats:
     """Return the log-likelihood of each measured number given those before it."""
-    phi, sigma = likeliest(problem, posterior)
+    phi, sigma = best_vectors(problem, posterior)
     noise = problem.trajectory_noise
     cells = -0.5 * problem.robust(phi, sigma) ** 2 - np.log(noise.scale(sigma))
     whole = problem.log_density(problem.residual(phi), sigma, phi)
@@ -254,7 +254,7 @@ def find_laws(loop: Loop, most: int = 3) -> list[Law]:
     if not recorded(loop.posterior_after):
         return []
     problem = problem_of(loop.posterior_after, loop.catalogue)
-    phi, _ = likeliest(problem, loop.posterior_after)
+    phi, _ = best_vectors(problem, loop.posterior_after)
     body = [moving.name for moving in problem.scene.moving].index(remains.body)
     residual = _residual_force(problem, phi, body, remains.dimension)
     if residual is None:

@@ -12,7 +12,7 @@ from pbrl_ppl.criticism import Loop
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.posterior import likeliest_draw, parameter_draws, problem_of
+from pbrl_ppl.posterior import best_draw, parameter_draws, problem_of
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats, wrapped
 
@@ -42,9 +42,9 @@ class Motion:
     after: Floats
 
 
-def likeliest(problem: Problem, posterior: Any) -> tuple[Floats, Floats]:
+def best_vectors(problem: Problem, posterior: Any) -> tuple[Floats, Floats]:
     """Return the draw of highest likelihood: phi, shape (p,), and the noise parameters."""
-    best = likeliest_draw(posterior)
+    best = best_draw(posterior)
     phi, sigma = parameter_draws(problem, posterior)
     return phi[best], sigma[best]
 
@@ -96,7 +96,7 @@ def _predicted(
 ) -> dict[tuple[int, int], Floats]:
     """Return the poses that a posterior predicts, by trajectory and starting step."""
     problem = problem_of(posterior, effects)
-    phi, _ = likeliest(problem, posterior)
+    phi, _ = best_vectors(problem, posterior)
     longest = int(history.dataset["n_rows"].max()) - 1
     problem = problem.with_data(history=history, states=None, horizon=longest)
     segments = problem.segments

@@ -244,7 +244,7 @@ def test_draws_of_the_model_have_its_covariance(problem) -> None:
     noise = problem.trajectory_noise
     rng = np.random.default_rng(4)
     drawn = np.array([problem.next_states(problem.predict(PHI), NOISE, rng) for _ in range(4000)])
-    mean, covariance = noise.foreseen(noise.cells.of_residual(problem.residual(PHI)), NOISE)
+    mean, covariance = noise.predictive(noise.cells.of_residual(problem.residual(PHI)), NOISE)
     cells = drawn[:, :, 0, 0] - problem.observations.values[:, 0, 0]
     sd = np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
     # 72 means and 72 variances of 4000 draws: 5 standard errors, chance of a false alarm 1e-4

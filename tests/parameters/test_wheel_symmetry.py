@@ -13,7 +13,7 @@ from pbrl_ppl.parameters import (
     fold_draws,
     fold_wheels,
     gathered,
-    likeliest,
+    most_probable_wheels,
     prior_draws,
     redescribed,
     wheels,
@@ -120,7 +120,7 @@ def test_the_likeliest_description_is(name) -> None:
     layout = layout_of(name)
     (wheel,) = wheels(layout)
     phi = draws_of(layout, 100)
-    best = layout.log_prior(likeliest(layout, phi)).sum(axis=1)
+    best = layout.log_prior(most_probable_wheels(layout, phi)).sum(axis=1)
     for turns in range(4):
         assert (best >= layout.log_prior(wheel.turned(phi, turns)).sum(axis=1) - 1e-12).all()
 
