@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.effects import attach
 from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
 from tests.helpers.places import ROOT
 
@@ -278,7 +278,7 @@ def test_a_drawn_body_makes_histories_that_its_scene_explains(attribution, sort)
     again, _ = case.histories(seed=0)
     assert again.data_sha256 == train.data_sha256 != case.histories(seed=1)[0].data_sha256
     scene = case.body.scene.replace(substeps=200)
-    problem = Problem.of(scene, train, attach(scene))
+    problem = Problem.of(Physics.declare(scene), train)
     truth = {
         f"{name}[{s.name}]": getattr(s, name) for s in setups for name in ("mass", "r", "mu_c")
     }
