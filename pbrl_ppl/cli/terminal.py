@@ -41,21 +41,22 @@ _ARGUMENT = re.compile(r"\b([a-z_]+)=(?:True\b)?(?=[\s,;.)]|$)")
 def stages(quiet: bool) -> Iterator[Callable[[str], None]]:
     """Show stages on stderr with the time elapsed; a terminal also shows the running stage."""
     console = Console(stderr=True, quiet=quiet, highlight=False, markup=False)
-    running = Stage()
+    running = Status()
     with console.status(running):
 
         def progress(stage: str) -> None:
             console.print(f"[{running.elapsed:5.1f} s] {stage}", soft_wrap=True)
-            running.name = stage
+            running.name, running.share = stage, getattr(stage, "share", None)
 
         yield progress
 
 
-class Stage:
-    """Status line with the present stage and the time elapsed."""
+class Status:
+    """Status line with the present stage, the time elapsed and, where known, the share done."""
 
     def __init__(self) -> None:
         self.name, self._begin = "starting", time.monotonic()
+        self.share: float | None = None
 
     @property
     def elapsed(self) -> float:
@@ -63,7 +64,8 @@ class Stage:
         return time.monotonic() - self._begin
 
     def __rich__(self) -> Text:
-        return Text(f"{self.name}, {self.elapsed:.0f} s")
+        done = "" if self.share is None else f", about {self.share:.0%} done"
+        return Text(f"{self.name}, {self.elapsed:.0f} s{done}")
 
 
 @contextmanager

@@ -97,7 +97,8 @@ def close_loop(
     criteria : Criteria
         Thresholds of the decisions.
     progress : callable, optional
-        Called with the name of each stage.
+        Called with each :class:`Stage`, a sentence with the share of the time at which it usually
+        begins, and with sentences on what was found.
 
     Returns
     -------

@@ -104,12 +104,14 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
 def test_a_status_line_has_the_stage_and_the_time_elapsed(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
     monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
-    running = terminal.Stage()
+    running = terminal.Status()
     running.name = "sampling [all]"
     now[0] = 281.4
     shown = StringIO()
     Console(file=shown, width=80).print(running)
-    assert shown.getvalue() == "sampling [all], 181 s\n"
+    running.share = 0.4
+    Console(file=shown, width=80).print(running)
+    assert shown.getvalue() == "sampling [all], 181 s\nsampling [all], 181 s, about 40% done\n"
 
 
 @pytest.mark.usefixtures("files")
