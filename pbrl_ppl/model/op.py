@@ -183,7 +183,7 @@ class JacobianOp(_EngineOp):
 @numba_funcify.register(_EngineOp)
 def _numba_engine(op: _EngineOp, node: Any = None, **kwargs: Any) -> Any:
     """Dispatch the Op in numba: a call in object mode."""
-    kind = numba.types.Floats(numba.float64, 2 + len(op._last), "C")
+    kind = numba.types.Array(numba.float64, 2 + len(op._last), "C")
 
     @numba.njit
     def simulate(phi, start, actions):  # type: ignore[no-untyped-def]

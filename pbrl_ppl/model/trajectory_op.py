@@ -148,7 +148,7 @@ class _DerivativeOp(_DensityOp):
 @numba_funcify.register(TrajectoryDensityOp)
 def _numba_density(op: TrajectoryDensityOp, node: Any = None, **kwargs: Any) -> Any:
     """Dispatch the density in numba: a call in object mode."""
-    kind = numba.types.Floats(numba.float64, 1, "C")
+    kind = numba.types.Array(numba.float64, 1, "C")
 
     @numba.njit
     def density(deviation, residual, sigma, tail):  # type: ignore[no-untyped-def]
@@ -162,8 +162,8 @@ def _numba_density(op: TrajectoryDensityOp, node: Any = None, **kwargs: Any) -> 
 @numba_funcify.register(_DerivativeOp)
 def _numba_derivative(op: _DerivativeOp, node: Any = None, **kwargs: Any) -> Any:
     """Dispatch the derivative in numba: a call in object mode."""
-    wide = numba.types.Floats(numba.float64, 4, "C")
-    flat = numba.types.Floats(numba.float64, 1, "C")
+    wide = numba.types.Array(numba.float64, 4, "C")
+    flat = numba.types.Array(numba.float64, 1, "C")
 
     @numba.njit
     def derivative(deviation, residual, sigma, tail, weights):  # type: ignore[no-untyped-def]
