@@ -39,11 +39,12 @@ def disk_cache(function: Callable[..., Any], digest: str) -> FunctionCache:
     """
     cache = FunctionCache(function)
     base = cache._impl.filename_base
-    named = f"{base}.{digest[:16]}"
-    for path in Path(cache.cache_path).glob(f"{base}.*"):
-        if not path.name.startswith(named):
-            with suppress(OSError):
-                path.unlink()
+    named, folder = f"{base}.{digest[:16]}", Path(cache.cache_path)
+    if not (folder / f"{named}.nbi").exists():  # the first use of these sources
+        for path in folder.glob(f"{base}.*"):
+            if not path.name.startswith(named):
+                with suppress(OSError):
+                    path.unlink()
     cache._cache_file = IndexDataCacheFile(cache.cache_path, named, digest)
     return cache
 

@@ -171,7 +171,7 @@ class OneWorld:
     def __init__(self, physics: Physics) -> None:
         self.parted = physics.simulator
         # contacts are not extrapolated, nor is anything else in a transition that has one
-        self._apart = PartedSimulator(physics.changed(extrapolate=False))
+        self._apart = physics.changed(extrapolate=False).simulator
         self._reach = [body.shape.bounding_radius for body in physics.scene.moving]
         self._whole = Simulator(physics.changed(extrapolate=False, parts=None))
 

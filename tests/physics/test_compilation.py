@@ -2,6 +2,7 @@
 
 import importlib.util
 from pathlib import Path
+from types import ModuleType
 
 import numba
 import pymunk
@@ -81,13 +82,18 @@ def test_the_digest_follows_contents_and_names(tmp_path) -> None:
     assert sources_digest(tmp_path) != first
 
 
-def test_another_digest_compiles_anew(tmp_path) -> None:
+@pytest.fixture
+def module(tmp_path) -> ModuleType:
+    """A module in a file, with a function to compile."""
     path = tmp_path / "loop.py"
     path.write_text("def double(x):\n    return 2.0 * x\n")
     spec = importlib.util.spec_from_file_location("loop", path)
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
+    return module
 
+
+def test_another_digest_compiles_anew(module) -> None:
     def hits(digest: str) -> int:
         dispatcher = numba.njit(module.double)
         dispatcher._cache = disk_cache(module.double, digest)
@@ -97,13 +103,8 @@ def test_another_digest_compiles_anew(tmp_path) -> None:
     assert [hits(digest) for digest in ("a", "a", "b", "b", "a")] == [0, 1, 0, 1, 0]
 
 
-def test_an_older_cache_that_cannot_be_read_is_deleted(tmp_path) -> None:
+def test_an_older_cache_that_cannot_be_read_is_deleted(module) -> None:
     """It may mention modules that are gone."""
-    path = tmp_path / "loop.py"
-    path.write_text("def double(x):\n    return 2.0 * x\n")
-    spec = importlib.util.spec_from_file_location("loop", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
     older = disk_cache(module.double, "a")
     index = Path(older._cache_file._index_path)
     index.parent.mkdir(exist_ok=True)
