@@ -16,6 +16,7 @@ from .likelihood import TrajectoryLikelihood as TrajectoryLikelihood
 from .likelihood import TransitionLikelihood as TransitionLikelihood
 from .likelihood import log_norm as log_norm
 from .likelihood import next_state_random as next_state_random
+from .likelihood import noise_labels as noise_labels
 from .likelihood import robust as robust
 from .log_posterior import exponential as exponential
 from .log_posterior import log_noise_prior as log_noise_prior

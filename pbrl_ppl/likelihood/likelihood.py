@@ -92,8 +92,14 @@ class Likelihood(ABC):
         """
 
     @abstractmethod
+    def whitened_nu(
+        self, nu: float | Floats | None, shape: tuple[int, ...]
+    ) -> float | Floats | None:
+        """Return the degrees of freedom of whitened residuals, from those of this shape."""
+
     def robust(self, residual: Floats, sigma: Floats, nu: float | Floats | None) -> Floats:
         """Return least-squares residuals, shape as of :meth:`whiten`; see :func:`robust`."""
+        return robust(self.whiten(residual, sigma), self.whitened_nu(nu, residual.shape))
 
     @abstractmethod
     def log_density(
@@ -187,11 +193,13 @@ class TransitionLikelihood(Likelihood):
         scaled = residual / np.asarray(sigma)[..., None, None, None, :]
         return np.asarray(scaled.reshape(*scaled.shape[:-3], -1))
 
-    def robust(self, residual: Floats, sigma: Floats, nu: float | Floats | None) -> Floats:
-        """Return least-squares residuals."""
-        if isinstance(nu, np.ndarray) and nu.ndim:
-            nu = np.broadcast_to(nu, residual.shape).reshape(*residual.shape[:-3], -1)
-        return robust(self.whiten(residual, sigma), nu)
+    def whitened_nu(
+        self, nu: float | Floats | None, shape: tuple[int, ...]
+    ) -> float | Floats | None:
+        """Return one number for all, or one a residual, shape (..., transition, coordinate)."""
+        if not isinstance(nu, np.ndarray) or nu.ndim == 0:
+            return nu
+        return np.broadcast_to(nu, shape).reshape(*shape[:-3], -1)
 
     def log_density(
         self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
@@ -257,16 +265,18 @@ class TrajectoryLikelihood(Likelihood):
         """Return the innovations over their standard deviations."""
         return self.noise.whiten(residual, sigma)
 
-    def robust(self, residual: Floats, sigma: Floats, nu: float | Floats | None) -> Floats:
-        """Return least-squares residuals."""
-        return robust(self.whiten(residual, sigma), self.noise.of_cells(nu, residual.shape))
+    def whitened_nu(
+        self, nu: float | Floats | None, shape: tuple[int, ...]
+    ) -> float | Floats | None:
+        """Return one number for all, or one an innovation, shape (..., transition, coordinate)."""
+        return self.noise.of_cells(nu, shape)
 
     def log_density(
         self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
     ) -> Floats:
         """Return the log-density of each transition's measurements given those before."""
         z, log_scale = self.noise.whitened(residual, sigma)
-        nu = self.noise.of_cells(nu, residual.shape)
+        nu = self.whitened_nu(nu, residual.shape)
         norm = np.where(self.noise.seen, log_norm(nu), 0.0).sum(axis=-1)
         return _finite(norm - 0.5 * (robust(z, nu) ** 2).sum(-1) - log_scale)
 
@@ -280,6 +290,13 @@ class TrajectoryLikelihood(Likelihood):
     ) -> Floats:
         """Draw measured next states, given those before."""
         return self.noise.random(predicted, linearised, sigma, rng)
+
+
+def noise_labels(variables: dict[str, tuple[str, ...]], scalar: bool) -> tuple[str, ...]:
+    """Return labels of noise parameters, such as ``sigma[x]``; ``sigma`` for a scalar."""
+    if scalar:
+        return ("sigma",)
+    return tuple(f"{name}[{dimension}]" for name, own in variables.items() for dimension in own)
 
 
 def _finite(log_density: Floats) -> Floats:

@@ -16,6 +16,7 @@ from pbrl_ppl.likelihood.likelihood import (
     Likelihood,
     TrajectoryLikelihood,
     TransitionLikelihood,
+    noise_labels,
 )
 from pbrl_ppl.likelihood.tails import degrees_of_freedom, tail_places
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
@@ -236,9 +237,7 @@ class Problem:
     @property
     def noise_labels(self) -> tuple[str, ...]:
         """Labels of the inferred noise parameters, such as ``sigma[x]``."""
-        if self.scalar_sigma:
-            return ("sigma",)
-        return tuple(f"{name}[{of}]" for name, own in self.noise_variables.items() for of in own)
+        return noise_labels(self.noise_variables, self.scalar_sigma)
 
     @property
     def measured(self) -> Floats:

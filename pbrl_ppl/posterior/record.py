@@ -12,7 +12,7 @@ import numpy as np
 
 from pbrl_ppl.effects import Attached, Effect, attach, catalogue, learned_remainder
 from pbrl_ppl.errors import PosteriorError
-from pbrl_ppl.likelihood import Cells
+from pbrl_ppl.likelihood import Cells, noise_labels
 from pbrl_ppl.parameters import Layout, ParameterLibrary
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.posterior.store import SCHEMA, check_schema, draws
@@ -168,11 +168,9 @@ class PosteriorRecord:
         return _attached(self.scene, self.learned_remainder, effects)
 
     @property
-    def noise_labels(self) -> list[str]:
+    def noise_labels(self) -> tuple[str, ...]:
         """Labels of the noise parameters, such as ``sigma[x]``; ``sigma`` for a scalar."""
-        if self.scalar_sigma:
-            return ["sigma"]
-        return [f"{name}[{of}]" for name, about in self.noise_variables.items() for of in about]
+        return noise_labels(self.noise_variables, self.scalar_sigma)
 
     def mode_vectors(self, layout: Layout) -> tuple[Floats, Floats]:
         """Return the mode as vectors: phi, shape (p,), and sigma, shape (noise parameter,).
