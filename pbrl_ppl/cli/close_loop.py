@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 class Method(StrEnum):
     """Samplers of the loop's posteriors."""
 
+    IMPORTANCE = "importance"
     METROPOLIS = "metropolis"
     LAPLACE = "laplace"
 
@@ -73,10 +74,11 @@ def close_loop(
     method: Annotated[
         Method,
         typer.Option(
-            help="metropolis draws the posteriors; laplace takes Gaussians at the modes, on which"
-            " the verdict then stands."
+            help="importance weights proposals of an emulator, or runs chains where none is close"
+            " enough; metropolis runs chains; laplace takes Gaussians at the modes, on which the"
+            " verdict then stands."
         ),
-    ] = Method.METROPOLIS,
+    ] = Method.IMPORTANCE,
     noise: options.Noise = None,
     estimate_velocities: options.Velocities = False,
     columns: options.Columns = None,

@@ -58,8 +58,10 @@ def fit(
     substeps: options.Substeps = None,
     method: Annotated[
         str,
-        typer.Option(help="metropolis, paper, demetropolisz, smc, nuts, laplace or map."),
-    ] = "metropolis",
+        typer.Option(
+            help="importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map."
+        ),
+    ] = "importance",
     draws: Annotated[
         int | None, typer.Option(min=1, max=1_000_000, help="Posterior draws of each chain.")
     ] = None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -54,8 +55,9 @@ from pbrl_ppl.posterior import compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.scene import Scene
 
-#: Draws of each chain, then those where that is not enough; independent draws; least tuning draws.
-DRAWS, INDEPENDENT, LEAST_TUNE = (300, 1000), (125,), 100
+#: Draws of each chain, then those where that is not enough; those of other methods; least tuning.
+CHAIN_DRAWS, LEAST_TUNE = (300, 1000), 100
+DRAWS = {"importance": (180, 600), "laplace": (125,)}
 #: Draws from the prior, some of which must reach the measurements.
 PRIOR_DRAWS = 100
 
@@ -69,7 +71,7 @@ def close_loop(
     seed: int = 0,
     substeps: int | None = None,
     draws: int | None = None,
-    method: str = "metropolis",
+    method: str = "importance",
     criteria: Criteria = DEFAULT,
     progress: Callable[[str], None] | None = None,
 ) -> Loop:
@@ -91,7 +93,8 @@ def close_loop(
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws kept of each chain; by default 300, or 1000 where chains have not converged.
+        Posterior draws kept of each chain; by default 180 of importance sampling and 300 of chains,
+        more where these do not suffice.
     method : str
         Sampler of :func:`pbrl_ppl.fit`; with ``laplace`` the verdict relies on modes.
     criteria : Criteria
@@ -231,14 +234,11 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
             misfit = without.with_test(prior)
     if steps:
         misfit = with_negligible_acceleration(misfit, revised, after)
-    say(Stage.SAMPLE_DECLARED)
-    posterior = _posterior(task, declared)
-    first = last = _Model(declared, before, posterior, HeldOut.of(declared, test))
-    if steps:
-        say(Stage.SAMPLE_REVISED)
-        posterior = _posterior(task, revised)
+    say(Stage.SAMPLE)
+    posteriors = _posteriors(task, [declared, revised] if steps else [declared])
+    first = last = _Model(declared, before, posteriors[0], HeldOut.of(declared, test))
     if revised is not declared:
-        last = _Model(revised, after, posterior, HeldOut.of(revised, test))
+        last = _Model(revised, after, posteriors[-1], HeldOut.of(revised, test))
     say(Stage.COMPARE)
     rollout = longest_rollout(test, horizon)
     return replace(
@@ -314,32 +314,54 @@ def _too_much_remains(
     return after.square / before.square > limit
 
 
-def _posterior(task: _Task, mode: Mode) -> Any:
-    """Sample a mode's model, with more draws if the chains have not converged."""
+def _posteriors(task: _Task, modes: list[Mode]) -> list[Any]:
+    """Sample the models of modes, the first beside the others; issue their warnings."""
+    from pbrl_ppl.sampling import background
+
+    with background(partial(_posterior, task, modes[0])) as first:
+        others = [_posterior(task, mode) for mode in modes[1:]]
+        results = [first(), *others]
+    for _, caught, said in results:
+        for sentence in said:
+            task.say(sentence)
+        for message in caught:
+            warnings.warn(message, stacklevel=3)
+    return [fitted for fitted, *_ in results]
+
+
+def _posterior(task: _Task, mode: Mode) -> tuple[Any, list[Warning], list[str]]:
+    """Sample a mode's model, with more draws if they do not suffice.
+
+    Returns the posterior, its warnings, and what to tell the user.
+    """
     from pbrl_ppl.model import build_model  # PyMC takes seconds to load
-    from pbrl_ppl.sampling import fit
+    from pbrl_ppl.sampling import DEFAULT, FALLBACK, fit, unsuited
 
     # one thread a chain: more would wait for each other
     mode = replace(mode, problem=mode.problem.with_physics(threads=1))
-    model = build_model(mode.problem)
-    chains = task.method != "laplace"
-    for n in (DRAWS if chains else INDEPENDENT) if task.draws is None else (task.draws,):
+    model, method, said = build_model(mode.problem), task.method, []
+    if method == DEFAULT and (why := unsuited(mode)):
+        method = FALLBACK
+        said.append(f"sampling by chains: {why}")
+    for n in DRAWS.get(method, CHAIN_DRAWS) if task.draws is None else (task.draws,):
         tune = max(LEAST_TUNE, 5 * n // 8)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             fitted = fit(
-                model, method=task.method, seed=task.seed, draws=n, tune=tune, start=mode,
+                model, method=method, seed=task.seed, draws=n, tune=tune, start=mode,
                 progress=False,
             )  # fmt: skip
         if "interrupted" in fitted.attrs:  # half a posterior gives no verdict
             raise KeyboardInterrupt
+        if why := fitted.attrs.get("fallback"):
+            said.append(f"sampling by chains: {why}")
         if _converged(fitted, task.criteria):
             break
-        task.say(f"the chains have not converged after {n} draws each")
-    for warning in caught:  # of the last fit; independent draws are no chains that converge
-        if chains or not issubclass(warning.category, ConvergenceWarning):
-            warnings.warn(warning.message, stacklevel=2)
-    return fitted
+        said.append(f"{n} draws of each chain are too few")
+    # of the last fit; draws from a Gaussian are no chains that converge
+    unheeded: tuple[type[Warning], ...] = (ConvergenceWarning,) if method == "laplace" else ()
+    kept = [each.message for each in caught if not issubclass(each.category, unheeded)]
+    return fitted, [message for message in kept if isinstance(message, Warning)], said
 
 
 def _converged(posterior: Any, criteria: Criteria) -> bool:

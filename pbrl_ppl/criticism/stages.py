@@ -30,8 +30,7 @@ class Stage(StrEnum):
     PRUNE = "checking that each added effect is still needed", 0.29
     TEST = "testing the residual", 0.38
     WITHDRAW = "no effect of the catalogue explains what is missing"
-    SAMPLE_DECLARED = "sampling the posterior of the declared model", 0.4
-    SAMPLE_REVISED = "sampling the posterior of the revised model", 0.67
+    SAMPLE = "sampling the posteriors", 0.5
     COMPARE = "comparing errors on held-out data", 0.99
     LEARN = "learning a force for the residual"
     REFIT = "fitting the model with the learned remainder"

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -31,10 +32,22 @@ class Memory:
 
     def __init__(self) -> None:
         self._known: OrderedDict[Hashable, Any] = OrderedDict()
+        self._kept = _REMEMBERED
 
     def __getstate__(self) -> dict[str, object]:
         """Nothing."""
-        return {"_known": OrderedDict()}
+        return {"_known": OrderedDict(), "_kept": _REMEMBERED}
+
+    @contextmanager
+    def keeping(self, n: int) -> Iterator[None]:
+        """Remember this many results for a while."""
+        self._kept = n
+        try:
+            yield
+        finally:
+            self._kept = _REMEMBERED
+            while len(self._known) > _REMEMBERED:
+                self._known.popitem(last=False)
 
     def recall(self, arguments: tuple[Floats, ...], compute: Callable[..., R]) -> R:
         """Return ``compute(*arguments)``, from memory for equal arguments.
@@ -53,7 +66,7 @@ class Memory:
             self._known.move_to_end(key)
         else:
             self._known[key] = compute(*arguments)
-            if len(self._known) > _REMEMBERED:
+            if len(self._known) > self._kept:
                 self._known.popitem(last=False)
         result: R = self._known[key]
         return result

@@ -1,6 +1,8 @@
 """Posterior files: save, load, draws, what the data inform, the next prior."""
 
+from .completion import LIKELIHOOD as LIKELIHOOD
 from .completion import MIN_ESS as MIN_ESS
+from .completion import PARETO_K as PARETO_K
 from .completion import checked as checked
 from .completion import complete as complete
 from .completion import evaluate as evaluate
@@ -36,6 +38,7 @@ from .record import scene_of as scene_of
 from .record import vectors as vectors
 from .store import DATATREE as DATATREE
 from .store import HDI_PROB as HDI_PROB
+from .store import SIZE as SIZE
 from .store import best_draw as best_draw
 from .store import convergence as convergence
 from .store import draws as draws

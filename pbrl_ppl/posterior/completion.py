@@ -33,9 +33,12 @@ from pbrl_ppl.posterior.data import CELLS, placed, places, record_of, recording
 from pbrl_ppl.posterior.identifiability import uninformed
 from pbrl_ppl.posterior.mode import Point, packed_mode
 from pbrl_ppl.posterior.record import vectors
-from pbrl_ppl.posterior.store import convergence, from_groups, group, groups
+from pbrl_ppl.posterior.store import SIZE, convergence, from_groups, group, groups
 from pbrl_ppl.state import Floats, Ints
 
+#: Attributes of a trace of weighted proposals: their Pareto k, and log-likelihoods of transitions,
+#: shape (draw, transition), chains joined, which need not be evaluated anew.
+PARETO_K, LIKELIHOOD = "pareto_k", "log_likelihood"
 #: Largest R-hat and least effective sample size of reliable summaries (Vehtari et al., 2021).
 MAX_RHAT, MIN_ESS = 1.01, 400
 #: Draws are simulated in groups of this many, or of more with at most this many transitions.
@@ -89,7 +92,8 @@ def complete(
     chains, n = posterior.sizes["chain"], posterior.sizes["draw"]
     rng = np.random.default_rng(seed)
     rows = predictive_rows(chains, n, problem.measured.size)
-    likelihood, predictive = evaluate(problem, phi, sigma, rows.ravel(), rng)
+    known = trace.attrs.get(LIKELIHOOD)
+    likelihood, predictive = evaluate(problem, phi, sigma, rows.ravel(), rng, known)
     data = groups(trace)
     posterior = _with_units(problem, posterior)
     coords = {dim: data["observed_data"][dim].values for dim in CELLS}
@@ -119,8 +123,9 @@ def complete(
     if isinstance(problem.likelihood, TrajectoryLikelihood) and len(phi) > 1:
         record = replace(record, linearisation=linearisation(problem, phi, sigma))
     idata = placed(from_groups(result, record.attributes()), places(problem.segments))
-    if ATTRIBUTE in trace.attrs:
-        idata.attrs[ATTRIBUTE] = trace.attrs[ATTRIBUTE]
+    for name in (ATTRIBUTE, PARETO_K, SIZE):
+        if name in trace.attrs:
+            idata.attrs[name] = trace.attrs[name]
     return checked(problem, idata, asked)
 
 
@@ -129,7 +134,12 @@ def _next_state(dims: tuple[str, ...], values: Floats, coords: Any) -> xr.Datase
 
 
 def evaluate(
-    problem: Problem, phi: Floats, sigma: Floats, rows: Any, rng: np.random.Generator
+    problem: Problem,
+    phi: Floats,
+    sigma: Floats,
+    rows: Any,
+    rng: np.random.Generator,
+    known: Floats | None = None,
 ) -> tuple[Floats, Floats]:
     """Return log-likelihoods of the transitions at draws, and next states drawn from some of them.
 
@@ -143,6 +153,8 @@ def evaluate(
         Draws to predict with, in increasing order.
     rng : Generator
         Of the predictions.
+    known : ndarray, optional
+        Log-likelihoods where the sampler has them already.
 
     Returns
     -------
@@ -151,18 +163,19 @@ def evaluate(
     predictive : ndarray
         Shape (row, transition, H, body, state).
     """
-    likelihood = np.empty((len(phi), problem.segments.n))
+    likelihood = np.empty((len(phi), problem.segments.n)) if known is None else known
     predictive = []
     wide = problem.with_physics(threads=max(problem.physics.threads, 2))
     rows = np.asarray(rows, dtype=int)
     size = max(_DRAWS_AT_ONCE, _TRANSITIONS_AT_ONCE // problem.segments.n)
     for begin in range(0, len(phi), size):
         part = slice(begin, begin + size)
-        # a chain repeats a draw where it rejects a proposal
-        different, which = np.unique(phi[part], axis=0, return_inverse=True)
-        states = wide.predict(different)[which.ravel()]
-        residual = problem.observations.residual(states)
-        likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
+        if known is None:
+            # a chain repeats a draw where it rejects a proposal
+            different, which = np.unique(phi[part], axis=0, return_inverse=True)
+            states = wide.predict(different)[which.ravel()]
+            residual = problem.observations.residual(states)
+            likelihood[part] = problem.log_density(residual, sigma[part], phi[part])
         for i in rows[(begin <= rows) & (rows < begin + size)]:
             states = wide.predict(phi[i], wide.one_world)
             predictive.append(problem.next_states(states, sigma[i], rng, phi[i]))

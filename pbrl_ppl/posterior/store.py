@@ -28,6 +28,8 @@ DATATREE = not version("arviz").startswith("0.")
 
 #: Level of the intervals in reports, as in ArviZ 0.x.
 HDI_PROB = 0.94
+#: Attribute of resampled draws: the number of independent draws that they are worth.
+SIZE = "importance_ess"
 
 #: Version of the attributes of a posterior file, see `PosteriorRecord`.
 SCHEMA = 2
@@ -274,6 +276,8 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
         )
     r_hat = {str(name): float(hat[name]) for name in flat.data_vars}
     ess = {str(name): float(min(bulk[name], tail[name])) for name in flat.data_vars}
+    most = float(idata.attrs.get(SIZE, np.inf))  # resampled draws look independent
+    ess = {name: min(value, most) for name, value in ess.items()}
     return r_hat | dict.fromkeys(constant, 1.0), ess | constant
 
 

@@ -161,7 +161,7 @@ class Settings:
     seed: int = 0
     substeps: int | None = None
     draws: int | None = None
-    method: str = "metropolis"
+    method: str = "importance"
     catalogue: tuple[Effect, ...] | None = None
     noise: Mapping[str, float] = field(default_factory=dict)
     estimate_velocities: bool = False

@@ -87,7 +87,7 @@ def close_loop_many(
     seed: int = 0,
     substeps: int | None = None,
     draws: int | None = None,
-    method: str = "metropolis",
+    method: str = "importance",
     catalogue: Iterable[Effect] | None = None,
     noise: Mapping[str, float] | None = None,
     estimate_velocities: bool = False,

@@ -1,8 +1,12 @@
 """Draws from the posterior: `fit` and its samplers, `update`, and whether the sampler is right."""
 
+from .background import background as background
 from .calibration import calibrate as calibrate
 from .declaration import physics_model as physics_model
+from .fitting import DEFAULT as DEFAULT
+from .fitting import FALLBACK as FALLBACK
 from .fitting import fit as fit
+from .importance import unsuited as unsuited
 from .pooling import Pooled as Pooled
 from .pooling import pool as pool
 from .ranks import Calibration as Calibration

@@ -20,7 +20,7 @@ from pbrl_ppl.sampling.starts import blank_point, evened_logp
 from pbrl_ppl.state import Floats, Ints
 
 #: Factor of the surrogate's log-likelihood: with lighter tails than the posterior's, chains stick.
-_FLATTER = 0.9
+FLATTER = 0.9
 #: Degrees to try; engine runs a coefficient, at least and at most; rounds of each.
 _DEGREES, _A_COEFFICIENT, _LEAST, _MOST, _ROUNDS = (1, 2), 4, 100, 400, 4
 #: Standard deviation of the log-likelihood's error at which a fit ends (half of the moves are then
@@ -71,6 +71,13 @@ class Pieces:
     emulated: list[Piece]
     rows: Ints
     exact: Callable[[Floats], Floats]
+
+    def without(self, places: Ints) -> Pieces:
+        """Return pieces that do not depend on some parameters."""
+        kept = [
+            replace(piece, places=np.setdiff1d(piece.places, places)) for piece in self.emulated
+        ]
+        return replace(self, emulated=kept)
 
     @classmethod
     def of(cls, problem: Problem) -> Pieces:
@@ -151,6 +158,28 @@ class Emulator:
             weights = np.asarray(np.linalg.lstsq(terms, targets, rcond=None)[0], dtype=float)
             self._fits.append(_Fit(where, centre, scale, weights))
 
+    def batch(self, phi: Floats) -> Floats:
+        """Return residuals for phi of shape (point, p), shape (point, transition, ...)."""
+        result = np.zeros((len(phi), *self.shape))
+        for i, piece in enumerate(self.pieces.emulated):
+            bodies = self._residual[self._fits[i].where].shape
+            values = (self.terms(phi, i) @ self._fits[i].weights).reshape(len(phi), *bodies)
+            result[
+                np.ix_(np.arange(len(phi)), piece.rows, np.arange(self.shape[1]), piece.bodies)
+            ] = values
+        if len(self.pieces.rows):
+            result[:, self.pieces.rows] = self.pieces.exact(phi)
+        return result
+
+    def correct(self, phi: Floats, residual: Floats) -> None:
+        """Add residuals (run, transition, H, body, state), as linear functions of phi (run, p)."""
+        self._last.clear()
+        for i, piece in enumerate(self.pieces.emulated):
+            terms = self.terms(phi, i)[:, : 1 + len(piece.places)]
+            targets = residual[:, piece.rows][:, :, :, piece.bodies].reshape(len(phi), -1)
+            change = np.linalg.lstsq(terms, targets, rcond=None)[0]
+            self._fits[i].weights[: len(change)] += change
+
     def __call__(self, phi: Floats) -> Floats:
         """Return residuals for phi of shape (p,); the next call changes the array."""
         for i, piece in enumerate(self.pieces.emulated):
@@ -170,8 +199,8 @@ class Emulator:
         return len(self.pieces.emulated) == 1 and not len(self.pieces.rows)
 
     def terms(self, phi: Floats, piece: int) -> Floats:
-        """Return the monomials of a piece, shape (term,), for phi of shape (p,)."""
-        fit, x = self._fits[piece], phi[self.pieces.emulated[piece].places]
+        """Return the monomials of a piece, shape (..., term), for phi of shape (..., p)."""
+        fit, x = self._fits[piece], phi[..., self.pieces.emulated[piece].places]
         return monomials((x - fit.centre) / fit.scale, self.degree)
 
     @property
@@ -257,7 +286,7 @@ class Surrogate:
         phi, sigma, prior = self.unpack(q)
         if not np.isfinite(prior):
             return -np.inf
-        return prior + _FLATTER * self._likelihood(phi, sigma)
+        return prior + FLATTER * self._likelihood(phi, sigma)
 
     def _likelihood(self, phi: Floats, sigma: Floats) -> float:
         """Return the log-likelihood; a quadratic form where the noise is that of the last call."""

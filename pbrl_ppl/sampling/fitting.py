@@ -26,13 +26,15 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     stored_mode,
 )
-from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job
+from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job, Unsuited
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, prior_starts, summed
 from pbrl_ppl.sampling.starts import dispersed, from_posterior
 from pbrl_ppl.state import Floats
 
 #: The default sampler.
-DEFAULT = "metropolis"
+DEFAULT = "importance"
+#: The sampler where the default one does not suit the posterior.
+FALLBACK = "metropolis"
 #: Draws of a trace at which contacts between parts are looked for, at most.
 _CHECKED_DRAWS = 50
 
@@ -69,8 +71,11 @@ def fit(
     model : pymc.Model
         As made by ``physics_model``.
     method : str
-        ``metropolis``: adaptive blocks that follow the scene's independent parts and look ahead
-        with polynomials where engine runs are dear; ``paper``: one random walk a variable, by
+        ``importance``: proposals that many walkers draw together from the posterior of an
+        emulator, weighted by the engine in one batch and resampled; where bodies touch, where the
+        scene has several independent parts or modes, or where no emulator is close enough,
+        ``metropolis``, and ``attrs["fallback"]`` says why; ``metropolis``: adaptive blocks that
+        follow the scene's independent parts and look ahead with polynomials where engine runs are dear; ``paper``: one random walk a variable, by
         default on the schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations,
         1,000 of them burn-in, each tenth kept); with a library, on that for the apartment
         (``draws=400, tune=1000, thin=10, chains=1``), each body's set proposed uniformly;
@@ -131,23 +136,28 @@ def fit(
         fit, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
         cores=cores, progress=progress,
     )  # fmt: skip
-    library = problem.library
+    library, why = problem.library, ""
+    if method == DEFAULT and (library is not None or problem.layout.discrete.any()):
+        method = FALLBACK
     chosen = METHODS[method] if library is None else OVER_LIBRARY.get(method, METHODS[method])
     # with one set there is no choice to sample
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
-    draws = chosen.draws if draws is None else draws
     chains = chosen.chains if chains is None else chains
     if method == "map":
         draws = chains = 1
 
+    def wanted() -> int:
+        return chosen.draws if draws is None else draws
+
     def sampled(model: pm.Model, mode: Any, starts: list[dict[str, Any]] | None = None) -> Any:
+        nonlocal chosen, method, why
         if starts is None:
             starts = dispersed(mode, np.random.default_rng(seed), chains)
         job = Job(
             model=model,
             mode=mode,
             seed=seed,
-            draws=draws,
+            draws=wanted(),
             tune=chosen.tune if tune is None else tune,
             chains=len(starts),
             thin=chosen.thin if thin is None else thin,
@@ -160,7 +170,11 @@ def fit(
             warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
             # draws from the prior, of which SMC needs some, are not compiled on the newer stack
             warnings.filterwarnings("ignore", message="Numba will use object mode")
-            return chosen.run(job)
+            try:
+                return chosen.run(job)
+            except Unsuited as unsuited:
+                chosen, method, why = METHODS[FALLBACK], FALLBACK, str(unsuited)
+        return sampled(model, mode, starts)
 
     model = _as_in(model, resume)
     problem = model.problem
@@ -169,12 +183,12 @@ def fit(
         trace = sampled(model, None, starts)
         point = most_frequent(problem, trace)
     elif library is not None:
-        trace, point = summed(model, draws, chains, seed)
+        trace, point = summed(model, wanted(), chains, seed)
         method = "exact sum over the library"
     elif problem.layout.discrete.any():
         found = weigh(problem, seed=seed, progress=progress)
         point = most_probable(problem, found)
-        trace = mix(model, problem, found, sampled, draws=draws, chains=chains, seed=seed)
+        trace = mix(model, problem, found, sampled, draws=wanted(), chains=chains, seed=seed)
     elif resume is not None:
         trace = sampled(model, *from_posterior(problem, resume))
         point = stored_mode(problem, resume)
@@ -194,15 +208,18 @@ def fit(
     # PyMC ends an interrupted run quietly, with fewer draws or with the chains that had most
     sizes = group(trace, "posterior").sizes
     all_chains = chains if resume is None else group(resume, "posterior").sizes["chain"]
-    cut = sizes["draw"] < draws or sizes["chain"] < all_chains
+    cut = sizes["draw"] < wanted() or sizes["chain"] < all_chains
     if not cut and (joined := _joined_of_draws(problem, trace)):
         return again(joined)
     if resume is not None:
         if sizes["chain"] < all_chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
         trace = _appended(resume, trace)
-    asked = (draws, all_chains) if cut else None
-    return complete(problem, trace, seed=seed, method=method, asked=asked, mode=point)
+    asked = (wanted(), all_chains) if cut else None
+    result = complete(problem, trace, seed=seed, method=method, asked=asked, mode=point)
+    if why:
+        result.attrs["fallback"] = why
+    return result
 
 
 def _checked_problem(model: pm.Model, method: str, start: Any, resume: Any) -> Problem:

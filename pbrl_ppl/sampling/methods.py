@@ -11,12 +11,15 @@ import numpy as np
 import pymc as pm
 import xarray as xr
 
-from pbrl_ppl.posterior import CELLS, from_groups, groups
+from pbrl_ppl.posterior import CELLS, LIKELIHOOD, PARETO_K, SIZE, from_groups, groups
 from pbrl_ppl.sampling.emulator import Surrogate, Unpack, emulate
+from pbrl_ppl.sampling.importance import MAX_PARETO_K, draw_pool, resample, stream, unsuited
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps, Schedule
 from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
 from pbrl_ppl.state import Floats
 
+#: Weighted proposals a draw, and the least share of the draws that they must be worth.
+_PROPOSALS, _WORTH = 1.5, 0.3
 #: Engine steps below which a surrogate does not pay.
 _LITTLE = 2000
 
@@ -114,6 +117,37 @@ def _metropolis(job: Job) -> Any:
             initial_point=blank_point(model, problem),
         )
     )
+
+
+class Unsuited(Exception):
+    """A sampler does not suit a posterior, and why."""
+
+
+def _importance(job: Job) -> Any:
+    """Weight proposals from an emulator's posterior; see `importance`.
+
+    Raises
+    ------
+    Unsuited
+        If no emulator is close enough to the posterior.
+    """
+    if why := unsuited(job.mode):
+        raise Unsuited(why)
+    shape, seed = (job.chains, job.draws), stream(job.seed, job.starts)
+    n = job.chains * job.draws
+    pool, why = draw_pool(job.mode, int(_PROPOSALS * n), seed, job.cores)
+    if pool is None:
+        raise Unsuited(why)
+    chosen, k, size = resample(pool.log_weight, n, np.random.default_rng(seed))
+    if not k <= MAX_PARETO_K:
+        raise Unsuited(f"Pareto k of the proposals is {k:.2f}, above {MAX_PARETO_K}")
+    if size < _WORTH * n:
+        raise Unsuited(f"weights leave {size:.0f} of {n} draws")
+    phi, sigma = pool.phi[chosen], pool.sigma[chosen]
+    values = job.mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
+    trace = as_trace(job.model, values, {"log_weight": pool.log_weight[chosen].reshape(shape)})
+    trace.attrs |= {PARETO_K: k, SIZE: size, LIKELIHOOD: pool.log_likelihood[chosen]}
+    return trace
 
 
 def _paper(job: Job) -> Any:
@@ -222,6 +256,7 @@ def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
 #: iterations, of which the first 1,000 are burnt in and each tenth of the others is kept. (PyMC 2
 #: counted the burn-in among the iterations.)
 METHODS: Mapping[str, Method] = {
+    "importance": Method(_importance, draws=250, tune=0, thin=1),
     "metropolis": Method(_metropolis, draws=800, tune=500, thin=1),
     "paper": Method(_paper, draws=1900, tune=1000, thin=10, chains=30),
     "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),

@@ -34,27 +34,36 @@ def gaussian_blocks(model: pm.Model, mode: Mode) -> list[Gaussian]:
         places[model.values_to_rvs[variable].name] = np.arange(offset, offset + size)
         offset += size
     where = np.concatenate([np.zeros(0, int), *(places[b.name] for b in problem.layout.blocks)])
-    mean, covariance = _laplace(problem, mode)
+    mean, covariance = laplace(problem, mode)
     blocks = [
         Gaussian(where[i], mean[i], covariance[np.ix_(i, i)])
         for i in (part.places for part in problem.simulator.parts)
         if len(i)
     ]
     entries = np.concatenate([places[name] for name in problem.noise_variables])
+    noise_mean, noise_covariance = noise_block(mode)
     # along trajectories each change of the noise costs a run of the filter: a block by itself
     independent = isinstance(problem.likelihood, TransitionLikelihood)
-    if independent:  # the variance of log sigma is half the inverse of the number of measurements
-        counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
-        noise_mean = problem.likelihood.free(np.log(mode.sigma))
-        noise_covariance = np.diag(0.5 / np.maximum(counts, 1))
-    else:
-        noise_mean, noise_covariance = mode.noise_gaussian()
     if len(blocks) == 1 and independent:
         (only,) = blocks
         both = np.concatenate([only.places, entries]), np.concatenate([only.mean, noise_mean])
         return [Gaussian(*both, block_diag(only.covariance, noise_covariance))]
     cheap = _CHEAP if independent else _CHEAP_ALONG
     return [*blocks, Gaussian(entries, noise_mean, noise_covariance, cheap)]
+
+
+def noise_block(mode: Mode) -> tuple[Floats, Floats]:
+    """Return the Laplace approximation of the logarithm of the free noise parameters.
+
+    Shapes (free,) and (free, free).
+    """
+    problem = mode.problem
+    if isinstance(problem.likelihood, TrajectoryLikelihood):
+        return mode.noise_gaussian()
+    # the variance of log sigma is half the inverse of the number of measurements
+    counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
+    covariance = np.diag(0.5 / np.maximum(counts, 1))
+    return problem.likelihood.free(np.log(mode.sigma)), covariance
 
 
 def blank_point(model: pm.Model, problem: Problem) -> dict[str, Floats]:
@@ -94,7 +103,7 @@ def constrain(prior: Prior, u: Any) -> Any:
     return u
 
 
-def _laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
+def laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
     """Return mode and Laplace covariance in the sampler's space, no wider than a prior's."""
     pairs = map(unconstrain, problem.layout.priors, mode.phi)
     mean, scale = np.array(list(pairs)).reshape(-1, 2).T

@@ -34,6 +34,7 @@ from pbrl_ppl.posterior import (
     problem_of,
 )
 from pbrl_ppl.sampling.fitting import fit
+from pbrl_ppl.sampling.importance import systematic
 from pbrl_ppl.sampling.rejuvenation import rejuvenate
 from pbrl_ppl.sampling.update_checks import (
     as_recorded,
@@ -42,7 +43,7 @@ from pbrl_ppl.sampling.update_checks import (
     check_posterior,
     judgement,
 )
-from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.state import Floats
 
 #: Group of the fitted draws with their weights. Each update resamples these: resampling the draws
 #: of the last update would lose more of them.
@@ -290,7 +291,7 @@ def _without_fit(
     if new.share < _REFIT or new.heavy or chosen_among or new.more_noise:
         return None, whole, {}
     draws = min(base.sizes["draw"], -(-_WALKERS // base.sizes["chain"]))
-    chosen = _systematic(new.weights, base.sizes["chain"] * draws, rng)
+    chosen = systematic(new.weights, base.sizes["chain"] * draws, rng)
     phi, sigma, accepted = rejuvenate(whole, new.phi[chosen], new.sigma[chosen], rng)
     like = base[list(whole.named(phi, sigma))].isel(draw=slice(draws))
     posterior = like.assign(
@@ -325,7 +326,7 @@ def _reweighted(new: _Weighted, rng: np.random.Generator) -> Any:
     base, weights = new.base, new.weights
     chains, n = base.sizes["chain"], base.sizes["draw"]
     ancestor = np.stack(
-        [_systematic(chain_weights, n, rng) for chain_weights in weights.reshape(chains, n)]
+        [systematic(chain_weights, n, rng) for chain_weights in weights.reshape(chains, n)]
     )
     where = xr.DataArray(ancestor, dims=("chain", "draw"))
     drawn = base.isel(chain=xr.DataArray(np.arange(chains), dims="chain"), draw=where)
@@ -333,7 +334,7 @@ def _reweighted(new: _Weighted, rng: np.random.Generator) -> Any:
     added = ("log_likelihood", "log_weight", "next_state", "min_ess")
     posterior = _used(drawn[[str(v) for v in base.data_vars if v not in added]])
     vectors = parameter_draws(new.problem, from_groups({"posterior": posterior}, {}))
-    rows = _systematic(weights[base["row"].to_numpy()] + 1e-300, base.sizes["row"], rng)
+    rows = systematic(weights[base["row"].to_numpy()] + 1e-300, base.sizes["row"], rng)
     predictive = base["next_state"].isel(row=rows).rename(row="draw")
     predictive = predictive.assign_coords(draw=np.arange(len(rows))).expand_dims(chain=[0])
     result = {
@@ -356,13 +357,6 @@ def _used(data: xr.Dataset) -> xr.Dataset:
     """Return the dataset without coordinates that no variable has."""
     dims = {dim for variable in data.data_vars.values() for dim in variable.dims}
     return data.drop_vars([str(c) for c in data.coords if not set(data[c].dims) <= dims])
-
-
-def _systematic(weights: Floats, n: int, rng: np.random.Generator) -> Ints:
-    """Return ``n`` indices in increasing order by systematic resampling."""
-    ends = np.cumsum(weights)
-    indices = np.searchsorted(ends / ends[-1], (rng.uniform() + np.arange(n)) / n)
-    return np.minimum(indices, len(weights) - 1)
 
 
 def _base(idata: Any) -> xr.Dataset:

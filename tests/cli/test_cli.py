@@ -98,7 +98,7 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     scene, train, test, options = calls[0]
     assert scene.substeps == 4
     assert train.n_transitions == test.n_transitions == 4
-    assert options == {"seed": 1, "draws": None, "method": "metropolis"}
+    assert options == {"seed": 1, "draws": None, "method": "importance"}
 
 
 def test_a_status_line_has_the_stage_and_the_time_elapsed(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -129,7 +129,7 @@ def test_close_loop_options(calls: list[Any], capsys: pytest.CaptureFixture[str]
     assert len(calls) == 1
     assert main([*argv, "--overwrite"]) == 0
     assert main([*argv, "--overwrite", "--method", "nuts"]) == 2
-    assert "'metropolis', 'laplace'" in capsys.readouterr().err
+    assert "'importance', 'metropolis', 'laplace'" in capsys.readouterr().err
 
 
 @pytest.mark.usefixtures("files")

@@ -1,0 +1,73 @@
+"""Evaluation of a function in a forked process, beside the caller."""
+
+from __future__ import annotations
+
+import multiprocessing as mp
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+R = TypeVar("R")
+
+
+@contextmanager
+def background(function: Callable[[], R]) -> Iterator[Callable[[], R]]:
+    """Evaluate a function in a forked process, which ends with the context.
+
+    Without processors to spare or without forks, the caller's process evaluates it when asked.
+
+    Parameters
+    ----------
+    function : callable
+        Takes nothing; its result can be pickled.
+
+    Yields
+    ------
+    callable
+        Waits for the result and returns it; raises what the function raised.
+
+    Examples
+    --------
+    >>> with background(lambda: 6 * 7) as answer:
+    ...     answer()
+    42
+    """
+    if mp.cpu_count() < 2 or "fork" not in mp.get_all_start_methods():
+        yield function
+        return
+    context = mp.get_context("fork")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(function, sender))
+    with warnings.catch_warnings():
+        # of processes with threads: those of BLAS and of the engine wait between calls
+        warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
+        process.start()
+    sender.close()
+
+    def result() -> R:
+        try:
+            succeeded, value = receiver.recv()
+        except EOFError:  # the process was killed, as by a lack of memory
+            return function()
+        if not succeeded:
+            raise value
+        answer: R = value
+        return answer
+
+    try:
+        yield result
+    finally:
+        process.terminate()
+        process.join()
+        receiver.close()
+
+
+def _send(function: Callable[[], Any], sender: Any) -> None:
+    """Send whether the function succeeded, and its result or what it raised."""
+    try:
+        answer = True, function()
+    except BaseException as error:
+        answer = False, error
+    sender.send(answer)
+    sender.close()
