@@ -83,6 +83,9 @@ class SelectionCriteria:
         catalogue does.
     least_trajectories : int
         With fewer trajectories, cross-validation leaves out runs of them, and evidence decides.
+    promise : float
+        A candidate is refitted only if, by its score, it changes predictions by at least this
+        share of ``negligible``.
     """
 
     refits: int = 4
@@ -90,6 +93,7 @@ class SelectionCriteria:
     informed: float = 0.7
     tie: float = 1.0
     least_trajectories: int = 8
+    promise: float = 0.25
 
 
 @dataclass(frozen=True)

@@ -38,6 +38,8 @@ class Signature:
         Orthonormal basis of the projected signature, shape (n, q).
     direction : ndarray
         Unit vector of the fitted signature, shape (n,); zero if there is none.
+    absorbed : ndarray
+        Change of the declared parameters with the effect of the estimated size, shape (p,).
     """
 
     attached: Attached
@@ -45,6 +47,7 @@ class Signature:
     log_p: float
     basis: Floats
     direction: Floats
+    absorbed: Floats
 
 
 def rank_candidates(
@@ -78,8 +81,9 @@ def rank_candidates(
     residual, jacobian, signatures = _signatures(mode, smooth)
     q, r = np.linalg.qr(jacobian)
     # a parameter that neither the data nor the prior inform has no direction
-    q = q[:, np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)]
-    test = _Test(q, residual - q @ (q.T @ residual), len(candidates), criteria)
+    informed = np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)
+    back, q = np.linalg.pinv(r)[:, informed], q[:, informed]
+    test = _Test(q, back, residual - q @ (q.T @ residual), len(candidates), criteria)
     derived = dict(zip(smooth, signatures, strict=True))
 
     def score(attached: Attached) -> Signature:
@@ -152,11 +156,13 @@ class _Evidence:
     basis: Floats
     direction: Floats
     unit: Floats
+    absorbed: Floats
 
 
-def _none(n: int) -> _Evidence:
-    """Return no evidence for one column, over n whitened residuals."""
-    return _Evidence(0.0, 0.0, 0.0, np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1))
+def _none(n: int, p: int) -> _Evidence:
+    """Return no evidence for one column, over n whitened residuals and p parameters."""
+    nothing = np.zeros(1), np.zeros((n, 0)), np.zeros(n), np.zeros(1), np.zeros(p)
+    return _Evidence(0.0, 0.0, 0.0, *nothing)
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,7 +172,9 @@ class _Test:
     Parameters
     ----------
     q : ndarray
-        Orthonormal directions that the declared parameters absorb, shape (n, p).
+        Orthonormal directions that the declared parameters absorb, shape (n, direction).
+    back : ndarray
+        From these directions to the declared parameters, shape (p, direction).
     residual : ndarray
         Whitened residual without these directions, shape (n,).
     candidates : int
@@ -176,6 +184,7 @@ class _Test:
     """
 
     q: Floats
+    back: Floats
     residual: Floats
     candidates: int
     criteria: Criteria
@@ -220,7 +229,8 @@ class _Test:
                 log_p = log_p + np.log(0.5) if allowed else 0.0
             if statistic > 0:
                 direction = basis @ coordinates / np.sqrt(statistic)
-        return _Evidence(statistic, log_p, share, size, basis, direction, unit)
+        absorbed = -self.back @ (self.q.T @ (signature @ (size / scales)))
+        return _Evidence(statistic, log_p, share, size, basis, direction, unit, absorbed)
 
 
 def _sides(attached: Attached) -> Ints:
@@ -257,13 +267,15 @@ def _signature(
         looks=n_looks,
         detectable=limits,
     )
-    return Signature(attached, candidate, log_p, evidence.basis, evidence.direction)
+    return Signature(
+        attached, candidate, log_p, evidence.basis, evidence.direction, evidence.absorbed
+    )
 
 
 def _best_look(mode: Mode, attached: Attached, test: _Test) -> Signature:
     """Return the signature of the grid point that explains most; a whole change has one sign."""
     effect, n, units = attached.effect, len(test.residual), []
-    tried, best = looks(mode, attached), _none(n)
+    tried, best = looks(mode, attached), _none(n, len(test.back))
     values = np.array(effect.null)
     for look in tried:
         rows = np.pad(look.signature, ((0, n - len(look.signature)), (0, 0)))
@@ -310,7 +322,7 @@ def _tail_score(mode: Mode, attached: Attached, test: _Test) -> Signature:
     score, variance = float((z**4 - 6 * z**2 + 3).sum() / 4), 1.5 * max(len(z), 1)
     heavier = score > 0
     evidence = replace(
-        _none(len(test.residual)),
+        _none(len(test.residual), len(test.back)),
         statistic=score**2 / variance if heavier else 0.0,
         log_p=float(norm.logsf(score / np.sqrt(variance))) if heavier else 0.0,
         share=1.0,

@@ -18,6 +18,7 @@ from pbrl_ppl.criticism.cross_validation import (
     trajectory_count,
 )
 from pbrl_ppl.criticism.forecast import longest_forecast
+from pbrl_ppl.criticism.promise import promised_share
 from pbrl_ppl.criticism.recordings import outliers
 from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
@@ -95,7 +96,7 @@ class Selection:
             penalty = 0.5 * _informed(fitted, signature.attached, limits.informed) * np.log(shown)
             return float(_log_likelihood(fitted) - penalty)
 
-        waiting = self._worth_a_refit(ranked, order)
+        waiting = self._worth_a_refit(mode, ranked, order)
         while waiting:
             # those far behind the first are tried only once it has failed
             enough = limits.worth_a_refit * waiting[0].candidate.statistic
@@ -121,8 +122,10 @@ class Selection:
                 return step
         return None
 
-    def _worth_a_refit(self, ranked: list[Signature], order: list[str]) -> list[Signature]:
-        """Return the significant candidates, best first; of twins, the first in the catalogue.
+    def _worth_a_refit(
+        self, mode: Mode, ranked: list[Signature], order: list[str]
+    ) -> list[Signature]:
+        """Return the candidates that could be added, best first; of twins, the first in the catalogue.
 
         The noise's shape is scored and never added, for it would take up any misfit.
         """
@@ -145,32 +148,49 @@ class Selection:
         most = self.criteria.selection.refits
         for signature in kept[most:]:
             self._note(signature, f"behind the {most} that are refitted in a round")
-        return kept[:most]
+        least = self.criteria.selection.promise * self.criteria.negligible
+        promising = []
+        for signature in kept[:most]:
+            share = promised_share(mode, signature)
+            if share < least:
+                self._negligible(signature, share)
+            else:
+                promising.append(signature)
+        return promising
 
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
         """Return the step if its gain is significant in cross-validation and not negligible."""
-        fitted = with_enough_substeps(fitted, self.say, self.criteria)
-        if why := self._implausible(fitted, signature):
-            self._note(signature, why)
-            return None
-        density, forecasts = _gains(mode, fitted, self.criteria)
-        if why := self._uncertain(mode, fitted, density, forecasts):
-            self._note(signature, why)
-            return None
-        share, negligible = _share(mode, fitted), self.criteria.negligible
-        if forecasts.certain(self.criteria.min_elpd_se):
-            share = max(share, forecasts.total)
-        if share < negligible:
-            size = f"changes predictions by {100 * share:.2g} %"
-            self._note(signature, f"{size}: less than {100 * negligible:g} % is negligible")
-            if not self.small:  # others may be significant only without it
-                self.small.append(signature.candidate)
-            return None
+        coarse = fitted  # what fails with few engine steps needs no more of them
+        while True:
+            if why := self._implausible(fitted, signature):
+                self._note(signature, why)
+                return None
+            density, forecasts = _gains(mode, fitted, self.criteria)
+            if why := self._uncertain(mode, fitted, density, forecasts):
+                self._note(signature, why)
+                return None
+            share = _share(mode, fitted)
+            if forecasts.certain(self.criteria.min_elpd_se):
+                share = max(share, forecasts.total)
+            if share < self.criteria.negligible:
+                self._negligible(signature, share)
+                return None
+            fitted = with_enough_substeps(fitted, self.say, self.criteria)
+            if fitted is coarse:
+                break
+            coarse = fitted
         self._note(signature, "added")
         others = inseparable(signature, ranked, self.criteria)
         return Step(signature, others, fitted, density.total, density.error)
+
+    def _negligible(self, signature: Signature, share: float) -> None:
+        """Record that a candidate changes predictions by a negligible share."""
+        limit = f"less than {100 * self.criteria.negligible:g} % is negligible"
+        self._note(signature, f"changes predictions by {100 * share:.2g} %: {limit}")
+        if not self.small:  # others may be significant only without it
+            self.small.append(signature.candidate)
 
     def _implausible(self, mode: Mode, signature: Signature) -> str:
         """Return why the fitted size of an effect is not accepted; empty if it is."""

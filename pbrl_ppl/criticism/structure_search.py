@@ -7,7 +7,7 @@ from scipy.optimize import minimize
 
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.modes import Mode, trajectory_mode
+from pbrl_ppl.modes import Mode, nearby_mode, trajectory_mode
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.state import Floats
 
@@ -50,8 +50,10 @@ def structure_mode(mode: Mode, candidate: Attached, estimate: Floats) -> Mode:
         With at least 40 substeps an interval.
     """
     physics = mode.problem.physics
+    substeps = max(_SUBSTEPS, physics.substeps)
+    # where bodies touch, extrapolation gains nothing
     problem = mode.problem.with_physics(
-        effects=(*physics.effects, candidate), substeps=max(_SUBSTEPS, physics.substeps)
+        effects=(*physics.effects, candidate), substeps=_SUBSTEPS, extrapolate=False
     )
     layout = problem.layout
     phi = layout.from_layout(mode.problem.layout, mode.phi)
@@ -77,7 +79,8 @@ def structure_mode(mode: Mode, candidate: Attached, estimate: Floats) -> Mode:
         if again.log_posterior < best.log_posterior + _BETTER:
             break
         best = again
-    return best
+    exact = best.problem.with_physics(substeps=substeps, extrapolate=physics.extrapolate)
+    return nearby_mode(exact, best.phi, best.sigma)
 
 
 def _places(

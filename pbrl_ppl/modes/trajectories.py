@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from pbrl_ppl.likelihood import (
@@ -14,6 +16,7 @@ from pbrl_ppl.likelihood import (
     with_sensitivity,
 )
 from pbrl_ppl.modes.laplace import Mode
+from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import change_from, inside
@@ -26,6 +29,9 @@ _ROUNDS, _SETTLED = 6, 0.2
 _QUIET = 0.1
 #: Rounds of a climb between two linearisations.
 _CLIMB = 5
+#: Corrections of the error of few engine steps, at most; one with which the log-posterior (nats) is
+#: as with many steps is the last.
+_CORRECTIONS, _SAME = 3, 0.5
 #: Climbs of a search, and how much farther apart than draws from single transitions they begin.
 _STARTS, _WIDER = 5, 2.0
 
@@ -77,7 +83,8 @@ def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) 
     whole = isinstance(problem.likelihood, TrajectoryLikelihood)
     if sigma is None or not whole:
         cells = problem.trajectory_noise.cells if whole else None
-        problem = along_trajectories(problem, phi, cells=cells)
+        rough = along_trajectories(problem.rough, phi, cells=cells)
+        problem = replace(rough, physics=problem.physics)
         sigma = problem.trajectory_noise.sigma
     mode = nearby_mode(problem, phi, sigma)
     quiet = mode.problem.quiet(mode.sigma, _QUIET)
@@ -90,6 +97,9 @@ def trajectory_mode(problem: Problem, phi: Floats, sigma: Floats | None = None) 
 def nearby_mode(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
     """Return the mode by alternating climbs with smoothing.
 
+    It climbs with few engine steps, whose error at the start is corrected, and corrects it again
+    where that ends.
+
     Parameters
     ----------
     problem : Problem
@@ -97,6 +107,30 @@ def nearby_mode(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
     phi, sigma : ndarray
         Where to begin, shapes (p,) and (parameter,).
     """
+    best: Mode | None = None
+    for _ in range(_CORRECTIONS):
+        cheap = problem.corrected(phi)
+        mode = _settled(cheap, phi, sigma)
+        if cheap is problem:
+            return mode
+        problem = replace(mode.problem, physics=problem.physics, defect=None)
+        moved, phi = _change(mode, phi), mode.phi
+        residual = problem.residual(phi)
+        sigma = profile_sigma(problem, residual, phi)
+        density = problem.log_density(residual, sigma, phi).sum()
+        height = float(log_posterior(problem, phi, sigma, log_likelihood=density))
+        fine = replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=())
+        if best is None or height > best.log_posterior:
+            best = fine
+        if moved < _SETTLED or abs(height - mode.log_posterior) < _SAME:
+            break
+    if best is None:
+        raise ValueError("a mode takes at least one correction")
+    return best
+
+
+def _settled(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
+    """Return the mode of a problem by alternating climbs with smoothing."""
     for i in range(_ROUNDS):
         if i:
             problem = smoothed(problem, phi, sigma)
