@@ -23,12 +23,15 @@ class Forecast:
         Measured minus predicted, shape (start, cell), SI units; NaN where not measured.
     variance : ndarray
         Expected square of the error under measurement noise, shape (start, cell).
+    motion : ndarray
+        Measured change over the forecast, shape (start, cell), SI units; NaN where not measured.
     dimension : ndarray of int
         State dimension of each cell, shape (cell,).
     """
 
     error: Floats
     variance: Floats
+    motion: Floats
     dimension: Ints
 
     def rmse(self) -> dict[str, float]:
@@ -113,14 +116,16 @@ def forecast(
         at = at[within[at]]
     if not len(at):
         none = np.zeros((0, len(cells.places)))
-        return Forecast(none, none, cells.places % len(STATE))
+        return Forecast(none, none, none, cells.places % len(STATE))
     trajectory, step = segments.trajectory[at], segments.step[at]
     every = at[:, None] + np.arange(intervals)
     states = filtered_states(problem, phi, sigma)[trajectory, step]
     inputs = problem.inputs[every, 0]
     ends = cells.of(problem.one_world(phi, states, inputs)[:, -1])
     observed = problem.data.history.dataset["observed"].to_numpy()
-    error = cells.wrapped(cells.of(observed[trajectory, step + intervals]) - ends)
+    measured_ends = cells.of(observed[trajectory, step + intervals])
+    error = cells.wrapped(measured_ends - ends)
+    motion = measured_ends - cells.of(states)
     covariance = _spread(noise, sigma, at, step)
     free, touching = cells.steps(sigma)
     contact = touching - free  # uncertainty of how bodies part
@@ -135,7 +140,8 @@ def forecast(
         covariance = covariance + noise.touching[every[:, i], None, None] * contact
         pushed = slope @ pushed + pushes
     variance = np.diagonal(covariance, axis1=1, axis2=2) + cells.errors(sigma) ** 2
-    return Forecast(error, variance + (pushed**2).sum(axis=2), cells.places % len(STATE))
+    variance = variance + (pushed**2).sum(axis=2)
+    return Forecast(error, variance, motion, cells.places % len(STATE))
 
 
 def _spread(noise: TrajectoryNoise, sigma: Floats, at: Ints, step: Ints) -> Floats:

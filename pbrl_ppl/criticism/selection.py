@@ -17,7 +17,7 @@ from pbrl_ppl.criticism.cross_validation import (
     relative_fall,
     trajectory_count,
 )
-from pbrl_ppl.criticism.forecast import longest_forecast
+from pbrl_ppl.criticism.forecast import forecast, longest_forecast
 from pbrl_ppl.criticism.promise import promised_share
 from pbrl_ppl.criticism.recordings import outliers
 from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
@@ -173,7 +173,8 @@ class Selection:
                 return None
             share = _share(mode, fitted)
             if forecasts.certain(self.criteria.min_elpd_se):
-                share = max(share, forecasts.total)
+                # of errors near the noise, any share is small beside the motion
+                share = max(share, min(forecasts.total, _forecast_change(mode, fitted)))
             if share < self.criteria.negligible:
                 self._negligible(signature, share)
                 return None
@@ -320,6 +321,20 @@ def _gains(before: Mode, after: Mode, criteria: Criteria) -> tuple[Change, Chang
         for mode, left_out in zip((before, after), models, strict=True)
     )
     return Change.of(models[1].density - models[0].density), relative_fall(worse, better)
+
+
+def _forecast_change(before: Mode, after: Mode) -> float:
+    """Return the largest change of long forecasts over a coordinate's motion in that time."""
+    intervals = longest_forecast(after.problem)
+    worse, better = (
+        forecast(each.problem, each.phi, each.sigma, intervals) for each in (before, after)
+    )
+    changed = np.isfinite(worse.error) & np.isfinite(better.error)
+    change = worse.error - better.error
+    size, motion = (
+        (np.where(changed, each, 0.0) ** 2).sum(axis=0) for each in (change, worse.motion)
+    )
+    return float(np.sqrt(np.max(size / np.maximum(motion, 1e-300), initial=0.0)))
 
 
 def _share(before: Mode, after: Mode) -> float:
