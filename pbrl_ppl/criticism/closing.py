@@ -57,7 +57,7 @@ from pbrl_ppl.scene import Scene
 
 #: Draws of each chain, then those where that is not enough; those of other methods; least tuning.
 CHAIN_DRAWS, LEAST_TUNE = (300, 1000), 100
-DRAWS = {"importance": (180, 600), "laplace": (125,)}
+DRAWS = {"importance": (150, 600), "laplace": (125,)}
 #: Draws from the prior, some of which must reach the measurements.
 PRIOR_DRAWS = 100
 
@@ -93,7 +93,7 @@ def close_loop(
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws kept of each chain; by default 180 of importance sampling and 300 of chains,
+        Posterior draws kept of each chain; by default 150 of importance sampling and 300 of chains,
         more where these do not suffice.
     method : str
         Sampler of :func:`pbrl_ppl.fit`; with ``laplace`` the verdict relies on modes.

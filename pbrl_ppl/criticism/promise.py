@@ -1,13 +1,16 @@
-"""Size of a candidate's effect on predictions, from its score and without a refit."""
+"""Size of an effect on predictions, and what a candidate's score promises without a refit."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from pbrl_ppl.criticism.forecast import forecast, longest_forecast
+from pbrl_ppl.criticism.forecast import Forecast, forecast, longest_forecast
 from pbrl_ppl.criticism.score import Signature
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import inside
+from pbrl_ppl.state import Floats
 
 
 def promised_share(mode: Mode, signature: Signature) -> float:
@@ -25,28 +28,45 @@ def promised_share(mode: Mode, signature: Signature) -> float:
         The candidate.
     """
     attached, problem = signature.attached, mode.problem
-    square = float((mode.whitened_residual**2).sum())
-    innovations = 0.5 * signature.candidate.statistic / max(square, 1e-300)
-    without = problem.rough
     within = problem.with_physics(effects=(*problem.physics.effects, attached)).rough
     layout = within.layout
-    moved = mode.phi + signature.absorbed
-    phi = layout.from_layout(problem.layout, moved)
+    phi = layout.from_layout(problem.layout, mode.phi + signature.absorbed)
     places = [layout.labels.index(label) for label in attached.labels]
     phi[places] = list(signature.candidate.estimate.values())
-    phi = inside(layout.priors, phi)
-    intervals = longest_forecast(problem)
-    worse, better = (
-        forecast(model, at, mode.sigma, intervals).error
-        for model, at in ((without, mode.phi), (within, phi))
-    )
-    if not len(worse):
-        return innovations
-    both = np.isfinite(worse) & np.isfinite(better)
-    before, after = (np.where(both, each, 0.0) ** 2 for each in (worse, better))
-    unit = before.sum(axis=0)
-    seen = unit > 0
+    changed = replace(mode, problem=within, phi=inside(layout.priors, phi))
+    before = replace(mode, problem=problem.rough)
+    worse, better = _forecasts(before, changed)
+    errors = _squares(worse, better, worse.error)
+    seen = errors > 0
     if not seen.any():
-        return innovations
-    falls = 1.0 - after.sum(axis=0)[seen] / unit[seen]
-    return max(innovations, 0.5 * float(falls.mean()))
+        return signature.fall
+    falls = 1.0 - _squares(worse, better, better.error)[seen] / errors[seen]
+    return max(signature.fall, min(0.5 * float(falls.mean()), forecast_change(before, changed)))
+
+
+def forecast_change(before: Mode, after: Mode) -> float:
+    """Return the change of long forecasts over the motion in that time, of the worst coordinate.
+
+    Near the noise any share of an error is small beside the motion.
+    """
+    worse, better = _forecasts(before, after)
+    if not len(worse.error):
+        return 0.0
+    change = _squares(worse, better, worse.error - better.error)
+    motion = _squares(worse, better, worse.motion)
+    return float(np.sqrt((change / np.maximum(motion, 1e-300)).max()))
+
+
+def _forecasts(before: Mode, after: Mode) -> tuple[Forecast, Forecast]:
+    """Return the longest forecasts of both models."""
+    intervals = longest_forecast(after.problem)
+    worse, better = (
+        forecast(each.problem, each.phi, each.sigma, intervals) for each in (before, after)
+    )
+    return worse, better
+
+
+def _squares(worse: Forecast, better: Forecast, values: Floats) -> Floats:
+    """Return sums of squares of what both models forecast, shape (coordinate,)."""
+    both = np.isfinite(worse.error) & np.isfinite(better.error)
+    return np.asarray((np.where(both, values, 0.0) ** 2).sum(axis=0))

@@ -57,7 +57,8 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
         return []
     body = problem.scene.body(candidate.body)
     proposed = effect.scan(problem.scene, problem.data.history, body)
-    wide = problem.with_physics(effects=(*problem.physics.effects, candidate)).rough
+    effects = (*problem.physics.effects, candidate)
+    wide = problem.with_physics(effects=effects, extrapolate=False).rough
     labels = wide.layout.labels
     declared = [labels.index(label) for label in problem.layout.labels]
     own = [labels.index(label) for label in candidate.labels]  # places in the wider vector

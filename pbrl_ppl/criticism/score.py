@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from scipy.stats import chi2, norm
@@ -40,6 +39,8 @@ class Signature:
         Unit vector of the fitted signature, shape (n,); zero if there is none.
     absorbed : ndarray
         Change of the declared parameters with the effect of the estimated size, shape (p,).
+    fall : float
+        Share by which the innovations fall, to first order.
     """
 
     attached: Attached
@@ -48,6 +49,7 @@ class Signature:
     basis: Floats
     direction: Floats
     absorbed: Floats
+    fall: float
 
 
 def rank_candidates(
@@ -114,35 +116,39 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Flo
     signatures : list of ndarray
         Derivative of the prediction by each candidate's parameters, shape (n + p, q) each.
     """
-    problem, p = mode.problem, len(mode.phi)
-    priors = problem.layout.priors
-    wide = problem.with_physics(effects=(*problem.physics.effects, *candidates)).rough
-    # declared parameters come first in both layouts, block by block, so look each one up
-    labels = wide.layout.labels
-    declared = [labels.index(label) for label in problem.layout.labels]
-    null = np.zeros(wide.layout.size)
-    null[declared] = mode.phi
-    columns: list[list[int]] = []
-    for attached in candidates:
-        places = [labels.index(label) for label in attached.labels]
-        null[places] = attached.effect.null
-        columns.append(places)
-    new = [*declared, *(place for places in columns for place in places)]
-    lower, upper = (bound[new] for bound in wide.layout.bounds)
-    begin = np.array([1e-3 * min(wide.layout.priors[place].sigma, 1.0) for place in new])
+    p, priors = len(mode.phi), mode.problem.layout.priors
+    residual = np.concatenate([mode.whitened_residual.ravel(), -prior_residual(priors, mode.phi)])
+    jacobian = np.vstack([_slopes(mode), np.diag(prior_slopes(priors, mode.phi))])
+    signatures = [_slopes(mode, attached) for attached in candidates]
+    return residual, jacobian, [np.pad(own, ((0, p), (0, 0))) for own in signatures]
+
+
+def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
+    """Return the derivative of whitened predictions, shape (n, columns).
+
+    By the parameters of a candidate at its null value, or else by the declared ones. Each candidate
+    is simulated by itself, for every law costs time in every engine step.
+    """
+    effects = mode.problem.physics.effects + (() if attached is None else (attached,))
+    wide = mode.problem.with_physics(effects=effects, extrapolate=False).rough
+    layout = wide.layout
+    null = layout.from_layout(mode.problem.layout, mode.phi)
+    labels = mode.problem.layout.labels
+    if attached is not None:
+        labels = attached.labels
+        null[[layout.labels.index(label) for label in labels]] = attached.effect.null
+    new = [layout.labels.index(label) for label in labels]
+    if not new:
+        return np.zeros((mode.whitened_residual.size, 0))
+    lower, upper = (bound[new] for bound in layout.bounds)
+    begin = np.array([1e-3 * min(layout.priors[place].sigma, 1.0) for place in new])
 
     def predict(points: Floats) -> Floats:
         phi = np.tile(null, (len(points), 1))
         phi[:, new] = points
         return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
-    derivative, _ = posterior_steps(predict, null[new], lower, upper, begin)
-    residual = np.concatenate([mode.whitened_residual.ravel(), -prior_residual(priors, mode.phi)])
-    jacobian = np.vstack([derivative[:, :p], np.diag(prior_slopes(priors, mode.phi))])
-    derivative = np.vstack([derivative[:, p:], np.zeros((p, len(new) - p))])
-    edges = np.cumsum([0, *map(len, columns)])
-    split = [derivative[:, a:b] for a, b in pairwise(edges)]
-    return residual, jacobian, split
+    return posterior_steps(predict, null[new], lower, upper, begin)[0]
 
 
 @dataclass(frozen=True, eq=False)
@@ -267,8 +273,9 @@ def _signature(
         looks=n_looks,
         detectable=limits,
     )
+    fall = 0.5 * evidence.statistic / max(float(test.residual @ test.residual), 1e-300)
     return Signature(
-        attached, candidate, log_p, evidence.basis, evidence.direction, evidence.absorbed
+        attached, candidate, log_p, evidence.basis, evidence.direction, evidence.absorbed, fall
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.stats import chi2
@@ -11,14 +12,15 @@ from scipy.stats import chi2
 from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.cross_validation import (
     Change,
+    LeftOut,
     folds,
     forecast_squares,
     leave_out,
     relative_fall,
     trajectory_count,
 )
-from pbrl_ppl.criticism.forecast import forecast, longest_forecast
-from pbrl_ppl.criticism.promise import promised_share
+from pbrl_ppl.criticism.forecast import longest_forecast
+from pbrl_ppl.criticism.promise import forecast_change, promised_share
 from pbrl_ppl.criticism.recordings import outliers
 from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
@@ -125,7 +127,7 @@ class Selection:
     def _worth_a_refit(
         self, mode: Mode, ranked: list[Signature], order: list[str]
     ) -> list[Signature]:
-        """Return the candidates that could be added, best first; of twins, the first in the catalogue.
+        """Return the candidates that could be added, best first; of twins, the earlier one.
 
         The noise's shape is scored and never added, for it would take up any misfit.
         """
@@ -173,8 +175,7 @@ class Selection:
                 return None
             share = _share(mode, fitted)
             if forecasts.certain(self.criteria.min_elpd_se):
-                # of errors near the noise, any share is small beside the motion
-                share = max(share, min(forecasts.total, _forecast_change(mode, fitted)))
+                share = max(share, min(forecasts.total, forecast_change(mode, fitted)))
             if share < self.criteria.negligible:
                 self._negligible(signature, share)
                 return None
@@ -313,28 +314,16 @@ def _gains(before: Mode, after: Mode, criteria: Criteria) -> tuple[Change, Chang
     The forecasts are as long as the recording allows; the fall is a mean over observed coordinates,
     each in units of the errors before.
     """
-    fold = folds(after, criteria)
-    models = [leave_out(mode, fold) for mode in (before, after)]
-    intervals = longest_forecast(after.problem)
-    worse, better = (
-        forecast_squares(mode, fold, left_out, intervals)
-        for mode, left_out in zip((before, after), models, strict=True)
-    )
-    return Change.of(models[1].density - models[0].density), relative_fall(worse, better)
+    (worse, low), (better, high) = (_left_out(mode, criteria) for mode in (before, after))
+    return Change.of(high.density - low.density), relative_fall(worse, better)
 
 
-def _forecast_change(before: Mode, after: Mode) -> float:
-    """Return the largest change of long forecasts over a coordinate's motion in that time."""
-    intervals = longest_forecast(after.problem)
-    worse, better = (
-        forecast(each.problem, each.phi, each.sigma, intervals) for each in (before, after)
-    )
-    changed = np.isfinite(worse.error) & np.isfinite(better.error)
-    change = worse.error - better.error
-    size, motion = (
-        (np.where(changed, each, 0.0) ** 2).sum(axis=0) for each in (change, worse.motion)
-    )
-    return float(np.sqrt(np.max(size / np.maximum(motion, 1e-300), initial=0.0)))
+@lru_cache(maxsize=2)  # candidates of a round are compared with the same mode
+def _left_out(mode: Mode, criteria: Criteria) -> tuple[Floats, LeftOut]:
+    """Return squared errors of the longest forecasts of each fold, and the fits without it."""
+    fold = folds(mode, criteria)
+    left_out = leave_out(mode, fold)
+    return forecast_squares(mode, fold, left_out, longest_forecast(mode.problem)), left_out
 
 
 def _share(before: Mode, after: Mode) -> float:

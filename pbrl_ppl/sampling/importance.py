@@ -36,9 +36,9 @@ _A_COEFFICIENT, _LEAST, _ROUNDS = 4, 160, 6
 #: Largest number of coefficients of a quadratic emulator.
 _MOST = 250
 #: Sweeps of the walkers between two fits, then between two looks at whether they still drift.
-_SWEEPS, _LOOKS = 5, 6
+_SWEEPS, _LOOKS = 4, 8
 #: Walkers' means may differ by this many standard errors between two looks.
-_DRIFT = 4.5
+_DRIFT = 3.5
 #: A parameter whose derivative is below this in units of noise over its prior is not informed.
 _SILENT = 1e-3
 #: Numbers of the filter's gains that are kept at once, and of residuals.

@@ -19,7 +19,7 @@ from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
 from pbrl_ppl.state import Floats
 
 #: Weighted proposals a draw, and the least share of the draws that they must be worth.
-_PROPOSALS, _WORTH = 1.5, 0.3
+_PROPOSALS, _WORTH = 1.4, 0.3
 #: Engine steps below which a surrogate does not pay.
 _LITTLE = 2000
 
