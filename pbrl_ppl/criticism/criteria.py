@@ -93,7 +93,7 @@ class SelectionCriteria:
     informed: float = 0.7
     tie: float = 1.0
     least_trajectories: int = 8
-    promise: float = 0.5
+    promise: float = 0.75
 
 
 @dataclass(frozen=True)

@@ -30,15 +30,18 @@ class Look:
         is not scanned, or the whole change where all are.
     columns : tuple of int
         The parameter of each column; empty for a whole change.
+    proposed : ndarray
+        As the scan proposed it, shape (q,), NaN for what is not scanned.
     """
 
     values: Floats
     signature: Floats
     columns: tuple[int, ...]
+    proposed: Floats
 
 
-def looks(mode: Mode, candidate: Attached) -> list[Look]:
-    """Simulate a candidate at every grid point that its scan proposes.
+def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> list[Look]:
+    """Simulate a candidate at grid points.
 
     Parameters
     ----------
@@ -46,6 +49,9 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
         Mode of the model that lacks the effect.
     candidate : Attached
         An effect with a ``scan``.
+    proposed : ndarray, optional
+        The grid points, shape (point, q); by default all that its scan proposes, simulated with as
+        few engine steps as tell them apart.
 
     Returns
     -------
@@ -56,9 +62,11 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
     if effect.scan is None:
         return []
     body = problem.scene.body(candidate.body)
-    proposed = effect.scan(problem.scene, problem.data.history, body)
-    effects = (*problem.physics.effects, candidate)
-    wide = problem.with_physics(effects=effects, extrapolate=False).rough
+    wide = problem.with_physics(
+        effects=(*problem.physics.effects, candidate), extrapolate=False
+    ).rough
+    if proposed is None:
+        proposed, wide = effect.scan(problem.scene, problem.data.history, body), wide.coarse
     labels = wide.layout.labels
     declared = [labels.index(label) for label in problem.layout.labels]
     own = [labels.index(label) for label in candidate.labels]  # places in the wider vector
@@ -81,7 +89,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
         part = slice(begin, begin + _AT_ONCE)
         points, plan = _points(proposed[part], free[part], null, (ahead, behind))
         states = whitened(points)
-        for values, columns, rows in plan:
+        for asked, (values, columns, rows) in zip(proposed[part], plan, strict=True):
             if columns:
                 ends = states[rows].reshape(len(columns), 2, -1)
                 width = (ahead - behind)[list(columns)]
@@ -89,7 +97,7 @@ def looks(mode: Mode, candidate: Attached) -> list[Look]:
             else:
                 signature = (states[rows] - nothing).T
             if np.any(signature):
-                found.append(Look(values, signature, columns))
+                found.append(Look(values, signature, columns, asked))
     return found
 
 

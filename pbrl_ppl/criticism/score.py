@@ -10,7 +10,7 @@ from scipy.stats import chi2, norm
 
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
-from pbrl_ppl.criticism.scan import caps, detectable_sizes, detection_limits_of_scan, looks
+from pbrl_ppl.criticism.scan import Look, caps, detectable_sizes, detection_limits_of_scan, looks
 from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.likelihood import TrajectoryLikelihood
 from pbrl_ppl.modes import Mode, posterior_steps
@@ -19,6 +19,8 @@ from pbrl_ppl.state import Floats, Ints
 
 #: Decimals of a p-value's logarithm: effects that are the same physics differ by rounding.
 _EQUAL = 3
+#: Grid points of a scan that are simulated again with more engine steps.
+_LEADING = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,20 +283,26 @@ def _signature(
 
 def _best_look(mode: Mode, attached: Attached, test: _Test) -> Signature:
     """Return the signature of the grid point that explains most; a whole change has one sign."""
-    effect, n, units = attached.effect, len(test.residual), []
-    tried, best = looks(mode, attached), _none(n, len(test.back))
-    values = np.array(effect.null)
-    for look in tried:
+    effect, n = attached.effect, len(test.residual)
+
+    def evidence(look: Look) -> _Evidence:
         rows = np.pad(look.signature, ((0, n - len(look.signature)), (0, 0)))
         columns = list(look.columns)
         sides = _sides(attached)[columns] if columns else np.ones(1, dtype=np.intp)
         scales = _scales(attached)[columns] if columns else np.ones(1)
-        found = test.evidence(rows, sides, scales)
-        units.append(found.unit)
-        if found.log_p < best.log_p:
-            best, values = found, look.values.copy()
-            for column, size in zip(look.columns, found.size, strict=False):
-                values[column] += size
+        return test.evidence(rows, sides, scales)
+
+    tried = looks(mode, attached)
+    scores = [evidence(look) for look in tried]
+    units = [found.unit for found in scores]
+    best, values = _none(n, len(test.back)), np.array(effect.null)
+    leading = sorted(range(len(tried)), key=lambda i: scores[i].log_p)[:_LEADING]
+    if leading and scores[leading[0]].log_p < 0.0:
+        again = looks(mode, attached, np.array([tried[i].proposed for i in leading]))
+        best, look = min(((evidence(look), look) for look in again), key=lambda own: own[0].log_p)
+        values = look.values.copy()
+        for column, size in zip(look.columns, best.size, strict=False):
+            values[column] += size
     signature = _signature(attached, best, values, len(tried), test)
     candidate = replace(
         signature.candidate,
