@@ -72,6 +72,17 @@ class Pieces:
     rows: Ints
     exact: Callable[[Floats], Floats]
 
+    def smooth(self, problem: Problem) -> Pieces:
+        """Return pieces that also emulate transitions in which bodies meet, kinks or not."""
+        if not len(self.rows):
+            return self
+        more = [
+            Piece(part.places, part.bodies, self.rows)
+            for part in problem.simulator.parts
+        ]
+        nothing = np.zeros(0, dtype=int)
+        return Pieces([*self.emulated, *more], nothing, _engine(problem, nothing))
+
     def without(self, places: Ints) -> Pieces:
         """Return pieces that do not depend on some parameters."""
         kept = [

@@ -220,8 +220,6 @@ def unsuited(mode: Mode) -> str:
         return "the posterior has several modes"
     if len(problem.simulator.parts) > 1:
         return "the scene has several independent parts"
-    if len(Pieces.of(problem).rows):
-        return "bodies touch"
     return ""
 
 
