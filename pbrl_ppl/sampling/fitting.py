@@ -16,9 +16,12 @@ from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_mode, find_trajectory_mode, following, weigh
 from pbrl_ppl.posterior import (
+    PARETO_K,
+    SIZE,
     Point,
     PosteriorRecord,
     complete,
+    convergence,
     from_groups,
     group,
     groups,
@@ -140,6 +143,10 @@ def fit(
     library, why = problem.library, ""
     if method == DEFAULT and (library is not None or problem.layout.discrete.any()):
         method = FALLBACK
+    elif method == DEFAULT and resume is not None:
+        earlier = PosteriorRecord.of(resume)
+        if earlier.method != DEFAULT:  # chains go on as chains
+            method, why = FALLBACK, earlier.fallback or ""
     chosen = METHODS[method] if library is None else OVER_LIBRARY.get(method, METHODS[method])
     # with one set there is no choice to sample
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
@@ -310,4 +317,15 @@ def _appended(earlier: Any, trace: Any) -> Any:
         shared = [str(variable) for variable in new.data_vars if variable in old]
         both = xr.concat([old[shared], new[shared]], dim="draw")
         data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
-    return from_groups(data, {})
+    attributes = {}
+    if SIZE in earlier.attrs or SIZE in trace.attrs:
+        runs = (earlier, trace)
+        attributes[PARETO_K] = max(run.attrs.get(PARETO_K, -np.inf) for run in runs)
+        attributes[SIZE] = sum(map(_size, runs))
+    return from_groups(data, attributes)
+
+
+def _size(idata: Any) -> float:
+    """Return the number of independent draws that a posterior's or a trace's draws are worth."""
+    size = idata.attrs.get(SIZE)
+    return min(convergence(idata)[1].values()) if size is None else float(size)

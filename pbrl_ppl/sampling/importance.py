@@ -204,7 +204,13 @@ def silent(mode: Mode) -> Bools:
     A wheel's parameters are never among them, for its prior is not one of independent numbers.
     """
     problem = mode.problem
-    scale = np.array([prior.sigma for prior in problem.layout.priors])
+    # the sigma of a log-normal prior is that of the logarithm
+    scale = np.array(
+        [
+            prior.sigma * (x if prior.family == "log_normal" else 1.0)
+            for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
+        ]
+    )
     size = np.sqrt((mode.jacobian**2).sum(axis=0)) * np.nan_to_num(scale, nan=1.0)
     mask = (size < _SILENT) & bool(mode.jacobian.any())
     for wheel in wheels(problem.layout):
@@ -400,11 +406,12 @@ def resample(
     k : float
         Pareto k.
     size : float
-        Number of independent draws of the posterior that the draws are worth.
+        Number of independent draws of the posterior that the draws are worth; 0, with an infinite
+        k, if a weight is infinite or fewer than two are positive.
     """
     weight = np.zeros(len(log_weight))
     there = np.isfinite(log_weight)
-    if there.sum() < 2:
+    if there.sum() < 2 or np.isposinf(log_weight).any():
         return np.zeros(n, dtype=int), np.inf, 0.0
     weight[there], k = smoothed(log_weight[there])
     counts = np.bincount(systematic(weight, n, rng), minlength=len(weight))
