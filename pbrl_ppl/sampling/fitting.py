@@ -315,7 +315,9 @@ def _appended(earlier: Any, trace: Any) -> Any:
     for name in ("posterior", "sample_stats"):
         old, new = group(earlier, name), data[name]
         shared = [str(variable) for variable in new.data_vars if variable in old]
-        both = xr.concat([old[shared], new[shared]], dim="draw")
+        if shared:  # two samplers have no statistics in common: then NaN stands for missing ones
+            old, new = old[shared], new[shared]
+        both = xr.concat([old, new], dim="draw")
         data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
     attributes = {}
     if SIZE in earlier.attrs or SIZE in trace.attrs:

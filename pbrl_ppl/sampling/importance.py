@@ -417,11 +417,8 @@ def resample(
     counts = np.bincount(systematic(weight, n, rng), minlength=len(weight))
     # the variance of a mean is that of weighted proposals, and what resampling adds
     added = ((counts / n - weight) ** 2).sum()
-    return (
-        rng.permutation(np.repeat(np.arange(len(weight)), counts)),
-        k,
-        1.0 / float((weight**2).sum() + added),
-    )
+    size = min(1.0 / float((weight**2).sum() + added), float(n))
+    return rng.permutation(np.repeat(np.arange(len(weight)), counts)), k, size
 
 
 def stream(seed: int, starts: list[dict[str, Any]]) -> list[int]:
