@@ -50,7 +50,7 @@ STATISTICS = {
     " them, in nats; more is better.",
     "LOO": "Leave-one-out cross-validation: elpd of each transition given all others; of whole"
     " trajectories leave-one-trajectory-out, elpd of each trajectory given all others.",
-    "Pareto k": "Of LOO: how far leaving one of them out changes the posterior; above the threshold,"
+    "Pareto k": "Of LOO: how far leaving one out changes the posterior; above the threshold,"
     " LOO is not to be relied on. Of importance sampling: how heavy the tail of the proposals'"
     " weights is; above 0.7, the proposals miss a part of the posterior, and chains are run.",
     "R-hat": "Spread of all chains over that within one; 1 if they agree, at most 1.01 is wanted.",

@@ -75,14 +75,14 @@ def fit(
         As made by ``physics_model``.
     method : str
         ``importance``: proposals that many walkers draw together from the posterior of an
-        emulator, weighted by the engine in one batch and resampled; where bodies touch, where the
-        scene has several independent parts or modes, or where no emulator is close enough,
-        ``metropolis``, and ``attrs["fallback"]`` says why; ``metropolis``: adaptive blocks that
-        follow the scene's independent parts and look ahead with polynomials where engine runs are
-        dear; ``paper``: one random walk a variable, by default on the schedule of the paper's Table
-        2 for the cart (30 chains of 20,000 iterations, 1,000 of them burn-in, each tenth kept);
-        with a library, on that for the apartment (``draws=400, tune=1000, thin=10, chains=1``),
-        each body's set proposed uniformly;
+        emulator, weighted by the engine in one batch and resampled; where bodies touch along whole
+        trajectories, where there are several independent parts or modes, or where no emulator is
+        close enough, ``metropolis``, and ``attrs["fallback"]`` says why; ``metropolis``: adaptive
+        blocks that follow the scene's independent parts and look ahead with polynomials where
+        engine runs are dear; ``paper``: one random walk a variable, by default on the schedule of
+        the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them burn-in,
+        each tenth kept); with a library, on that for the apartment (``draws=400, tune=1000,
+        thin=10, chains=1``), each body's set proposed uniformly;
         ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient; ``laplace``:
         independent draws from the Gaussian at the mode, which no chain has checked; ``map``: the
         mode alone, as one draw.
