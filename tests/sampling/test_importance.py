@@ -468,6 +468,15 @@ def test_background_runs_in_another_process() -> None:
     assert value == 42
 
 
+@pytest.mark.usefixtures("two_processors")
+def test_background_returns_a_posterior(fitted) -> None:
+    with background(lambda: fitted) as answer:
+        found = answer()
+    assert found is not fitted  # it came from the other process
+    assert dict(found.attrs) == dict(fitted.attrs)
+    np.testing.assert_array_equal(draws(found)["mass"], draws(fitted)["mass"])
+
+
 @pytest.mark.one_stack
 @pytest.mark.usefixtures("two_processors")
 def test_background_raises_what_the_function_raised() -> None:
