@@ -406,8 +406,8 @@ def resample(
     k : float
         Pareto k.
     size : float
-        Number of independent draws of the posterior that the draws are worth; 0, with an infinite
-        k, if a weight is infinite or fewer than two are positive.
+        Number of independent draws of the posterior that the draws are worth if the proposals are
+        independent; 0, with an infinite k, if a weight is infinite or fewer than two are positive.
     """
     weight = np.zeros(len(log_weight))
     there = np.isfinite(log_weight)
