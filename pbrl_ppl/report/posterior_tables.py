@@ -201,7 +201,8 @@ def _origin_in_words(attributes: Mapping[str, Any]) -> str:
     return (
         f" The draws are resampled proposals of an emulator: Pareto k of their weights is"
         f" {number(attributes[PARETO_K])} (above 0.7 the proposals would miss a part of the"
-        f" posterior), and by their weights the draws are worth {number(attributes[SIZE])} independent ones."
+        f" posterior), and by their weights the draws are worth {number(attributes[SIZE])}"
+        " independent ones."
     )
 
 

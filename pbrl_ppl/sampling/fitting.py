@@ -114,8 +114,8 @@ def fit(
         ``attrs`` the scene, effects, method, versions, seed, the hash of the data and the
         convergence. Of importance sampling there are ``pareto_k``, the shape of the weights' tail
         (at most 0.7), and ``importance_ess``, the number of independent draws that the draws are
-        worth by their weights, which limits each parameter's effective sample size. Interrupted chains keep the
-        draws so far.
+        worth by their weights, which limits each parameter's effective sample size. Interrupted
+        chains keep the draws so far.
 
     Raises
     ------
