@@ -59,7 +59,8 @@ def fit(
     method: Annotated[
         str,
         typer.Option(
-            help="importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map."
+            help="importance (chains of metropolis where it does not suit), metropolis, paper,"
+            " demetropolisz, smc, nuts, laplace or map."
         ),
     ] = "importance",
     draws: Annotated[
@@ -72,7 +73,7 @@ def fit(
     thin: Annotated[int | None, typer.Option(min=1, max=10_000, help="Steps a draw.")] = None,
     resume: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Go on where this posterior's chains ended."),
+        typer.Option(metavar="FILE", help="Go on with this posterior: its chains, or more draws."),
     ] = None,
     seed: options.Seed = 1,
     estimate_velocities: options.Velocities = False,
@@ -86,8 +87,8 @@ def fit(
 ) -> None:
     """Fit the declared model to a history: a posterior file, and a table of it.
 
-    Exits with 3 if the chains have not converged, and with 130 if it was interrupted; the draws
-    so far are kept.
+    Exits with 3 if chains have not converged or draws are too few, and with 130 if it was
+    interrupted; the draws of chains so far are kept.
     """
     reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:

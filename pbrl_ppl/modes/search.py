@@ -110,6 +110,8 @@ def find_modes(
     if not few:
         found = [climb(problem, phi, problem.coarse.simulator) for phi, *_ in found[:_POLISHED]]
     found.sort(key=lambda peak: -peak.log_posterior)
+    if not few and len(found) > 1:  # all data may join what a part of them told apart
+        found = _distinct(problem.coarse, found)
     best = _polish(problem, found[0])
     return [finish(problem, peak) for peak in (best, *found[1:])]
 

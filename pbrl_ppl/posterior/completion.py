@@ -332,7 +332,8 @@ def _warnings(
     on = "go on with resume= this posterior"
     if problem.layout.discrete.any():  # fit does not go on over joints of unknown bodies
         on = "name the bodies that were found in the scene, fit that and go on with resume="
-    more = f"raise draws= or thin=, or {on}"
+    weighted = SIZE in idata.attrs
+    more = f"raise draws=, or {on}" if weighted else f"raise draws= or thin=, or {on}"
     if "updates" in idata.attrs:  # resampled draws are no chain that could go on
         more = "these draws were reweighted by update; fit all data anew"
     found = json.loads(str(idata.attrs.get("linearisation", '{"sd": 0}')))
@@ -381,8 +382,8 @@ def _warnings(
             size = f"{np.floor(ess[worst_ess]):.0f} for {worst_ess} (want >= {MIN_ESS})"
             short.append(f"effective sample size is {size}")
         if short:
-            text = f"the chains have not converged: {', '.join(short)}; {more}"
-            yield ConvergenceWarning, text
+            failed = "the draws are too few" if weighted else "the chains have not converged"
+            yield ConvergenceWarning, f"{failed}: {', '.join(short)}; {more}"
     if problem.library is not None:  # what follows compares with Table 1
         return
     phi, _ = parameter_draws(problem, idata)

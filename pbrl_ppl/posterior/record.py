@@ -98,6 +98,11 @@ class PosteriorRecord:
         Warnings of the fit.
     interrupted : bool, optional
         True if an interrupt left fewer draws than were asked for.
+    pareto_k, importance_ess : float, optional
+        Of draws by importance sampling: Pareto k of the proposals' weights, and the number of
+        independent draws that the resampled draws are worth, which limits every parameter's ESS.
+    fallback : str, optional
+        Why chains were run in place of importance sampling.
     """
 
     scene: Scene
@@ -124,6 +129,9 @@ class PosteriorRecord:
     min_ess: float | None = None
     warnings: tuple[str, ...] | None = None
     interrupted: bool | None = None
+    pareto_k: float | None = None
+    importance_ess: float | None = None
+    fallback: str | None = None
 
     @classmethod
     def of(cls, idata: Any) -> PosteriorRecord:

@@ -253,7 +253,8 @@ def convergence(idata: Any) -> tuple[dict[str, float], dict[str, float]]:
     -------
     r_hat, ess : dict of str to float
         By label, such as ``mass[cart]``. One that is the same in all draws, as the index of a joint
-        that is certain, has converged: 1, and the number of draws. R-hat of one chain is NaN.
+        that is certain, has converged: 1, and the number of draws. R-hat of one chain is NaN. Draws
+        by importance sampling are worth no more than ``attrs["importance_ess"]``.
     """
     variables = scalars(idata)
     fixed = [str(name) for name, v in variables.data_vars.items() if v.min() == v.max()]

@@ -20,6 +20,7 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import (
     DATATREE,
     HDI_PROB,
+    SIZE,
     convergence,
     from_groups,
     group,
@@ -49,7 +50,8 @@ def summary(posterior: Any) -> pd.DataFrame:
     Returns
     -------
     pandas.DataFrame
-        Columns mean, sd, lower, upper (94 % highest density), ess_bulk, ess_tail, r_hat.
+        Columns mean, sd, lower, upper (94 % highest density), ess_bulk, ess_tail, r_hat. Resampled
+        draws are worth no more than their weights say, see `convergence`.
     """
     # the same interval has other names before and after ArviZ 1.0
     options = {"ci_prob": HDI_PROB, "ci_kind": "hdi"} if DATATREE else {"hdi_prob": HDI_PROB}
@@ -58,6 +60,8 @@ def summary(posterior: Any) -> pd.DataFrame:
     names = {table.columns[2]: "lower", table.columns[3]: "upper"}
     columns = ["mean", "sd", "lower", "upper", "ess_bulk", "ess_tail", "r_hat"]
     result: pd.DataFrame = table.rename(columns=names)[columns]
+    sizes, most = ["ess_bulk", "ess_tail"], float(posterior.attrs.get(SIZE, np.inf))
+    result[sizes] = result[sizes].clip(upper=most)
     return result
 
 

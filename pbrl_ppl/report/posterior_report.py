@@ -184,7 +184,11 @@ def _predicts(covered: Mapping[str, Coverage] | None, missing: dict[str, str]) -
 def _warned(posterior: Any, identified: bool) -> list[str]:
     """Return the warnings of the fit, without those that other parts of the page cover."""
     every = json.loads(str(posterior.attrs.get("warnings", "[]")))
-    covered = ("have not converged", *(("say nothing about",) if identified else ()))
+    covered = (
+        "have not converged",
+        "draws are too few",
+        *(("say nothing about",) if identified else ()),
+    )
     return [each for each in every if not any(words in each for words in covered)]
 
 

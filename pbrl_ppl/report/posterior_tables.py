@@ -10,7 +10,7 @@ import pandas as pd
 
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.parameters import BODY_PARAMETERS, JOINT_ANCHORS
-from pbrl_ppl.posterior import Identifiability, interval, scalars
+from pbrl_ppl.posterior import PARETO_K, SIZE, Identifiability, interval, scalars
 from pbrl_ppl.report.page import Table
 from pbrl_ppl.report.posterior_plots import most_interesting, prior_draws, summary
 from pbrl_ppl.report.style import UNITS, acceleration_unit
@@ -50,8 +50,9 @@ STATISTICS = {
     " them, in nats; more is better.",
     "LOO": "Leave-one-out cross-validation: elpd of each transition given all others; of whole"
     " trajectories leave-one-trajectory-out, elpd of each trajectory given all others.",
-    "Pareto k": "How far leaving one of them out changes the posterior; above the threshold, LOO"
-    " is not to be relied on.",
+    "Pareto k": "Of LOO: how far leaving one out changes the posterior; above the threshold,"
+    " LOO is not to be relied on. Of importance sampling: how heavy the tail of the proposals'"
+    " weights is; above 0.7, the proposals miss a part of the posterior, and chains are run.",
     "R-hat": "Spread of all chains over that within one; 1 if they agree, at most 1.01 is wanted.",
     "ESS": "Effective sample size: how many independent draws the chains are worth; at least 400"
     " are wanted.",
@@ -111,7 +112,7 @@ def parameter_section(
         "posterior": _parameter_table(rows),
         "count": len(rows),
         "bad": [row for row in rows if row["failed"]],
-        "sampled": _sampler_in_words(rows),
+        "sampled": _sampler_in_words(rows, posterior.attrs),
         "widths": known
         and _width_table(posterior, known, {row["label"]: row["unit"] for row in rows}),
         "shown": most_interesting(table, added),
@@ -191,7 +192,21 @@ class SamplerResult(NamedTuple):
     sentence: str
 
 
-def _sampler_in_words(rows: list[dict[str, Any]]) -> SamplerResult:
+def _origin_in_words(attributes: Mapping[str, Any]) -> str:
+    """Return why chains were run, or what the weights of importance sampling are worth; or none."""
+    if "fallback" in attributes:
+        return f" Chains were run in place of importance sampling: {attributes['fallback']}."
+    if PARETO_K not in attributes:
+        return ""
+    return (
+        f" The draws are resampled proposals of an emulator: Pareto k of their weights is"
+        f" {number(attributes[PARETO_K])} (above 0.7 the proposals would miss a part of the"
+        f" posterior), and by their weights the draws are worth {number(attributes[SIZE])}"
+        " independent ones."
+    )
+
+
+def _sampler_in_words(rows: list[dict[str, Any]], attributes: Mapping[str, Any]) -> SamplerResult:
     """Return the verdict on the sampler, by the worst of its diagnostics."""
     if not all(row["chains"] for row in rows):
         return SamplerResult(
@@ -204,7 +219,9 @@ def _sampler_in_words(rows: list[dict[str, Any]]) -> SamplerResult:
         f"The largest R-hat of {len(rows)} parameters is {number(max(hats), 4)} (at most"
         f" {GOOD_R_HAT} is wanted), the smallest effective sample size"
         f" {number(float(np.nanmin(sizes)))} (at least {GOOD_ESS:.0f})."
+        f"{_origin_in_words(attributes)}"
     )
+    agree = "The draws suffice" if SIZE in attributes else "The chains agree"
     if failed:
         return SamplerResult(
             "Not converged.", f"{failed} of {len(rows)} parameters did not converge. {found}"
@@ -212,12 +229,13 @@ def _sampler_in_words(rows: list[dict[str, Any]]) -> SamplerResult:
     if rough:
         return SamplerResult(
             "Well enough.",
-            f"The chains agree, but {rough} of {len(rows)} parameters have fewer effective draws"
+            f"{agree}, but {rough} of {len(rows)} parameters have fewer effective draws"
             f" or a larger R-hat than is wanted: the last digits of their intervals are rough."
             f" {found} With R-hat up to {ROUGH_R_HAT} and from {ROUGH_ESS:.0f} effective draws on"
             " conclusions stand; for more digits take more draws.",
         )
-    return SamplerResult("Yes.", f"The chains agree and are long enough. {found}")
+    long = "" if SIZE in attributes else " and are long enough"
+    return SamplerResult("Yes.", f"{agree}{long}. {found}")
 
 
 def _width_table(posterior: Any, known: Identifiability, units: Mapping[str, str]) -> Table:

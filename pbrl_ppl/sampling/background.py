@@ -48,7 +48,7 @@ def background(function: Callable[[], R]) -> Iterator[Callable[[], R]]:
     def result() -> R:
         try:
             succeeded, value = receiver.recv()
-        except EOFError:  # the process was killed, as by a lack of memory
+        except (EOFError, OSError):  # the process was killed, as by a lack of memory
             return function()
         if not succeeded:
             raise value

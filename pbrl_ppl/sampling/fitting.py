@@ -16,9 +16,12 @@ from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_mode, find_trajectory_mode, following, weigh
 from pbrl_ppl.posterior import (
+    PARETO_K,
+    SIZE,
     Point,
     PosteriorRecord,
     complete,
+    convergence,
     from_groups,
     group,
     groups,
@@ -55,11 +58,11 @@ def fit(
 ) -> Any:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
-    The chains start about the mode, which multi-start least squares finds if the model holds none.
-    Where the scene does not say which bodies a joint joins, every choice is fitted by itself, and
-    their draws are mixed by their evidences (:func:`pbrl_ppl.joint_probabilities`). A model with a
-    ``library`` needs no chain: all choices are summed over, unless ``method="paper"`` walks among
-    them.
+    Draws come from importance sampling, or from chains where that does not suit. Both start about
+    the mode, which multi-start least squares finds if the model holds none. Where the scene does
+    not say which bodies a joint joins, every choice is fitted by itself, and their draws are mixed
+    by their evidences (:func:`pbrl_ppl.joint_probabilities`). A model with a ``library`` needs no
+    chain: all choices are summed over, unless ``method="paper"`` walks among them.
 
     The mode is kept in ``attrs["mode"]`` as JSON: ``parameters`` and ``noise`` by label, and
     ``log_posterior``. With a library it is the most probable choice of each body (of bodies that
@@ -72,21 +75,22 @@ def fit(
         As made by ``physics_model``.
     method : str
         ``importance``: proposals that many walkers draw together from the posterior of an
-        emulator, weighted by the engine in one batch and resampled; where bodies touch, where the
-        scene has several independent parts or modes, or where no emulator is close enough,
-        ``metropolis``, and ``attrs["fallback"]`` says why; ``metropolis``: adaptive blocks that
-        follow the scene's independent parts and look ahead with polynomials where engine runs are
-        dear; ``paper``: one random walk a variable, by
-        default on the schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations,
-        1,000 of them burn-in, each tenth kept); with a library, on that for the apartment
-        (``draws=400, tune=1000, thin=10, chains=1``), each body's set proposed uniformly;
+        emulator, weighted by the engine in one batch and resampled; where bodies touch along whole
+        trajectories, where there are several independent parts or modes, or where no emulator is
+        close enough, ``metropolis``, and ``attrs["fallback"]`` says why; ``metropolis``: adaptive
+        blocks that follow the scene's independent parts and look ahead with polynomials where
+        engine runs are dear; ``paper``: one random walk a variable, by default on the schedule of
+        the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them burn-in,
+        each tenth kept); with a library, on that for the apartment (``draws=400, tune=1000,
+        thin=10, chains=1``), each body's set proposed uniformly;
         ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient; ``laplace``:
         independent draws from the Gaussian at the mode, which no chain has checked; ``map``: the
         mode alone, as one draw.
     seed : int
         The same seed gives the same posterior.
     draws, tune : int, optional
-        Draws kept and tuning draws of each chain; each method has its own default.
+        Draws kept and tuning draws of each chain; each method has its own default. Draws by
+        importance sampling are independent, and divided among chains for ArviZ.
     chains : int, optional
         Chains; 4 by default, 30 for ``paper``, 1 for ``paper`` with a library.
     thin : int, optional
@@ -96,8 +100,9 @@ def fit(
     start : Mode, optional
         A mode found before, in place of the search for one.
     resume : InferenceData or DataTree, optional
-        A posterior of the same model, whose chains go on where they ended, with the new draws after
-        the old. Whole trajectories are linearised as they are in it.
+        A posterior of the same model. Its chains go on as chains where they ended, and draws by
+        importance sampling get more; the new draws stand after the old. Whole trajectories are
+        linearised as they are in it.
     progress : bool
         Whether to show PyMC's progress bar.
 
@@ -107,7 +112,10 @@ def fit(
         Posterior, sample_stats, log_likelihood, posterior_predictive (of up to 200 draws, under
         their own labels), prior, log_prior, observed_data and constant_data, with units, and in
         ``attrs`` the scene, effects, method, versions, seed, the hash of the data and the
-        convergence. An interrupted run keeps the draws so far.
+        convergence. Of importance sampling there are ``pareto_k``, the shape of the weights' tail
+        (at most 0.7), and ``importance_ess``, the number of independent draws that the draws are
+        worth by their weights, which limits each parameter's effective sample size. Interrupted
+        chains keep the draws so far.
 
     Raises
     ------
@@ -140,6 +148,10 @@ def fit(
     library, why = problem.library, ""
     if method == DEFAULT and (library is not None or problem.layout.discrete.any()):
         method = FALLBACK
+    elif method == DEFAULT and resume is not None:
+        earlier = PosteriorRecord.of(resume)
+        if earlier.method != DEFAULT:  # chains go on as chains
+            method, why = FALLBACK, earlier.fallback or ""
     chosen = METHODS[method] if library is None else OVER_LIBRARY.get(method, METHODS[method])
     # with one set there is no choice to sample
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
@@ -308,6 +320,19 @@ def _appended(earlier: Any, trace: Any) -> Any:
     for name in ("posterior", "sample_stats"):
         old, new = group(earlier, name), data[name]
         shared = [str(variable) for variable in new.data_vars if variable in old]
-        both = xr.concat([old[shared], new[shared]], dim="draw")
+        if shared:  # two samplers have no statistics in common: then NaN stands for missing ones
+            old, new = old[shared], new[shared]
+        both = xr.concat([old, new], dim="draw")
         data[name] = both.assign_coords(draw=np.arange(both.sizes["draw"]))
-    return from_groups(data, {})
+    attributes = {}
+    if SIZE in earlier.attrs or SIZE in trace.attrs:
+        runs = (earlier, trace)
+        attributes[PARETO_K] = max(run.attrs.get(PARETO_K, -np.inf) for run in runs)
+        attributes[SIZE] = sum(map(_size, runs))
+    return from_groups(data, attributes)
+
+
+def _size(idata: Any) -> float:
+    """Return the number of independent draws that a posterior's or a trace's draws are worth."""
+    size = idata.attrs.get(SIZE)
+    return min(convergence(idata)[1].values()) if size is None else float(size)

@@ -204,7 +204,13 @@ def silent(mode: Mode) -> Bools:
     A wheel's parameters are never among them, for its prior is not one of independent numbers.
     """
     problem = mode.problem
-    scale = np.array([prior.sigma for prior in problem.layout.priors])
+    # the sigma of a log-normal prior is that of the logarithm
+    scale = np.array(
+        [
+            prior.sigma * (x if prior.family == "log_normal" else 1.0)
+            for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
+        ]
+    )
     size = np.sqrt((mode.jacobian**2).sum(axis=0)) * np.nan_to_num(scale, nan=1.0)
     mask = (size < _SILENT) & bool(mode.jacobian.any())
     for wheel in wheels(problem.layout):
@@ -398,21 +404,19 @@ def resample(
     k : float
         Pareto k.
     size : float
-        Number of independent draws of the posterior that the draws are worth.
+        Number of independent draws of the posterior that the draws are worth if the proposals are
+        independent; 0, with an infinite k, if a weight is infinite or fewer than two are positive.
     """
     weight = np.zeros(len(log_weight))
     there = np.isfinite(log_weight)
-    if there.sum() < 2:
+    if there.sum() < 2 or np.isposinf(log_weight).any():
         return np.zeros(n, dtype=int), np.inf, 0.0
     weight[there], k = smoothed(log_weight[there])
     counts = np.bincount(systematic(weight, n, rng), minlength=len(weight))
     # the variance of a mean is that of weighted proposals, and what resampling adds
     added = ((counts / n - weight) ** 2).sum()
-    return (
-        rng.permutation(np.repeat(np.arange(len(weight)), counts)),
-        k,
-        1.0 / float((weight**2).sum() + added),
-    )
+    size = min(1.0 / float((weight**2).sum() + added), float(n))
+    return rng.permutation(np.repeat(np.arange(len(weight)), counts)), k, size
 
 
 def stream(seed: int, starts: list[dict[str, Any]]) -> list[int]:

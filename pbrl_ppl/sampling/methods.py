@@ -138,7 +138,7 @@ def _importance(job: Job) -> Any:
     pool, why = draw_pool(job.mode, int(_PROPOSALS * n), seed, job.cores)
     if pool is None:
         raise Unsuited(why)
-    chosen, k, size = resample(pool.log_weight, n, np.random.default_rng(seed))
+    chosen, k, size = resample(pool.log_weight, n, np.random.default_rng([*seed, 1]))
     if not k <= MAX_PARETO_K:
         raise Unsuited(f"Pareto k of the proposals is {k:.2f}, above {MAX_PARETO_K}")
     if size < _WORTH * n:

@@ -331,7 +331,7 @@ def _reweighted(new: _Weighted, rng: np.random.Generator) -> Any:
     where = xr.DataArray(ancestor, dims=("chain", "draw"))
     drawn = base.isel(chain=xr.DataArray(np.arange(chains), dims="chain"), draw=where)
     drawn = drawn.assign_coords(chain=base["chain"], draw=base["draw"])
-    added = ("log_likelihood", "log_weight", "next_state", "min_ess")
+    added = ("log_likelihood", "log_weight", "next_state", "min_ess", files.SIZE)
     posterior = _used(drawn[[str(v) for v in base.data_vars if v not in added]])
     vectors = parameter_draws(new.problem, from_groups({"posterior": posterior}, {}))
     rows = systematic(weights[base["row"].to_numpy()] + 1e-300, base.sizes["row"], rng)
@@ -346,7 +346,11 @@ def _reweighted(new: _Weighted, rng: np.random.Generator) -> Any:
         **files.prior_groups(new.problem, posterior, *vectors, int(new.attributes["seed"])),
         BASE: base,
     }
-    return from_groups(result, new.attributes | {"updates": "[]"})  # the caller adds the entry
+    attributes = new.attributes | {"updates": "[]"}  # the caller adds the entry
+    if files.SIZE in base:  # the fit's draws were weighted before
+        worth = new.share * float(base[files.SIZE])
+        attributes[files.SIZE] = min(worth, float(attributes[files.SIZE]))
+    return from_groups(result, attributes)
 
 
 def _chain_and_draw(data: xr.Dataset) -> dict[str, Any]:
@@ -375,6 +379,8 @@ def _base(idata: Any) -> xr.Dataset:
         "log_weight": (("chain", "draw"), np.zeros((chains, draws))),
         "next_state": (("row", *CELLS), predictive.to_numpy()),
     }
+    if files.SIZE in idata.attrs:
+        variables[files.SIZE] = ((), float(idata.attrs[files.SIZE]))
     return posterior.assign(variables).assign_coords(
         row=files.predicted_rows(posterior, predictions)
     )

@@ -316,7 +316,9 @@ def test_fit_without_convergence_exits_with_3(capsys: pytest.CaptureFixture[str]
     fit = ("fit", "scene.toml", "train.csv", "-o", "puck.nc", "--draws", "5", "--method", "laplace")
     assert answer(capsys, *fit, "--chains", "2", "-q", code=3)["converged"] is False
     assert Path("puck.nc").exists()  # it may be looked at, and gone on with
-    assert "one of metropolis" in message(capsys, *fit[:4], "a.nc", "--method", "metropols")
+    assert "one of importance, metropolis" in message(
+        capsys, *fit[:4], "a.nc", "--method", "metropols"
+    )
     said = message(capsys, *fit[:4], "a.nc", "--horizon", "3")
     assert "--transitions" in said
 

@@ -398,5 +398,5 @@ def test_only_chains_are_said_not_to_converge(method, said, monkeypatch) -> None
     task = SimpleNamespace(method=method, seed=1, draws=None, criteria=DEFAULT, say=print)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        loop_module._posterior(task, mode)
+        loop_module._posteriors(task, [mode])
     assert len(caught) == said

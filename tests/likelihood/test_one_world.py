@@ -180,7 +180,7 @@ def test_a_body_too_heavy_to_be_moved_is_joined_with_what_meets_it() -> None:
 
 
 @pytest.mark.one_stack
-@pytest.mark.filterwarnings("ignore:the chains have not converged")
+@pytest.mark.filterwarnings("ignore:the draws are too few")
 def test_a_fit_finds_out_that_they_have_met() -> None:
     """A puck that bounces off a heavy one is back before it is seen again."""
     rest = {"r": 0.9, "mu_c": 0.0, "mass": 1e4}

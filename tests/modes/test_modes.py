@@ -16,7 +16,7 @@ from pbrl_ppl.modes.laplace import climb
 from pbrl_ppl.modes.search import find_mode, find_modes
 from pbrl_ppl.parameters import differentiate, fold_wheels
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history
 
@@ -281,3 +281,13 @@ def test_recovers_the_scene_s_effect() -> None:
     problem = Problem.of(Physics.declare(scene), history)
     z = z_scores(find_mode(problem, seed=1), truth)
     assert max(np.abs(list(z.values()))) < 4, z
+
+
+@pytest.mark.parametrize("seed", range(1, 5))
+def test_a_mode_is_found_once(seed) -> None:
+    """Searches that a part of the data leads to different peaks end in the same one with all."""
+    puck = Body("a", Shape.circle(0.1), known={"r": 0.0, "mu_c": 0.0}, effects=("linear_drag",))
+    scene = Scene(time_step=0.1, substeps=4, bodies=(puck,))
+    truth = {"mass": 2.0, "linear_drag_coefficient": 1.0}
+    history = simulated_history(scene, truth, seed=3, trajectories=32, intervals=1, substeps=4)
+    assert len(find_modes(Problem.of(Physics.declare(scene), history), seed=seed)) == 1

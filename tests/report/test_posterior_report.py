@@ -11,7 +11,13 @@ from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.posterior import DATATREE, from_groups, groups, load_posterior
 from pbrl_ppl.report import page as page_module
 from pbrl_ppl.report import plot_rank, render_posterior
-from pbrl_ppl.report.posterior_plots import coverage, most_dependent, plot_pairs, plot_prior
+from pbrl_ppl.report.posterior_plots import (
+    coverage,
+    most_dependent,
+    plot_pairs,
+    plot_prior,
+    summary,
+)
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import made_up_posterior
 from tests.helpers.revised import revised
@@ -52,6 +58,24 @@ def test_page_of_whole_trajectories() -> None:
     assert "trajectories=True" in text and "no draws from the prior" not in text
     for shares in coverage(revised().posterior_after).values():
         assert shares[1] == pytest.approx(0.94, abs=0.08) and shares[2] == 72
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_page_of_importance_draws() -> None:
+    """Effective sample sizes are no larger than what the weights leave."""
+    chains = load_posterior(file("5"))
+    weights = {"method": "importance", "pareto_k": 0.25, "importance_ess": 432.1}
+    few = {"warnings": '["the draws are too few: effective sample size is ..."]'}
+    drawn = from_groups(groups(chains), chains.attrs | weights | few)
+    assert summary(drawn)["ess_bulk"].max() == 432.1
+    text = Page(render_posterior(drawn)).text
+    assert "Did the sampler work? Yes. The draws suffice." in text
+    assert "Pareto k of their weights is 0.250 (above 0.7" in text
+    assert "the draws are worth 432 independent ones" in text
+    assert "Warning of the fit" not in text
+    why = {"fallback": "bodies touch"}
+    text = Page(render_posterior(from_groups(groups(chains), chains.attrs | why))).text
+    assert "Chains were run in place of importance sampling: bodies touch." in text
 
 
 @pytest.mark.usefixtures("undrawn")

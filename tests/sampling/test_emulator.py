@@ -160,6 +160,7 @@ def test_looking_ahead_changes_nothing_but_the_speed(model, monkeypatch) -> None
     time.
     """
     options = {"seed": 2, "chains": 2, "cores": 1, "progress": False, "tune": 300}
+    options["method"] = "metropolis"
     ahead = fit(model, draws=800, **options)
     assert float(group(ahead, "sample_stats")["look_ahead_accept"].mean()) > 0.5
     monkeypatch.setattr(methods, "_LITTLE", np.inf)

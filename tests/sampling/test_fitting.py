@@ -47,6 +47,7 @@ UNITS = ("kg", "m", "m", "rad", "1", "1")
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 QUICK = {"draws": 200, "tune": 200, "chains": 2, "cores": 1, "progress": False}
 SHORT = QUICK | {"draws": 100, "tune": 100}
+CHAINS = QUICK | {"method": "metropolis"}
 
 
 @pytest.fixture(scope="module")
@@ -94,8 +95,7 @@ def test_groups_are_complete(model, fitted) -> None:
     assert data["observed_data"]["next_state"].dims == cells
     assert data["posterior_predictive"]["next_state"].dims == ("chain", "draw", *cells)
     assert set(data["constant_data"].data_vars) == {"start", "actions"}
-    for name in ("accept", "look_ahead_accept"):
-        assert data["sample_stats"][name].sizes["draw"] == 200
+    assert dict(data["sample_stats"]["log_weight"].sizes) == {"chain": 2, "draw": 200}
     np.testing.assert_array_equal(
         data["observed_data"]["next_state"].values, model.problem.segments.observed
     )
@@ -318,7 +318,7 @@ def test_an_early_interrupt_leaves_nothing(model, mode, monkeypatch):
 
     monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", nothing)
     with pytest.raises(KeyboardInterrupt):
-        fit(model, draws=10, tune=10, start=mode, progress=False)
+        fit(model, method="metropolis", draws=10, tune=10, start=mode, progress=False)
 
 
 @pytest.fixture(scope="module")
@@ -336,7 +336,7 @@ def interrupted(model, mode):
                 ConvergenceWarning, match="after 30 of 50 draws in 2 of 2 chains.*resume="
             ),
         ):
-            return fit(model, seed=4, start=mode, **(QUICK | {"draws": 50}))
+            return fit(model, seed=4, start=mode, **(CHAINS | {"draws": 50}))
 
 
 def test_an_interrupt_keeps_the_draws(interrupted) -> None:
@@ -344,6 +344,8 @@ def test_an_interrupt_keeps_the_draws(interrupted) -> None:
     assert interrupted.attrs["interrupted"] == 1
     assert "interrupted" in json.loads(interrupted.attrs["warnings"])[0]
     assert group(interrupted, "log_likelihood").sizes["draw"] == 30
+    for name in ("accept", "look_ahead_accept"):
+        assert group(interrupted, "sample_stats")[name].sizes["draw"] == 30
 
 
 def test_chains_that_an_interrupt_left_out_are_missed(model, mode, interrupted, monkeypatch):
@@ -358,14 +360,14 @@ def test_chains_that_an_interrupt_left_out_are_missed(model, mode, interrupted, 
         pytest.warns(ConvergenceWarning, match="have not converged"),
         pytest.warns(ConvergenceWarning, match="after 30 of 30 draws in 2 of 3 chains"),
     ):
-        cut = fit(model, seed=4, start=mode, **(QUICK | {"draws": 30, "chains": 3}))
+        cut = fit(model, seed=4, start=mode, **(CHAINS | {"draws": 30, "chains": 3}))
     assert cut.attrs["interrupted"] == 1
     monkeypatch.setattr(
         "pbrl_ppl.sampling.fitting.pm.sample",
         lambda **options: sample(**(options | {"chains": 1, "initvals": options["initvals"][:1]})),
     )
     with pytest.raises(KeyboardInterrupt):  # the earlier draws are where they were
-        fit(model, seed=4, resume=interrupted, **(QUICK | {"draws": 30, "tune": 0}))
+        fit(model, seed=4, resume=interrupted, **(CHAINS | {"draws": 30, "tune": 0}))
 
 
 def test_too_few_draws_for_r_hat_have_not_converged(model, mode) -> None:
@@ -377,7 +379,7 @@ def test_too_few_draws_for_r_hat_have_not_converged(model, mode) -> None:
 def test_an_interrupted_fit_goes_on(model, interrupted) -> None:
     """New draws follow the old ones, which stay."""
     with pytest.warns(ConvergenceWarning, match="not converged"):
-        whole = fit(model, seed=5, resume=interrupted, **(QUICK | {"draws": 170, "tune": 0}))
+        whole = fit(model, seed=5, resume=interrupted, **(CHAINS | {"draws": 170, "tune": 0}))
     assert "interrupted" not in whole.attrs
     posterior = group(whole, "posterior")
     assert dict(posterior.sizes) == {"chain": 2, "draw": 200, "body": 1, "state": 6}
@@ -452,7 +454,7 @@ def test_a_parameter_that_the_data_say_nothing_about_is_named(model) -> None:
 
 
 def test_unknown_method(model) -> None:
-    with pytest.raises(FitError, match="method is 'gibbs', expected one of metropolis, paper"):
+    with pytest.raises(FitError, match="method is 'gibbs', expected one of importance, metropolis"):
         fit(model, method="gibbs")
 
 
