@@ -76,10 +76,7 @@ class Pieces:
         """Return pieces that also emulate transitions in which bodies meet, kinks or not."""
         if not len(self.rows):
             return self
-        more = [
-            Piece(part.places, part.bodies, self.rows)
-            for part in problem.simulator.parts
-        ]
+        more = [Piece(part.places, part.bodies, self.rows) for part in problem.simulator.parts]
         nothing = np.zeros(0, dtype=int)
         return Pieces([*self.emulated, *more], nothing, _engine(problem, nothing))
 

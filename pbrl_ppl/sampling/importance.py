@@ -12,12 +12,14 @@ import zlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, log_noise_prior
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, exponential, log_noise_prior
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.parameters import evened, inside, wheels
 from pbrl_ppl.posterior import smoothed
@@ -35,10 +37,15 @@ _CLOSE, _ENOUGH = 0.7, 2.0
 _A_COEFFICIENT, _LEAST, _ROUNDS = 4, 160, 6
 #: Largest number of coefficients of a quadratic emulator.
 _MOST = 250
-#: Sweeps of the walkers between two fits, then between two looks at whether they still drift.
-_SWEEPS, _LOOKS = 4, 8
+#: Sweeps of the walkers between two fits and between two looks at whether they drift, and looks. In
+#: so many sweeps a walker of a cart's posterior forgets four fifths of where it was.
+_SWEEPS, _LOOKS = 3, 8
 #: Walkers' means may differ by this many standard errors between two looks.
 _DRIFT = 3.5
+#: Noise that may vanish is a power of its coordinate.
+_ROOT = 3.0
+#: Variance of proposals over that of the walkers: a walker in a tail moves on.
+_WIDER = 1.3
 #: A parameter whose derivative is below this in units of noise over its prior is not informed.
 _SILENT = 1e-3
 #: Numbers of the filter's gains that are kept at once, and of residuals.
@@ -47,7 +54,11 @@ _NUMBERS = 8_000_000
 
 @dataclass(frozen=True, eq=False)
 class Space:
-    """Unconstrained space of a problem: its transformed parameters, then the logarithm of noise.
+    """Space of a problem: its transformed parameters, then the noise, in which it is near normal.
+
+    Measurement noise is by its logarithm. Unexplained accelerations and correlated errors, which
+    may vanish, are by their cube root (E. B. Wilson and M. M. Hilferty, The distribution of
+    chi-square, 1931).
 
     Parameters
     ----------
@@ -57,13 +68,24 @@ class Space:
 
     problem: Problem
 
+    @cached_property
+    def roots(self) -> Bools:
+        """Which noise parameters are by their cube root, shape (free,)."""
+        free = self.problem.likelihood.free(exponential(self.problem).astype(float))
+        return np.asarray(free, dtype=bool)
+
+    def noise(self, log_sigma: Floats) -> Floats:
+        """Return the coordinates of free noise parameters, given their logarithm, (..., free)."""
+        return np.where(self.roots, np.exp(log_sigma / _ROOT), log_sigma)
+
     def split(self, q: Floats) -> tuple[Floats, Floats]:
         """Return phi, shape (..., p), and sigma, shape (..., parameter), at points (..., d)."""
         problem = self.problem
         priors, p = problem.layout.priors, problem.layout.size
         with np.errstate(over="ignore"):
             columns = [constrain(prior, q[..., i]) for i, prior in enumerate(priors)]
-            sigma = np.exp(q[..., p:])
+            noise = q[..., p:]
+            sigma = np.where(self.roots, np.abs(noise) ** _ROOT, np.exp(noise))
         phi = np.stack(columns, axis=-1) if columns else q[..., :0]
         return phi, np.broadcast_to(sigma, (*sigma.shape[:-1], len(problem.noise_prior[0])))
 
@@ -79,7 +101,11 @@ class Space:
             slopes = [unconstrain(prior, phi[..., i])[1] for i, prior in enumerate(priors)]
             density = problem.layout.log_prior(phi) + evened(problem.layout, phi)
             density = density.sum(axis=-1) - np.log(np.abs(slopes)).sum(axis=0)
-            total = density + log_noise_prior(problem, q[..., p:])
+            noise = q[..., p:]
+            log_sigma = np.where(self.roots, _ROOT * np.log(noise), noise)
+            # the density of a root, from that of the logarithm
+            slope = np.where(self.roots, np.log(_ROOT / noise), 0.0).sum(axis=-1)
+            total = density + log_noise_prior(problem, log_sigma) + slope
         return np.where(np.isfinite(total), total, -np.inf)
 
 
@@ -183,7 +209,11 @@ class Walkers:
                 taken = self.rng.uniform(size=len(q)) < rate
                 q = np.where(taken[:, None], there, q)
                 here = np.where(taken, new, here)
-                block.lengthen(float(rate.mean()) - TARGET_ACCEPTANCE, walk)
+                change = float(rate.mean()) - TARGET_ACCEPTANCE
+                if walk:
+                    block.lengthen(change, walk)
+                else:  # up to draws that forget where they were
+                    block.log_beta = min(block.log_beta + change, 0.0)
         return q
 
     def settle(self) -> bool:
@@ -258,7 +288,7 @@ def draw_pool(mode: Mode, n: int, seed: Any, threads: int) -> tuple[Pool | None,
         return None, fitted
     walkers, prior = fitted, _PriorDraws(space, quiet)
     walkers.q = walkers.q[np.arange(n) % len(walkers.q)]
-    walkers.sweep(_SWEEPS)
+    walkers.sweep(2 * _SWEEPS)
     if not walkers.settle():
         return None, "the proposals still drift"
     return _evaluated(walkers, prior.filled(walkers.q, rng)), ""
@@ -275,8 +305,8 @@ def _emulate(mode: Mode, space: Space, quiet: Bools, rng: np.random.Generator) -
     widest = max((len(piece.places) for piece in pieces.emulated), default=0)
     degree = 2 if _terms(widest, 2) <= _MOST else 1
     half = max(_LEAST, _A_COEFFICIENT * _terms(widest, degree)) // 2
-    prior = _PriorDraws(space, quiet)
-    q = prior.filled(np.zeros((half, len(quiet) + len(blocks[-1].places))), rng)
+    prior, entries = _PriorDraws(space, quiet), len(space.roots)
+    q = prior.filled(np.zeros((half, len(quiet) + entries)), rng)
     for block in blocks:
         noise = rng.standard_normal((half, len(block.places)))
         q[:, block.places] = block.mean + noise @ block.factor.T
@@ -342,10 +372,20 @@ def _blocks(mode: Mode, rough: Problem, loud: Any) -> list[Gaussian]:
     mean, covariance = laplace(rough, mode)
     noise_mean, noise_covariance = noise_block(mode)
     entries = len(mean) + np.arange(len(noise_mean))
-    return [
-        Gaussian(loud, mean[loud], covariance[np.ix_(loud, loud)]),
-        Gaussian(entries, noise_mean, noise_covariance),
-    ]
+    sensors, steps = entries, entries[:0]
+    if isinstance(mode.problem.likelihood, TrajectoryLikelihood):
+        n = len(mode.problem.trajectory_noise.cells.sensors)
+        sensors, steps = entries[:n], entries[n:]
+    mean = np.concatenate([mean, noise_mean])
+    covariance = block_diag(covariance, noise_covariance)
+    space = Space(mode.problem)
+    log_noise = mean[entries]
+    mean[entries] = space.noise(log_noise)
+    slope = np.ones(len(mean))
+    slope[entries] = np.where(space.roots, mean[entries] / _ROOT, 1.0)
+    covariance = slope[:, None] * covariance * slope
+    blocks = (loud, sensors, loud, steps)  # a move of the parameters costs no run of the filter
+    return [Gaussian(own, mean[own], covariance[np.ix_(own, own)]) for own in blocks]
 
 
 def _learned(block: Gaussian, q: Floats) -> Gaussian:
@@ -355,7 +395,7 @@ def _learned(block: Gaussian, q: Floats) -> Gaussian:
     x = q[:, block.places]
     covariance = np.atleast_2d(np.cov(x, rowvar=False))
     ridge = 1e-9 * np.diag(np.diag(covariance)) + 1e-12 * np.eye(len(covariance))
-    learned = Gaussian(block.places, x.mean(axis=0), covariance + ridge)
+    learned = Gaussian(block.places, x.mean(axis=0), _WIDER * covariance + ridge)
     learned.log_scale, learned.log_beta = block.log_scale, block.log_beta
     return learned
 
