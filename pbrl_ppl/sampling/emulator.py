@@ -72,14 +72,6 @@ class Pieces:
     rows: Ints
     exact: Callable[[Floats], Floats]
 
-    def smooth(self, problem: Problem) -> Pieces:
-        """Return pieces that also emulate transitions in which bodies meet, kinks or not."""
-        if not len(self.rows):
-            return self
-        more = [Piece(part.places, part.bodies, self.rows) for part in problem.simulator.parts]
-        nothing = np.zeros(0, dtype=int)
-        return Pieces([*self.emulated, *more], nothing, _engine(problem, nothing))
-
     def without(self, places: Ints) -> Pieces:
         """Return pieces that do not depend on some parameters."""
         kept = [
@@ -278,11 +270,11 @@ class Surrogate:
         The exact problem.
     unpack : Unpack
         Map of the problem's model.
-    emulator : Emulator
+    emulator : Emulator or FewSteps
         From phi, shape (p,), to residuals as of :meth:`Problem.residual`.
     """
 
-    def __init__(self, problem: Problem, unpack: Unpack, emulator: Emulator) -> None:
+    def __init__(self, problem: Problem, unpack: Unpack, emulator: Emulator | FewSteps) -> None:
         self.problem, self.unpack, self.emulator = problem, unpack, emulator
         # white residuals are then linear in the polynomials' terms, given the noise
         gaussian = problem.likelihood.nu is None and not problem.tails
@@ -317,6 +309,25 @@ class Surrogate:
         return value
 
 
+class FewSteps:
+    """Residuals by the engine with few steps, corrected at a mode: where no polynomial is close.
+
+    Parameters
+    ----------
+    mode : Mode
+        Where the error of few steps is corrected.
+    """
+
+    linear = False
+
+    def __init__(self, mode: Mode) -> None:
+        self._problem = mode.problem.corrected(mode.phi)
+
+    def __call__(self, phi: Floats) -> Floats:
+        """Return residuals for phi of shape (p,)."""
+        return self._problem.residual(phi)
+
+
 def emulate(
     mode: Mode, unpack: Unpack, blocks: list[Gaussian], seed: int | np.random.Generator
 ) -> Emulator | None:
@@ -339,7 +350,8 @@ def emulate(
         None where the polynomials' log-likelihood stays far from the engine's.
     """
     rng = np.random.default_rng(seed)
-    problem = mode.problem.with_physics(threads=max(mode.problem.physics.threads, 2))
+    threads = max(mode.problem.physics.threads, 2)
+    problem = mode.problem.with_physics(threads=threads).corrected(mode.phi)
     q = np.empty(sum(len(block.places) for block in blocks))
     for block in blocks:
         q[block.places] = block.mean
@@ -393,10 +405,10 @@ def errors(approximate: Floats, exact: Floats, draws: int) -> Floats:
     return np.asarray((approximate - exact)[far])
 
 
-def spread(problem: Problem, phi: Floats) -> Floats:
+def spread(problem: Problem, phi: Floats, farther: float = _FARTHER) -> Floats:
     """Return draws, and as many again farther from their middle, shape (2 n, p).
 
     Where friction makes a kink, the posterior may be wider beyond it than the first runs.
     """
     centre = phi.mean(axis=0)
-    return np.concatenate([phi, inside(problem.layout.priors, centre + _FARTHER * (phi - centre))])
+    return np.concatenate([phi, inside(problem.layout.priors, centre + farther * (phi - centre))])

@@ -35,7 +35,7 @@ MAX_PARETO_K = 0.7
 _CLOSE, _ENOUGH = 0.7, 2.0
 #: Engine runs a coefficient of the emulator, at least; rounds of them.
 _A_COEFFICIENT, _LEAST, _ROUNDS = 4, 160, 6
-#: Largest number of coefficients of a quadratic emulator.
+#: Largest number of coefficients of an emulator that is not linear.
 _MOST = 250
 #: Sweeps of the walkers between two fits and between two looks at whether they drift, and looks. In
 #: so many sweeps a walker of a cart's posterior forgets four fifths of where it was.
@@ -44,6 +44,8 @@ _SWEEPS, _LOOKS = 3, 8
 _DRIFT = 3.5
 #: Noise that may vanish is a power of its coordinate.
 _ROOT = 3.0
+#: Half of an emulator's runs are this many times as far from the walkers' mean.
+_FARTHER = 1.4
 #: Variance of proposals over that of the walkers: a walker in a tail moves on.
 _WIDER = 1.3
 #: A parameter whose derivative is below this in units of noise over its prior is not informed.
@@ -256,6 +258,8 @@ def unsuited(mode: Mode) -> str:
         return "the posterior has several modes"
     if len(problem.simulator.parts) > 1:
         return "the scene has several independent parts"
+    if len(Pieces.of(problem).rows):
+        return "bodies touch"
     return ""
 
 
@@ -303,7 +307,7 @@ def _emulate(mode: Mode, space: Space, quiet: Bools, rng: np.random.Generator) -
     blocks = _blocks(mode, rough, np.flatnonzero(~quiet))
     pieces = Pieces.of(rough).without(np.flatnonzero(quiet))
     widest = max((len(piece.places) for piece in pieces.emulated), default=0)
-    degree = 2 if _terms(widest, 2) <= _MOST else 1
+    degree = next((d for d in (3, 2) if _terms(widest, d) <= _MOST), 1)
     half = max(_LEAST, _A_COEFFICIENT * _terms(widest, degree)) // 2
     prior, entries = _PriorDraws(space, quiet), len(space.roots)
     q = prior.filled(np.zeros((half, len(quiet) + entries)), rng)
@@ -320,7 +324,7 @@ def _emulate(mode: Mode, space: Space, quiet: Bools, rng: np.random.Generator) -
     off = np.inf
     for _ in range(_ROUNDS + 1):
         drawn, sigma = space.split(q)
-        phi = spread(problem, inside(problem.layout.priors, drawn))
+        phi = spread(problem, inside(problem.layout.priors, drawn), _FARTHER)
         residual = rough.residual(phi)
         if walkers:  # judge the emulator of the round before, where its walkers are
             both = np.concatenate([sigma, sigma])

@@ -12,7 +12,7 @@ import pymc as pm
 import xarray as xr
 
 from pbrl_ppl.posterior import CELLS, LIKELIHOOD, PARETO_K, SIZE, from_groups, groups
-from pbrl_ppl.sampling.emulator import Surrogate, Unpack, emulate
+from pbrl_ppl.sampling.emulator import FewSteps, Surrogate, Unpack, emulate
 from pbrl_ppl.sampling.importance import MAX_PARETO_K, draw_pool, resample, stream, unsuited
 from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps, Schedule
 from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
@@ -20,6 +20,8 @@ from pbrl_ppl.state import Floats
 
 #: Weighted proposals a draw, and the least share of the draws that they must be worth.
 _PROPOSALS, _WORTH = 1.4, 0.3
+#: Ratio of engine steps from which the engine with few of them is a surrogate.
+_FEWER = 4
 #: Engine steps below which a surrogate does not pay.
 _LITTLE = 2000
 
@@ -106,6 +108,9 @@ def _metropolis(job: Job) -> Any:
         if emulator := emulate(job.mode, unpack, blocks, job.seed):
             rough = Surrogate(problem, unpack, emulator)
             schedule = Schedule(inner=45, plain=0.3, thin=job.thin)
+        elif engine.steps >= _FEWER * problem.rough.simulator.steps:
+            rough = Surrogate(problem, unpack, FewSteps(job.mode))
+            schedule = Schedule(inner=20, plain=0.1, thin=job.thin)
     return job.sample(
         AdaptiveMetropolis(
             model.free_RVs,

@@ -113,9 +113,18 @@ def test_the_density_is_pymc_s(likelihood) -> None:
     centre = [unconstrain(p, x)[0] for p, x in zip(layout.priors, mode.phi, strict=True)]
     noise = problem.likelihood.free(np.log(np.maximum(mode.sigma, 1e-3)))
     rng = np.random.default_rng(4)
-    q = np.concatenate([centre, noise]) + 0.3 * rng.standard_normal((5, len(centre) + len(noise)))
+    logs = np.concatenate([centre, noise])
+    logs = logs + 0.3 * rng.standard_normal((5, len(logs)))
+    noise = space.noise(logs[:, layout.size :])
+    q = np.concatenate([logs[:, : layout.size], noise], axis=1)
     phi, sigma = space.split(q)
-    ours = space.log_prior(q) + problem.log_density(problem.residual(phi), sigma, phi).sum(axis=-1)
+    # the density of a cube root is 3 / root times that of the logarithm
+    roots = np.log(3.0 / noise[:, space.roots]).sum(axis=-1)
+    ours = (
+        -roots
+        + space.log_prior(q)
+        + problem.log_density(problem.residual(phi), sigma, phi).sum(axis=-1)
+    )
     density = model.logp() + evened_logp(model, problem)
     function, theirs = model.compile_fn(density, inputs=model.value_vars), []
     for point, x, noise in zip(q, phi, sigma, strict=True):
