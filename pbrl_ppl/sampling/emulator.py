@@ -278,7 +278,9 @@ class Surrogate:
         self.problem, self.unpack, self.emulator = problem, unpack, emulator
         # white residuals are then linear in the polynomials' terms, given the noise
         gaussian = problem.likelihood.nu is None and not problem.tails
-        self._linear = gaussian and emulator.linear
+        self._polynomials: Emulator | None = None
+        if gaussian and isinstance(emulator, Emulator) and emulator.linear:
+            self._polynomials = emulator
         self._noise, self._form, self._first = b"", np.zeros((0, 0)), (np.zeros(0), 0.0)
 
     def __call__(self, q: Floats) -> float:
@@ -291,17 +293,18 @@ class Surrogate:
     def _likelihood(self, phi: Floats, sigma: Floats) -> float:
         """Return the log-likelihood; a quadratic form where the noise is that of the last call."""
         noise = sigma.tobytes()
-        if self._linear and noise == self._noise:
+        polynomials = self._polynomials
+        if polynomials is not None and noise == self._noise:
             phi_before, before = self._first
             if not self._form.size:
-                basis = self.emulator.basis
+                basis = polynomials.basis
                 likelihood = self.problem.likelihood
                 white = likelihood.whiten(basis, sigma)
                 # for trajectories each includes the measurements
                 white[1:] -= likelihood.whiten(0.0 * basis[0], sigma)
                 flat = white.reshape(len(white), -1)
                 self._form = flat @ flat.T
-            new, old = (self.emulator.terms(x, 0) for x in (phi, phi_before))
+            new, old = (polynomials.terms(x, 0) for x in (phi, phi_before))
             return float(before - 0.5 * (new @ self._form @ new - old @ self._form @ old))
         density = self.problem.log_density(self.emulator(phi), sigma, phi)
         value = float(density.sum())
@@ -317,8 +320,6 @@ class FewSteps:
     mode : Mode
         Where the error of few steps is corrected.
     """
-
-    linear = False
 
     def __init__(self, mode: Mode) -> None:
         self._problem = mode.problem.corrected(mode.phi)
