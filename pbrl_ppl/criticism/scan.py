@@ -62,9 +62,7 @@ def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> li
     if effect.scan is None:
         return []
     body = problem.scene.body(candidate.body)
-    wide = problem.with_physics(
-        effects=(*problem.physics.effects, candidate), extrapolate=False
-    ).rough
+    wide = problem.with_physics(effects=(*problem.physics.effects, candidate)).rough
     if proposed is None:
         proposed, wide = effect.scan(problem.scene, problem.data.history, body), wide.coarse
     labels = wide.layout.labels

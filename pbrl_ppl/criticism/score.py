@@ -132,7 +132,7 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     is simulated by itself, for every law costs time in every engine step.
     """
     effects = mode.problem.physics.effects + (() if attached is None else (attached,))
-    wide = mode.problem.with_physics(effects=effects, extrapolate=False).rough
+    wide = mode.problem.with_physics(effects=effects).rough
     layout = wide.layout
     null = layout.from_layout(mode.problem.layout, mode.phi)
     labels = mode.problem.layout.labels
