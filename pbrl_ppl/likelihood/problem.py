@@ -27,6 +27,8 @@ from pbrl_ppl.state import STATE, Floats
 
 #: Phi, start states and wrenches in, next states out.
 Engine = Callable[[Floats, Floats, Floats], Floats]
+#: Ratio of engine steps from which a correction saves time.
+_WORTH_CORRECTING = 3
 #: How far predictions may differ and be the same to the likelihood, in units of the noise.
 _SAME = 0.01
 
@@ -129,7 +131,7 @@ class Problem:
         errors propagated in the numerical integration of differential equations, 1976).
         """
         rough = self.rough
-        if rough.physics == self.physics:
+        if rough.physics.substeps * _WORTH_CORRECTING > self.physics.substeps:
             return self
         defect = self.predict(phi) - rough.predict(phi)
         return replace(rough, defect=np.nan_to_num(defect))
