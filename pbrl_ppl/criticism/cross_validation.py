@@ -251,10 +251,8 @@ def _residual_slopes(mode: Mode, scale: Floats) -> Floats:
     lower, upper = box(priors)
     informed = scale * np.abs(prior_slopes(priors, mode.phi)) < _INFORMED
 
-    rough = problem.rough  # its slope agrees with that of more engine steps
-
     def residual(points: Floats) -> Floats:
-        return np.nan_to_num(cells.of_residual(rough.residual(points)))
+        return np.nan_to_num(cells.of_residual(problem.residual(points)))
 
     # a long step of a parameter that the data do not inform would cross thresholds
     steps = np.where(informed, scale, 1e-3 * np.minimum(scale, 1.0))
