@@ -30,14 +30,18 @@ class Look:
         is not scanned, or the whole change where all are.
     columns : tuple of int
         The parameter of each column; empty for a whole change.
-    proposed : ndarray
-        As the scan proposed it, shape (q,), NaN for what is not scanned.
     """
 
     values: Floats
     signature: Floats
     columns: tuple[int, ...]
-    proposed: Floats
+
+    @property
+    def proposed(self) -> Floats:
+        """Return the grid point as a scan proposes it, shape (q,), NaN for what is not scanned."""
+        point = self.values.astype(float)
+        point[list(self.columns)] = np.nan
+        return point
 
 
 def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> list[Look]:
@@ -87,7 +91,7 @@ def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> li
         part = slice(begin, begin + _AT_ONCE)
         points, plan = _points(proposed[part], free[part], null, (ahead, behind))
         states = whitened(points)
-        for asked, (values, columns, rows) in zip(proposed[part], plan, strict=True):
+        for values, columns, rows in plan:
             if columns:
                 ends = states[rows].reshape(len(columns), 2, -1)
                 width = (ahead - behind)[list(columns)]
@@ -95,7 +99,7 @@ def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> li
             else:
                 signature = (states[rows] - nothing).T
             if np.any(signature):
-                found.append(Look(values, signature, columns, asked))
+                found.append(Look(values, signature, columns))
     return found
 
 
