@@ -21,6 +21,8 @@ from pbrl_ppl.state import Floats
 
 Laws = tuple[NDArray[Any], ...]
 
+#: Items of a thread's chunk, at least: each costs as much Python as some hundred items.
+_CHUNK = 512
 #: Items whose bodies' ways are kept at a time.
 _BLOCK = 512
 
@@ -183,7 +185,7 @@ def share_out(run: Callable[[Engine, int, int], None], engines: list[Engine], n:
         run(engines[0], 0, n)
         return
     # chunks, so that a thread which the machine slows down takes fewer of them
-    chunks = min(8 * workers, max(workers, n // 64))
+    chunks = min(4 * workers, max(workers, n // _CHUNK))
     edges = np.linspace(0, n, chunks + 1).astype(int)
     idle: SimpleQueue[Engine] = SimpleQueue()
     for engine in engines:
