@@ -164,25 +164,26 @@ class Selection:
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
         """Return the step if its gain is significant in cross-validation and not negligible."""
-        coarse = fitted  # what fails with few engine steps needs no more of them
-        while True:
-            if why := self._implausible(fitted, signature):
-                self._note(signature, why)
-                return None
-            density, forecasts = _gains(mode, fitted, self.criteria)
-            if why := self._uncertain(mode, fitted, density, forecasts):
-                self._note(signature, why)
-                return None
-            share = _share(mode, fitted)
-            if forecasts.certain(self.criteria.min_elpd_se):
-                share = max(share, min(forecasts.total, forecast_change(mode, fitted)))
-            if share < self.criteria.negligible:
-                self._negligible(signature, share)
-                return None
-            fitted = with_enough_substeps(fitted, self.say, self.criteria)
-            if fitted is coarse:
-                break
-            coarse = fitted
+        negligible = self.criteria.negligible
+        least = self.criteria.selection.promise * negligible
+        share = max(_share(mode, fitted), forecast_change(mode, fitted))
+        if share < least:  # before the cost of more engine steps
+            self._negligible(signature, share)
+            return None
+        fitted = with_enough_substeps(fitted, self.say, self.criteria)
+        if why := self._implausible(fitted, signature):
+            self._note(signature, why)
+            return None
+        density, forecasts = _gains(mode, fitted, self.criteria)
+        if why := self._uncertain(mode, fitted, density, forecasts):
+            self._note(signature, why)
+            return None
+        share = _share(mode, fitted)
+        if forecasts.certain(self.criteria.min_elpd_se):
+            share = max(share, min(forecasts.total, forecast_change(mode, fitted)))
+        if share < negligible:
+            self._negligible(signature, share)
+            return None
         self._note(signature, "added")
         others = inseparable(signature, ranked, self.criteria)
         return Step(signature, others, fitted, density.total, density.error)
