@@ -50,6 +50,8 @@ _FARTHER = 1.4
 _WIDER = 1.3
 #: A parameter whose derivative is below this in units of noise over its prior is not informed.
 _SILENT = 1e-3
+#: Measured numbers from which a recording is long: the posterior is near its Laplace approximation.
+_LONG = 300_000
 #: Numbers of the filter's gains that are kept at once, and of residuals.
 _NUMBERS = 8_000_000
 
@@ -91,10 +93,11 @@ class Space:
         phi = np.stack(columns, axis=-1) if columns else q[..., :0]
         return phi, np.broadcast_to(sigma, (*sigma.shape[:-1], len(problem.noise_prior[0])))
 
-    def log_prior(self, q: Floats) -> Floats:
+    def log_prior(self, q: Floats, but: Bools | None = None) -> Floats:
         """Return the log-density of the prior in this space, shape (...).
 
-        A wheel's equal descriptions share their prior evenly; see `parameters.evened`.
+        A wheel's equal descriptions share their prior evenly; see `parameters.evened`. ``but`` are
+        parameters that do not count, shape (p,).
         """
         problem = self.problem
         priors, p = problem.layout.priors, problem.layout.size
@@ -102,7 +105,8 @@ class Space:
         with np.errstate(all="ignore"):
             slopes = [unconstrain(prior, phi[..., i])[1] for i, prior in enumerate(priors)]
             density = problem.layout.log_prior(phi) + evened(problem.layout, phi)
-            density = density.sum(axis=-1) - np.log(np.abs(slopes)).sum(axis=0)
+            density -= np.moveaxis(np.log(np.abs(slopes)), 0, -1) if slopes else 0.0
+            density = density.sum(axis=-1, where=True if but is None else ~but)
             noise = q[..., p:]
             log_sigma = np.where(self.roots, _ROOT * np.log(noise), noise)
             # the density of a root, from that of the logarithm
@@ -287,6 +291,8 @@ def draw_pool(mode: Mode, n: int, seed: Any, threads: int) -> tuple[Pool | None,
     rng = np.random.default_rng(seed)
     problem = mode.problem.with_physics(threads=threads)
     space, quiet = Space(problem), silent(mode)
+    if problem.measured.size > _LONG:
+        return _from_gaussians(mode, space, quiet, n, rng), ""
     fitted = _emulate(mode, space, quiet, rng)
     if isinstance(fitted, str):
         return None, fitted
@@ -295,7 +301,27 @@ def draw_pool(mode: Mode, n: int, seed: Any, threads: int) -> tuple[Pool | None,
     walkers.sweep(2 * _SWEEPS)
     if not walkers.settle():
         return None, "the proposals still drift"
-    return _evaluated(walkers, prior.filled(walkers.q, rng)), ""
+    q = prior.filled(walkers.q, rng)
+    phi, sigma, exact = _evaluated(space, q)
+    likelihood = np.concatenate([walkers.likelihood(part) for part in np.array_split(q, 8)])
+    return Pool(phi, sigma, exact.sum(axis=1) - FLATTER * likelihood, exact), ""
+
+
+def _from_gaussians(
+    mode: Mode, space: Space, quiet: Bools, n: int, rng: np.random.Generator
+) -> Pool:
+    """Return proposals from the widened Laplace approximations, to which long recordings come."""
+    loud, sensors, _, steps = _blocks(mode, space.problem.rough, np.flatnonzero(~quiet))
+    q = np.zeros((n, len(quiet) + len(space.roots)))
+    log_density = np.zeros(n)
+    for block in (loud, sensors, steps):
+        noise = rng.standard_normal((n, len(block.places)))
+        q[:, block.places] = block.mean + np.sqrt(_WIDER) * noise @ block.factor.T
+        log_density -= 0.5 * (noise**2).sum(axis=1)
+    q = _PriorDraws(space, quiet).filled(q, rng)
+    phi, sigma, exact = _evaluated(space, q)
+    height = exact.sum(axis=1) + space.log_prior(q, but=quiet)
+    return Pool(phi, sigma, height - log_density, exact)
 
 
 def _emulate(mode: Mode, space: Space, quiet: Bools, rng: np.random.Generator) -> Walkers | str:
@@ -404,20 +430,17 @@ def _learned(block: Gaussian, q: Floats) -> Gaussian:
     return learned
 
 
-def _evaluated(walkers: Walkers, q: Floats) -> Pool:
-    """Return proposals with the engine's log-likelihood."""
-    problem = walkers.space.problem
-    phi, sigma = walkers.space.split(q)
+def _evaluated(space: Space, q: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return parameters, noise, and the engine's log-likelihoods (proposal, transition)."""
+    problem = space.problem
+    phi, sigma = space.split(q)
     exact = np.empty((len(q), problem.segments.n))
-    emulated = np.empty(len(q))
     width = max(16, _NUMBERS // max(problem.measured.size, 1))
     for first in range(0, len(q), width):
         chosen = slice(first, first + width)
         residual = problem.residual(phi[chosen])
         exact[chosen] = problem.log_density(residual, sigma[chosen], phi[chosen])
-        emulated[chosen] = walkers.likelihood(q[chosen])
-    exact = np.where(np.isnan(exact), -np.inf, exact)
-    return Pool(phi, sigma, exact.sum(axis=1) - FLATTER * emulated, exact)
+    return phi, sigma, exact
 
 
 def systematic(weights: Floats, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
