@@ -297,8 +297,10 @@ def _best_look(mode: Mode, attached: Attached, test: _Test) -> Signature:
     units = [found.unit for found in scores]
     best, values = _none(n, len(test.back)), np.array(effect.null)
     leading = sorted(range(len(tried)), key=lambda i: scores[i].log_p)[:_LEADING]
+    again: list[Look] = []
     if leading and scores[leading[0]].log_p < 0.0:
         again = looks(mode, attached, np.array([tried[i].proposed for i in leading]))
+    if again:  # with more engine steps a body may pass by
         best, look = min(((evidence(look), look) for look in again), key=lambda own: own[0].log_p)
         values = look.values.copy()
         for column, size in zip(look.columns, best.size, strict=False):

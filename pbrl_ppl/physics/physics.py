@@ -146,7 +146,7 @@ class Physics:
     def coarse(self) -> Physics:
         """The same with few substeps: cheap, and its derivative is nearly right."""
         enough = max(COARSE, math.ceil(self.scene.time_step / LONGEST_COARSE))
-        return self.changed(substeps=min(enough, self.substeps))
+        return self.changed(substeps=min(enough, self.substeps), extrapolate=False)
 
     @property
     def rough(self) -> Physics:
