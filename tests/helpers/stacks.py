@@ -36,7 +36,8 @@ def file(generation: str) -> Path:
 def fitted(draws: int = 500, tune: int = 500) -> Any:
     """Return the puck's posterior on the running generation."""
     model = physics_model(SCENE, history(1))
-    return fit(model, seed=3, draws=draws, tune=tune, chains=2, progress=False)
+    settings = {"draws": draws, "tune": tune, "chains": 2, "progress": False}
+    return fit(model, method="metropolis", seed=3, **settings)
 
 
 if __name__ == "__main__":
