@@ -333,7 +333,7 @@ def _emulate(mode: Mode, space: Space, quiet: Bools, rng: np.random.Generator) -
     blocks = _blocks(mode, rough, np.flatnonzero(~quiet))
     pieces = Pieces.of(rough).without(np.flatnonzero(quiet))
     widest = max((len(piece.places) for piece in pieces.emulated), default=0)
-    degree = next((d for d in (3, 2) if _terms(widest, d) <= _MOST), 1)
+    degree = 2 if _terms(widest, 2) <= _MOST else 1
     half = max(_LEAST, _A_COEFFICIENT * _terms(widest, degree)) // 2
     prior, entries = _PriorDraws(space, quiet), len(space.roots)
     q = prior.filled(np.zeros((half, len(quiet) + entries)), rng)
