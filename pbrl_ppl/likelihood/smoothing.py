@@ -22,6 +22,8 @@ from pbrl_ppl.state import STATE, Bools, Floats
 _FAR = 10.0
 #: Largest change of states in the last round (in standard deviations), and most rounds.
 _SETTLED, _ROUNDS = 0.05, 4
+#: A slope is taken anew where the state has moved by more than this (standard deviations).
+_STALE = 0.3
 #: Least unexplained acceleration to smooth with, as a share of its prior median.
 _LITTLE = 0.1
 #: Steps (of the logarithm) by which unexplained accelerations fall to the given ones.
@@ -101,6 +103,7 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     steps = list(problem.trajectory_noise.cells.accelerations)
     sigma = sigma.copy()
     sigma[steps] = np.maximum(sigma[steps], _LITTLE * problem.noise_prior[0][steps])
+    begun: Floats | None = None  # states at which each transition's slope was taken
     for _ in range(_ROUNDS):
         noise = problem.trajectory_noise
         cells = noise.cells
@@ -114,7 +117,14 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
         problem = replace(
             problem, data=replace(problem.data, states=with_predicted_gaps(problem, phi))
         )
-        problem = problem.along(_sloped(problem, cells, phi, sigma, spread))
+        begin = cells.of(problem.segments.start)
+        if begun is None:
+            problem = problem.along(_sloped(problem, cells, phi, sigma, spread))
+            begun = begin
+        else:
+            moved = np.asarray((np.abs(begin - begun) > _STALE * spread).any(axis=1))
+            problem = problem.along(_sloped(problem, cells, phi, sigma, spread, moved))
+            begun = np.where(moved[:, None], begin, begun)
         shown = after[noise.seen.any(axis=1)]
         if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
             break
@@ -225,22 +235,36 @@ def _moved(problem: Problem, cells: Cells, first: Bools, before: Floats, after: 
 
 
 def _sloped(
-    problem: Problem, cells: Cells, phi: Floats, sigma: Floats, steps: Floats
+    problem: Problem,
+    cells: Cells,
+    phi: Floats,
+    sigma: Floats,
+    steps: Floats,
+    rows: Bools | None = None,
 ) -> TrajectoryNoise:
-    """Linearise the transitions about the problem's states by central differences."""
+    """Linearise the transitions about the problem's states by central differences.
+
+    Where ``rows``, shape (transition,), is not set, the slopes are those that the problem has.
+    """
     segments = problem.segments
-    d, n = len(cells.places), segments.n
-    moved = np.tile(segments.start, (2 * d, 1, 1, 1))
+    chosen = np.arange(segments.n) if rows is None else np.flatnonzero(rows)
+    if not len(chosen):
+        return linearised(problem, cells, problem.trajectory_noise.slope, sigma)
+    start = segments.start[chosen]
+    d, n = len(cells.places), len(chosen)
+    moved = np.tile(start, (2 * d, 1, 1, 1))
     flat = moved.reshape(2 * d, n, -1)
     for i, place in enumerate(cells.places):
         flat[2 * i, :, place] += steps[i]
         flat[2 * i + 1, :, place] -= steps[i]
-    moved = cells.completed(problem.scene, moved).reshape(2 * d * n, *segments.start.shape[1:])
-    inputs = np.tile(problem.inputs, (2 * d, 1, 1, 1))
+    moved = cells.completed(problem.scene, moved).reshape(2 * d * n, *start.shape[1:])
+    inputs = np.tile(problem.inputs[chosen], (2 * d, 1, 1, 1))
     # a coarse engine's slope agrees with a fine one's
     ends = cells.of(problem.rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
-    slope = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
-    return linearised(problem, cells, np.nan_to_num(slope), sigma)
+    own = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
+    slope = np.nan_to_num(own) if rows is None else problem.trajectory_noise.slope.copy()
+    slope[chosen] = np.nan_to_num(own)
+    return linearised(problem, cells, slope, sigma)
 
 
 def linearised(problem: Problem, cells: Cells, slope: Floats, sigma: Floats) -> TrajectoryNoise:
