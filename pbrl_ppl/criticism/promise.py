@@ -41,7 +41,7 @@ def promised_share(mode: Mode, signature: Signature) -> float:
     if not seen.any():
         return signature.fall
     falls = 1.0 - _squares(worse, better, better.error)[seen] / errors[seen]
-    return max(signature.fall, min(0.5 * float(falls.mean()), forecast_change(before, changed)))
+    return max(signature.fall, min(0.5 * float(falls.mean()), _change(worse, better)))
 
 
 def forecast_change(before: Mode, after: Mode) -> float:
@@ -49,7 +49,11 @@ def forecast_change(before: Mode, after: Mode) -> float:
 
     Near the noise any share of an error is small beside the motion.
     """
-    worse, better = _forecasts(before, after)
+    return _change(*_forecasts(before, after))
+
+
+def _change(worse: Forecast, better: Forecast) -> float:
+    """Return the change of forecasts over the motion, of the worst coordinate; 0 without any."""
     if not len(worse.error):
         return 0.0
     change = _squares(worse, better, worse.error - better.error)

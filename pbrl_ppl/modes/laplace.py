@@ -121,7 +121,7 @@ def climb(
     """
     priors = problem.layout.priors
     lower, upper = box(priors)
-    sigma, value = _at(problem, phi)
+    sigma, value = profiled(problem, phi)
     if not priors:
         return Peak(phi, sigma, value)
     steps = 1e-3 * problem.layout.scale(phi)
@@ -150,7 +150,7 @@ def climb(
             ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
         reached = best_tails(problem, result.x, sigma)
-        better, improved = _at(problem, reached)
+        better, improved = profiled(problem, reached)
         if improved < value:
             break
         phi, sigma, gain, value = reached, better, improved - value, improved
@@ -161,7 +161,7 @@ def climb(
     return Peak(phi, sigma, value)
 
 
-def _at(problem: Problem, phi: Floats) -> tuple[Floats, float]:
+def profiled(problem: Problem, phi: Floats) -> tuple[Floats, float]:
     """Return the most probable sigma at phi, and the log-posterior there."""
     residual = problem.residual(phi)
     sigma = profile_sigma(problem, residual, phi)

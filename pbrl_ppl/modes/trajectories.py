@@ -15,8 +15,7 @@ from pbrl_ppl.likelihood import (
     smoothed,
     with_sensitivity,
 )
-from pbrl_ppl.modes.laplace import Mode
-from pbrl_ppl.modes.noise import profile_sigma
+from pbrl_ppl.modes.laplace import Mode, profiled
 from pbrl_ppl.modes.search import find_mode
 from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import change_from, inside
@@ -107,7 +106,7 @@ def nearby_mode(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
     phi, sigma : ndarray
         Where to begin, shapes (p,) and (parameter,).
     """
-    best: Mode | None = None
+    found: list[Mode] = []
     for _ in range(_CORRECTIONS):
         cheap = problem.corrected(phi)
         mode = _settled(cheap, phi, sigma)
@@ -115,18 +114,11 @@ def nearby_mode(problem: Problem, phi: Floats, sigma: Floats) -> Mode:
             return mode
         problem = replace(mode.problem, physics=problem.physics, defect=None)
         moved, phi = _change(mode, phi), mode.phi
-        residual = problem.residual(phi)
-        sigma = profile_sigma(problem, residual, phi)
-        density = problem.log_density(residual, sigma, phi).sum()
-        height = float(log_posterior(problem, phi, sigma, log_likelihood=density))
-        fine = replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=())
-        if best is None or height > best.log_posterior:
-            best = fine
+        sigma, height = profiled(problem, phi)
+        found.append(replace(mode, problem=problem, sigma=sigma, log_posterior=height, others=()))
         if moved < _SETTLED or abs(height - mode.log_posterior) < _SAME:
             break
-    if best is None:
-        raise ValueError("a mode takes at least one correction")
-    return best
+    return max(found, key=lambda own: own.log_posterior)
 
 
 def _settled(problem: Problem, phi: Floats, sigma: Floats) -> Mode:

@@ -409,8 +409,7 @@ def _blocks(mode: Mode, rough: Problem, loud: Any) -> list[Gaussian]:
     mean = np.concatenate([mean, noise_mean])
     covariance = block_diag(covariance, noise_covariance)
     space = Space(mode.problem)
-    log_noise = mean[entries]
-    mean[entries] = space.noise(log_noise)
+    mean[entries] = space.noise(noise_mean)
     slope = np.ones(len(mean))
     slope[entries] = np.where(space.roots, mean[entries] / _ROOT, 1.0)
     covariance = slope[:, None] * covariance * slope
