@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pbrl_ppl.background import background
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.held_out import HeldOut, example_rollout, longest_rollout, rollout_horizon
 from pbrl_ppl.criticism.loop import ADEQUATE, EFFECTS_ADDED, NOT_CONVERGED, UNEXPLAINED, Loop
@@ -187,12 +188,15 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
     selection = Selection(scene, task.catalogue, criteria, say)
     effects = attach(scene, (), task.catalogue)
     say(Stage.CHECK_PRIOR)
-    prior = _prior_test(task, train, effects)
-    if not prior.passed:  # before the long fit: units may be wrong
-        hint = "the declared prior does not explain this recording, unless a missing effect is why"
-        warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
-    say(Stage.FIT)
-    declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
+    with background(partial(_compile, scene, train)) as compiled:
+        prior = _prior_test(task, train, effects)
+        if not prior.passed:  # before the long fit: units may be wrong
+            hint = "the declared prior does not explain this recording"
+            hint = f"{hint}, unless a missing effect is why"
+            warnings.warn(f"{hint}: {prior.sentence}", PriorWarning, stacklevel=3)
+        say(Stage.FIT)
+        declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
+        compiled()
     search = _add_effects(declared, selection, provisional=True)
     # with the right noise model effects may show that were hidden before
     for again in reversed(range(criteria.noise_rounds)):
@@ -249,6 +253,14 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         bad_frames=bad,
         criteria=criteria,
     )
+
+
+def _compile(scene: Scene, train: History) -> None:
+    """Compile the engine's loop unless it is on disk; candidates need it, the fit rarely."""
+    physics = Physics(scene, substeps=1, engine="chipmunk")
+    rng = np.random.default_rng(0)
+    phi = np.array([prior.sample(rng, 1)[0] for prior in physics.layout.priors])
+    Problem.of(physics, train).predict(phi)
 
 
 def _add_effects(declared: Mode, selection: Selection, *, provisional: bool) -> _Search:
@@ -316,8 +328,6 @@ def _too_much_remains(
 
 def _posteriors(task: _Task, modes: list[Mode]) -> list[Any]:
     """Sample the models of modes, the first beside the others; issue their warnings."""
-    from pbrl_ppl.sampling import background
-
     with background(partial(_posterior, task, modes[0])) as first:
         others = [_posterior(task, mode) for mode in modes[1:]]
         results = [first(), *others]

@@ -7,7 +7,8 @@ that missing ones are simply left out. See B. D. O. Anderson and J. B. Moore, Op
 The derivative by the noise is S. J. Koopman and N. Shephard's, Exact score for time series models
 in state space form (1992).
 
-Noise so small that a variance rounds to zero gives NaN, which is no likelihood.
+Noise so small that a variance rounds to zero gives NaN, which is no likelihood. Arrays are copied
+by loops: assigning one adds seconds to the compilation, for the message of a wrong shape.
 """
 
 from __future__ import annotations
@@ -95,7 +96,9 @@ def gains(
                 for a in range(d):
                     for b in range(a):
                         p[b, a] = p[a, b]
-        covariance[k] = p
+        for a in range(d):
+            for b in range(d):
+                covariance[k, a, b] = p[a, b]
     return gain, scale, covariance
 
 
@@ -134,7 +137,8 @@ def innovations(
     for j in range(sets):
         for k in range(n):
             if first[k]:
-                state[:] = begin[k]
+                for a in range(d):
+                    state[a] = begin[k, a]
             for a in range(d):
                 total = -residual[j, k, a]
                 for b in range(d):
@@ -146,8 +150,8 @@ def innovations(
                     white[j, k, i] = innovation / scale[k, i]
                     for a in range(d):
                         moved[a] += gain[k, i, a] * innovation
-            state[:] = moved
-            filtered[j, k] = state
+            for a in range(d):
+                state[a] = filtered[j, k, a] = moved[a]
     return white, filtered
 
 
@@ -181,20 +185,20 @@ def adjoint(
     for k in range(n - 1, -1, -1):
         if last[k]:
             state[:] = 0.0
-        after[k] = state
+        for a in range(d):
+            after[k, a] = state[a]
         for i in range(d - 1, -1, -1):
             if seen[k, i]:
                 total = weighted[k, i] / scale[k, i]
                 for a in range(d):
                     total += gain[k, i, a] * state[a]
                 state[i] -= total
-        residual[k] = state
-        moved = np.zeros(d)
         for a in range(d):
+            residual[k, a] = state[a]
             for b in range(d):
-                moved[a] += slope[k, b, a] * state[b]
-        state[:] = moved
-        before[k] = state
+                before[k, a] += slope[k, b, a] * state[b]
+        for a in range(d):
+            state[a] = before[k, a]
     return before, residual, after
 
 
@@ -278,8 +282,8 @@ def score(
                 for c in range(d):
                     total += own[c, a] * pulled[c, b]
                 known[a, b] = known[b, a] = total
-        state[:] = moved
         for a in range(d):
+            state[a] = moved[a]
             begin[k, a] = state[a] * state[a] - known[a, a]
             if known[a, a] > 0.0:
                 auxiliary[1, k, a] = state[a] / np.sqrt(known[a, a])

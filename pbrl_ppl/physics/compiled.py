@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.physics.calls import call1, call2, call_int, call_law, call_pointer, get1, get2
-from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.compilation import compiled, copy
 from pbrl_ppl.physics.properties import COLUMN
 from pbrl_ppl.physics.setters import (
     arm,
@@ -160,7 +160,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
     command_parameters, force_parameters = batch.given[3][p], batch.given[4][p]
     start, inputs, normal_gravity = batch.start, batch.inputs[t], batch.normal_gravity
     properties, joints = intervals(batch.given[0], p, t, len(inputs)), batch.given[1][p]
-    state[:] = start[p if len(start) > 1 else 0, t]
+    copy(start[p if len(start) > 1 else 0, t], state)
     bodies = properties[0]
     for j in range(len(axes)):
         turn = bodies[world.wheel_body[j], COLUMN.w_theta]
@@ -180,7 +180,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
             call_int(fn.cpSpaceSetIterations, world.space, iterations(world, bodies))
         if driven:
             drive(fn, world, state, inputs[h])
-        wrench[:] = inputs[h, :, :3]
+        copy(inputs[h], wrench)
         for s in range(substeps):
             if acting:
                 act(
@@ -217,7 +217,7 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
                 if watch and touched == _FREE:
                     near = _near_contact(i, state, world.radii, world.obstacles, world.can_touch)
                     touched = _TOUCHED if near else _FREE
-        out[h] = state
+        copy(state, out[h])
     return touched
 
 
@@ -271,13 +271,15 @@ def rollout(fn, world, batch, items, out):  # type: ignore[no-untyped-def]
             if outcome == _LOST:
                 return place
             if level == 0:
-                out[item] = states
+                for h in range(horizon):
+                    copy(states[h], out[item, h])
             if outcome == _TOUCHED:
                 break
             total += batch.weights[level] * states
         if outcome == _FREE and len(batch.counts) > 1:
             for i in range(k):
                 if world.kinematic[i]:  # the weights' sum is 1 but for rounding
-                    total[:, i] = out[item, :, i]
-            out[item] = total
+                    copy(out[item, :, i], total[:, i])
+            for h in range(horizon):
+                copy(total[h], out[item, h])
     return len(items)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pbrl_ppl.physics import lockstep_solver as solver
-from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.compilation import compiled, copy
 from pbrl_ppl.physics.compiled import act
 from pbrl_ppl.physics.joints import ROD
 from pbrl_ppl.physics.lockstep_solver import BLOCK, LINK_ROWS, POINT_ROWS, ROWS, X0, Y0
@@ -116,7 +116,7 @@ def rollout(free, batch, first, last, out, left, trail):  # type: ignore[no-unty
                         if h == 0:
                             for d in range(6):
                                 own[d] = start[p if len(start) > 1 else 0, t, 0, d]
-                            own_discs[i] = discs[p]
+                            copy(discs[p], own_discs[i])
                         else:
                             solver.get_state(z, i, own)
                         shifted |= solver.set_properties(

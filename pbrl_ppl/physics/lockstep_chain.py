@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.physics import lockstep_joints as joined
 from pbrl_ppl.physics import lockstep_solver as solver
-from pbrl_ppl.physics.compilation import compiled
+from pbrl_ppl.physics.compilation import compiled, copy
 from pbrl_ppl.physics.compiled import act
 from pbrl_ppl.physics.joints import ROD
 from pbrl_ppl.physics.lockstep_joints import JOINT_ROWS, M_MAX, MJ, SHARE, Block
@@ -135,8 +135,8 @@ def rollout(chain, batch, items, out, left):  # type: ignore[no-untyped-def]
                     item = items[begin + min(i, width - 1)]  # the rest of a block repeats the last
                     p, t = item // n, item % n
                     if h == 0:
-                        states[i] = start[p if len(start) > 1 else 0, t]
-                        own_discs[i] = discs[p]
+                        copy(start[p if len(start) > 1 else 0, t], states[i])
+                        copy(discs[p], own_discs[i])
                     if timed or h == 0:
                         own = rows[p, t * horizon + h if timed else 0]
                         most[i] = iterations(chain, own)
@@ -190,4 +190,5 @@ def rollout(chain, batch, items, out, left):  # type: ignore[no-untyped-def]
                         if i < width:
                             at = out[items[begin + i], h, k]
                             solver.add(at, states[i, k], batch.weights[level], level, levels)
-        left[begin : begin + width] = touched[:width]
+        for i in range(width):
+            left[begin + i] = touched[i]

@@ -6,12 +6,14 @@ import base64
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from pbrl_ppl.background import background
 from pbrl_ppl.report.style import NARROW, WIDE, png
 from pbrl_ppl.report.words import (
     change,
@@ -105,7 +107,13 @@ def render_page(
     for words in (number, percent, p_equals, plain, joined, change, quantity):
         environment.filters[words.__name__] = words
     environment.filters["data"] = _data
-    picture = {name: _picture(draw) for name, draw in pictures.items()}
+    names = list(pictures)
+
+    def drawn(chosen: list[str]) -> dict[str, dict[str, str]]:
+        return {name: _picture(pictures[name]) for name in chosen}
+
+    with background(partial(drawn, names[1::2])) as others:
+        picture = drawn(names[::2]) | others()
     return environment.get_template(template).render(picture=picture, digits_of=digits_of, **values)
 
 

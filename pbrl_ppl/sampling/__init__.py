@@ -1,6 +1,5 @@
 """Draws from the posterior: `fit` and its samplers, `update`, and whether the sampler is right."""
 
-from .background import background as background
 from .calibration import calibrate as calibrate
 from .declaration import physics_model as physics_model
 from .fitting import DEFAULT as DEFAULT

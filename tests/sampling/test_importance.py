@@ -14,6 +14,7 @@ import pytest
 from scipy.special import logsumexp
 from scipy.stats import kstest, norm
 
+from pbrl_ppl.background import background
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
 from pbrl_ppl.likelihood import single_transitions
@@ -33,7 +34,7 @@ from pbrl_ppl.posterior import (
     scalars,
     smoothed,
 )
-from pbrl_ppl.sampling import background, fit, physics_model, update, updating
+from pbrl_ppl.sampling import fit, physics_model, update, updating
 from pbrl_ppl.sampling.importance import (
     MAX_PARETO_K,
     Space,
