@@ -4,14 +4,16 @@
     python analysis/benchmarks/loop.py --json              # one JSON object
     python analysis/benchmarks/loop.py --only pair real    # minutes each; long: far more
 
-`loop`, the default, is `make demo`'s history: Box2D's cart with an undeclared drag; `pair` two
-bodies that touch; `long` a hundred thousand transitions; `real` the measured recordings. Pair and
-measurements lie beside the project and are left out where they do not. Seconds are this machine's.
+`loop`, the default, is `make demo`'s history: Box2D's cart with an undeclared drag; `first` the
+command itself with an empty cache of compiled code; `pair` two bodies that touch; `long` a hundred
+thousand transitions; `real` the measured recordings. Pair and measurements lie beside the project
+and are left out where they do not. Seconds are this machine's.
 """
 
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 import tempfile
@@ -97,6 +99,24 @@ def measure_loop() -> Iterator[Row]:
     yield "loop_ess", "the same: least ESS", ">= 400", found.posterior_after.attrs["min_ess"]
 
 
+def measure_first() -> Iterator[Row]:
+    """`make demo` after installation, nothing compiled before."""
+    with tempfile.TemporaryDirectory() as empty:
+        begin = time.perf_counter()
+        data = CART / "recorded"
+        subprocess.run(
+            [
+                Path(sys.executable).with_name("pbrl-ppl"), "close-loop", CART / "scene.toml",
+                data / "train.csv", "--test", data / "test.csv", "-o", Path(empty) / "out",
+            ],
+            env=os.environ | {"NUMBA_CACHE_DIR": str(Path(empty) / "cache")},
+            capture_output=True,
+            check=True,
+        )  # fmt: skip
+        took = time.perf_counter() - begin
+    yield "first_seconds", "make demo, nothing compiled before (s)", "<= 45", took
+
+
 def measure_pair() -> Iterator[Row]:
     """The loop on two bodies that touch, of which one has an undeclared drag."""
     if there("pair_seconds", PAIR):
@@ -132,7 +152,13 @@ def measure_real() -> Iterator[Row]:
     yield "real_seconds_max", "the longest of the measured recordings (s)", "< 300", longest
 
 
-PARTS = {"loop": measure_loop, "pair": measure_pair, "long": measure_long, "real": measure_real}
+PARTS = {
+    "loop": measure_loop,
+    "first": measure_first,
+    "pair": measure_pair,
+    "long": measure_long,
+    "real": measure_real,
+}
 
 if __name__ == "__main__":
     measure(PARTS, __doc__, usual=["loop"])

@@ -428,8 +428,10 @@ def test_no_parameter_is_worth_more_than_the_weights(fitted) -> None:
 
 def test_too_few_draws(model, mode) -> None:
     cure = r"the draws are too few: .*effective.*; raise draws=, or go on with resume="
-    with pytest.warns(ConvergenceWarning, match=cure):
-        fit(model, seed=1, start=mode, **(QUICK | {"draws": 40}))
+    with pytest.warns(ConvergenceWarning, match=cure) as caught:
+        few = fit(model, seed=1, start=mode, **(QUICK | {"draws": 40}))
+    assert few.attrs["max_rhat"] > 1.01  # as that of a few independent draws is
+    assert "R-hat" not in "".join(str(each.message) for each in caught)
 
 
 def test_updates_keep_count_of_what_draws_are_worth(model, mode) -> None:
