@@ -129,7 +129,7 @@ def fit(
     Warns
     -----
     ConvergenceWarning
-        If an R-hat is over 1.01 or an effective sample size under 400, if sampling was
+        If an R-hat of chains is over 1.01 or an effective sample size under 400, if sampling was
         interrupted, or if an evidence is too rough for the probability of a joint.
     LinearisationWarning
         If states smoothed anew at draws give another likelihood (``attrs["linearisation"]``, nats).
