@@ -44,7 +44,7 @@ def check(
     reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         declared, (loaded,) = options.load(scene, [history], reading, time_step=time_step)
-        from pbrl_ppl.history import unit_mismatches, unused_velocities
+        from pbrl_ppl.history import unit_mismatches, unused_velocities, with_units
         from pbrl_ppl.physics import check_history
 
         check_history(declared, loaded, loaded.segments(1))
@@ -66,7 +66,8 @@ def check(
             from pbrl_ppl.model import build_model
 
             horizon = telling_horizon(loaded)
-            model = build_model(Problem.of(Physics.declare(declared), loaded, horizon=horizon))
+            physics = Physics.declare(with_units(declared, loaded))
+            model = build_model(Problem.of(physics, loaded, horizon=horizon))
             checked = prior_predictive_check(model, draws=draws, seed=seed)
             for sentence in checked.summary:
                 console.print(f"prior: {sentence}", soft_wrap=True)

@@ -48,7 +48,7 @@ from pbrl_ppl.criticism.unexplained import (
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.errors import ConvergenceWarning, PriorWarning
-from pbrl_ppl.history import History, without_measurements
+from pbrl_ppl.history import History, with_units, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, try_effect
@@ -176,10 +176,12 @@ class _Search(NamedTuple):
 
 def _closed(task: _Task, train: History, test: History) -> Loop:
     """Go through the stages of :func:`close_loop`."""
-    scene, seed, criteria, say = task.scene, task.seed, task.criteria, task.say
+    seed, criteria, say = task.seed, task.criteria, task.say
     if task.substeps is not None:
-        scene.replace(substeps=task.substeps)  # it is checked there
-    train, test, unused, bad = checked_histories(scene, train, test)
+        task.scene.replace(substeps=task.substeps)  # it is checked there
+    train, test, unused, bad = checked_histories(task.scene, train, test)
+    scene = with_units(task.scene, train)
+    task = replace(task, scene=scene)
     for sentence in (*(velocity.sentence for velocity in unused), *bad):
         say(sentence)
     for effect in task.catalogue:

@@ -16,7 +16,7 @@ from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import unexplained_acceleration
 from pbrl_ppl.effects import Attached, Effect, attach, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem, single_transitions
 from pbrl_ppl.modes import Mode, find_mode, trajectory_mode
 from pbrl_ppl.physics import Physics
@@ -98,6 +98,7 @@ def criticise(
         history, _, unused, bad = checked_histories(scene, history, history)
         for sentence in (*(velocity.sentence for velocity in unused), *bad):
             say(sentence)
+        scene = with_units(scene, history)
         effects = attach(scene, (), catalogue)
         say(Stage.FIT)
         mode = declared_mode(scene, history, effects, seed, substeps, say, criteria)

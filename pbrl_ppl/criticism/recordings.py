@@ -110,7 +110,7 @@ def outliers(mode: Mode, criteria: Criteria = DEFAULT) -> Floats:
     noise, segments = problem.trajectory_noise, problem.segments
     residual = noise.cells.of_residual(problem.residual(mode.phi))
     sigma = without_acceleration(mode).sigma
-    both, error = noise.auxiliary(residual, sigma), noise.cells.white(sigma)
+    both, error = noise.auxiliary(residual, sigma), noise.cells.errors(sigma)
     size = np.abs(np.concatenate(both))  # of rows that transitions end at, then of first rows
     size[size == 0.0] = np.nan
     off = np.concatenate([noise.measured, noise.begin])

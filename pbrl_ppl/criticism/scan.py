@@ -81,7 +81,7 @@ def looks(mode: Mode, candidate: Attached, proposed: Floats | None = None) -> li
         return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
     free = np.isnan(proposed)
-    steps = np.array([1e-3 * min(p.prior.sigma, 1.0) for p in effect.parameters])
+    steps = 1e-3 * np.array([parameter.prior.scale for parameter in effect.parameters])
     lower, upper = np.array([p.prior.support for p in effect.parameters]).T
     # one-sided where the null is the least that there can be
     ahead, behind = np.minimum(null + steps, upper) - null, np.maximum(null - steps, lower) - null

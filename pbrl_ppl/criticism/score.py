@@ -143,7 +143,7 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     if not new:
         return np.zeros((mode.whitened_residual.size, 0))
     lower, upper = (bound[new] for bound in layout.bounds)
-    begin = np.array([1e-3 * min(layout.priors[place].sigma, 1.0) for place in new])
+    begin = 1e-3 * np.array([layout.priors[place].scale for place in new])
 
     def predict(points: Floats) -> Floats:
         phi = np.tile(null, (len(points), 1))

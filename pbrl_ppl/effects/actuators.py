@@ -12,11 +12,11 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
 _GAIN = Prior("log_normal", mu=0.0, sigma=0.5)
-_THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=10.0))
+_THRESHOLD = EffectParameter("threshold", "N", Prior("half_normal", sigma=0.5), scale="force")
 #: Force levels that a scan tries. The likelihood jumps where the cut-off passes a commanded force,
 #: and an optimiser cannot follow it: more levels there.
 _LEVELS, _CUTOFF_LEVELS = 20, 200
-#: No actuator reaches this force (N).
+#: No actuator reaches this force, in typical forces.
 _UNREACHED = 1e9
 
 
@@ -167,7 +167,15 @@ def _scan_limits(scene: Scene, history: History, body: Body) -> Any:
 
 saturation = Effect(
     "saturation",
-    (EffectParameter("limit", "N", Prior("log_normal", mu=2.5, sigma=1.5), null=_UNREACHED),),
+    (
+        EffectParameter(
+            "limit",
+            "N",
+            Prior("log_normal", mu=0.0, sigma=1.5),
+            null=_UNREACHED,
+            scale="force",
+        ),
+    ),
     "a push is never stronger than a limit, whatever is commanded: the actuator saturates",
     "saturation of an actuator",
     Command(_saturate),

@@ -56,6 +56,8 @@ def attach(
 ) -> tuple[Attached, ...]:
     """Return all effects of a model: those that the scene declares, then the extra ones.
 
+    Their priors are in SI units; see :func:`pbrl_ppl.scene.units_of`.
+
     Parameters
     ----------
     scene : Scene
@@ -115,16 +117,19 @@ def attach(
         if (name, on_body) in seen:
             raise EffectError(f"effect {name} is put on body {on_body!r} twice")
         seen.add((name, on_body))
-    return tuple(result)
+    return tuple(attached.in_si(scene) for attached in result)
 
 
 def candidates(
     scene: Scene, declared: Iterable[Attached], effects: Iterable[Effect] = catalogue
 ) -> tuple[Attached, ...]:
-    """Return every applicable effect on every body that the model does not have yet."""
+    """Return every applicable effect on every body that the model does not have yet.
+
+    Their priors are in SI units; see :func:`pbrl_ppl.scene.units_of`.
+    """
     present = {(attached.effect.name, attached.body) for attached in declared}
     return tuple(
-        effect.on(body.name)
+        effect.on(body.name).in_si(scene)
         for effect in effects
         for body in scene.dynamic
         if (effect.name, body.name) not in present and effect.applies(scene, body)

@@ -7,6 +7,9 @@ from pbrl_ppl.effects.effect import Effect, EffectParameter
 from pbrl_ppl.effects.stages import Force
 from pbrl_ppl.parameters import Prior
 
+#: At the typical motion such a law is of the order of the typical force or torque.
+_TYPICAL = Prior("half_normal", sigma=1.0)
+
 
 def _linear(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
     wrench[0] -= parameters[0] * state[3]
@@ -15,7 +18,7 @@ def _linear(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
 
 linear_drag = Effect(
     "linear_drag",
-    (EffectParameter("coefficient", "kg/s", Prior("half_normal", sigma=20.0)),),
+    (EffectParameter("coefficient", "kg/s", _TYPICAL, scale="force/speed"),),
     "a force against the motion that grows with the speed, as in oil or at low speed in air",
     "Stokes' law, F = -c v",
     Force(_linear),
@@ -30,7 +33,7 @@ def _quadratic(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
 
 quadratic_drag = Effect(
     "quadratic_drag",
-    (EffectParameter("coefficient", "kg/m", Prior("half_normal", sigma=20.0)),),
+    (EffectParameter("coefficient", "kg/m", _TYPICAL, scale="force/speed^2"),),
     "a force against the motion that grows with the square of the speed, as in air or water",
     "Rayleigh's drag equation, F = -c |v| v",
     Force(_quadratic),
@@ -43,7 +46,7 @@ def _angular(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
 
 angular_drag = Effect(
     "angular_drag",
-    (EffectParameter("coefficient", "N m s", Prior("half_normal", sigma=10.0)),),
+    (EffectParameter("coefficient", "N m s", _TYPICAL, scale="torque/turn_rate"),),
     "a torque against the rotation that grows with the angular speed",
     "viscous torque, tau = -c omega",
     Force(_angular),
@@ -57,7 +60,11 @@ def _magnus(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
 
 magnus_force = Effect(
     "magnus_force",
-    (EffectParameter("coefficient", "kg", Prior("normal", sigma=1.0)),),
+    (
+        EffectParameter(
+            "coefficient", "kg", Prior("normal", sigma=1.0), scale="force/speed turn_rate"
+        ),
+    ),
     "a force across the motion that grows with the speed and the turning: a spinning body is drawn"
     " aside",
     "Magnus force, F = c omega x v",

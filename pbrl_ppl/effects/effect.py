@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import InitVar, dataclass
+from dataclasses import InitVar, dataclass, replace
 
 import numpy as np
 
@@ -11,7 +11,16 @@ from pbrl_ppl.effects.stages import STAGES, Command, Force, Law, Properties, Sta
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
-from pbrl_ppl.scene import WORLD, Body, Joint, Scene
+from pbrl_ppl.scene import (
+    PLACES,
+    WORLD,
+    Body,
+    Joint,
+    Scene,
+    Units,
+    check_product,
+    units_of,
+)
 from pbrl_ppl.state import Floats
 
 #: ``scan(scene, history, body) -> (point, q)``: grid of parameter values at which an effect is
@@ -39,12 +48,55 @@ class EffectParameter:
         Its prior once the effect is in the model.
     null : float
         The value at which the effect vanishes.
+    scale : str
+        Product of natural units of the body, names of :class:`pbrl_ppl.scene.Units`, in which the
+        prior and the null value are numbers, such as ``force/speed``: the effect then suits a rig
+        of any size. SI units without it.
+    origin : str
+        ``x`` or ``y``: for places, which are counted from the body's mean position.
+
+    Raises
+    ------
+    SceneError
+        If the scale names an unknown unit.
+
+    Examples
+    --------
+    >>> from pbrl_ppl.scene import Body, Scene, Shape, units_of
+    >>> puck = Body("puck", Shape.circle(0.5), typical={"force": 6.0, "speed": 2.0})
+    >>> units = units_of(Scene(time_step=0.1, bodies=(puck,)), "puck")
+    >>> prior = Prior("half_normal", sigma=1.0)
+    >>> EffectParameter("coefficient", "kg/s", prior, scale="force/speed").in_si(units).prior.sigma
+    3.0
     """
 
     name: str
     unit: str
     prior: Prior
     null: float = 0.0
+    scale: str = ""
+    origin: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the scale."""
+        check_product(self.scale)
+        if self.origin not in ("", *PLACES):
+            raise EffectError(
+                f"parameter {self.name}: origin is {self.origin!r}, expected {' or '.join(PLACES)}"
+            )
+
+    def in_si(self, units: Units) -> EffectParameter:
+        """Return the parameter with its prior and null value in SI units."""
+        if not self.scale:
+            return self
+        factor, origin = units.of(self.scale), getattr(units, self.origin) if self.origin else 0.0
+        return replace(
+            self,
+            prior=self.prior.scaled(factor, origin),
+            null=origin + factor * self.null,
+            scale="",
+            origin="",
+        )
 
 
 @dataclass(frozen=True)
@@ -127,6 +179,11 @@ class Effect:
         """Return the effect attached to the body of this name."""
         return Attached(self, body)
 
+    def in_si(self, units: Units) -> Effect:
+        """Return the effect with its priors and null values in SI units."""
+        parameters = tuple(parameter.in_si(units) for parameter in self.parameters)
+        return self if parameters == self.parameters else replace(self, parameters=parameters)
+
     @property
     def null(self) -> tuple[float, ...]:
         """Values of the parameters at which the effect vanishes."""
@@ -143,6 +200,10 @@ class Attached:
 
     effect: Effect
     body: str
+
+    def in_si(self, scene: Scene) -> Attached:
+        """Return the same with priors and null values in SI units; see :func:`units_of`."""
+        return Attached(self.effect.in_si(units_of(scene, self.body)), self.body)
 
     @property
     def variables(self) -> tuple[str, ...]:

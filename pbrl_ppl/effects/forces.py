@@ -10,9 +10,10 @@ from pbrl_ppl.effects.stages import Force, Properties
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
+_TYPICAL = Prior("normal", sigma=1.0)
 _FORCES = (
-    EffectParameter("force_x", "N", Prior("normal", sigma=20.0)),
-    EffectParameter("force_y", "N", Prior("normal", sigma=20.0)),
+    EffectParameter("force_x", "N", _TYPICAL, scale="force"),
+    EffectParameter("force_y", "N", _TYPICAL, scale="force"),
 )
 
 
@@ -71,7 +72,7 @@ def _torque(state: Any, command: Any, parameters: Any, wrench: Any) -> None:
 
 constant_torque = Effect(
     "constant_torque",
-    (EffectParameter("torque", "N m", Prior("normal", sigma=10.0)),),
+    (EffectParameter("torque", "N m", _TYPICAL, scale="torque"),),
     "a steady twist in one direction, such as a torque sensor that is off zero",
     "Euler's second law with a constant torque",
     Force(_torque),
@@ -88,8 +89,8 @@ def _moment_of_push(state: Any, command: Any, parameters: Any, wrench: Any) -> N
 push_offset = Effect(
     "push_offset",
     (
-        EffectParameter("offset_x", "m", Prior("normal", sigma=0.5)),
-        EffectParameter("offset_y", "m", Prior("normal", sigma=0.5)),
+        EffectParameter("offset_x", "m", _TYPICAL, scale="length"),
+        EffectParameter("offset_y", "m", _TYPICAL, scale="length"),
     ),
     "the push acts at a point beside the body's centre, and so turns it as well",
     "moment of a force about a point, tau = r x F",

@@ -24,7 +24,11 @@ def _add_pivot_damping(properties: Any, parameters: Any, clock: Any) -> None:
 
 pivot_damping = Effect(
     "pivot_damping",
-    (EffectParameter("coefficient", "N m s", Prior("half_normal", sigma=1.0)),),
+    (
+        EffectParameter(
+            "coefficient", "N m s", Prior("half_normal", sigma=1.0), scale="torque/turn_rate"
+        ),
+    ),
     "viscous friction in the hinge: a torque against the rotation that grows with its speed",
     "viscous torque on the relative angular velocity, tau = -c omega",
     Properties(_add_pivot_damping),
@@ -38,7 +42,7 @@ def _add_pivot_torque(properties: Any, parameters: Any, clock: Any) -> None:
 
 pivot_friction = Effect(
     "pivot_friction",
-    (EffectParameter("torque", "N m", Prior("half_normal", sigma=1.0)),),
+    (EffectParameter("torque", "N m", Prior("half_normal", sigma=1.0), scale="torque"),),
     "dry friction in the hinge: a steady torque against the rotation that can also hold it still",
     "Coulomb's law of friction",
     Properties(_add_pivot_torque),
@@ -69,7 +73,9 @@ sliding_friction = Effect(
     "sliding_friction",
     (
         EffectParameter("mu", "1", _FRICTION),
-        EffectParameter("radius", "m", Prior("log_normal", mu=-2.0, sigma=1.0), null=0.1),
+        EffectParameter(
+            "radius", "m", Prior("log_normal", mu=-1.5, sigma=1.0), null=0.2, scale="length"
+        ),
     ),
     "dry friction on the floor: a steady force and torque against any sliding and turning, which"
     " can also hold the body still",
@@ -99,8 +105,8 @@ def _scan_wheels(scene: Scene, history: History, body: Body) -> Any:
 wheel = Effect(
     "wheel",
     (
-        EffectParameter("w_x", "m", Prior("normal", sigma=0.5)),
-        EffectParameter("w_y", "m", Prior("normal", sigma=0.5)),
+        EffectParameter("w_x", "m", Prior("normal", sigma=1.0), scale="length"),
+        EffectParameter("w_y", "m", Prior("normal", sigma=1.0), scale="length"),
         EffectParameter("w_theta", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
         EffectParameter("mu_x", "1", _FRICTION),
         EffectParameter("mu_y", "1", _FRICTION),

@@ -10,6 +10,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 
+_OFFSET = Prior("normal", sigma=0.2)
 _SCALE = Prior("log_normal", mu=0.0, sigma=0.5)
 #: Trajectories, and times, of a change of mass that a scan tries at most.
 _BEGINS = 20
@@ -36,8 +37,8 @@ def _shift_centre(properties: Any, parameters: Any, clock: Any) -> None:
 com_offset = Effect(
     "com_offset",
     (
-        EffectParameter("x", "m", Prior("normal", sigma=0.1)),
-        EffectParameter("y", "m", Prior("normal", sigma=0.1)),
+        EffectParameter("x", "m", _OFFSET, scale="length"),
+        EffectParameter("y", "m", _OFFSET, scale="length"),
     ),
     "the centre of mass is not in the middle of the outline: mass is not spread evenly",
     "centre of mass of a rigid body, in the body's frame",
@@ -69,7 +70,7 @@ mass_change = Effect(
     (
         EffectParameter("factor", "1", _SCALE, null=1.0),
         EffectParameter("trajectory", "1", Prior("half_normal", sigma=100.0)),
-        EffectParameter("time", "s", Prior("half_normal", sigma=100.0)),
+        EffectParameter("time", "s", Prior("half_normal", sigma=1.0), scale="time"),
     ),
     "the body is heavier or lighter from some trajectory, or some time, on: it carries a load",
     "a change point in the mass",

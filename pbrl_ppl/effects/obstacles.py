@@ -119,9 +119,9 @@ def _exit(shape: Shape, direction: Floats, offset: float) -> Floats:
 hidden_obstacle = Effect(
     "hidden_obstacle",
     (
-        EffectParameter("x", "m", Prior("normal", sigma=10.0)),
-        EffectParameter("y", "m", Prior("normal", sigma=10.0)),
-        EffectParameter("radius", "m", Prior("half_normal", sigma=0.5)),
+        EffectParameter("x", "m", Prior("normal", sigma=1.0), scale="range", origin="x"),
+        EffectParameter("y", "m", Prior("normal", sigma=1.0), scale="range", origin="y"),
+        EffectParameter("radius", "m", Prior("half_normal", sigma=1.0), scale="length"),
     ),
     "the body ran into something that the scene does not show",
     "contact with a static disc",

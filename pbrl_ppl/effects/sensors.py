@@ -9,6 +9,9 @@ from pbrl_ppl.effects.stages import Noise, Sensor
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.state import STATE, STATE_UNITS
 
+#: Natural units of a body's state; an angle has none.
+_SCALES = ("range", "range", "", "speed", "speed", "turn_rate")
+
 
 def _bias(parameters: Any) -> Any:
     return np.stack(np.broadcast_arrays(*(parameters[name] for name in STATE)), axis=-1)
@@ -25,8 +28,8 @@ def _subtract_bias(measured: Any, parameters: Any) -> Any:
 sensor_bias = Effect(
     "sensor_bias",
     tuple(
-        EffectParameter(name, unit, Prior("normal", sigma=0.2))
-        for name, unit in zip(STATE, STATE_UNITS, strict=True)
+        EffectParameter(name, unit, Prior("normal", sigma=0.1), scale=scale)
+        for name, unit, scale in zip(STATE, STATE_UNITS, _SCALES, strict=True)
     ),
     "what is measured is off by a constant: a sensor is not zeroed, or not where it is thought",
     "additive sensor bias",

@@ -14,21 +14,20 @@ from pbrl_ppl.parameters import Prior
 from pbrl_ppl.scene import Body, Scene
 from pbrl_ppl.state import Floats, wrapped
 
-_PLACE = Prior("normal", sigma=10.0)
+_PLACE = Prior("normal", sigma=1.0)
 #: Anchors of a spring that a scan tries along each axis: quantiles of the measured positions.
 _QUANTILES = (0.1, 0.5, 0.9)
 #: Angles of rest that a scan tries.
 _ANGLES = 8
 #: Attractors that a scan tries along each axis, how far beyond the measured positions (share of
-#: their range), and their depths (m).
-_PLACES, _BEYOND, _DEPTHS = 9, 0.15, (0.08, 0.25)
+#: their range), and their depths in radii of the body.
+_PLACES, _BEYOND, _DEPTHS = 9, 0.15, (0.15, 0.45)
 #: Largest standard deviation of a rod's length, and largest length, as shares of the standard
 #: deviation of the positions: a longer rod cannot be told from a straight line.
 _HELD, _LONGEST = 0.03, 20.0
-#: Length of a rod (m) below which the data do not inform its direction.
-_SHORTEST = 0.02
-#: Ends of rods closer than this (m) are the same.
-_SAME = 0.01
+#: Length of a rod below which the data do not inform its direction, and distance of ends that are
+#: the same, in radii of the body.
+_SHORTEST, _SAME = 0.04, 0.02
 
 
 def _poses(history: History, body: Body, width: int) -> Floats:
@@ -54,9 +53,9 @@ def _scan_anchors(scene: Scene, history: History, body: Body) -> Any:
 spring = Effect(
     "spring",
     (
-        EffectParameter("stiffness", "N/m", Prior("half_normal", sigma=20.0)),
-        EffectParameter("anchor_x", "m", _PLACE),
-        EffectParameter("anchor_y", "m", _PLACE),
+        EffectParameter("stiffness", "N/m", Prior("half_normal", sigma=1.0), scale="force/length"),
+        EffectParameter("anchor_x", "m", _PLACE, scale="range", origin="x"),
+        EffectParameter("anchor_y", "m", _PLACE, scale="range", origin="y"),
     ),
     "a pull towards a place that grows with the distance: a cable or a hose drags at the body",
     "Hooke's law",
@@ -89,7 +88,7 @@ def _scan_angles(scene: Scene, history: History, body: Body) -> Any:
 torsion_spring = Effect(
     "torsion_spring",
     (
-        EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=5.0)),
+        EffectParameter("stiffness", "N m/rad", Prior("half_normal", sigma=0.5), scale="torque"),
         EffectParameter("angle", "rad", Prior("von_mises", mu=0.0, kappa=0.0)),
     ),
     "a torque towards an angle that grows with the deflection: a twisted cable or a bent hinge",
@@ -114,16 +113,19 @@ def _scan_places(scene: Scene, history: History, body: Body) -> Any:
     low, high = places.min(axis=0), places.max(axis=0)
     wider = _BEYOND * (high - low)
     x, y = np.linspace(low - wider, high + wider, _PLACES).T
-    return np.array([(np.nan, *at) for at in product(np.unique(x), np.unique(y), _DEPTHS)])
+    depths = [share * body.shape.bounding_radius for share in _DEPTHS]
+    return np.array([(np.nan, *at) for at in product(np.unique(x), np.unique(y), depths)])
 
 
 point_attractor = Effect(
     "point_attractor",
     (
-        EffectParameter("strength", "N m^2", Prior("normal", sigma=10.0)),
-        EffectParameter("x", "m", _PLACE),
-        EffectParameter("y", "m", _PLACE),
-        EffectParameter("depth", "m", Prior("log_normal", mu=-1.6, sigma=0.7), null=0.2),
+        EffectParameter("strength", "N m^2", Prior("normal", sigma=1.0), scale="force length^2"),
+        EffectParameter("x", "m", _PLACE, scale="range", origin="x"),
+        EffectParameter("y", "m", _PLACE, scale="range", origin="y"),
+        EffectParameter(
+            "depth", "m", Prior("log_normal", mu=-1.0, sigma=0.7), null=0.4, scale="length"
+        ),
     ),
     "a pull towards a place, or a push away, that is strong near it and weak far off: a magnet",
     "inverse-square law, of a source below or above the plane",
@@ -139,7 +141,8 @@ def _rod(parameters: Any) -> Rod:
 
 def _scan_rods(scene: Scene, history: History, body: Body) -> Any:
     """Return rods whose length is constant over the measured poses, by least squares."""
-    poses = _poses(history, body, 3)
+    radius = body.shape.bounding_radius
+    poses = _poses(history, body, 3) / [radius, radius, 1.0]  # in radii of the body
     if len(poses) < 6:
         return np.empty((0, 5))
     spread = float(np.sqrt(poses[:, :2].var(axis=0).sum()))
@@ -149,7 +152,7 @@ def _scan_rods(scene: Scene, history: History, body: Body) -> Any:
         return np.asarray(length - length.mean())
 
     found: list[Floats] = []
-    for begin in body_points(body):
+    for begin in body_points(body) / radius:
         ends = np.array([*begin, *_centre(begin, poses)])
         fitted = least_squares(deviation, ends, x_scale="jac").x
         length = float(_length(fitted, poses).mean())
@@ -157,7 +160,7 @@ def _scan_rods(scene: Scene, history: History, body: Body) -> Any:
             continue
         if all(np.abs(fitted - other[:4]).max() > _SAME for other in found):
             found.append(np.array([*fitted, length]))
-    return np.array(found).reshape(-1, 5)
+    return radius * np.array(found).reshape(-1, 5)
 
 
 def _length(ends: Floats, poses: Floats) -> Floats:
@@ -182,11 +185,11 @@ def _centre(point: Floats, poses: Floats) -> Floats:
 distance_joint = Effect(
     "distance_joint",
     (
-        EffectParameter("a_x", "m", Prior("normal", sigma=0.5)),
-        EffectParameter("a_y", "m", Prior("normal", sigma=0.5)),
-        EffectParameter("b_x", "m", _PLACE),
-        EffectParameter("b_y", "m", _PLACE),
-        EffectParameter("length", "m", Prior("half_normal", sigma=3.0)),
+        EffectParameter("a_x", "m", Prior("normal", sigma=1.0), scale="length"),
+        EffectParameter("a_y", "m", Prior("normal", sigma=1.0), scale="length"),
+        EffectParameter("b_x", "m", _PLACE, scale="range", origin="x"),
+        EffectParameter("b_y", "m", _PLACE, scale="range", origin="y"),
+        EffectParameter("length", "m", Prior("half_normal", sigma=1.0), scale="range"),
     ),
     "a rod or a taut tether that the scene does not show: it holds a point of the body at a"
     " distance from a place",

@@ -153,9 +153,7 @@ class Layout:
 
     def scale(self, phi: Floats) -> Floats:
         """Return the scale of each entry of phi for step sizes, shape (p,); 0 if discrete."""
-        least = np.array(
-            [0.0 if prior.discrete else min(prior.sigma, 1.0) for prior in self.priors]
-        )
+        least = np.array([prior.scale for prior in self.priors])
         return np.where(self.discrete, 0.0, np.maximum(np.abs(phi), 0.1 * least))
 
     def slices(self) -> Iterator[tuple[Block, slice]]:

@@ -1,7 +1,9 @@
 """Univariate priors as data, bounds of a search, and finite differences."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -81,6 +83,38 @@ class Prior:
                 f" [{lower:g}, {upper:g}], where the density underflows; expected at most"
                 f" {_FARTHEST:g}; move mu towards the support or widen sigma"
             )
+
+    def scaled(self, factor: float, origin: float = 0.0) -> Prior:
+        """Return the prior of ``origin`` plus so many times the value.
+
+        Raises
+        ------
+        ParameterError
+            If the family has no scale: ``von_mises`` and ``categorical``, or an ``origin`` of
+            positive values.
+
+        Examples
+        --------
+        >>> Prior("half_normal", sigma=0.5).scaled(20.0).sigma
+        10.0
+        """
+        if self.family == "log_normal" and not origin:
+            return replace(self, mu=self.mu + float(np.log(factor)))
+        if self.family in ("normal", "truncated_normal") or not (
+            origin or self.family != "half_normal"
+        ):
+            ends = {key: origin + factor * getattr(self, key) for key in ("mu", "lower", "upper")}
+            return replace(self, sigma=factor * self.sigma, **ends)
+        raise ParameterError(f"{self.family}: it has no scale; expected a prior of a size")
+
+    @property
+    def scale(self) -> float:
+        """Typical change of a value, for steps of derivatives."""
+        if self.family == "log_normal":
+            return min(self.sigma, 1.0) * self.centre
+        if self.family in ("von_mises", "categorical"):
+            return 1.0
+        return min(self.sigma, self.upper - self.lower)
 
     @property
     def support(self) -> tuple[float, float]:

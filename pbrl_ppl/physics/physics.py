@@ -86,6 +86,8 @@ class Physics:
 
     def __post_init__(self) -> None:
         """Fill in what the scene and the effects decide."""
+        effects = tuple(attached.in_si(self.scene) for attached in self.effects)
+        object.__setattr__(self, "effects", effects)
         if self.substeps is None:
             object.__setattr__(self, "substeps", self.scene.substeps)
         if self.layout is None:

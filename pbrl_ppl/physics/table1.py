@@ -16,7 +16,7 @@ from pbrl_ppl.parameters import (
     Layout,
     Prior,
 )
-from pbrl_ppl.scene import CONTACT_NAMES, WORLD, Body, Joint, Scene, nearest
+from pbrl_ppl.scene import CONTACT_NAMES, MASS_PRIOR, WORLD, Body, Joint, Scene, nearest
 
 #: Half the side of the square in which a joint's anchor in the world is sought where the scene has
 #: neither walls nor poses (m).
@@ -50,7 +50,7 @@ def table1(body: Body) -> dict[str, Prior]:
     x_min, x_max, y_min, y_max = body.shape.bounds
     share = Prior("truncated_normal", mu=0.5, sigma=1.0, lower=0.0, upper=1.0)
     priors = {
-        "mass": Prior("log_normal", mu=1.0, sigma=1.5),
+        "mass": Prior("log_normal", *MASS_PRIOR),
         "r": Prior("log_normal", mu=-1.5, sigma=1.0),
         "mu_c": share,
         "w_x": Prior("truncated_normal", sigma=x_max - x_min, lower=x_min, upper=x_max),
@@ -224,10 +224,14 @@ def build_layout(scene: Scene, effects: tuple[Attached, ...] = ()) -> Layout:
             priors = tuple(table1(body)[name] for body in bodies)
             blocks.append(Block(name, tuple(body.owner for body in bodies), unit, priors))
     blocks += _joint_blocks(scene)
-    for effect in dict.fromkeys(attached.effect for attached in effects):
-        on = tuple(attached.body for attached in effects if attached.effect == effect)
-        for parameter in effect.parameters:
-            name = effect.variable(parameter)
-            priors = tuple(declared_prior(scene.body(owner), name, parameter.prior) for owner in on)
-            blocks.append(Block(name, on, parameter.unit, priors, effect=effect.name))
+    for effect in dict.fromkeys(attached.effect.name for attached in effects):
+        those = [attached.in_si(scene) for attached in effects if attached.effect.name == effect]
+        on = tuple(attached.body for attached in those)
+        parameters = zip(*(attached.effect.parameters for attached in those), strict=True)
+        for name, alike in zip(those[0].variables, parameters, strict=True):
+            priors = tuple(
+                declared_prior(scene.body(owner), name, parameter.prior)
+                for owner, parameter in zip(on, alike, strict=True)
+            )
+            blocks.append(Block(name, on, alike[0].unit, priors, effect=effect))
     return Layout(tuple(blocks))

@@ -21,7 +21,7 @@ from pbrl_ppl.effects import (
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
 from pbrl_ppl.physics.properties import COLUMNS
-from pbrl_ppl.scene import Body, Scene
+from pbrl_ppl.scene import Body, Scene, units_of
 from pbrl_ppl.state import Floats
 
 #: Time after which a trial counts as an endless loop (s).
@@ -78,9 +78,10 @@ def try_effect(effect: Effect, scene: Scene, history: History, patience: float =
 def _try(effect: Effect, scene: Scene, history: History) -> None:
     bodies = [body for body in scene.dynamic if effect.applies(scene, body)]
     rng = np.random.default_rng(0)
-    drawn = np.array([parameter.prior.sample(rng, _DRAWS) for parameter in effect.parameters])
-    values = np.vstack([effect.null, drawn.T])
     for body in bodies:
+        sized = effect.in_si(units_of(scene, body.name))
+        drawn = np.array([parameter.prior.sample(rng, _DRAWS) for parameter in sized.parameters])
+        values = np.vstack([sized.null, drawn.T])
         if effect.scan is not None:
             points = np.asarray(effect.scan(scene, history, body), dtype=float)
             if points.ndim != 2 or points.shape[1] != len(effect.parameters):

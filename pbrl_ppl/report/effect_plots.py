@@ -17,6 +17,7 @@ from pbrl_ppl.posterior import scalars
 from pbrl_ppl.report.evidence import Evidence, Law, bin_means
 from pbrl_ppl.report.style import AFTER, BEFORE, PLAIN, WIDE, blank_figure, label, legend
 from pbrl_ppl.report.words import plain
+from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import Floats
 
 #: Candidates are significant below this corrected p-value.
@@ -80,7 +81,7 @@ def plot_added(loop: Loop, width: float = WIDE) -> Figure:
     width = width if columns > 1 else min(width, 5.0)
     figure, panels = blank_figure(width, 2.6 * rows, rows, columns, "x", count=len(shown))
     draws = scalars(loop.posterior_after)
-    nulls = {(effect.name, p.name): p.null for effect in loop.catalogue for p in effect.parameters}
+    effects = {effect.name: effect for effect in loop.catalogue}
     for axes, (added, name, estimate) in zip(panels, shown, strict=False):
         low, high = estimate.hdi
         variable = f"{added.effect}_{name}[{added.body}]"
@@ -96,8 +97,9 @@ def plot_added(loop: Loop, width: float = WIDE) -> Figure:
                 axes.fill_between(grid[inside], density[inside], color=AFTER, alpha=0.25)
         axes.plot([low, high], [-0.06 * top] * 2, color=AFTER, linewidth=4, solid_capstyle="butt")
         axes.plot(estimate.mean, -0.06 * top, "o", color="white", markeredgecolor=AFTER)
-        null = nulls.get((added.effect, name))
-        if null is not None:
+        if added.effect in effects:
+            sized = effects[added.effect].in_si(units_of(loop.scene, added.body))
+            null = {parameter.name: parameter.null for parameter in sized.parameters}[name]
             _mark_null(axes, null, estimate.mean, max(estimate.sd, 1e-12), top)
         axes.set_ylim(-0.14 * top, 1.15 * top)
         axes.set_yticks([])

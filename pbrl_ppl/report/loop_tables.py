@@ -16,6 +16,7 @@ from pbrl_ppl.report.evidence import Evidence
 from pbrl_ppl.report.page import Table
 from pbrl_ppl.report.style import UNITS, acceleration_unit
 from pbrl_ppl.report.words import chance, number, percent, plain, quantity
+from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import STATE, Floats
 
 #: A size is plausible if the effect's prior has more than this probability beyond it.
@@ -38,6 +39,8 @@ def limits_in_words(candidate: Candidate, loop: Loop) -> str:
     A limit beyond what the effect's prior allows is left out: no plausible size would be found.
     """
     effect = next((each for each in loop.catalogue if each.name == candidate.effect), None)
+    if effect is not None:
+        effect = effect.in_si(units_of(loop.scene, candidate.body))
     priors = {} if effect is None else {each.name: each for each in effect.parameters}
     limits = {}
     for name in measured_parameters(candidate, loop):

@@ -8,7 +8,7 @@ from typing import Any
 import pymc as pm
 
 from pbrl_ppl.effects import Attached, Effect
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import TrajectoryLikelihood, TransitionLikelihood, declared_problem
 from pbrl_ppl.model import build_model
 from pbrl_ppl.modes import Mode, find_trajectory_mode, following, trajectory_mode
@@ -109,7 +109,7 @@ def physics_model(
     if around is not None and not trajectories:
         raise ValueError("around is given without trajectories, expected with trajectories=True")
     problem = declared_problem(
-        Physics.declare(scene, effects, substeps=substeps, threads=threads),
+        Physics.declare(with_units(scene, history), effects, substeps=substeps, threads=threads),
         history,
         horizon=horizon,
         likelihood=TransitionLikelihood.declare(sigma, nu),

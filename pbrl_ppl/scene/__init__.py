@@ -9,3 +9,8 @@ from .joints import WORLD as WORLD
 from .joints import Joint as Joint
 from .scene import Scene as Scene
 from .shape import Shape as Shape
+from .units import MASS_PRIOR as MASS_PRIOR
+from .units import PLACES as PLACES
+from .units import Units as Units
+from .units import check_product as check_product
+from .units import units_of as units_of

@@ -18,6 +18,7 @@ from pbrl_ppl.scene.checks import (
 )
 from pbrl_ppl.scene.joints import WORLD
 from pbrl_ppl.scene.shape import Shape
+from pbrl_ppl.scene.units import typical_sizes
 
 
 @dataclass(frozen=True)
@@ -52,6 +53,9 @@ class Body:
         attributes have one set of Table 1's parameters, under the name `owner`.
     attributes : tuple of str
         Attributes of the OO-MDP, such as ``wheels_locked``.
+    typical : tuple of (str, float)
+        Natural units of the body, names of :class:`Units`, in which default priors of effects are
+        numbers; a mapping is accepted. A recording and the scene give those that are left out.
 
     Raises
     ------
@@ -77,6 +81,7 @@ class Body:
     pose: tuple[float, float, float] | None = None
     object_class: str | None = None
     attributes: tuple[str, ...] = ()
+    typical: Named = ()
 
     def __post_init__(self) -> None:
         label(self.name, "body: name")
@@ -91,6 +96,7 @@ class Body:
         for key in ("effects", "attributes"):
             object.__setattr__(self, key, names(getattr(self, key), f"{where}: {key}"))
         object.__setattr__(self, "prior", hyper_parameters(self.prior, where, self.effects))
+        object.__setattr__(self, "typical", typical_sizes(self.typical, where))
         if self.object_class is not None:
             label(self.object_class, f"{where}: class")
         for name in dict(self.known).keys() & dict(self.prior).keys():

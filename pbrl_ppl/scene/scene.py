@@ -216,6 +216,7 @@ class Scene:
             table["prior"] = {name: dict(hyper) for name, hyper in body.prior}
             table["class"] = table.pop("object_class")
             table["attributes"] = body.attributes or None
+            table["typical"] = dict(body.typical) or None
             sections.append(("[[body]]", table))
         sections += [("[[wall]]", {"from": w.start, "to": w.end}) for w in self.walls]
         for joint in self.joints:

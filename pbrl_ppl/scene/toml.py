@@ -19,7 +19,7 @@ KEYS: dict[str, tuple[str, str]] = {
     "[noise]": ("", " ".join(STATE)),
     "body": (
         "name shape",
-        "wheel static kinematic known prior effects pose class attributes",
+        "wheel static kinematic known prior effects pose class attributes typical",
     ),
     "shape": ("kind", "size radius vertices"),
     "wall": ("from to", ""),

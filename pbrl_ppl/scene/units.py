@@ -1,0 +1,161 @@
+"""Natural units of a body: typical sizes in which default priors and thresholds are numbers."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
+
+from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene.checks import Named, finite, nearest, positive, table
+
+if TYPE_CHECKING:
+    from pbrl_ppl.scene.scene import Scene
+
+#: Location and scale of the logarithm of a mass (kg) under Table 1, uninformative by default.
+MASS_PRIOR = 1.0, 1.5
+#: Range of the motion in body lengths, and its duration in samples, where neither the scene nor a
+#: recording shows them.
+_RANGE, _DURATION = 10.0, 100
+
+
+@dataclass(frozen=True)
+class Units:
+    """Natural units of a body, in SI units.
+
+    Attributes
+    ----------
+    mass : float
+        Its known mass, or its prior's median (kg).
+    length : float
+        Radius of its bounding circle or, if it is larger, its lever about a hinge (m).
+    time : float
+        Duration of the longest trajectory (s).
+    force : float
+        The largest of weight, commanded forces, and mass times acceleration (N).
+    torque : float
+        The larger of force times length and the commanded torques (N m).
+    speed : float
+        Root mean square speed (m/s).
+    turn_rate : float
+        Root mean square angular speed (rad/s).
+    range : float
+        Largest distance of a position from their mean (m).
+    x, y : float
+        Mean position (m).
+
+    Examples
+    --------
+    >>> from pbrl_ppl.scene import Body, Scene, Shape
+    >>> puck = Body("puck", Shape.circle(0.5), known={"mass": 2.0})
+    >>> units = units_of(Scene(time_step=0.1, bodies=(puck,), gravity=(0, -10)), "puck")
+    >>> units.force, units.of("force length^2"), units.of("mass/length")
+    (20.0, 5.0, 4.0)
+    """
+
+    mass: float
+    length: float
+    time: float
+    force: float
+    torque: float
+    speed: float
+    turn_rate: float
+    range: float
+    x: float = 0.0
+    y: float = 0.0
+
+    def of(self, product: str) -> float:
+        """Return a product of natural units, such as ``force/speed^2``, in SI units.
+
+        Raises
+        ------
+        SceneError
+            If a name is not one of the units.
+        """
+        value = 1.0
+        for place, part in enumerate(product.split("/")):
+            for factor in part.split():
+                name, power = _factor(factor)
+                value *= getattr(self, name) ** (-power if place else power)
+        return value
+
+
+#: Names of the natural units, and of the mean position.
+UNITS = tuple(field.name for field in fields(Units))
+PLACES = ("x", "y")
+
+
+def _factor(factor: str) -> tuple[str, int]:
+    """Return the name and the power of a factor such as ``speed^2``."""
+    match = re.fullmatch(r"([a-z_]+)(?:\^(\d+))?", factor)
+    names = [name for name in UNITS if name not in PLACES]
+    if match is None or match[1] not in names:
+        raise SceneError(
+            f"natural unit {factor!r} is unknown{nearest(factor, names)} (known:"
+            f" {', '.join(names)}, with a power as in speed^2)"
+        )
+    return match[1], int(match[2] or 1)
+
+
+def check_product(product: str) -> None:
+    """Raise `SceneError` where a product of natural units cannot be read."""
+    for factor in product.replace("/", " ").split():
+        _factor(factor)
+
+
+def typical_sizes(value: object, where: str) -> Named:
+    """Return the natural units that are given for a body, in the order of :class:`Units`."""
+
+    def check(name: str, item: object, at: str) -> float:
+        return (finite if name in PLACES else positive)(item, at)
+
+    return table(value, f"typical of {where}", UNITS, check, "size")
+
+
+def units_of(scene: Scene, name: str) -> Units:
+    """Return the natural units of a body: its ``typical``, and from the scene what that lacks.
+
+    Raises
+    ------
+    SceneError
+        If there is no such body.
+    """
+    body = scene.body(name)
+    mass = dict(body.known).get("mass")
+    if mass is None:  # the median of Table 1's log-normal
+        mass = math.exp(dict(dict(body.prior).get("mass", ())).get("mu", MASS_PRIOR[0]))
+    length = max([body.shape.bounding_radius, *_levers(scene, name)])
+    gravity = max(math.hypot(*scene.gravity), scene.normal_gravity)
+    speed = math.sqrt(gravity * length) or length / (_DURATION * scene.time_step)
+    extent, centre = _RANGE * length, (0.0, 0.0)
+    if scene.extent is not None:
+        x_min, x_max, y_min, y_max = scene.extent
+        centre = (x_min + x_max) / 2, (y_min + y_max) / 2
+        extent = max(length, math.hypot(x_max - x_min, y_max - y_min) / 2)
+    force = mass * (gravity or speed**2 / length)
+    units = Units(
+        mass=mass,
+        length=length,
+        time=_DURATION * scene.time_step,
+        force=force,
+        torque=force * length,
+        speed=speed,
+        turn_rate=speed / length,
+        range=extent,
+        x=centre[0],
+        y=centre[1],
+    )
+    return replace(units, **dict(body.typical))
+
+
+def _levers(scene: Scene, name: str) -> list[float]:
+    """Return the distances (m) of a body's origin from the hinges that hold it."""
+    anchors = [
+        anchor
+        for joint in scene.joints
+        if joint.traits.pins_anchors and joint.bodies
+        for owner, anchor in zip(joint.bodies, (joint.anchor_a, joint.anchor_b), strict=True)
+        if owner == name and anchor is not None
+    ]
+    return [math.hypot(*anchor) for anchor in anchors]
