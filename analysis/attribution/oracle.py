@@ -127,9 +127,8 @@ def ask(case: Case, declared: Mode, test: pp.History, seed: int) -> Oracle:
     without, best, statistic = _compared(case, declared)
     # what lasts lasts in what was recorded later
     test = test.numbered(case.body.setups[0].n_train)
-    horizon = longest_rollout(
-        test, rollout_horizon(without.problem.data.history, case.body.scene.time_step)
-    )
+    problem = without.problem
+    horizon = longest_rollout(test, rollout_horizon(problem.data.history, problem.scene))
     plain, errors = (
         forecast(HeldOut.of(mode, test).problem, mode.phi, mode.sigma, horizon).rmse()
         for mode in (without, best)

@@ -44,7 +44,12 @@ def check(
     reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         declared, (loaded,) = options.load(scene, [history], reading, time_step=time_step)
-        from pbrl_ppl.history import unit_mismatches, unused_velocities, with_units
+        from pbrl_ppl.history import (
+            mass_contradictions,
+            unit_mismatches,
+            unused_velocities,
+            with_units,
+        )
         from pbrl_ppl.physics import check_history
 
         check_history(declared, loaded, loaded.segments(1))
@@ -56,8 +61,12 @@ def check(
             listed.add_row(name, value)
         console.print(listed)
         console.print(_missing_table(missing, int(loaded.dataset["n_rows"].sum())))
-        for velocity in unused:
-            console.print(velocity.sentence, soft_wrap=True)
+        masses = mass_contradictions(declared, loaded)
+        for sentence in (*(velocity.sentence for velocity in unused), *masses):
+            console.print(sentence, soft_wrap=True)
+        sized = with_units(declared, loaded)
+        priors = _default_priors(sized)
+        console.print(_priors_table(priors))
         checked = None
         if prior:
             progress("comparing with draws from the prior")
@@ -66,7 +75,7 @@ def check(
             from pbrl_ppl.model import build_model
 
             horizon = telling_horizon(loaded)
-            physics = Physics.declare(with_units(declared, loaded))
+            physics = Physics.declare(sized)
             model = build_model(Problem.of(physics, loaded, horizon=horizon))
             checked = prior_predictive_check(model, draws=draws, seed=seed)
             for sentence in checked.summary:
@@ -81,6 +90,9 @@ def check(
                 "missing": missing,
                 "velocities_not_used": [vars(each) for each in unused],
                 "unit_mismatches": unit_mismatches(loaded),
+                "mass_contradictions": masses,
+                "typical": {body.name: dict(body.typical) for body in sized.dynamic},
+                "default_priors": priors,
                 "prior": found,
             }
         )
@@ -122,6 +134,32 @@ def _missing_table(missing: dict[str, dict[str, int]], rows: int) -> Table:
     words = {0: "none", rows: "all"}
     for body, counts in missing.items():
         table.add_row(body, *(words.get(n, f"{n} of {rows}") for n in counts.values()))
+    return table
+
+
+def _default_priors(scene: Scene) -> dict[str, dict[str, str]]:
+    """Return the priors of effects that depend on the recording's units, by body and variable."""
+    from pbrl_ppl.effects import candidates, catalogue
+
+    sized = {(effect.name, p.name) for effect in catalogue for p in effect.parameters if p.scale}
+    priors: dict[str, dict[str, str]] = {body.name: {} for body in scene.dynamic}
+    for attached in candidates(scene, ()):
+        effect = attached.effect
+        for parameter in effect.parameters:
+            if (effect.name, parameter.name) in sized:
+                words = parameter.prior.in_words(parameter.unit)
+                priors[attached.body][effect.variable(parameter)] = words
+    return priors
+
+
+def _priors_table(priors: dict[str, dict[str, str]]) -> Table:
+    """Return a table of default priors, a column for each body."""
+    table = Table(title="default priors of effects, from the recording", title_justify="left")
+    table.add_column("parameter")
+    for body in priors:
+        table.add_column(body)
+    for name in dict.fromkeys(name for own in priors.values() for name in own):
+        table.add_row(name, *(own.get(name, "") for own in priors.values()))
     return table
 
 

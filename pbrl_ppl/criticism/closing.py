@@ -221,7 +221,7 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
     bad += tuple(f"held out: {frame}" for frame in frames)
     say(Stage.TEST)
     before, after = (unexplained_acceleration(mode, criteria) for mode in (declared, revised))
-    horizon = rollout_horizon(train, scene.time_step)
+    horizon = rollout_horizon(train, scene)
     with_added = prior
     if steps and not prior.passed:  # the missing effect may be why
         values = dict(zip(revised.problem.layout.labels, revised.phi.tolist(), strict=True))

@@ -255,7 +255,7 @@ def _residual_slopes(mode: Mode, scale: Floats) -> Floats:
         return np.nan_to_num(cells.of_residual(problem.residual(points)))
 
     # a long step of a parameter that the data do not inform would cross thresholds
-    steps = np.where(informed, scale, 1e-3 * np.minimum(scale, 1.0))
+    steps = np.where(informed, scale, 1e-3 * np.minimum(scale, problem.layout.scale(mode.phi)))
     steps[list(problem.tails)] = 0.0  # they change the density, not the residual
     slopes = differentiate(residual, mode.phi, steps, lower, upper) * scale
     return np.ascontiguousarray(np.moveaxis(slopes, -1, 0))

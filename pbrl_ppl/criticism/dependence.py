@@ -169,7 +169,7 @@ def recorded_quantities(problem: Problem, body: int) -> Floats:
 def _kernels(features: Floats) -> Iterator[Floats]:
     """Yield a Gaussian kernel of each quantity's ranks, scaled to unit range, shape (n, n)."""
     ranks = (rankdata(features, axis=0) - 1) / max(len(features) - 1, 1)  # equal ones share theirs
-    varies = np.ptp(features, axis=0) > 1e-9
+    varies = np.ptp(features, axis=0) > 1e-9 * np.abs(features).max(axis=0, initial=0.0)
     for rank, moves in zip(ranks.T, varies, strict=True):
         difference = rank[:, None] - rank
         yield np.exp(-0.5 * (difference / 0.2) ** 2) * moves / max(int(varies.sum()), 1)

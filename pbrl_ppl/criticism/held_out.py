@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,19 +16,21 @@ from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.likelihood import Problem, along_trajectories, cells_of
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.posterior import parameter_draws
+from pbrl_ppl.scene import Scene, motion_time, state_sizes
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
-#: Length of the forecasts in the error table (s), if trajectories are as long.
-ROLLOUT_SECONDS = 1.0
+#: Length of the forecasts in the error table, in motion times, if trajectories are as long.
+ROLLOUT_TIMES = 10.0
 _DRAWS = 100
 
 
-def rollout_horizon(history: History, time_step: float) -> int:
-    """Return the intervals of a recording's forecasts: a second, or a whole trajectory.
+def rollout_horizon(history: History, scene: Scene) -> int:
+    """Return the intervals of a recording's forecasts: some motion times, or a whole trajectory.
 
-    More than a second where bodies are seen less often.
+    More where bodies are seen less often.
     """
-    return longest_rollout(history, max(longest_gap(history), round(ROLLOUT_SECONDS / time_step)))
+    intervals = math.ceil(ROLLOUT_TIMES * motion_time(scene) / scene.time_step)
+    return longest_rollout(history, max(longest_gap(history), intervals))
 
 
 def longest_rollout(history: History, intervals: int) -> int:
@@ -139,7 +142,8 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
     columns = [d for d in range(len(STATE)) if np.isfinite(measured[..., d]).any()]
     sensors = revised.mode.problem.trajectory_noise.cells.sensors
     noise = dict(zip(sensors, revised.mode.sigma.tolist(), strict=False))
-    spread = np.nanstd(measured[..., columns], axis=0) / [noise.get(d, 1.0) for d in columns]
+    sizes = state_sizes(scene)
+    spread = np.nanstd(measured[..., columns], axis=0) / [noise.get(d, sizes[d]) for d in columns]
     free = np.array([not body.kinematic for body in scene.moving])
     body = int(np.argmax(np.where(free, np.nansum(spread, axis=1), -1.0)))
     predicted = []

@@ -162,7 +162,7 @@ def _with_correlation(mode: Mode, memory: float) -> Problem:
     problem = mode.problem
     noise = problem.trajectory_noise
     cells = noise.cells.drifting(memory)
-    every = noise_medians(cells, problem.data.history, problem.data.smoothed_states)
+    every = noise_medians(cells, problem.scene, problem.data.history, problem.data.smoothed_states)
     medians = every[cells.drift_parameters]
     sigma = np.concatenate([mode.sigma, mode.sigma[: len(medians)]])
     prior = (*problem.noise_prior[0].tolist(), *medians.tolist()), problem.noise_prior[1]

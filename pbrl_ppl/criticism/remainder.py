@@ -24,6 +24,7 @@ from pbrl_ppl.likelihood import ACCELERATION
 from pbrl_ppl.modes import Mode, trajectory_mode
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.posterior import group
+from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import STATE, Floats
 
 #: Transitions that the process is fitted to, at most.
@@ -135,7 +136,7 @@ def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRem
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.permutation(len(x))[:_MOST])
     low, high = x.min(axis=0), x.max(axis=0)
-    size = np.maximum(high - low, 1e-9)
+    size = np.maximum(high - low, 1e-9 * np.array(state_sizes(mode.problem.scene))[3:])
     table: dict[str, list[Any]] = {"centre": [], "width": [], "output": []}
     blocks = []
     excess = unexplained_acceleration(mode, criteria)

@@ -83,10 +83,11 @@ def rank_candidates(
         return []
     smooth = [one for one in candidates if one.effect.scan is None and not _of_noise(one)]
     residual, jacobian, signatures = _signatures(mode, smooth)
-    q, r = np.linalg.qr(jacobian)
+    scale = 1.0 / np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
+    q, r = np.linalg.qr(jacobian * scale)
     # a parameter that neither the data nor the prior inform has no direction
     informed = np.abs(np.diag(r)) > 1e-10 * np.abs(np.diag(r)).max(initial=0.0)
-    back, q = np.linalg.pinv(r)[:, informed], q[:, informed]
+    back, q = scale[:, None] * np.linalg.pinv(r)[:, informed], q[:, informed]
     test = _Test(q, back, residual - q @ (q.T @ residual), len(candidates), criteria)
     derived = dict(zip(smooth, signatures, strict=True))
 

@@ -19,6 +19,8 @@ _NU = 4.0
 _ADDED = 0.3
 #: Guesses that are improved, runs of the engine for each, and how far the first ones go (prior sd).
 _GUESSES, _RUNS, _SIDE = 6, 200, 0.05
+#: The simplex at which a search ends, as a share of the first one.
+_CLOSE = 4e-3
 #: Places with losses that differ by less are the same.
 _SAME = 1.0
 #: Places from which the other parameters and the noise are fitted, and rounds after the first.
@@ -99,20 +101,20 @@ def _places(
         return float(0.5 * (_NU + whitened.shape[1]) * np.log1p(square / _NU).sum())
 
     losses = [loss(guess) for guess in guesses]
-    side = _SIDE * min(problem.layout.priors[place].sigma for place in own)
+    side = _SIDE * min(problem.layout.priors[place].scale for place in own)
     found: list[tuple[float, Floats]] = []
     for i in np.argsort(losses)[:_GUESSES]:
         best = minimize(
-            loss,
-            guesses[i],
+            lambda values: loss(side * values),
+            guesses[i] / side,
             method="Nelder-Mead",
             options={
                 "maxfev": _RUNS,
-                "initial_simplex": np.vstack([guesses[i], guesses[i] + side * np.eye(len(own))]),
-                "xatol": 1e-4,
+                "initial_simplex": guesses[i] / side + np.eye(len(own) + 1, len(own), -1),
+                "xatol": _CLOSE,
                 "fatol": 0.1,
             },
         )
         if all(abs(best.fun - value) > _SAME for value, _ in found):
-            found.append((float(best.fun), best.x))
+            found.append((float(best.fun), side * best.x))
     return [place for _, place in sorted(found, key=lambda entry: entry[0])]

@@ -8,6 +8,7 @@ from .cells import cells_of as cells_of
 from .cells import check_moves as check_moves
 from .data import Observations as Observations
 from .data import estimate_sigma as estimate_sigma
+from .data import least_noise as least_noise
 from .data import sigma_prior as sigma_prior
 from .declared import declared_problem as declared_problem
 from .likelihood import GAUSSIAN as GAUSSIAN

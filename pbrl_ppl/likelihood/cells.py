@@ -11,7 +11,7 @@ import numpy as np
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, estimate_rates, fill_hinges, hung_bodies
 from pbrl_ppl.physics import touching
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, state_sizes
 from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
 
 #: Variable of the process noise: the unexplained acceleration.
@@ -114,6 +114,10 @@ class Cells:
         drawn = sigma[..., self.pushed] * rng.standard_normal((*touching.shape, len(self.pushed)))
         return np.where(self.always | touching[..., None], drawn, 0.0) @ self.push
 
+    def sizes(self, scene: Scene) -> Floats:
+        """Return typical sizes of the cells, shape (cell,); see :func:`state_sizes`."""
+        return np.array(state_sizes(scene))[self.places % len(STATE)]
+
     def white(self, sigma: Floats) -> Floats:
         """Return the uncorrelated measurement noise of each cell, shape (cell,)."""
         return np.where(self.sensor >= 0, sigma[self.sensor], self.fixed)
@@ -197,7 +201,7 @@ def check_moves(cells: Cells, scene: Scene) -> None:
         )
 
 
-#: Error of measuring what does not move at all (m, rad, m/s, rad/s).
+#: Error of measuring what does not move at all, as a share of the coordinate's typical size.
 _EXACT = 1e-6
 #: A position's velocity is so many places on.
 _RATE = 3
@@ -223,6 +227,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
     places = np.flatnonzero(free)
     body, dimension = np.divmod(places, len(STATE))
     stated = dict(scene.noise)
+    exact = _EXACT * np.array(state_sizes(scene))
     given = np.array([name in stated for name in STATE])
     sensed = free & measured & ~still & ~given
     sensors = np.flatnonzero(sensed.any(axis=0))
@@ -250,7 +255,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
         places,
         tuple(int(d) for d in np.unique(dimension)),
         sensor,
-        np.array([stated.get(STATE[d], _EXACT) for d in dimension]),
+        np.array([stated.get(STATE[d], exact[d]) for d in dimension]),
         np.array(push).reshape(-1, len(places)),
         np.array(pushed, dtype=np.intp),
         tuple(int(d) for d in sensors),

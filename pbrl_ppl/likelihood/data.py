@@ -10,7 +10,7 @@ import numpy as np
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, Segments
 from pbrl_ppl.physics import check_history
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, state_sizes
 from pbrl_ppl.state import STATE, THETA, Bools, Floats, wrapped
 
 
@@ -86,7 +86,18 @@ class Observations:
         return np.asarray(difference)
 
 
-def sigma_prior(observations: Observations, segments: Segments) -> tuple[Floats, float]:
+#: Least noise of a coordinate, for recordings without any, as a share of its typical size.
+LEAST_NOISE = 1e-9
+
+
+def least_noise(scene: Scene) -> Floats:
+    """Return the least noise of each coordinate of a state, shape (6,)."""
+    return LEAST_NOISE * np.array(state_sizes(scene))
+
+
+def sigma_prior(
+    observations: Observations, segments: Segments, scene: Scene
+) -> tuple[Floats, float]:
     """Return median and log-scale of a weak prior of sigma: a tenth of the states' change.
 
     Returns
@@ -100,22 +111,24 @@ def sigma_prior(observations: Observations, segments: Segments) -> tuple[Floats,
     change = observations.residual(segments.start[:, None])
     seen = observations.measured
     typical = np.sqrt((change**2).sum((0, 1, 2)) / np.maximum(seen.sum((0, 1, 2)), 1))
-    return np.maximum(0.1 * typical, 1e-9) * np.ones(len(columns)), 2.0
+    return np.maximum(0.1 * typical, least_noise(scene)[list(columns)]), 2.0
 
 
-def estimate_sigma(residual: Floats, measured: Bools) -> Floats:
+def estimate_sigma(residual: Floats, observations: Observations, scene: Scene) -> Floats:
     """Return the maximum-likelihood sigma of each dimension under Eq. 11, shape (state,).
 
     Parameters
     ----------
     residual : ndarray
         Shape (transition, H, body, state).
-    measured : ndarray
-        Same shape.
+    observations : Observations
+        What was measured.
+    scene : Scene
+        Its sizes give a scale to histories without noise.
     """
-    count = np.maximum(measured.sum((0, 1, 2)), 1)
-    # histories without noise still need a scale
-    return np.asarray(np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / count), 1e-9))
+    count = np.maximum(observations.measured.sum((0, 1, 2)), 1)
+    least = least_noise(scene)[list(observations.columns)]
+    return np.asarray(np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / count), least))
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,9 @@ import numpy as np
 
 from pbrl_ppl.history import History, unseen
 from pbrl_ppl.likelihood.cells import Cells
+from pbrl_ppl.likelihood.data import least_noise
 from pbrl_ppl.likelihood.problem import Problem
+from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, THETA, Floats
 
 #: Medians of the log-normal priors of errors of measuring and of contact accelerations, as shares
@@ -24,8 +26,9 @@ _MEDIAN = np.log(2.0) / -np.log(ACCELERATION_CHANCE)
 _RATE = 3
 
 
-def noise_medians(cells: Cells, history: History, states: Floats) -> Floats:
+def noise_medians(cells: Cells, scene: Scene, history: History, states: Floats) -> Floats:
     """Return the medians of the noise priors, shape (parameter,), from changes of the states."""
+    least = least_noise(scene)
     real = np.isfinite(history.dataset["clock"].to_numpy())
     shown = real & ~unseen(history).any(axis=-1)
     each, seen = (
@@ -37,7 +40,13 @@ def noise_medians(cells: Cells, history: History, states: Floats) -> Floats:
     steps = ACCELERATION_SHARE * _MEDIAN * _vectors(each, cells.rates) / dt
     contacts = CONTACT_SHARE * each[list(cells.contacts)] / dt
     drifts = DRIFT_SHARE * _MEDIAN * ranges(cells, history, states)
-    return np.asarray(np.maximum(np.concatenate([sensors, steps, contacts, drifts]), 1e-9))
+    medians = [
+        np.maximum(sensors, least[list(cells.sensors)]),
+        np.maximum(steps, least[list(cells.rates)] / dt),
+        np.maximum(contacts, least[list(cells.contacts)] / dt),
+        np.maximum(drifts, least[list(cells.drifts)]),
+    ]
+    return np.concatenate(medians)
 
 
 def ranges(cells: Cells, history: History, states: Floats) -> Floats:

@@ -212,7 +212,7 @@ class Problem:
     def noise_prior(self) -> tuple[Floats, float]:
         """Medians of sigma's prior, shape (parameter,), and its log-scale."""
         if self.likelihood.prior is None:
-            return sigma_prior(self.observations, self.segments)
+            return sigma_prior(self.observations, self.segments, self.scene)
         median, spread = self.likelihood.prior
         return np.array(median), spread
 

@@ -22,7 +22,7 @@ from pbrl_ppl.parameters import Layout, change_from
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Bools, Floats
 
-#: No state moves as far as this (SI units): a sampler may look at parameters that say so.
+#: Larger changes of a state count as divergence, in typical sizes of its coordinates.
 _FAR = 1e6
 #: Predicts next states from phi, start states and inputs, as a simulator does.
 Engine = Callable[[Floats, Floats, Floats], Floats]
@@ -98,7 +98,8 @@ class Sensitivity:
             What acts, shape (transition, 1, body, 3 or 9).
         """
         moved = self.moved(phi)
-        moved = np.where(np.abs(moved) < _FAR, moved, np.nan)  # nothing is predicted from there
+        far = _FAR * self.cells.sizes(self.scene)
+        moved = np.where(np.abs(moved) < far, moved, np.nan)  # nothing is predicted from there
         states = engine(phi, self.begun(np.nan_to_num(moved), start), inputs)
         back = np.matmul(self.slope, moved[..., None])[..., 0]
         return self._added(states, -back[..., None, :])

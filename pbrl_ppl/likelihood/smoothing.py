@@ -18,7 +18,7 @@ from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.physics import touching
 from pbrl_ppl.state import STATE, Bools, Floats
 
-#: Prior scale of an unmeasured state, as a multiple of the largest estimated one.
+#: Prior scale of an unmeasured state, as a multiple of its range and typical size.
 _FAR = 10.0
 #: Largest change of states in the last round (in standard deviations), and most rounds.
 _SETTLED, _ROUNDS = 0.05, 4
@@ -66,7 +66,7 @@ def along_trajectories(
     if cells is None:
         cells = cells_of(problem.scene, history)
         check_moves(cells, problem.scene)
-        medians = tuple(noise_medians(cells, history, states).tolist())
+        medians = tuple(noise_medians(cells, problem.scene, history, states).tolist())
         eq_11 = replace(problem.likelihood.of_data(), scalar=False, prior=(medians, SPREAD))
         problem = replace(problem, likelihood=eq_11)
     data = replace(problem.data, horizon=1, states=states, columns=cells.columns)
@@ -79,7 +79,7 @@ def along_trajectories(
         for share in _SHARES:
             problem = smoothed(problem, phi, _between(begin, sigma, share, cells))
     if not given:  # the noise of measurements adds to the changes of states as measured
-        moved = noise_medians(cells, history, problem.data.smoothed_states)
+        moved = noise_medians(cells, problem.scene, history, problem.data.smoothed_states)
         steps = list(cells.accelerations)
         least = problem.noise_prior[0].copy()
         least[steps] = np.minimum(least[steps], moved[steps])
@@ -286,7 +286,7 @@ def linearised(problem: Problem, cells: Cells, slope: Floats, sigma: Floats) -> 
     observed = problem.data.history.dataset["observed"].to_numpy()
     deviation = cells.wrapped(cells.of(observed) - cells.of(states))
     end, begin = deviation[trajectory, step + 1], deviation[trajectory, step]
-    far = _FAR * np.abs(cells.of(states)).max(axis=(0, 1)) + 1.0
+    far = _FAR * (np.ptp(cells.of(states), axis=(0, 1)) + cells.sizes(problem.scene))
     return TrajectoryNoise(
         cells=cells,
         slope=np.ascontiguousarray(slope),

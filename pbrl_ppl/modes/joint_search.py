@@ -285,9 +285,13 @@ def _anchors(problem: Problem, name: str, joint: Joint) -> list[Floats]:
         starts = starts[:1]
     starts = inside(priors, starts)
     bounds = np.array([prior.support for prior in priors]).T
-    found = [least_squares(miss, start, bounds=bounds) for start in starts]
+    size = float(np.ptp(bounds, axis=0).min())  # so that the optimiser's tolerances have no unit
+    found = [
+        least_squares(lambda u: miss(size * u) / size, start / size, bounds=bounds / size)
+        for start in starts
+    ]
     found.sort(key=lambda result: float(result.cost))
-    return [result.x for result in found[:_KEPT]]
+    return [size * result.x for result in found[:_KEPT]]
 
 
 def _states(problem: Problem, body: str) -> Floats:

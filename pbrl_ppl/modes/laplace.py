@@ -68,8 +68,9 @@ class Mode:
     @property
     def factor(self) -> Floats:
         """Cholesky factor of the covariance, shape (p, p)."""
-        jitter = 1e-15 * np.eye(len(self.phi))
-        return np.asarray(np.linalg.cholesky(self.covariance + jitter), dtype=float)
+        sd = np.sqrt(np.maximum(np.diag(self.covariance), 1e-300))
+        correlation = self.covariance / np.outer(sd, sd) + 1e-15 * np.eye(len(sd))
+        return np.asarray(sd[:, None] * np.linalg.cholesky(correlation), dtype=float)
 
     def noise_gaussian(self) -> tuple[Floats, Floats]:
         """Return the Laplace approximation of log sigma: mean and covariance.
@@ -124,11 +125,14 @@ def climb(
     sigma, value = profiled(problem, phi)
     if not priors:
         return Peak(phi, sigma, value)
-    steps = 1e-3 * problem.layout.scale(phi)
+    # least squares over multiples of each parameter's scale, whatever its unit
+    origin, scale = phi, np.where(problem.layout.discrete, 1.0, problem.layout.scale(phi))
+    ends = (lower - origin) / scale, (upper - origin) / scale
+    steps = np.where(problem.layout.discrete, 0.0, 1e-3)
     tails = list(problem.tails)
 
-    def whole(points: Floats, sigma: Floats, engine: PartedSimulator | None = None) -> Floats:
-        points = points.copy()
+    def whole(moved: Floats, sigma: Floats, engine: PartedSimulator | None = None) -> Floats:
+        points = np.clip(origin + scale * moved, lower, upper)  # rounding leaves no support
         points[..., tails] = phi[tails]  # no least squares: see `best_tails`
         z = problem.robust(points, sigma, engine).reshape(*points.shape[:-1], -1)
         z = np.nan_to_num(z, nan=FAR_OFF, posinf=FAR_OFF, neginf=-FAR_OFF)
@@ -136,20 +140,18 @@ def climb(
 
     for _ in range(rounds):
 
-        def residual(point: Floats, sigma: Floats = sigma) -> Floats:
-            return whole(point, sigma)
+        def residual(moved: Floats, sigma: Floats = sigma) -> Floats:
+            return whole(moved, sigma)
 
-        def jacobian(point: Floats, sigma: Floats = sigma, steps: Floats = steps) -> Floats:
-            size = np.minimum(steps, 0.1 * np.maximum(np.abs(point), steps))
-            return differentiate(
-                lambda points: whole(points, sigma, slope), point, size, lower, upper
-            )
+        def jacobian(moved: Floats, sigma: Floats = sigma, steps: Floats = steps) -> Floats:
+            return differentiate(lambda points: whole(points, sigma, slope), moved, steps, *ends)
 
         result = least_squares(
-            residual, phi, jac=jacobian, bounds=(lower, upper), x_scale="jac", max_nfev=tries,
-            ftol=1e-6, xtol=1e-6, gtol=1e-6,
+            residual, (phi - origin) / scale, jac=jacobian, bounds=ends, x_scale="jac",
+            max_nfev=tries, ftol=1e-6, xtol=1e-6, gtol=1e-6,
         )  # fmt: skip
-        reached = best_tails(problem, result.x, sigma)
+        reached = np.clip(origin + scale * result.x, lower, upper)
+        reached = best_tails(problem, reached, sigma)
         better, improved = profiled(problem, reached)
         if improved < value:
             break
@@ -157,7 +159,7 @@ def climb(
         if gain < STALLED:
             break
         size = np.sqrt((result.jac**2).sum(axis=0))
-        steps = np.clip(1.0 / np.maximum(size, 1e-12), 1e-6, 0.1)
+        steps = np.where(steps > 0, np.clip(1.0 / np.maximum(size, 1e-300), 1e-6, 0.1), 0.0)
     return Peak(phi, sigma, value)
 
 
@@ -201,7 +203,8 @@ def finish(problem: Problem, peak: Peak) -> Mode:
         precision[tails, tails] = tail_precision(problem, phi, sigma)
     angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
     precision[angles, angles] += _CIRCLE  # no angle is wider than its circle
-    covariance = np.linalg.pinv(precision, hermitian=True)
+    sd = 1.0 / np.sqrt(np.maximum(np.diag(precision), 1e-300))
+    covariance = np.linalg.pinv(precision * np.outer(sd, sd), hermitian=True) * np.outer(sd, sd)
     n_cells = len(jacobian) - len(phi)
     return Mode(
         problem, phi, sigma, jacobian[:n_cells], np.asarray(covariance, dtype=float), log_posterior

@@ -171,5 +171,5 @@ def _rough_sigma(problem: Problem, parts: list[_Combinations], sigma: Floats) ->
             cost = np.log1p(z**2) if turn == 0 else z**2
             best = int(cost.reshape(len(z), -1).sum(axis=1).argmin())
             residual[:, :, part.bodies] = np.nan_to_num(own.residual[best])
-        sigma = estimate_sigma(residual, observations.measured)
+        sigma = estimate_sigma(residual, observations, problem.scene)
     return sigma

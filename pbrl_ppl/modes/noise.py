@@ -14,23 +14,29 @@ from pbrl_ppl.likelihood import (
     TrajectoryLikelihood,
     TrajectoryNoise,
     exponential,
+    least_noise,
     log_noise_prior,
     noise_law,
     noise_prior_slope,
 )
 from pbrl_ppl.parameters import box
+from pbrl_ppl.scene import state_sizes
 from pbrl_ppl.state import Floats
 
 #: Residuals are clipped at this many noise units.
 FAR_OFF = 1e3
-#: Least sigma, for recordings without noise.
-_LEAST = 1e-9
 #: Bound of the change of a log noise parameter from the linearisation point.
 _FAR = 6.0
 #: Unexplained acceleration that counts as zero, as a share of its prior's median.
 NOTHING = 1e-3
 #: Step of second differences in the logarithm of a noise parameter.
 _SECOND = 0.05
+
+
+def finite(problem: Problem, residual: Floats) -> Floats:
+    """Return residuals in SI units with large ones where a prediction diverged, same shape."""
+    far = FAR_OFF * np.array(state_sizes(problem.scene))[list(problem.observations.columns)]
+    return np.where(np.isfinite(residual), residual, far)
 
 
 def profile_sigma(
@@ -54,7 +60,7 @@ def profile_sigma(
     """
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         return _of_trajectories(problem, problem.likelihood.noise, residual, phi, held or {})
-    residual = np.nan_to_num(residual, nan=FAR_OFF)
+    residual = finite(problem, residual)
     ones = np.ones(residual.shape[-1])
     begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
     if problem.nu(phi) is None:
@@ -75,7 +81,7 @@ def _of_trajectories(
     held: Mapping[int, float],
 ) -> Floats:
     """Return the noise parameters of highest posterior density along trajectories."""
-    residual = np.nan_to_num(residual, nan=FAR_OFF)
+    residual = finite(problem, residual)
     gaussian = problem.nu(phi) is None
     begin = np.log(noise.sigma)
     bounds = [(b - _FAR, b + _FAR) for b in begin]
@@ -136,7 +142,8 @@ def gaussian_log_sigma(problem: Problem, square: Floats) -> Floats:
     a = spread**2 * (count + 1)
     with np.errstate(divide="ignore"):  # an exact fit
         y = 0.5 * wrightomega(np.log(2 * spread**2 * square) + 2 * (a - centre))
-    return np.asarray(np.maximum(y - a + centre, np.log(_LEAST)))
+    least = np.log(least_noise(problem.scene)[list(problem.observations.columns)])
+    return np.asarray(np.maximum(y - a + centre, least if y.shape[-1] > 1 else least.min()))
 
 
 def gaussian_profile(problem: Problem, square: Floats) -> Floats:
@@ -204,7 +211,7 @@ _TAIL_STEP, _LEAST_CURVATURE = 0.02, 1.0
 
 def _tail_cost(problem: Problem, phi: Floats, sigma: Floats) -> Callable[[Floats], float]:
     """Return the negative log-posterior as a function of the tails alone."""
-    residual, tails = np.nan_to_num(problem.residual(phi), nan=FAR_OFF), list(problem.tails)
+    residual, tails = finite(problem, problem.residual(phi)), list(problem.tails)
 
     def cost(values: Floats) -> float:
         point = phi.copy()

@@ -11,7 +11,7 @@ from scipy.optimize import differential_evolution
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, estimate_sigma
 from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
-from pbrl_ppl.modes.noise import FAR_OFF, gaussian_profile
+from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
 from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import box, inside, most_probable_wheels, prior_draws
 from pbrl_ppl.state import Floats
@@ -96,7 +96,7 @@ def find_modes(
     # the basins show in a part of the data already, and with few engine steps
     part = problem if few else _part(problem, _PART)
     residual = part.residual(draws)
-    sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations.measured)
+    sigma = estimate_sigma(np.nanmedian(residual, axis=0), part.observations, part.scene)
     z = np.nan_to_num(residual / sigma, nan=FAR_OFF).reshape(len(draws), -1)
     # log(1 + z^2): a good start fits most transitions, not the worst one
     order = np.argsort(np.log1p(np.minimum(z, FAR_OFF) ** 2).sum(axis=1))
@@ -128,7 +128,7 @@ def _evolve(problem: Problem, rng: np.random.Generator) -> Floats:
 
     def cost(points: Floats) -> Floats:
         phi = inside(priors, points.T)
-        residual = np.where(measured, np.nan_to_num(problem.residual(phi), nan=FAR_OFF), 0.0)
+        residual = np.where(measured, finite(problem, problem.residual(phi)), 0.0)
         fit = gaussian_profile(problem, (residual**2).sum((1, 2, 3)))
         return np.asarray(-fit - problem.layout.log_prior(phi).sum(axis=-1))
 

@@ -154,7 +154,9 @@ class Layout:
     def scale(self, phi: Floats) -> Floats:
         """Return the scale of each entry of phi for step sizes, shape (p,); 0 if discrete."""
         least = np.array([prior.scale for prior in self.priors])
-        return np.where(self.discrete, 0.0, np.maximum(np.abs(phi), 0.1 * least))
+        # places are counted from their prior's mean, whatever the origin of the scene
+        centre = np.array([prior.mu * (prior.family == "normal") for prior in self.priors])
+        return np.where(self.discrete, 0.0, np.maximum(np.abs(phi - centre), 0.1 * least))
 
     def slices(self) -> Iterator[tuple[Block, slice]]:
         """Yield each block with its place in the vector."""

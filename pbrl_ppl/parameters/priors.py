@@ -15,7 +15,7 @@ from pbrl_ppl.state import Floats
 
 #: How far (in sigmas) mu may lie outside the support: farther out, densities lose their digits.
 _FARTHEST = 30.0
-#: How far inside a bound the search stays, as a share of the interval or of one unit.
+#: How far inside a bound the search stays, as a share of the prior's scale.
 _MARGIN = 1e-6
 
 
@@ -158,6 +158,27 @@ class Prior:
             return self.lower
         return float(np.clip(self.mu, *self.support))
 
+    def in_words(self, unit: str) -> str:
+        """Return the prior of a value in this unit as text; ``1`` is no unit.
+
+        Examples
+        --------
+        >>> Prior("half_normal", sigma=20.0).in_words("kg/s")
+        'half-normal, 20 kg/s'
+        >>> Prior("log_normal", mu=1.0, sigma=1.5).in_words("kg")
+        'log-normal, median 2.72 kg, sigma 1.5'
+        """
+        name, unit = self.family.replace("_", "-"), f" {unit}" if unit != "1" else ""
+        if self.family == "log_normal":
+            return f"{name}, median {self.centre:.3g}{unit}, sigma {self.sigma:.3g}"
+        if self.uniform:
+            return "uniform on the circle"
+        if self.family == "von_mises":
+            return f"{name}, about {self.mu:.3g}{unit}, kappa {self.kappa:.3g}"
+        about = f"{self.mu:.3g} ± " if self.mu else ""
+        ends = f", in [{self.lower:.3g}, {self.upper:.3g}]" if np.isfinite(self.upper) else ""
+        return f"{name}, {about}{self.sigma:.3g}{unit}{ends}"
+
     def residual(self, x: Floats) -> Floats:
         """Return the residual: half its square is the negative log-density up to a constant.
 
@@ -180,6 +201,16 @@ class Prior:
         if self.family == "von_mises":
             return np.asarray(2.0 * np.sqrt(self.kappa) * np.sin((x - self.mu) / 2.0))
         return np.asarray((x - self.mu) / self.sigma)
+
+    def slope(self, x: Floats) -> Floats:
+        """Return the derivative of :meth:`residual`, same shape."""
+        if self.family == "log_normal":
+            return np.asarray(1.0 / (self.sigma * np.maximum(x, 1e-300)))
+        if self.discrete:
+            return np.zeros_like(x)
+        if self.family == "von_mises":
+            return np.asarray(np.sqrt(self.kappa) * np.cos((x - self.mu) / 2.0))
+        return np.full_like(x, 1.0 / self.sigma)
 
     def log_density(self, x: Floats) -> Floats:
         """Return the logarithm of the normalised density, minus infinity outside the support.
@@ -256,8 +287,8 @@ def prior_residual(priors: Sequence[Prior], phi: Floats) -> Floats:
 
 def prior_slopes(priors: Sequence[Prior], phi: Floats) -> Floats:
     """Return the derivative of each prior's residual by its parameter, shape (p,)."""
-    step = 1e-6 * np.maximum(np.abs(phi), 1e-3)
-    return (prior_residual(priors, phi + step) - prior_residual(priors, phi - step)) / (2 * step)
+    slopes = [prior.slope(x) for prior, x in zip(priors, phi, strict=True)]
+    return np.array(slopes, dtype=float).reshape(len(priors))
 
 
 def inside(priors: Sequence[Prior], phi: Floats) -> Floats:
@@ -269,7 +300,7 @@ def inside(priors: Sequence[Prior], phi: Floats) -> Floats:
 def box(priors: Sequence[Prior]) -> tuple[Floats, Floats]:
     """Return the bounds of a search: the supports less a margin, which discrete priors lack."""
     support = np.array([prior.support for prior in priors]).reshape(-1, 2)
-    width = np.where(np.isfinite(np.ptp(support, axis=1)), np.ptp(support, axis=1), 1.0)
+    width = np.array([prior.scale for prior in priors])
     width[[prior.discrete for prior in priors]] = 0.0
     return support[:, 0] + _MARGIN * width, support[:, 1] - _MARGIN * width
 

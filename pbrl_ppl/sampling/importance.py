@@ -423,7 +423,7 @@ def _learned(block: Gaussian, q: Floats) -> Gaussian:
         return block
     x = q[:, block.places]
     covariance = np.atleast_2d(np.cov(x, rowvar=False))
-    ridge = 1e-9 * np.diag(np.diag(covariance)) + 1e-12 * np.eye(len(covariance))
+    ridge = 1e-9 * np.diag(np.diag(covariance))
     learned = Gaussian(block.places, x.mean(axis=0), _WIDER * covariance + ridge)
     learned.log_scale, learned.log_beta = block.log_scale, block.log_beta
     return learned

@@ -239,4 +239,4 @@ def _spread(points: Floats, columns: Ints) -> Floats:
     if not len(columns):  # of a part whose parameters are known
         return np.zeros((0, 0))
     covariance = np.cov(points[:, columns], rowvar=False).reshape(2 * (len(columns),))
-    return covariance + 1e-9 * np.diag(np.diag(covariance)) + 1e-12 * np.eye(len(columns))
+    return np.asarray(covariance + np.diag(np.maximum(1e-9 * np.diag(covariance), 1e-300)))

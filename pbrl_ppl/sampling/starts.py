@@ -110,8 +110,10 @@ def laplace(problem: Problem, mode: Mode) -> tuple[Floats, Floats]:
     covariance = scale[:, None] * mode.covariance * scale
     covariance = widened(problem, mode, mean, covariance)
     deviation = np.sqrt(np.diag(covariance))
-    shrink = np.minimum(deviation, 2.0) / deviation
-    return mean, shrink[:, None] * covariance * shrink + 1e-12 * np.eye(len(scale))
+    widest = [p.sigma if p.family == "normal" else 2.0 for p in problem.layout.priors]
+    shrink = np.minimum(deviation, widest) / deviation
+    covariance = shrink[:, None] * covariance * shrink
+    return mean, covariance + 1e-12 * np.diag(np.diag(covariance))
 
 
 def widened(problem: Problem, mode: Mode, mean: Floats, covariance: Floats) -> Floats:

@@ -149,6 +149,24 @@ def units_of(scene: Scene, name: str) -> Units:
     return replace(units, **dict(body.typical))
 
 
+def motion_time(scene: Scene) -> float:
+    """Return the shortest time in which a typical force makes a body's typical speed (s)."""
+    bodies = [units_of(scene, body.name) for body in scene.dynamic]
+    return min(units.of("mass speed/force") for units in bodies)
+
+
+def state_sizes(scene: Scene) -> tuple[float, ...]:
+    """Return typical sizes of the six coordinates of a state, those of the body that moves most.
+
+    In the order of :data:`pbrl_ppl.state.STATE`: m, m, rad, m/s, m/s, rad/s.
+    """
+    bodies = [units_of(scene, body.name) for body in scene.dynamic]
+    place, speed, rate = (
+        max(getattr(units, name) for units in bodies) for name in ("range", "speed", "turn_rate")
+    )
+    return place, place, 1.0, speed, speed, rate
+
+
 def _levers(scene: Scene, name: str) -> list[float]:
     """Return the distances (m) of a body's origin from the hinges that hold it."""
     anchors = [
