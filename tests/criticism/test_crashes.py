@@ -6,9 +6,12 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.criticism import close_loop
-from pbrl_ppl.effects import catalogue
+from pbrl_ppl.criticism.score import rank_candidates
+from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.history import History
-from tests.helpers.free_puck import DISC, Disc
+from pbrl_ppl.scene import Scene
+from tests.helpers.free_puck import DISC, Disc, fitted
+from tests.helpers.places import MODELS
 
 # a posterior of few draws is enough to test that there is one
 pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
@@ -29,3 +32,29 @@ def test_a_prior_of_a_declared_effect_is_used() -> None:
     )
     found = close_loop(scene, train, test, catalogue=COM_OFFSET, seed=1, method="laplace")
     assert "com_offset_x" in found.posterior_after.posterior
+
+
+@pytest.fixture(scope="module", params=["every row", "gaps"])
+def unknown_pivot(request, make_history):
+    """Mode and ranking of a pendulum on a hinge of unknown anchors, from its angle alone."""
+    arm = Scene.load(MODELS / "pendulum" / "scene.toml")
+    hinge = replace(arm.joints[0], known=False)
+    scene = arm.replace(time_step=0.05, substeps=102, joints=(hinge,))
+    setup = replace(
+        make_history.PENDULUM, time_step=0.05, step=1e-3, n_intervals=40, n_train=4, n_test=1
+    )
+    frame, _ = make_history.simulate(9, setup, pivot_damping=0.02)
+    frame = frame.assign(**dict.fromkeys(("x", "y", "vx", "vy", "omega"), np.nan))
+    if request.param == "gaps":
+        lost = (np.random.default_rng(4).random(len(frame)) < 0.2) & (frame["step"] > 0)
+        frame = frame.assign(theta=frame["theta"].mask(lost))
+    mode = fitted(scene, History.from_dataframe(frame, scene, estimate_velocities=True))
+    return mode, rank_candidates(mode, candidates(scene, mode.problem.physics.effects, catalogue))
+
+
+def test_a_pivot_is_inferred_from_an_angle_alone(unknown_pivot) -> None:
+    """Smoothed positions of the arm's centre diverged, and every score was NaN."""
+    mode, ranked = unknown_pivot
+    assert np.isfinite(mode.log_posterior)
+    assert np.isfinite(mode.whitened_residual).all()
+    assert all(np.isfinite(one.candidate.statistic) for one in ranked)
