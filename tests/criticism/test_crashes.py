@@ -6,6 +6,11 @@ import numpy as np
 import pytest
 
 from pbrl_ppl.criticism import close_loop
+from pbrl_ppl.criticism.criteria import DEFAULT
+from pbrl_ppl.criticism.cross_validation import LeftOut, forecast_squares
+from pbrl_ppl.criticism.forecast import forecast
+from pbrl_ppl.criticism.misfit import _forecasts
+from pbrl_ppl.criticism.promise import promised_share
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.history import History
@@ -17,6 +22,7 @@ from tests.helpers.places import MODELS
 pytestmark = pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning")
 
 COM_OFFSET = tuple(effect for effect in catalogue if effect.name == "com_offset")
+DRAG = tuple(effect for effect in catalogue if effect.name == "linear_drag")
 
 
 def test_a_prior_of_a_declared_effect_is_used() -> None:
@@ -58,3 +64,36 @@ def test_a_pivot_is_inferred_from_an_angle_alone(unknown_pivot) -> None:
     assert np.isfinite(mode.log_posterior)
     assert np.isfinite(mode.whitened_residual).all()
     assert all(np.isfinite(one.candidate.statistic) for one in ranked)
+
+
+def test_a_score_promises_something_where_its_forecasts_diverge(unknown_pivot) -> None:
+    """Sizes to first order may be unphysical, so that no forecast with them is finite."""
+    mode, ranked = unknown_pivot
+    assert np.isfinite([promised_share(mode, signature) for signature in ranked]).all()
+
+
+@pytest.fixture(scope="module")
+def diverging():
+    """A disc whose drag is so strong that the engine's steps overflow."""
+    mode = fitted(DISC, Disc(4, 8).frame(np.random.default_rng(1)), DRAG)
+    return replace(mode, phi=np.array([mode.phi[0], 1e80]))
+
+
+def test_errors_of_diverging_forecasts_are_infinite(diverging) -> None:
+    made = forecast(diverging.problem, diverging.phi, diverging.sigma, 3)
+    assert np.isposinf(made.error[:, made.dimension == 0]).all()
+    assert made.rmse()["x"] == np.inf
+    assert np.isfinite(made.floor()["x"])
+
+
+def test_diverging_forecasts_fail_their_test(diverging) -> None:
+    test, _ = _forecasts(diverging, diverging.sigma, 3, DEFAULT)
+    assert not test.passed
+
+
+def test_diverging_forecasts_are_no_gain(diverging) -> None:
+    """Their squares are left out whole: those that do not diverge would look like a gain."""
+    fold = np.zeros(diverging.problem.segments.n, dtype=np.intp)
+    left_out = LeftOut(np.zeros(1), diverging.phi[None], diverging.sigma[None])
+    squares = forecast_squares(diverging, fold, left_out, 3)
+    assert np.isnan(squares[:, diverging.problem.trajectory_noise.cells.places == 0]).all()
