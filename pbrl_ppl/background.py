@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import multiprocessing as mp
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from threading import Thread
 from typing import Any, TypeVar
 
 R = TypeVar("R")
@@ -13,7 +15,7 @@ R = TypeVar("R")
 
 @contextmanager
 def background(function: Callable[[], R]) -> Iterator[Callable[[], R]]:
-    """Evaluate a function in a forked process, which ends with the context.
+    """Evaluate a function in a forked process, which ends with the context or its parent.
 
     Without processors to spare or without forks, the caller's process evaluates it when asked.
 
@@ -65,9 +67,18 @@ def background(function: Callable[[], R]) -> Iterator[Callable[[], R]]:
 
 def _send(function: Callable[[], Any], sender: Any) -> None:
     """Send whether the function succeeded, and its result or what it raised."""
+    Thread(target=_end_with_parent, daemon=True).start()
     try:
         answer = True, function()
     except BaseException as error:
         answer = False, error
     sender.send(answer)
     sender.close()
+
+
+def _end_with_parent() -> None:
+    """End this process once its parent has ended, be it killed."""
+    parent = mp.parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

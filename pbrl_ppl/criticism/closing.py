@@ -190,7 +190,7 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
     selection = Selection(scene, task.catalogue, criteria, say)
     effects = attach(scene, (), task.catalogue)
     say(Stage.CHECK_PRIOR)
-    with background(partial(_compile, scene, train)) as compiled:
+    with background(partial(_compile, scene, train, effects)) as compiled:
         prior = _prior_test(task, train, effects)
         if not prior.passed:  # before the long fit: units may be wrong
             hint = "the declared prior does not explain this recording"
@@ -257,9 +257,9 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
     )
 
 
-def _compile(scene: Scene, train: History) -> None:
+def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> None:
     """Compile the engine's loop unless it is on disk; candidates need it, the fit rarely."""
-    physics = Physics(scene, substeps=1, engine="chipmunk")
+    physics = Physics(scene, effects, substeps=1, engine="chipmunk")
     rng = np.random.default_rng(0)
     phi = np.array([prior.sample(rng, 1)[0] for prior in physics.layout.priors])
     Problem.of(physics, train).predict(phi)

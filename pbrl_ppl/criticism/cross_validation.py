@@ -182,15 +182,16 @@ def forecast_squares(mode: Mode, fold: Ints, left_out: LeftOut, intervals: int) 
     Returns
     -------
     ndarray
-        Shape (fold, cell), SI units squared; NaN where no forecast begins or nothing was measured.
+        Shape (fold, cell), SI units squared; NaN where no forecast begins, nothing was measured or
+        one diverges.
     """
     cells = len(mode.problem.trajectory_noise.cells.places)
     squares = np.full((len(left_out.phi), cells), np.nan)
     for f, (phi, sigma) in enumerate(zip(left_out.phi, left_out.sigma, strict=True)):
         error = forecast(mode.problem, phi, sigma, intervals, within=fold == f).error
-        seen = np.isfinite(error)
-        total = np.where(seen, error, 0.0) ** 2
-        squares[f] = np.where(seen.any(axis=0), total.sum(axis=0), np.nan)
+        total = np.nansum(error**2, axis=0)
+        some = np.isfinite(total) & ~np.isnan(error).all(axis=0)
+        squares[f] = np.where(some, total, np.nan)
     return squares
 
 

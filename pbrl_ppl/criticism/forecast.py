@@ -20,7 +20,8 @@ class Forecast:
     Parameters
     ----------
     error : ndarray
-        Measured minus predicted, shape (start, cell), SI units; NaN where not measured.
+        Measured minus predicted, shape (start, cell), SI units; NaN where not measured, infinite
+        where the prediction diverges.
     variance : ndarray
         Expected square of the error under measurement noise, shape (start, cell).
     motion : ndarray
@@ -40,14 +41,14 @@ class Forecast:
 
     def floor(self) -> dict[str, float]:
         """Return the same for the noise alone."""
-        return self._by_dimension(np.where(np.isfinite(self.error), self.variance, np.nan))
+        return self._by_dimension(np.where(np.isnan(self.error), np.nan, self.variance))
 
     def _by_dimension(self, square: Floats) -> dict[str, float]:
         """Return root mean squares by state dimension."""
         result = {}
         for d in np.unique(self.dimension):
             own = square[:, self.dimension == d]
-            if np.isfinite(own).any():
+            if not np.isnan(own).all():
                 result[STATE[d]] = float(np.sqrt(np.nanmean(own)))
         return result
 
@@ -73,6 +74,32 @@ def filtered_states(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
     first = np.where(hidden, few.smoothed(residual, sigma)[0], noise.begin)[noise.first]
     flat[segments.trajectory[noise.first, None], 0, cells.places] += first
     return cells.completed(problem.scene, states)
+
+
+def rollout(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
+    """Return predicted states after each interval, NaN from where a prediction diverges.
+
+    Parameters
+    ----------
+    problem : Problem
+        A problem of whole trajectories.
+    phi : ndarray
+        Shape (p,).
+    start : ndarray
+        Filtered states, shape (n, body, 6), SI units: not finite where the filter diverges.
+    inputs : ndarray
+        Inputs of the intervals, shape (n, H, body, 3 or 9).
+
+    Returns
+    -------
+    ndarray
+        Shape (n, H, body, 6), SI units.
+    """
+    states = np.full((*inputs.shape[:2], *start.shape[1:]), np.nan)
+    finite = np.isfinite(start).all(axis=(1, 2))
+    states[finite] = problem.one_world(phi, start[finite], inputs[finite])
+    states[~np.isfinite(states)] = np.nan
+    return states
 
 
 def forecast(
@@ -121,10 +148,11 @@ def forecast(
     every = at[:, None] + np.arange(intervals)
     states = filtered_states(problem, phi, sigma)[trajectory, step]
     inputs = problem.inputs[every, 0]
-    ends = cells.of(problem.one_world(phi, states, inputs)[:, -1])
+    ends = cells.of(rollout(problem, phi, states, inputs)[:, -1])
     observed = problem.data.history.dataset["observed"].to_numpy()
     measured_ends = cells.of(observed[trajectory, step + intervals])
     error = cells.wrapped(measured_ends - ends)
+    error[np.isfinite(measured_ends) & np.isnan(ends)] = np.inf
     motion = measured_ends - cells.of(states)
     covariance = _spread(noise, sigma, at, step)
     free, touching = cells.steps(sigma)

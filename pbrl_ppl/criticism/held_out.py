@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from pbrl_ppl.criticism.forecast import filtered_states, forecast
+from pbrl_ppl.criticism.forecast import filtered_states, forecast, rollout
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
@@ -150,7 +150,7 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
     for model in (declared, revised):
         own, mode = model.problem, model.mode
         start = filtered_states(own, mode.phi, mode.sigma)[:1, 0]
-        states = own.one_world(mode.phi, start, own.inputs[:length, 0][None])[0]
+        states = rollout(own, mode.phi, start, own.inputs[:length, 0][None])[0]
         predicted.append(np.concatenate([start, states])[:, body][:, columns])
     return Rollout(
         body=scene.moving[body].name,

@@ -156,7 +156,7 @@ def _forecasts(
     dimensions = np.unique(last.dimension)
     for d in dimensions:
         error = last.error[:, last.dimension == d]
-        z = (error**2 / last.variance[:, last.dimension == d])[np.isfinite(error)]
+        z = (error**2 / last.variance[:, last.dimension == d])[~np.isnan(error)]
         if not z.size:
             continue
         # forecasts overlap by half, so half of them count

@@ -36,11 +36,11 @@ def promised_share(mode: Mode, signature: Signature) -> float:
     changed = replace(mode, problem=within, phi=inside(layout.priors, phi))
     before = replace(mode, problem=problem.rough)
     worse, better = _forecasts(before, changed)
-    errors = _squares(worse, better, worse.error)
+    errors = _squares(worse.error)
     seen = errors > 0
     if not seen.any():
         return signature.fall
-    falls = 1.0 - _squares(worse, better, better.error)[seen] / errors[seen]
+    falls = 1.0 - _squares(better.error)[seen] / errors[seen]
     return max(signature.fall, min(0.5 * float(falls.mean()), _change(worse, better)))
 
 
@@ -56,21 +56,24 @@ def _change(worse: Forecast, better: Forecast) -> float:
     """Return the change of forecasts over the motion, of the worst coordinate; 0 without any."""
     if not len(worse.error):
         return 0.0
-    change = _squares(worse, better, worse.error - better.error)
-    motion = _squares(worse, better, worse.motion)
+    change = _squares(worse.error - better.error)
+    motion = _squares(np.where(np.isnan(worse.error), np.nan, worse.motion))
     return float(np.sqrt((change / np.maximum(motion, 1e-300)).max()))
 
 
 def _forecasts(before: Mode, after: Mode) -> tuple[Forecast, Forecast]:
-    """Return the longest forecasts of both models."""
+    """Return the longest forecasts of both models; errors are NaN where one diverges."""
     intervals = longest_forecast(after.problem)
     worse, better = (
         forecast(each.problem, each.phi, each.sigma, intervals) for each in (before, after)
     )
+    both = np.isfinite(worse.error) & np.isfinite(better.error)
+    worse, better = (
+        replace(each, error=np.where(both, each.error, np.nan)) for each in (worse, better)
+    )
     return worse, better
 
 
-def _squares(worse: Forecast, better: Forecast, values: Floats) -> Floats:
-    """Return sums of squares of what both models forecast, shape (coordinate,)."""
-    both = np.isfinite(worse.error) & np.isfinite(better.error)
-    return np.asarray((np.where(both, values, 0.0) ** 2).sum(axis=0))
+def _squares(values: Floats) -> Floats:
+    """Return sums of squares, shape (coordinate,), of values (start, coordinate) or NaN."""
+    return np.asarray(np.nansum(values**2, axis=0))

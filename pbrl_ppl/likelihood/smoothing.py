@@ -104,27 +104,29 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     sigma = sigma.copy()
     sigma[steps] = np.maximum(sigma[steps], _LITTLE * problem.noise_prior[0][steps])
     begun: Floats | None = None  # states at which each transition's slope was taken
+    residual = problem.trajectory_noise.cells.of_residual(problem.residual(phi))
     for _ in range(_ROUNDS):
         noise = problem.trajectory_noise
         cells = noise.cells
-        residual = cells.of_residual(problem.residual(phi))
         before, after = noise.smoothed(residual, sigma)
         spread = np.sqrt(np.median(np.diagonal(noise.covariance(sigma), axis1=1, axis2=2), axis=0))
         states = _moved(problem, cells, noise.first, before, after)
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # diverged: keep the last linearisation
-        problem = replace(problem, data=replace(problem.data, states=states))
-        problem = replace(
-            problem, data=replace(problem.data, states=with_predicted_gaps(problem, phi))
-        )
-        begin = cells.of(problem.segments.start)
+        moved = replace(problem, data=replace(problem.data, states=states))
+        moved = replace(moved, data=replace(moved.data, states=with_predicted_gaps(moved, phi)))
+        begin = cells.of(moved.segments.start)
         if begun is None:
-            problem = problem.along(_sloped(problem, cells, phi, sigma, spread))
+            moved = moved.along(_sloped(moved, cells, phi, sigma, spread))
             begun = begin
         else:
-            moved = np.asarray((np.abs(begin - begun) > _STALE * spread).any(axis=1))
-            problem = problem.along(_sloped(problem, cells, phi, sigma, spread, moved))
-            begun = np.where(moved[:, None], begin, begun)
+            far = np.asarray((np.abs(begin - begun) > _STALE * spread).any(axis=1))
+            moved = moved.along(_sloped(moved, cells, phi, sigma, spread, far))
+            begun = np.where(far[:, None], begin, begun)
+        residual = cells.of_residual(moved.residual(phi))
+        if not np.isfinite(moved.trajectory_noise.filtered(residual[None], sigma)[0]).all():
+            break  # diverged: nothing follows from the new one
+        problem = moved
         shown = after[noise.seen.any(axis=1)]
         if (np.sqrt(np.mean(shown**2, axis=0)) < _SETTLED * spread).all():
             break

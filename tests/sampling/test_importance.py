@@ -4,6 +4,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 import time
 import warnings
 from dataclasses import replace
@@ -520,6 +522,34 @@ def test_background_ends_with_its_context() -> None:
     with pytest.raises(KeyError), background(lambda: time.sleep(60.0)):
         raise KeyError
     assert time.monotonic() - begin < 30.0
+
+
+#: Prints the number of the process in the background, which computes or has a result to send.
+KILLED = """
+import multiprocessing, os, time
+from pbrl_ppl.background import background
+multiprocessing.cpu_count = lambda: 2
+def work():
+    print(os.getpid(), flush=True)
+    return {work}
+with background(work):
+    time.sleep(120.0)
+"""
+
+
+@pytest.mark.one_stack
+@pytest.mark.parametrize("work", ["time.sleep(60.0)", "bytes(10**7)"])
+def test_background_ends_with_a_killed_parent(work) -> None:
+    parent = subprocess.Popen(
+        [sys.executable, "-c", KILLED.format(work=work)], stdout=subprocess.PIPE
+    )
+    child = int(parent.stdout.readline())
+    parent.kill()
+    try:
+        parent.communicate(timeout=20.0)  # the output ends once both have ended
+    except subprocess.TimeoutExpired:
+        os.kill(child, signal.SIGKILL)
+        raise
 
 
 @pytest.mark.one_stack
