@@ -47,7 +47,7 @@ from pbrl_ppl.criticism.unexplained import (
 )
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import ConvergenceWarning, PriorWarning
+from pbrl_ppl.errors import ConvergenceWarning, PriorWarning, UninformedWarning
 from pbrl_ppl.history import History, with_units, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
@@ -58,7 +58,7 @@ from pbrl_ppl.scene import Scene
 
 #: Draws of each chain, then those where that is not enough; those of other methods; least tuning.
 CHAIN_DRAWS, LEAST_TUNE = (300, 1000), 100
-DRAWS = {"importance": (150, 600), "laplace": (125,)}
+DRAWS = {"importance": (180, 600), "laplace": (125,)}
 #: Draws from the prior, some of which must reach the measurements.
 PRIOR_DRAWS = 100
 
@@ -94,7 +94,7 @@ def close_loop(
     substeps : int, optional
         Engine steps an interval to begin with; the scene's by default.
     draws : int, optional
-        Posterior draws kept of each chain; by default 150 of importance sampling and 300 of chains,
+        Posterior draws kept of each chain; by default 180 of importance sampling and 300 of chains,
         more where these do not suffice.
     method : str
         Sampler of :func:`pbrl_ppl.fit`; with ``laplace`` the verdict relies on modes.
@@ -329,14 +329,20 @@ def _too_much_remains(
 
 
 def _posteriors(task: _Task, modes: list[Mode]) -> list[Any]:
-    """Sample the models of modes, the first beside the others; issue their warnings."""
+    """Sample the models of modes, the first beside the others; issue their warnings, each once.
+
+    What the data do not inform is said, and in the report: no conclusion depends on it.
+    """
     with background(partial(_posterior, task, modes[0])) as first:
         others = [_posterior(task, mode) for mode in modes[1:]]
         results = [first(), *others]
-    for _, caught, said in results:
-        for sentence in said:
-            task.say(sentence)
-        for message in caught:
+    issued = {str(message): message for _, caught, _ in results for message in caught}
+    uninformed = [text for text, each in issued.items() if isinstance(each, UninformedWarning)]
+    said = [sentence for _, _, sentences in results for sentence in sentences]
+    for sentence in dict.fromkeys((*said, *uninformed)):
+        task.say(sentence)
+    for text, message in issued.items():
+        if text not in uninformed:
             warnings.warn(message, stacklevel=3)
     return [fitted for fitted, *_ in results]
 
