@@ -19,7 +19,7 @@ PARAMETER_NAMES = ("mass", "r", "mu_c", "w_x", "w_y", "w_theta", "mu_x", "mu_y")
 CONTACT_NAMES = ("r", "mu_c")
 #: Largest absolute value of a number and smallest positive one, in SI units: their products, such
 #: as inertias, stay far from the limits of floating-point numbers.
-LARGEST, SMALLEST = 1e9, 1e-12
+LARGEST, SMALLEST = 1e18, 1e-18
 
 
 def nearest(name: object, known: Iterable[str]) -> str:
