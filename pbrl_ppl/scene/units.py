@@ -149,6 +149,17 @@ def units_of(scene: Scene, name: str) -> Units:
     return replace(units, **dict(body.typical))
 
 
+def motion_time(scene: Scene) -> float:
+    """Return the least time in which a body's typical force gives it its typical speed (s)."""
+    units = [units_of(scene, body.name) for body in scene.dynamic]
+    return min(each.mass * each.speed / each.force for each in units)
+
+
+def smallest_radius(scene: Scene) -> float:
+    """Return the bounding radius of the smallest moving body (m)."""
+    return min(body.shape.bounding_radius for body in scene.moving)
+
+
 def _levers(scene: Scene, name: str) -> list[float]:
     """Return the distances (m) of a body's origin from the hinges that hold it."""
     anchors = [
