@@ -16,7 +16,7 @@ from pbrl_ppl.state import STATE, WRENCH, Bools, Floats, Ints
 #: How far an interval may be from the scene's time step, as a share of it.
 TIME_TOLERANCE = 0.01
 #: Largest absolute value of a state or wrench, in SI units.
-_LARGEST = 1e9
+_LARGEST = 1e18
 _INTEGER = re.compile(r"(-?(?:0|[1-9]\d{0,17}))(?:\.0*)?")
 
 

@@ -157,6 +157,9 @@ class Pointers(NamedTuple):
     iterations: int
     chained: NDArray[np.bool_]
     padding: int
+    size: float  # m
+    fastest: float  # m/s
+    far: float  # m
     bodies: NDArray[np.int64]
     kinematic: NDArray[np.bool_]
     shapes: NDArray[np.int64]
@@ -203,6 +206,9 @@ def pointers(world: World) -> Pointers:
         iterations=world.iterations,
         chained=world.chained,
         padding=world.padding,
+        size=world.size,
+        fastest=world.fastest,
+        far=world.far,
         bodies=at(*(body._body for body in world.bodies)),
         kinematic=world.kinematic,
         shapes=at(*(shape._shape for _, shape in world.shapes)),

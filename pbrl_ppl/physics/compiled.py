@@ -23,7 +23,7 @@ from pbrl_ppl.physics.setters import (
     set_properties,
     set_strengths,
 )
-from pbrl_ppl.physics.world import DIVERGED, FAR, FINER, TINY
+from pbrl_ppl.physics.world import FINER, TINY
 
 _FREE, _TOUCHED, _LOST = 0, 1, 2
 
@@ -40,18 +40,19 @@ class Scratch(NamedTuple):
 
 
 @numba.njit(inline="always")
-def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-untyped-def]
+def _forget(fn, world, bodies, batch, touched):  # type: ignore[no-untyped-def]
     """Clear the contacts and impulses that the engine keeps of the last transition.
 
     Contacts go with their shapes, which are removed and added as in a new world: far from each
     other, and in the same numbering. That is needed only after a contact. A joint's stored impulse
     is limited to its greatest force, here zero.
     """
+    normal_gravity = batch.normal_gravity
     if touched == _FREE and len(world.wheel_body) + len(world.links) + len(world.patch_body) == 0:
         return  # nothing to forget
     if touched:
         for i in range(len(world.bodies)):
-            call2(fn.cpBodySetPosition, world.bodies[i], FAR * (i + 1.0), FAR)
+            call2(fn.cpBodySetPosition, world.bodies[i], world.far * (i + 1.0), world.far)
             call1(fn.cpBodySetAngle, world.bodies[i], 0.0)
             call2(fn.cpBodySetVelocity, world.bodies[i], 0.0, 0.0)
             call1(fn.cpBodySetAngularVelocity, world.bodies[i], 0.0)
@@ -64,7 +65,7 @@ def _forget(fn, world, bodies, normal_gravity, touched):  # type: ignore[no-unty
             call_pointer(fn.cpSpaceAddShape, world.space, shape)
     set_strengths(fn, world, bodies, normal_gravity, 0.0)
     call_int(fn.cpSpaceSetIterations, world.space, 1)
-    call1(fn.cpSpaceStep, world.space, TINY)
+    call1(fn.cpSpaceStep, world.space, TINY * batch.time_step)
     call_int(fn.cpSpaceSetIterations, world.space, iterations(world, bodies))
     set_strengths(fn, world, bodies, normal_gravity, 1.0)
 
@@ -211,8 +212,8 @@ def _transition(fn, world, batch, p, t, substeps, scratch, out):  # type: ignore
                 x, y = arm(bodies[i], state[i, 2])
                 v_x, v_y = get2(fn.cpBodyGetVelocity, body)
                 state[i, 3], state[i, 4], state[i, 5] = v_x + turn * y, v_y - turn * x, turn
-                speed = abs(state[i, 3]) + abs(state[i, 4]) + abs(state[i, 5])
-                if not speed < DIVERGED:  # also true of NaN
+                speed = abs(state[i, 3]) + abs(state[i, 4]) + world.size * abs(turn)
+                if not speed < world.fastest:  # also true of NaN
                     return _LOST
                 if watch and touched == _FREE:
                     near = _near_contact(i, state, world.radii, world.obstacles, world.can_touch)
@@ -259,7 +260,7 @@ def rollout(fn, world, batch, items, out):  # type: ignore[no-untyped-def]
             for _ in range(2):
                 if timed:
                     set_properties(fn, world, first, joints[p])
-                _forget(fn, world, first, batch.normal_gravity, before)
+                _forget(fn, world, first, batch, before)
                 outcome = _transition(fn, world, batch, p, t, substeps, scratch, states)
                 if substeps > batch.counts[level] and outcome == _FREE:
                     outcome = _TOUCHED  # the first run touched: a refined one is not extrapolated

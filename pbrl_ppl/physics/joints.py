@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import JOINT_ANCHORS, JOINT_INDICES
-from pbrl_ppl.scene import WORLD, Scene
+from pbrl_ppl.scene import WORLD, Scene, smallest_radius
 from pbrl_ppl.state import Floats
 
 #: Columns of a joint's numbers: its anchors and its length (m).
 JOINT_COLUMNS = (*JOINT_ANCHORS, "length")
 A_X, A_Y, B_X, B_Y, LENGTH = range(len(JOINT_COLUMNS))
-#: A distance joint shorter than this (m) is a hinge in the engine.
+#: A distance joint shorter than this share of the smallest moving body is a hinge in the engine.
 _NO_LENGTH = 1e-9
 #: Newton steps of :func:`on_rod`; each squares the remaining relative error.
 _STEPS = 3
@@ -120,7 +120,9 @@ class SceneJoints:
         #: Kind of each joint in the engine.
         self.kinds = tuple(
             HINGE
-            if joint.kind == "distance" and joint.known and length < _NO_LENGTH
+            if joint.kind == "distance"
+            and joint.known
+            and length < _NO_LENGTH * smallest_radius(scene)
             else JOINT_KINDS[joint.kind]
             for joint, length in zip(scene.joints, lengths, strict=True)
         )
@@ -212,7 +214,7 @@ def on_rod(states: Floats, rod: Floats, unit_moment: float) -> Floats:
         c, s = np.cos(held[..., 2]), np.sin(held[..., 2])
         arm_x, arm_y = c * a_x - s * a_y, s * a_x + c * a_y
         x, y = held[..., 0] + arm_x - b_x, held[..., 1] + arm_y - b_y
-        distance = np.maximum(np.hypot(x, y), 1e-9)
+        distance = np.maximum(np.hypot(x, y), np.finfo(float).tiny)
         n_x, n_y = x / distance, y / distance
         lever = arm_x * n_y - arm_y * n_x
         return distance, n_x, n_y, lever, 1.0 + lever**2 / unit_moment

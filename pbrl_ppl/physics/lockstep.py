@@ -29,6 +29,8 @@ class FreeBody(NamedTuple):
     pivot: bool
     iterations: int
     gravity: NDArray[np.float64]  # (2,)
+    size: float  # of the smallest moving body (m)
+    fastest: float  # speed of divergence (m/s)
     link_joint: NDArray[np.int64]
     link_rod: NDArray[np.bool_]
     link_first: NDArray[np.bool_]  # whether the body is the joint's first
@@ -63,6 +65,8 @@ def _free_body(world: World, index: int) -> FreeBody:
         pivot=any(pivot.body == index for pivot in world.pivots),
         iterations=world.iterations,
         gravity=np.array(world.space.gravity, dtype=float),
+        size=world.size,
+        fastest=world.fastest,
         link_joint=np.array([link.joint for link in links], dtype=np.int64),
         link_rod=np.array([link.kind is ROD for link in links], dtype=bool),
         link_first=np.array([link.constraint.a is body for link in links], dtype=bool),
@@ -142,7 +146,7 @@ def rollout(free, batch, first, last, out, left, trail):  # type: ignore[no-unty
                     if shifted:
                         solver.lever(z)
                     solver.substep(z, links, points, free, slowing, patch_radius, step)
-                    solver.lose(z, touched)
+                    solver.lose(z, free, touched)
                     if watch or len(trail):
                         solver.locate(z)
                     if len(trail):

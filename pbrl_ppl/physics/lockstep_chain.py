@@ -31,6 +31,8 @@ class Chain(NamedTuple):
     chained: NDArray[np.bool_]  # (body,)
     iterations: int  # the fewest
     gravity: NDArray[np.float64]  # (2,)
+    size: float  # of the smallest moving body (m)
+    fastest: float  # speed of divergence (m/s)
     wheel: NDArray[np.bool_]  # (body,)
     link_joint: NDArray[np.int64]
     link_rod: NDArray[np.bool_]
@@ -67,6 +69,8 @@ def chain_of(world: World) -> Chain | None:
         chained=world.chained,
         iterations=world.iterations,
         gravity=np.array(world.space.gravity, dtype=float),
+        size=world.size,
+        fastest=world.fastest,
         wheel=np.isin(np.arange(len(world.bodies)), wheels),
         link_joint=np.array([link.joint for link in world.links], dtype=np.int64),
         link_rod=np.array([link.kind is ROD for link in world.links], dtype=bool),
@@ -181,7 +185,7 @@ def rollout(chain, batch, items, out, left):  # type: ignore[no-untyped-def]
                             solver.lever(bodies[k])
                     joined.substep(block, chain, step)
                     for k in range(moving):
-                        solver.lose(bodies[k], touched)
+                        solver.lose(bodies[k], chain, touched)
                     if watch:
                         _watch(bodies, chain, own_discs, touched)
                 for i in range(BLOCK):

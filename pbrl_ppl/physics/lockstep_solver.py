@@ -11,7 +11,7 @@ import math
 from pbrl_ppl.physics.compilation import compiled
 from pbrl_ppl.physics.joints import A_X, A_Y, B_X, B_Y, LENGTH
 from pbrl_ppl.physics.properties import COLUMN
-from pbrl_ppl.physics.world import DIVERGED, STICKING
+from pbrl_ppl.physics.world import STICKING
 
 #: Number of transitions in a block, which are computed side by side.
 BLOCK = 32
@@ -132,11 +132,11 @@ def locate(z):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def lose(z, touched):  # type: ignore[no-untyped-def]
+def lose(z, free, touched):  # type: ignore[no-untyped-def]
     """Mark the transitions that have diverged."""
     for i in range(BLOCK):
-        speed = abs(z[VX + i]) + abs(z[VY + i]) + abs(z[W + i])
-        touched[i] |= not speed < DIVERGED  # also true of NaN
+        speed = abs(z[VX + i]) + abs(z[VY + i]) + free.size * abs(z[W + i])
+        touched[i] |= not speed < free.fastest  # also true of NaN
 
 
 @compiled

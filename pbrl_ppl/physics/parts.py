@@ -15,13 +15,15 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.physics.coupling import SHARE, come_near
 from pbrl_ppl.physics.simulator import Simulator
+from pbrl_ppl.scene import smallest_radius
 from pbrl_ppl.state import Bools, Floats, Ints
 
 if TYPE_CHECKING:
     from pbrl_ppl.physics.physics import Physics
 
 R = TypeVar("R")
-#: Largest difference of one world's prediction from a part's that counts as rounding (SI units).
+#: Largest difference of one world's prediction from a part's that counts as rounding, in radii of
+#: the smallest body, rad and sampling intervals.
 _ROUNDING = 1e-6
 #: A Metropolis step asks for the proposed point and the current one: the latter was just computed.
 _REMEMBERED = 4
@@ -185,6 +187,8 @@ class OneWorld:
         self.parted = physics.simulator
         # contacts are not extrapolated, nor is anything else in a transition that has one
         self._apart = physics.changed(extrapolate=False).simulator
+        size, dt = smallest_radius(physics.scene), physics.scene.time_step
+        self._rounding = _ROUNDING * np.array([size, size, 1.0, size / dt, size / dt, 1.0 / dt])
         self._reach = [body.shape.bounding_radius for body in physics.scene.moving]
         self._whole = Simulator(physics.changed(extrapolate=False, parts=None))
 
@@ -200,7 +204,7 @@ class OneWorld:
             return states, met
         whole, apart = self._whole(phi, start, actions), self._apart(phi, start, actions)
         # in a contact within a part too, for the solver's iterations depend on the others
-        differ: Bools = np.asarray((~_same(whole, apart)).any(axis=(-3, -1)))
+        differ: Bools = np.asarray((~_same(whole, apart, self._rounding)).any(axis=(-3, -1)))
         if not differ.any():
             return states, met
         for bodies_a, bodies_b in combinations((part.bodies for part in self.parted.parts), 2):
@@ -226,6 +230,6 @@ class OneWorld:
         return found
 
 
-def _same(a: Floats, b: Floats) -> Bools:
+def _same(a: Floats, b: Floats, rounding: Floats) -> Bools:
     """Whether numbers are the same to rounding, or both are lost."""
-    return np.asarray((abs(a - b) <= _ROUNDING) | (np.isnan(a) & np.isnan(b)))
+    return np.asarray((abs(a - b) <= rounding) | (np.isnan(a) & np.isnan(b)))

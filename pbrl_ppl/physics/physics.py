@@ -15,14 +15,16 @@ from pbrl_ppl.physics.coupling import Parts, independent_parts, joined_parts
 from pbrl_ppl.physics.parts import OneWorld, PartedSimulator
 from pbrl_ppl.physics.simulator import check_engine
 from pbrl_ppl.physics.table1 import build_layout
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, motion_time
 from pbrl_ppl.state import Floats
 
-#: Engine steps of an interval for rough answers, and the longest of these steps (s).
-COARSE, LONGEST_COARSE = 4, 0.025
-#: Engine steps for derivatives and for what an effect changes, and the longest of these steps (s):
-#: where rows are far apart, dry friction at a turning point shows with short steps alone.
-ROUGH, LONGEST = 10, 0.005
+#: Engine steps of an interval for rough answers, and the longest of these steps as a share of the
+#: scene's motion time.
+COARSE, LONGEST_COARSE = 4, 0.2
+#: Engine steps for derivatives and for what an effect changes, and the longest of these steps as a
+#: share of the scene's motion time: where rows are far apart, dry friction at a turning point shows
+#: with short steps alone.
+ROUGH, LONGEST = 10, 0.04
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ class Physics:
     @cached_property
     def coarse(self) -> Physics:
         """The same with few substeps: cheap, and its derivative is nearly right."""
-        enough = max(COARSE, math.ceil(self.scene.time_step / LONGEST_COARSE))
+        enough = max(COARSE, self._steps_of(LONGEST_COARSE))
         return self.changed(substeps=min(enough, self.substeps), extrapolate=False)
 
     @property
@@ -158,7 +160,11 @@ class Physics:
     @property
     def fine_enough(self) -> int:
         """Substeps that are short enough to begin with."""
-        return math.ceil(self.scene.time_step / LONGEST)
+        return self._steps_of(LONGEST)
+
+    def _steps_of(self, longest: float) -> int:
+        """Return the substeps that are no longer than a share of the motion time."""
+        return math.ceil(self.scene.time_step / (longest * motion_time(self.scene)))
 
     def changed(self, **changes: object) -> Physics:
         """Return the same with other fields; itself, with its engines, where they are equal."""

@@ -11,7 +11,7 @@ import pymunk
 
 from pbrl_ppl.effects import Attached, Command, Force, at_stage
 from pbrl_ppl.physics.properties import COLUMN, EngineInput
-from pbrl_ppl.physics.world import DIVERGED, RING, STICKING, World
+from pbrl_ppl.physics.world import RING, STICKING, World
 from pbrl_ppl.state import Floats
 
 _EXTRA = [COLUMN.extra_gravity_x, COLUMN.extra_gravity_y]
@@ -99,7 +99,8 @@ def rollout(
             _place_patches(world, bodies, step)
             world.space.step(step)
             touched = touched or near_contact(world)
-            if not all(np.abs(_state(world, i)[3:]).sum() < DIVERGED for i in range(len(names))):
+            speeds = np.abs([_state(world, i)[3:] for i in range(len(names))])
+            if not (speeds @ (1.0, 1.0, world.size) < world.fastest).all():  # also true of NaN
                 states[:] = np.nan
                 return states, True
         for i in range(len(names)):

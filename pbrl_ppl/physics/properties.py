@@ -48,7 +48,7 @@ _POSITIVE = ("mass", "moment")
 _PATCH, _WHEEL = ("patch_mu",), ("mu_x", "mu_y")
 _ANY_SIGN = ("w_x", "w_y", "w_theta", "extra_gravity_x", "extra_gravity_y", "com_x", "com_y")
 #: Names that effects see in place of a column: moment per mass and the whole gravity.
-_SEEN = {
+SEEN = {
     "moment_per_mass": "moment",
     "gravity_x": "extra_gravity_x",
     "gravity_y": "extra_gravity_y",
@@ -92,7 +92,7 @@ def _changed_columns(attached: Attached) -> frozenset[str]:
     stage = attached.effect.stage
     if not isinstance(stage, Properties):
         return frozenset()
-    row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *_SEEN)}
+    row = {name: np.zeros((1, 1)) for name in (*COLUMNS, *SEEN)}
     centre = {p.name: np.full((1, 1), p.prior.centre) for p in attached.effect.parameters}
     stage.modify(row, centre, Clock(_NEVER, _NEVER, _NEVER))
     return frozenset(name for name, value in row.items() if value.any())
@@ -233,7 +233,7 @@ class EngineProperties:
             row = {
                 key: result[:, :, i, column].copy()
                 for column, key in enumerate(COLUMNS)
-                if key not in _SEEN.values()
+                if key not in SEEN.values()
             }
             row["moment_per_mass"] = np.full((len(phi), m), self._unit_moment[i])
             for key, value in zip(("gravity_x", "gravity_y"), gravity, strict=True):

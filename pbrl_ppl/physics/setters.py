@@ -9,7 +9,7 @@ import numpy as np
 from pbrl_ppl.physics.calls import call1, call2, call_pointer
 from pbrl_ppl.physics.compilation import compiled
 from pbrl_ppl.physics.properties import COLUMN
-from pbrl_ppl.physics.world import FAR, ITERATIONS_A_RATIO, MOST_ITERATIONS, NO_SIZE, STICKING
+from pbrl_ppl.physics.world import ITERATIONS_A_RATIO, MOST_ITERATIONS, STICKING
 
 
 @compiled
@@ -110,7 +110,7 @@ def set_discs(fn, world, discs):  # type: ignore[no-untyped-def]
     for j in range(len(world.discs)):
         x, y, radius = discs[j, 0], discs[j, 1], discs[j, 2]
         if not radius > 0.0:
-            x, y, radius = -FAR, -FAR * (j + 1.0), NO_SIZE
+            x, y, radius = -world.far, -world.far * (j + 1.0), 0.0
         call2(fn.cpCircleShapeSetOffset, world.discs[j], x, y)
         call1(fn.cpCircleShapeSetRadius, world.discs[j], radius)
         call_pointer(fn.cpSpaceAddShape, world.space, world.discs[j])

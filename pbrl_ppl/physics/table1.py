@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
+
 from pbrl_ppl.effects import Attached
 from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import (
@@ -16,11 +18,11 @@ from pbrl_ppl.parameters import (
     Layout,
     Prior,
 )
-from pbrl_ppl.scene import CONTACT_NAMES, MASS_PRIOR, WORLD, Body, Joint, Scene, nearest
+from pbrl_ppl.scene import CONTACT_NAMES, MASS_PRIOR, WORLD, Body, Joint, Scene, nearest, units_of
 
-#: Half the side of the square in which a joint's anchor in the world is sought where the scene has
-#: neither walls nor poses (m).
-_UNBOUNDED = 10.0
+#: Half the side of the square about a body's mean place in which a joint's anchor in the world is
+#: sought where the scene has neither walls nor poses, in ranges of the body.
+_UNBOUNDED = 2.0
 
 
 def table1(body: Body) -> dict[str, Prior]:
@@ -107,11 +109,22 @@ def anchor_prior(scene: Scene, holder: str, axis: int, centre: float | None = No
     centre : float, optional
         Where the anchor is thought to be (m); the middle by default.
     """
-    anywhere = (-_UNBOUNDED, _UNBOUNDED, -_UNBOUNDED, _UNBOUNDED)
-    bounds = (scene.extent or anywhere) if holder == WORLD else scene.body(holder).shape.bounds
+    if holder == WORLD:
+        bounds = scene.extent or _neighbourhood(scene)
+    else:
+        bounds = scene.body(holder).shape.bounds
     lower, upper = bounds[2 * axis : 2 * axis + 2]
     mu = (lower + upper) / 2 if centre is None else centre
     return Prior("truncated_normal", mu=mu, sigma=upper - lower, lower=lower, upper=upper)
+
+
+def _neighbourhood(scene: Scene) -> tuple[float, float, float, float]:
+    """Return bounds of the places of dynamic bodies: ``x_min, x_max, y_min, y_max`` (m)."""
+    units = [units_of(scene, body.name) for body in scene.dynamic]
+    reach = np.array([_UNBOUNDED * each.range for each in units])
+    x, y = np.array([(each.x, each.y) for each in units]).T
+    low_x, high_x, low_y, high_y = x - reach, x + reach, y - reach, y + reach
+    return float(low_x.min()), float(high_x.max()), float(low_y.min()), float(high_y.max())
 
 
 def index_priors(scene: Scene, joint: Joint) -> tuple[Prior, Prior]:

@@ -20,14 +20,16 @@ from pbrl_ppl.effects import (
 )
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
-from pbrl_ppl.physics.properties import COLUMNS
-from pbrl_ppl.scene import Body, Scene, units_of
+from pbrl_ppl.physics.properties import COLUMNS, SEEN
+from pbrl_ppl.scene import Body, Scene, Units, units_of
 from pbrl_ppl.state import Floats
 
 #: Time after which a trial counts as an endless loop (s).
 PATIENCE = 10.0
 #: Parameter values drawn from the prior, beside the null value.
 _DRAWS = 4
+#: Wrench of a trial, in the body's natural units.
+_TRIAL = np.array([1.0, -0.5, 0.2])
 
 
 def try_effect(effect: Effect, scene: Scene, history: History, patience: float = PATIENCE) -> None:
@@ -79,7 +81,8 @@ def _try(effect: Effect, scene: Scene, history: History) -> None:
     bodies = [body for body in scene.dynamic if effect.applies(scene, body)]
     rng = np.random.default_rng(0)
     for body in bodies:
-        sized = effect.in_si(units_of(scene, body.name))
+        units = units_of(scene, body.name)
+        sized = effect.in_si(units)
         drawn = np.array([parameter.prior.sample(rng, _DRAWS) for parameter in sized.parameters])
         values = np.vstack([sized.null, drawn.T])
         if effect.scan is not None:
@@ -91,7 +94,7 @@ def _try(effect: Effect, scene: Scene, history: History) -> None:
                 )
         state = _middle(history, body)
         for row in values:
-            result = _applied(effect, state, row)
+            result = _applied(effect, state, row, body, units)
             if not np.isfinite(result).all():
                 shown = ", ".join(
                     f"{parameter.name} = {value:.3g}"
@@ -110,7 +113,7 @@ def _middle(history: History, body: Body) -> Floats:
     return np.asarray(states[len(states) // 2] if len(states) else np.zeros(6))
 
 
-def _applied(effect: Effect, state: Floats, parameters: Floats) -> Floats:
+def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, units: Units) -> Floats:
     """Return the results of an effect's functions at a state and parameters, as one array."""
     stage: Any = effect.stage
     named = {
@@ -118,17 +121,19 @@ def _applied(effect: Effect, state: Floats, parameters: Floats) -> Floats:
         for parameter, value in zip(effect.parameters, parameters, strict=True)
     }
     if isinstance(stage, Force | Command):
-        wrench = np.array([1.0, -0.5, 0.2])
+        wrench = _TRIAL * (units.force, units.force, units.torque)
         command = wrench.copy()
         if isinstance(stage, Command):
             command = np.concatenate([wrench, 0.5 * wrench, [0.4, 0.5]])
         stage.law(state.copy(), command, parameters.copy(), wrench)
         return wrench
     if isinstance(stage, Properties):
-        ones = {name: np.ones((1, 1)) for name in (*COLUMNS, "moment_per_mass")}
+        values = {name: np.ones((1, 1)) for name in (*COLUMNS, *SEEN)}
+        values["mass"] = np.full((1, 1), units.mass)
+        values["moment_per_mass"] = np.full((1, 1), body.shape.unit_moment)
         clock = Clock(np.zeros((1, 1)), np.zeros((1, 1)), np.ones((1, 1)))
-        stage.modify(ones, named, clock)
-        return np.concatenate([np.ravel(value) for value in ones.values()])
+        stage.modify(values, named, clock)
+        return np.concatenate([np.ravel(value) for value in values.values()])
     if isinstance(stage, Sensor):
         flat = {name: value[0] for name, value in named.items()}
         measured = stage.measure(state[None].copy(), flat)

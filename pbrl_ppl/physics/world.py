@@ -13,7 +13,7 @@ from pymunk import autogeometry
 from pbrl_ppl.effects import hanging_body
 from pbrl_ppl.physics.joints import JOINT_KINDS, ROD, JointKind
 from pbrl_ppl.physics.properties import COLUMN
-from pbrl_ppl.scene import WORLD, Body, Joint, Scene
+from pbrl_ppl.scene import WORLD, Body, Joint, Scene, smallest_radius
 from pbrl_ppl.state import Floats
 
 #: Solver iterations. A single body without obstacles needs few, since its wheel or hinge then
@@ -26,19 +26,31 @@ RING = tuple((math.cos(0.25 * i * math.pi), math.sin(0.25 * i * math.pi)) for i 
 #: A point may stick if its speed is below this multiple of what friction takes away in a substep.
 #: (With 0.1, slow points stick across their direction of motion now and then: predictions jump.)
 STICKING = 1.0
-#: Allowed overlap of shapes (m); the engine's default is meant for pixels.
-COLLISION_SLOP = 1e-4
-#: Place where bodies are parked (m), and the duration of that step (s).
-FAR, TINY = 1e5, 1e-9
+#: Bounding radius (m) and engine time (s) of the shopping cart, for which the next two were chosen.
+_CART = math.hypot(0.45, 0.275)
+_CART_TIME = math.sqrt(_CART / 9.81)
+#: Allowed overlap of shapes as a share of the smallest moving body's bounding radius; the engine's
+#: default is meant for pixels.
+COLLISION_SLOP = 1e-4 / _CART
+#: Share of an overlap that the engine leaves after the engine time; its default for the cart.
+OVERLAP_LEFT = pymunk.Space().collision_bias ** _CART_TIME
+#: Engine time without gravity, in sampling intervals; that of the cart.
+ENGINE_INTERVALS = _CART_TIME / 0.1
+#: Least share of an overlap that is left after 1 s: the power underflows where the engine time is
+#: below a hundredth of the cart's, and overlaps are then corrected more slowly.
+LEAST_LEFT = 1e-300
+#: Place where bodies are parked, in units of the scene's extent, and the duration of that step, in
+#: sampling intervals.
+FAR, TINY = 1e9, 1e-9
 #: Refinement of the substeps near contacts in a scene with hidden discs: a disc's inferred place
 #: must not depend on the substep in which a body stops.
 FINER = 8
-#: Radius of a disc of radius 0 (m).
-NO_SIZE = 1e-9
 #: Sizes of the engine's hash tables; it takes the first that is larger than the number of entries.
 _TABLES = (5, 13, 23, 47, 97, 193, 389, 769, 1543, 3079, 6151, 12289)
-#: Speed from which the engine counts as diverged (m/s or rad/s).
-DIVERGED = 1e6
+#: Speed from which the engine counts as diverged, in radii of the smallest body an interval.
+DIVERGED = 1e5
+#: Rounding of a corner's cross product as a share of the outline's extent squared.
+_ROUNDING = 1e-12
 
 
 Brake = TypeVar("Brake", pymunk.PinJoint, pymunk.PivotJoint)
@@ -127,7 +139,12 @@ class World:
         self.scene = scene
         self.space = pymunk.Space()
         self.space.gravity = scene.gravity
-        self.space.collision_slop = COLLISION_SLOP
+        #: Bounding radius of the smallest moving body (m), and the speed of divergence (m/s).
+        self.size = smallest_radius(scene)
+        self.fastest = DIVERGED * self.size / scene.time_step
+        self.far = FAR * _extent(scene)
+        self.space.collision_slop = COLLISION_SLOP * self.size
+        self.space.collision_bias = max(OVERLAP_LEFT ** (1.0 / engine_time(scene)), LEAST_LEFT)
         self.bodies: list[pymunk.Body] = []
         self.shapes: list[tuple[int, pymunk.Shape]] = []
         self.wheels: list[Wheel] = []
@@ -137,15 +154,15 @@ class World:
         self._by_name: dict[str, pymunk.Body] = {WORLD: self.space.static_body}
         self._add_fixed()
         for j in range(discs):
-            away = -FAR, -FAR * (j + 1)
-            self.discs.append(pymunk.Circle(self.space.static_body, NO_SIZE, away))
+            away = -self.far, -self.far * (j + 1)
+            self.discs.append(pymunk.Circle(self.space.static_body, 0.0, away))
             self._add_static(self.discs[j])
         #: Which bodies follow a path, at the velocities in their actions.
         self.kinematic = np.array([body.kinematic for body in scene.moving])
         for i, body in enumerate(scene.moving):
             kind = pymunk.Body.KINEMATIC if body.kinematic else pymunk.Body.DYNAMIC
             rigid = pymunk.Body(1.0, 1.0, kind)
-            rigid.position = FAR * (i + 1.0), FAR
+            rigid.position = self.far * (i + 1.0), self.far
             self.bodies.append(rigid)
             self._by_name[body.name] = rigid
             self.space.add(rigid)
@@ -172,7 +189,7 @@ class World:
             for body in scene.bodies
             if body.static and body.pose is not None
         ]
-        fixed += [(-FAR, -FAR, -FAR, -FAR, NO_SIZE)] * discs  # the last ones
+        fixed += [(-self.far, -self.far, -self.far, -self.far, 0.0)] * discs  # the last ones
         self.obstacles = np.array(fixed, dtype=float).reshape(-1, 5)
 
     def _add_shapes(self) -> None:
@@ -189,7 +206,7 @@ class World:
             self.space.remove(first)
         for _, shape in self.shapes:
             self.space.add(shape)
-        self.space.step(TINY)
+        self.space.step(TINY * self.scene.time_step)
         for body in self.bodies:
             body.velocity = (0.0, 0.0)
 
@@ -278,7 +295,7 @@ class World:
         self.space.remove(*self.discs)
         for j, (shape, (x, y, radius)) in enumerate(zip(self.discs, discs, strict=True)):
             if not radius > 0:
-                x, y, radius = -FAR, -FAR * (j + 1), NO_SIZE
+                x, y, radius = -self.far, -self.far * (j + 1), 0.0
             shape.unsafe_set_offset((x, y))
             shape.unsafe_set_radius(radius)
             self.space.add(shape)
@@ -319,6 +336,20 @@ class World:
             pivot.damper.damping = bodies[pivot.body, COLUMN.pivot_damping]
 
 
+def engine_time(scene: Scene) -> float:
+    """Return the time in which gravity moves the smallest body by about its size (s)."""
+    gravity = max(math.hypot(*scene.gravity), scene.normal_gravity)
+    if gravity > 0.0:
+        return math.sqrt(smallest_radius(scene) / gravity)
+    return ENGINE_INTERVALS * scene.time_step
+
+
+def _extent(scene: Scene) -> float:
+    """Return the largest coordinate of walls and poses, or the largest body's radius (m)."""
+    radii = (body.shape.bounding_radius for body in scene.bodies)
+    return max([*map(abs, scene.extent or ()), *radii])
+
+
 def engine_shapes(body: Body, rigid: pymunk.Body) -> list[pymunk.Shape]:
     """Return the engine's shapes of a body; a concave outline is cut into convex parts."""
     outline = body.shape.outline
@@ -334,4 +365,5 @@ def _is_convex(outline: tuple[tuple[float, float], ...]) -> bool:
     corners = np.array(outline)
     edge = np.roll(corners, -1, axis=0) - corners
     after = np.roll(edge, -1, axis=0)
-    return bool((edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0] >= -1e-12).all())
+    cross = edge[:, 0] * after[:, 1] - edge[:, 1] * after[:, 0]
+    return bool((cross >= -_ROUNDING * np.ptp(corners, axis=0).max() ** 2).all())

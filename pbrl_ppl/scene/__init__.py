@@ -14,5 +14,6 @@ from .units import PLACES as PLACES
 from .units import Units as Units
 from .units import check_product as check_product
 from .units import motion_time as motion_time
+from .units import smallest_radius as smallest_radius
 from .units import state_sizes as state_sizes
 from .units import units_of as units_of

@@ -167,6 +167,11 @@ def state_sizes(scene: Scene) -> tuple[float, ...]:
     return place, place, 1.0, speed, speed, rate
 
 
+def smallest_radius(scene: Scene) -> float:
+    """Return the bounding radius of the smallest moving body (m)."""
+    return min(body.shape.bounding_radius for body in scene.moving)
+
+
 def _levers(scene: Scene, name: str) -> list[float]:
     """Return the distances (m) of a body's origin from the hinges that hold it."""
     anchors = [

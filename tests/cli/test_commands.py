@@ -388,9 +388,9 @@ def test_an_interrupt_that_a_sampler_swallowed_is_none_the_less_one(
     ("options", "says"),
     [
         (["--substeps", "100000"], "substeps is 100000, expected at most 1280"),
-        (["--noise", "x=1e308"], "[noise]: x is 1e+308, expected at most 1e+09"),
-        (["--noise", "x=1e-300"], "[noise]: x is 1e-300, expected at least 1e-12"),
-        (["--time-step", "1e308"], "time_step is 1e+308, expected at most 1e+09"),
+        (["--noise", "x=1e308"], "[noise]: x is 1e+308, expected at most 1e+18"),
+        (["--noise", "x=1e-300"], "[noise]: x is 1e-300, expected at least 1e-18"),
+        (["--time-step", "1e308"], "time_step is 1e+308, expected at most 1e+18"),
     ],
 )
 @pytest.mark.parametrize("command", ["fit", "criticise", "close-loop"])

@@ -62,8 +62,9 @@ def test_a_broken_effect_is_refused(history, stage, said) -> None:
 
 
 def test_the_whole_catalogue_passes(history) -> None:
-    for effect in catalogue:
-        try_effect(effect, PUCK, history)
+    for scene in (PUCK, PUCK.replace(gravity=(0.0, -9.81))):
+        for effect in catalogue:
+            try_effect(effect, scene, history)
 
 
 def test_a_scan_of_another_shape_is_refused(history) -> None:
