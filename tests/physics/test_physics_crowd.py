@@ -125,9 +125,9 @@ def run(scene: Scene, start, wrench) -> np.ndarray:
     return sim(phi_of(sim.physics.layout, VALUES), start[None], wrench[None, None])[0, 0]
 
 
-# 1e-12 as a rule, and every impact magnifies it; 1e-6 where a box stays pressed on a wall in two
-# points, which the solver takes in either order
-TOLERANCE = 1e-5
+# 1e-12 as a rule, and every impact magnifies it; 6e-5 at most in 300 random crowds, where a box
+# stays pressed on a wall in two points, which the solver takes in either order
+TOLERANCE = 1e-4
 motions = st.tuples(*[number] * 11)
 pushes = st.tuples(*[number] * 15).map(lambda w: np.reshape(w, (5, 3)) * [2.0, 2.0, 0.1])
 
