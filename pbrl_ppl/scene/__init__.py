@@ -13,4 +13,5 @@ from .units import MASS_PRIOR as MASS_PRIOR
 from .units import PLACES as PLACES
 from .units import Units as Units
 from .units import check_product as check_product
+from .units import state_sizes as state_sizes
 from .units import units_of as units_of
