@@ -59,7 +59,7 @@ def test_adds_nothing_to_a_true_model() -> None:
 
 def test_drops_what_later_data_do_not_bear_out() -> None:
     agent = PBRLAgent(CART, seed=1, revise=True, growth=10.0)
-    drag = EFFECTS["quadratic_drag"].on("cart").in_si(CART.scene)
+    drag = EFFECTS["quadratic_drag"].on("cart")
     agent.added = (Revision(drag, 4, 0.001, 10.0, 3.0, ()),)
     pushed(agent, "linear_drag", sigma=0.0, steps=5, seed=1)
     assert [each.effect for each in agent.added] == ["linear_drag"]
