@@ -66,8 +66,8 @@ ACTING, ACTING_NODES = ("true", "pbrl", "continuous", "oolwr"), 5_000
 #: What a plan must reach in the model: what lies at the rim of the goal there may be outside.
 AIM = pp.Goal(
     tuple(
-        replace(goal, tolerance=goal.tolerance / 1.5, angle_tolerance=goal.angle_tolerance / 1.5)
-        for goal in TASK.goal.targets
+        replace(goal, tolerance=tolerance / 1.5, angle_tolerance=goal.angle_tolerance / 1.5)
+        for goal, tolerance in zip(TASK.goal.targets, TASK.goal.tolerances(TASK.scene), strict=True)
     )
 )
 
@@ -97,7 +97,7 @@ def agent(name: str, seed: int, **options: object) -> pp.Agent:
         return pp.LibraryAgent(TASK, library(), seed=seed, **options)
     if name == "continuous":
         return pp.PBRLAgent(TASK, sigma="scalar", seed=seed, **options)
-    contacts = pp.SectorContacts(by_object=name == "oolwr_by_object")
+    contacts = pp.SectorContacts(radius=0.2, by_object=name == "oolwr_by_object")
     return pp.OOLWRAgent(TASK, learner={"relations": (contacts,)}, seed=seed, **options)
 
 

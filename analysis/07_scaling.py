@@ -44,7 +44,10 @@ OBSERVED = 1000
 #: Observations of an episode, each from the start.
 LENGTH = 25
 TOLERANCE = 0.05
-CONTACTS = {"": pp.SectorContacts(), "_by_object": pp.SectorContacts(by_object=True)}
+CONTACTS = {
+    "": pp.SectorContacts(radius=0.2),
+    "_by_object": pp.SectorContacts(radius=0.2, by_object=True),
+}
 
 
 def room(objects: int) -> tuple[Scene, np.ndarray]:

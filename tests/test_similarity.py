@@ -1,4 +1,4 @@
-"""A physically similar rig, or the same one in another frame, gives the same dimensionless answers."""
+"""A physically similar rig, or another frame, gives the same dimensionless answers."""
 
 from functools import cache
 from pathlib import Path

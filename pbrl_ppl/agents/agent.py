@@ -107,7 +107,9 @@ class Agent(ABC):
         if self.planned:
             wanted, self._ahead = self._ahead[0], self._ahead[1:]
             # the heading, and with it the wrench, differs a little from the plan's
-            chosen = int(np.argmin(((wrenches - wanted) ** 2).sum(axis=(1, 2))))
+            off = wrenches - wanted
+            off[..., 2] /= [body.shape.bounding_radius for body in self.task.scene.moving]
+            chosen = int(np.argmin((off**2).sum(axis=(1, 2))))
         else:
             chosen = int(self._rng.integers(len(wrenches)))
         self._last = wrenches[chosen]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import cmath
 import json
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -31,6 +31,8 @@ except ImportError as error:  # an optional dependency
 _CM = 100.0
 #: Largest number of corners of a polygon in Box2D.
 _CORNERS = 8
+#: Engine steps in a time step by default.
+_STEPS = 250
 #: Iterations of the engine's velocity and position solvers, and of the wheel's solver.
 _ITERATIONS, _WHEEL_ITERATIONS = (20, 10), 10
 
@@ -47,8 +49,8 @@ class Box2DWorld(World):
     ----------
     task, parameters, sigma, spread
         See :class:`World`.
-    step : float
-        Approximate step of the engine (s).
+    step : float, optional
+        Approximate step of the engine (s); a 250th of the scene's time step by default.
     acting : callable, optional
         Maps the commanded wrenches (body, 3) to those that act: an effect unknown to agents. Its
         ``repr`` describes it in the files of episodes.
@@ -79,12 +81,13 @@ class Box2DWorld(World):
         task: Task,
         parameters: Mapping[str, object],
         *,
-        sigma: float = 0.0,
-        spread: float = 0.0,
-        step: float = 0.001,
+        sigma: float | Sequence[float] = 0.0,
+        spread: float | Sequence[float] = 0.0,
+        step: float | None = None,
         acting: Callable[[Floats], Floats] | None = None,
     ) -> None:
         scene = task.scene
+        step = scene.time_step / _STEPS if step is None else step
         if not 0 < step <= scene.time_step:
             raise EpisodeError(
                 f"Box2D world: step is {step} s, expected above 0 and at most {scene.time_step:g} s"

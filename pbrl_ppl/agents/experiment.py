@@ -31,7 +31,7 @@ class AnyWorld(Protocol):
     A string ``description`` is optional; an episode file is not reused in a world with another one.
     """
 
-    sigma: float
+    sigma: float | tuple[float, ...]
 
     @property
     def task(self) -> Task:
@@ -121,7 +121,7 @@ def run_episode(
             rows[name].append(value)
         state, reached = after, outcome.reached
         if progress is not None:
-            progress(f"step {len(rows['action'])}, {-outcome.reward:.2f} m from the goal")
+            progress(f"step {len(rows['action'])}, {-outcome.reward:.3g} m from the goal")
     added = [
         {"effect": each.effect, "body": each.body, "transitions": each.transitions}
         for each in agent.added
@@ -278,7 +278,7 @@ def _stored(path: Path, world: AnyWorld, steps: int, seed: int) -> Episode:
     episode = Episode.load(path, world.task.scene)
     expected = {"seed": seed, "sigma": world.sigma, "limit": steps}
     for name, value in expected.items():
-        if (got := episode.dataset.attrs[name]) != value:
+        if not np.array_equal(got := episode.dataset.attrs[name], value):
             raise EpisodeError(
                 f"{path}: this is an episode with {name} {got}, expected {value}; give another"
                 " folder"

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from pbrl_ppl.agents.agent import PhysicsAgent, prediction_errors
+from pbrl_ppl.agents.pbrl import NEGLIGIBLE
 from pbrl_ppl.agents.world import Task
 from pbrl_ppl.errors import ConvergenceWarning, FitError
 from pbrl_ppl.history import from_segments
@@ -20,14 +21,13 @@ from pbrl_ppl.physics import Physics, build_layout, touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import Floats
 
 #: Draws of the paper's schedule: 5000 iterations, 1000 burn-in, thinning 10, one chain.
 _DRAWS = 400
-#: Share by which a body's data grow before its choice is updated, and prediction errors that need
-#: no update (SI units).
-_GROWTH, _NEGLIGIBLE = 0.2, 1e-4
+#: Share by which a body's data grow before its choice is updated.
+_GROWTH = 0.2
 
 
 @final
@@ -140,7 +140,8 @@ class LibraryAgent(PhysicsAgent):
     def _surprised(self, name: str) -> bool:
         scene, (state, action, after) = self._scenes[name], self._data(name)
         dynamics = Dynamics(scene, self._phi(build_layout(scene)), threads=1)
-        return bool((prediction_errors(dynamics, state, action, after) > _NEGLIGIBLE).any())
+        error = prediction_errors(dynamics, state, action, after)
+        return bool((error > NEGLIGIBLE * body_sizes(scene)).any())
 
     def _data(self, name: str) -> tuple[Floats, Floats, Floats]:
         """Return states, wrenches and next states of a body or class."""

@@ -23,10 +23,12 @@ from pbrl_ppl.physics import touching
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import group
 from pbrl_ppl.sampling import fit, physics_model
+from pbrl_ppl.scene import body_sizes
 from pbrl_ppl.state import Floats
 
-#: Prediction errors up to this (SI units) carry no information: they are the engine's.
-_NEGLIGIBLE = 1e-4
+#: Prediction errors up to this share of the natural sizes carry no information: they are the
+#: engine's.
+NEGLIGIBLE = 1e-4
 #: Prediction errors above this many sigma cause a refit.
 _SURPRISE = 4.0
 #: Fewest transitions for criticism, and the significance level over a whole episode.
@@ -111,6 +113,7 @@ class PBRLAgent(PhysicsAgent):
         self._declared = attach(task.scene, effects, self._catalogue)
         self._transitions: list[tuple[Floats, Floats, Floats]] = []
         self._sigma = np.empty(0)
+        self._negligible = NEGLIGIBLE * body_sizes(task.scene)
         self.fits = self._fitted = self.looks = self._looked = 0
 
     def observe(self, state: Floats, action: Floats, next_state: Floats) -> None:
@@ -128,9 +131,9 @@ class PBRLAgent(PhysicsAgent):
         state, inputs, after = (each[self._fitted :] for each in self._data())
         action, previous = inputs[..., :3], inputs[..., 3:6]
         error = prediction_errors(self._dynamics, state, action, after, previous)
-        if (error <= _NEGLIGIBLE).all():
+        if (error <= self._negligible).all():
             return False
-        surprised = not (error <= np.maximum(_SURPRISE * self._sigma, _NEGLIGIBLE)).all()
+        surprised = not (error <= np.maximum(_SURPRISE * self._sigma, self._negligible)).all()
         return self._grown(self._fitted) or surprised
 
     def _grown(self, since: int) -> bool:
@@ -165,7 +168,7 @@ class PBRLAgent(PhysicsAgent):
         self.looks, self._looked = self.looks + 1, len(free)
         level = _LEVEL / (self.looks * (self.looks + 1))
         found, mode = select_effects(
-            search, self._declared, self.added, self._catalogue, level=level, floor=_NEGLIGIBLE
+            search, self._declared, self.added, self._catalogue, level=level, floor=self._negligible
         )
         known = {revision.attached: revision.transitions for revision in self.added}
         self.added = tuple(

@@ -23,6 +23,7 @@ from pbrl_ppl.criticism import (
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, find_mode
 from pbrl_ppl.parameters import prior_slopes
+from pbrl_ppl.state import Floats
 
 #: Returns the mode of a model with these effects.
 Search = Callable[[tuple[Attached, ...]], Mode]
@@ -83,7 +84,7 @@ def select_effects(
     catalogue: Iterable[Effect],
     *,
     level: float,
-    floor: float,
+    floor: Floats,
 ) -> tuple[tuple[Revision, ...], Mode]:
     """Return the effects that a declared model lacks, and the mode with them.
 
@@ -103,8 +104,8 @@ def select_effects(
         stage, which would take misfit for noise, are not tried.
     level : float
         Significance level, corrected for the candidates.
-    floor : float
-        Errors up to this (SI units) are the engine's, and carry no information.
+    floor : ndarray
+        Errors up to this are the engine's, and carry no information, shape (body, 6), SI units.
 
     Returns
     -------
@@ -134,10 +135,11 @@ def select_effects(
     return found, mode
 
 
-def _is_exact(mode: Mode, floor: float) -> bool:
+def _is_exact(mode: Mode, floor: Floats) -> bool:
     """Return whether a model predicts its data up to the engine's error."""
-    residual = mode.problem.residual(mode.phi)[..., list(mode.problem.observations.columns)]
-    return bool((np.nan_to_num(abs(residual), nan=np.inf) <= floor).all())
+    columns = list(mode.problem.observations.columns)
+    residual = mode.problem.residual(mode.phi)[..., columns]
+    return bool((np.nan_to_num(abs(residual), nan=np.inf) <= floor[:, columns]).all())
 
 
 class _Addition(NamedTuple):
@@ -161,7 +163,7 @@ class _Step:
     search: Search
     catalogue: tuple[Effect, ...]
     level: float
-    floor: float
+    floor: Floats
 
     def addition(self, mode: Mode, known: Mapping[Attached, Mode]) -> _Addition | None:
         """Return the best candidate that cross-validation confirms, or None.
@@ -254,7 +256,9 @@ def _p_value(mode: Mode, signature: Signature) -> float:
 def _p_value_of_share(mode: Mode, signature: Signature, share: float) -> float:
     """Return the p-value of an explained share of squares (beta distribution: noise is unknown)."""
     q = signature.basis.shape[1]
-    free = np.count_nonzero(mode.whitened_residual) - np.linalg.matrix_rank(mode.jacobian) - q
+    size = np.linalg.norm(mode.jacobian, axis=0)  # by a parameter's unit
+    rank = np.linalg.matrix_rank(mode.jacobian / np.where(size > 0, size, 1.0))
+    free = np.count_nonzero(mode.whitened_residual) - rank - q
     if q == 0 or free < 1 or share <= 0.0:
         return 1.0
     return float(min(1.0, signature.candidate.looks * beta.sf(share, q / 2, free / 2)))
@@ -268,9 +272,9 @@ def _fit_with(mode: Mode, signature: Signature, *, estimate: bool = True) -> Mod
     return find_mode(problem, initial=phi)
 
 
-def _score(mode: Mode, signature: Signature, floor: float) -> float:
+def _score(mode: Mode, signature: Signature, floor: Floats) -> float:
     """Return the log-likelihood minus half the log number of transitions per parameter (BIC)."""
-    problem, sigma = mode.problem, np.maximum(mode.sigma, floor)
+    problem, sigma = mode.problem, _floored_noise(mode, floor)
     likelihood = problem.log_density(problem.residual(mode.phi), sigma, mode.phi).sum()
     return float(likelihood - 0.5 * signature.candidate.dof * np.log(problem.segments.n))
 
@@ -279,9 +283,15 @@ def _is_worth_adding(gained: Change) -> bool:
     return gained.total >= DEFAULT.min_elpd and gained.certain(DEFAULT.min_elpd_se)
 
 
-def _floored(mode: Mode, floor: float) -> Mode:
+def _floored_noise(mode: Mode, floor: Floats) -> Floats:
+    """Return the noise of each measured dimension, at least the engine's error of any body."""
+    columns = list(mode.problem.observations.columns)
+    return np.asarray(np.maximum(mode.sigma, floor.min(axis=0)[columns]))
+
+
+def _floored(mode: Mode, floor: Floats) -> Mode:
     """Return a mode whose noise is at least the engine's error, which bounds its certainty."""
-    sigma = np.maximum(mode.sigma, floor)
+    sigma = _floored_noise(mode, floor)
     if (sigma == mode.sigma).all():
         return mode
     priors, p = mode.problem.layout.priors, len(mode.phi)
@@ -290,5 +300,8 @@ def _floored(mode: Mode, floor: float) -> Mode:
     precision = jacobian.T @ jacobian + np.diag(prior_slopes(priors, mode.phi) ** 2)
     angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
     precision[angles, angles] += _CIRCLE
-    covariance = np.asarray(np.linalg.pinv(precision, hermitian=True), dtype=float)
+    size = np.sqrt(np.diag(precision))
+    size = np.where(size > 0, size, 1.0)  # by a parameter's unit
+    scaled = precision / np.outer(size, size)
+    covariance = np.linalg.pinv(scaled, hermitian=True) / np.outer(size, size)
     return replace(mode, sigma=sigma, jacobian=jacobian, covariance=covariance)

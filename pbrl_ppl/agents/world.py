@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,8 @@ from pbrl_ppl.planning import ActionSet, Dynamics, Goal, start_state
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
-#: Largest difference of an action from one of the set, for rounding (N and N m).
+#: Largest difference of an action from one of the set, for rounding, as a share of the largest
+#: force and the largest torque.
 _ROUNDING = 1e-9
 
 
@@ -95,8 +96,9 @@ class Task:
                 f"action: its shape is {action.shape}, expected {every.shape[1:]}: force_x, force_y"
                 f" and torque on {', '.join(body.name for body in self.scene.moving)}"
             )
-        size = max(1.0, float(abs(every).max()))
-        if not (abs(every - action).max(axis=(1, 2)) <= _ROUNDING * size).any():
+        force, torque = abs(every[..., :2]).max(), abs(every[..., 2]).max()
+        allowed = _ROUNDING * np.array([force, force, torque])
+        if not (abs(every - action) <= allowed).all(axis=(1, 2)).any():
             raise EpisodeError(
                 f"action: {action.tolist()} (N, N, N m; world frame) is none of the task's"
                 f" {len(every)} actions; choose one of Task.wrenches(state)"
@@ -143,19 +145,20 @@ class World:
         True parameters by name, as for :meth:`pbrl_ppl.Dynamics.known`.
     effects : iterable of Effect or Attached
         True effects in addition to those that the scene declares.
-    sigma : float
-        Noise of each observed state dimension (m, rad, m/s, rad/s).
-    spread : float
-        Largest offset of an episode's start from the task's, either way (m, m, rad). Without noise,
-        episodes of a deterministic agent differ only by it.
+    sigma : float or sequence of float
+        Noise of each observed state dimension (m, m, rad, m/s, m/s, rad/s): six numbers, or one
+        for all.
+    spread : float or sequence of float
+        Largest offset of an episode's start from the task's, either way (m, m, rad): three numbers,
+        or one for all. Without noise, episodes of a deterministic agent differ only by it.
     substeps : int, optional
         Engine steps per interval; the scene's by default.
 
     Raises
     ------
     EpisodeError
-        If ``sigma`` or ``spread`` is negative or not finite, or ``spread`` is given for a scene
-        with joints.
+        If ``sigma`` or ``spread`` is negative, not finite or of another length, or ``spread`` is
+        given for a scene with joints.
     ParameterError
         If a parameter is missing, unknown or impossible.
 
@@ -178,16 +181,14 @@ class World:
         parameters: Mapping[str, object],
         effects: Any = (),
         *,
-        sigma: float = 0.0,
-        spread: float = 0.0,
+        sigma: float | Sequence[float] = 0.0,
+        spread: float | Sequence[float] = 0.0,
         substeps: int | None = None,
     ) -> None:
-        for name, value in (("sigma", sigma), ("spread", spread)):
-            if not 0 <= value < np.inf:
-                raise EpisodeError(f"world: {name} is {value}, expected a finite number from 0 up")
-        if spread and task.scene.joints:
+        self.task = task
+        self.sigma, self.spread = _sizes("sigma", sigma, 6), _sizes("spread", spread, 3)
+        if np.any(self.spread) and task.scene.joints:
             raise EpisodeError("world: joints hold bodies of the scene at their start; spread is 0")
-        self.task, self.sigma, self.spread = task, float(sigma), float(spread)
         self._truth = Dynamics.known(task.scene, parameters, effects, threads=1, substeps=substeps)
         self.reset(0)
 
@@ -213,7 +214,8 @@ class World:
         """
         self._rng = np.random.default_rng([seed, 1])  # [seed, 0] is the agent's
         state = self.task.start
-        state[:, :3] += self._rng.uniform(-self.spread, self.spread, state[:, :3].shape)
+        spread = np.asarray(self.spread)
+        state[:, :3] += self._rng.uniform(-spread, spread, state[:, :3].shape)
         self._state, self._last = start_state(self.task.scene, state), self._truth.before
         return self._state.copy()
 
@@ -235,7 +237,7 @@ class World:
         begin = self._state
         state = self._play(begin, action)
         self._state, self._last = state, action
-        noise = self.sigma * self._rng.standard_normal(state.shape)
+        noise = np.asarray(self.sigma) * self._rng.standard_normal(state.shape)
         return Outcome(
             state=state.copy(),
             observed=state + noise,
@@ -248,3 +250,13 @@ class World:
         """Return the state (body, 6) after an interval."""
         after = self._truth.step(state[None, None], action[None], self._last[None])
         return np.asarray(after[0, 0])
+
+
+def _sizes(name: str, given: float | Sequence[float], count: int) -> float | tuple[float, ...]:
+    """Return a size, or one for each dimension, after a check."""
+    values = np.asarray(given, dtype=float)
+    if values.shape not in ((), (count,)) or not ((values >= 0) & (values < np.inf)).all():
+        raise EpisodeError(
+            f"world: {name} is {given}, expected a finite number from 0 up, or {count} of them"
+        )
+    return tuple(values.tolist()) if values.ndim else float(values)

@@ -44,7 +44,12 @@ def plan(
         float, typer.Option(help="Share of the worst draws that count; 1 is the expectation.")
     ] = 1.0,
     noise: Annotated[bool, typer.Option("--noise", help="Plan with Eq. 13's noise.")] = False,
-    tolerance: Annotated[float | None, typer.Option(help="Position tolerance (m).")] = None,
+    tolerance: Annotated[
+        float | None,
+        typer.Option(
+            help="Position tolerance (m); by default a fifth of the body's bounding radius."
+        ),
+    ] = None,
     angle_tolerance: Annotated[float | None, typer.Option(help="Angle tolerance (rad).")] = None,
     contact_penalty: Annotated[
         float | None, typer.Option(help="Cost of a second in contact (s); inf forbids it.")

@@ -57,7 +57,7 @@ def checked_histories(
                 f" {', '.join(names)}; load it with this scene"
             )
         step = float(history.dataset.attrs["time_step"])
-        if not np.isclose(step, scene.time_step):
+        if not np.isclose(step, scene.time_step, atol=0.0):
             raise HistoryError(
                 f"{which} history: it has a row each {step:g} s, the scene each"
                 f" {scene.time_step:g} s; load it with this scene"

@@ -103,8 +103,10 @@ actuator_delay = Effect(
 def _force_levels(history: History, body: Body, most: int) -> Any:
     """Return at most so many forces between the sizes of those commanded, shape (level, 1), N."""
     action = history.dataset["action"].sel(body=body.name).to_numpy()[..., :2]
-    size = np.unique(np.round(np.linalg.norm(action, axis=-1), 9))
+    size = np.linalg.norm(action, axis=-1)
     size = size[size > 0]  # not NaN either
+    _, first = np.unique(np.round(size / size.max(initial=0.0), 9), return_index=True)
+    size = size[first]
     if len(size) > most + 1:
         size = np.unique(np.quantile(size, np.linspace(0, 1, most + 1)))
     return np.asarray(0.5 * (size[1:] + size[:-1]))[:, None]

@@ -62,7 +62,9 @@ class UnusedVelocity:
     @property
     def sentence(self) -> str:
         """Sentence: the column, how it was computed or by how much it lags."""
-        name, late = f"{self.state} of {self.body}", f"{1e3 * abs(self.lag):.3g} ms"
+        name, late = f"{self.state} of {self.body}", f"{abs(self.lag):.3g} s"
+        if 1e-3 <= abs(self.lag) < 1.0:
+            late = f"{1e3 * abs(self.lag):.3g} ms"
         if self.computed_by is None:
             verb = "lags" if self.lag > 0 else "leads"
             return f"{name} {verb} {self.position} by {late} and is not used"

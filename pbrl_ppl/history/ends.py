@@ -382,7 +382,9 @@ def _near(scene: Scene, body: int, states: Floats, row: int) -> bool:
     reach = (1 + _REACH) * moving[body].shape.bounding_radius + 2 * float(speed)
     for wall in scene.walls:
         start, way = np.array(wall.start), np.array(wall.end) - np.array(wall.start)
-        along = np.clip((values - start) @ way / max(float(way @ way), 1e-12), 0.0, 1.0)
+        along = np.clip(
+            (values - start) @ way / max(float(way @ way), np.finfo(float).tiny), 0.0, 1.0
+        )
         if (np.linalg.norm(values - start - along[:, None] * way, axis=1) < reach).any():
             return True
     others = [(each, places[:, i]) for i, each in enumerate(moving) if i != body]

@@ -19,7 +19,7 @@ from pbrl_ppl.state import STATE, WRENCH, Floats
 _PLANES = {"xy": np.eye(3), "xz": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
 #: mjtJoint as numbers, as in mjmodel.h.
 _FREE, _SLIDE, _HINGE = 0, 2, 3
-#: How far out of the plane is out of it (of a unit vector, or m).
+#: How far out of the plane is out of it, of a unit vector or in bounding radii.
 _FLAT = 1e-3
 
 
@@ -111,12 +111,16 @@ def from_mujoco(
             " expected a whole number of rows a step; change the scene's, or give time_step"
         )
     axes = _PLANES[plane]
-    joints = {body.name: _joints(model, body.name, axes) for body in scene.moving}
+    reach = [body.shape.bounding_radius for body in scene.moving]
+    joints = {
+        body.name: _joints(model, body.name, axes, size)
+        for body, size in zip(scene.moving, reach, strict=True)
+    }
     k = len(joints)
     state = np.full((n, rows, k, len(STATE)), np.nan)
     for i, (name, held) in enumerate(joints.items()):
         origin = axes[:2] @ np.asarray(model.body(name).pos)
-        if not _fill(state[:, :, i], held, positions, velocities, origin, axes):
+        if not _fill(state[:, :, i], held, positions, velocities, origin, axes, reach[i]):
             raise HistoryError(
                 f'body "{name}" leaves the plane; expected one that moves in it alone'
             )
@@ -161,7 +165,7 @@ def _batched(values: npt.ArrayLike, width: int, name: str, symbol: str) -> Float
     return array
 
 
-def _joints(model: Any, name: str, axes: Floats) -> list[_Joint]:
+def _joints(model: Any, name: str, axes: Floats, reach: float) -> list[_Joint]:
     """Return a body's joints, each along one of the plane's axes."""
     try:
         body = model.body(name)
@@ -181,7 +185,7 @@ def _joints(model: Any, name: str, axes: Floats) -> list[_Joint]:
                 f'body "{name}": its joint {number} leads out of the plane; expected slides in it,'
                 " a hinge about its normal, or a free joint"
             )
-        if count > 1 and kind == _HINGE and np.abs(model.jnt_pos[number]).max() > _FLAT:
+        if count > 1 and kind == _HINGE and np.abs(model.jnt_pos[number]).max() > _FLAT * reach:
             raise HistoryError(
                 f'body "{name}": its hinge is not at its frame\'s origin, as a body that slides'
                 " needs; put the frame there"
@@ -204,7 +208,13 @@ def _joints(model: Any, name: str, axes: Floats) -> list[_Joint]:
 
 
 def _fill(
-    state: Floats, joints: list[_Joint], qpos: Floats, qvel: Floats, origin: Floats, axes: Floats
+    state: Floats,
+    joints: list[_Joint],
+    qpos: Floats,
+    qvel: Floats,
+    origin: Floats,
+    axes: Floats,
+    reach: float,
 ) -> bool:
     """Fill a body's states (trajectory, row, 6) in place; return whether it stays in the plane."""
     if any(joint.kind == _SLIDE for joint in joints):
@@ -216,7 +226,7 @@ def _fill(
             place = qpos[..., at : at + 3] @ axes.T
             turn = qpos[..., at + 4 : at + 7] @ axes.T
             drift = np.ptp(place[..., 2], axis=1).max() if place.size else 0.0
-            if np.abs(turn[..., :2]).max() > _FLAT or drift > _FLAT:
+            if np.abs(turn[..., :2]).max() > _FLAT or drift > _FLAT * reach:
                 return False
             state[..., :2] = place[..., :2]
             state[..., 2] = 2 * np.arctan2(turn[..., 2], qpos[..., at + 3])

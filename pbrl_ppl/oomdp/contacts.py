@@ -16,6 +16,8 @@ from pbrl_ppl.state import Bools, Floats
 #: A convex part of a solid: corners (k, 2) counter-clockwise, and a radius about them; one corner
 #: is a circle, two are a wall.
 Part = tuple[Floats, float]
+#: Collision radius by default, in bounding radii of the smallest moving body.
+_RADIUS = 0.4
 
 
 @final
@@ -32,10 +34,10 @@ class SectorContacts:
     it, and are left out.
 
     The paper gives the collision radius as 20, without a unit or the scale of its figures; pixels
-    are meant. Here it is 0.2 m: at 100 pixels per metre a cart of 0.9 m is 90 pixels long, and an
-    apartment of 10 m fits a screen. It is also the way of a body at 2 m/s in an interval of 0.1 s:
-    with less, a body would hit objects that are not in its condition at the interval's start. It
-    counts from the outline, so that one value serves chairs and beds.
+    are meant. Here it is 0.4 times the bounding radius of the smallest moving body: 0.21 m for a
+    cart of 0.9 m, which has 90 pixels at 100 pixels per metre. It should be the way of a body in an
+    interval: with less, a body would hit objects that are not in its condition at the interval's
+    start. It counts from the outline, so that one value serves chairs and beds.
 
     Attributes
     ----------
@@ -44,8 +46,9 @@ class SectorContacts:
         follow counter-clockwise (left, back, right).
     rays : int
         Rays in a sector, n_tps.
-    radius : float
-        Collision radius epsilon_c (m).
+    radius : float, optional
+        Collision radius epsilon_c (m); 0.4 times the bounding radius of the smallest moving body by
+        default.
     by_object : bool
         Whether predicates distinguish what touches a sector: each moving body, each static body,
         and the walls (all walls are one object, ``world``). In the paper's conditions there is one
@@ -58,7 +61,7 @@ class SectorContacts:
 
     References
     ----------
-    Table 2 of the paper has the defaults of ``sectors``, ``rays`` and ``radius``.
+    Table 2 of the paper has the defaults of ``sectors`` and ``rays``.
 
     Examples
     --------
@@ -74,7 +77,7 @@ class SectorContacts:
 
     sectors: int = 4
     rays: int = 10
-    radius: float = 0.2
+    radius: float | None = None
     by_object: bool = False
 
     def __post_init__(self) -> None:
@@ -82,7 +85,7 @@ class SectorContacts:
             value = getattr(self, name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
                 raise FitError(f"contacts: {name} is {value!r}, expected a whole number from 1 up")
-        if not 0 <= self.radius < np.inf:
+        if self.radius is not None and not 0 <= self.radius < np.inf:
             raise FitError(f"contacts: radius is {self.radius!r}, expected a length of 0 m or more")
 
     def objects(self, scene: Scene) -> tuple[str, ...]:
@@ -148,13 +151,16 @@ class SectorContacts:
         if not world.pairs:
             return flags
         # along a ray solids are no nearer than their bounding circles
-        near = circles(world.solids, world.pairs, poses) > -self.radius
+        radius = self.radius
+        if radius is None:
+            radius = _RADIUS * min(body.shape.bounding_radius for body in scene.moving)
+        near = circles(world.solids, world.pairs, poses) > -radius
         for (i, j), rows in zip(world.pairs, near.T, strict=True):
             at = np.flatnonzero(rows)
             for body, other in ((i, j), (j, i)):
                 if len(at) and body < count:
                     obj = names.index(world.solids[other].name) if self.by_object else 0
-                    flags[at, body, obj] |= self._sectors(world, body, other, poses[at])
+                    flags[at, body, obj] |= self._sectors(world, body, other, poses[at], radius)
         return flags
 
     def conditions(self, scene: Scene, states: Floats) -> list[list[Condition]]:
@@ -165,7 +171,9 @@ class SectorContacts:
         labels, flags = self.labels(scene), self.of(scene, states)
         return [[condition(body.ravel(), labels) for body in state] for state in flags]
 
-    def _sectors(self, world: Scenery, body: int, other: int, poses: Floats) -> Bools:
+    def _sectors(
+        self, world: Scenery, body: int, other: int, poses: Floats, radius: float
+    ) -> Bools:
         """Return which sectors of a body are in contact with another solid, shape (n, sector)."""
         rays = self.directions[None]
         insides = [spans(part, np.zeros((1, 2)), rays) for part in world.solids[body].parts]
@@ -178,7 +186,7 @@ class SectorContacts:
             for inside in insides:
                 # the gap is negative where spans overlap, and infinite where a ray misses
                 gap = np.maximum(outside[..., 0] - inside[..., 1], inside[..., 0] - outside[..., 1])
-                touched |= gap <= self.radius
+                touched |= gap <= radius
         return np.asarray(touched.reshape(-1, self.sectors, self.rays).any(axis=-1))
 
 

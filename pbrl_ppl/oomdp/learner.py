@@ -12,10 +12,10 @@ from pbrl_ppl.errors import FitError, HistoryError, SimulationError
 from pbrl_ppl.history import History, check_start
 from pbrl_ppl.oomdp.contacts import turned
 from pbrl_ppl.oomdp.regression import Experience
-from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.scene import Scene, body_sizes, nearest
 from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, wrapped
 
-#: Positions and speeds beyond this (SI units) are of extrapolations that have diverged.
+#: States beyond this many times the largest learned are of extrapolations that have diverged.
 _DIVERGED = 1e6
 
 
@@ -76,11 +76,13 @@ class Learner(ABC):
         of_class: dict[str, Experience] = {}
         for i, body in enumerate(scene.moving):
             if not body.kinematic:
-                experience = Experience(standardise=standardise, options=options)
+                reach = body.shape.bounding_radius
+                experience = Experience(reach, standardise=standardise, options=options)
                 if share_classes and body.object_class is not None:
                     experience = of_class.setdefault(body.object_class, experience)
                 self._experience[i] = experience
         self.transitions = 0
+        self._largest = body_sizes(scene).max(axis=0)  # in each dimension
 
     @abstractmethod
     def predicates(self, states: Floats, wrenches: Floats) -> Bools:
@@ -143,6 +145,8 @@ class Learner(ABC):
                 displacement = _turned(displacement, -begin[:, i, THETA])
             experience.add(self._inputs(begin[:, i], wrench[:, i]), displacement, flags[:, i])
         self.transitions += len(begin)
+        seen = np.concatenate([begin, after])[:, list(self._experience)]
+        self._largest = np.maximum(self._largest, abs(seen).max(axis=(0, 1)))
 
     def learn(self, history: History) -> None:
         """Learn from the completely measured transitions of a history.
@@ -265,7 +269,7 @@ class Learner(ABC):
             out[rows, i] = state + (
                 _turned(added, state[:, THETA]) if self.pose_invariant else added
             )
-        out[abs(out) > _DIVERGED] = np.nan
+        out[abs(out) > _DIVERGED * self._largest] = np.nan
         return np.asarray(out[None])
 
     def experience(self, body: str) -> Experience:

@@ -114,10 +114,13 @@ class Regression:
 class Experience:
     """Observed transitions of a body or a class, with one regression per condition.
 
-    See section 3.1.3 of the paper.
+    See section 3.1.3 of the paper. Inputs are triples of two planar components and an angular one,
+    the last of them the wrench.
 
     Parameters
     ----------
+    reach : float
+        Bounding radius of the body (m).
     standardise : bool
         Whether distances are in units of each input's standard deviation over all conditions;
         otherwise in SI units.
@@ -125,8 +128,8 @@ class Experience:
         Options of :class:`Regression`.
     """
 
-    def __init__(self, *, standardise: bool, options: Mapping[str, Any]) -> None:
-        self._standardise, self._options = standardise, options
+    def __init__(self, reach: float, *, standardise: bool, options: Mapping[str, Any]) -> None:
+        self._reach, self._standardise, self._options = reach, standardise, options
         self._x: list[Floats] = []
         self._y: list[Floats] = []
         self._rows: dict[Key, list[int]] = {}
@@ -159,17 +162,28 @@ class Experience:
         """Return the linear fit of outputs by inputs in the commonest condition, shape (p, q)."""
         x, y = self._joined()
         most = max(self._rows.values(), key=len)
-        return np.asarray(np.linalg.lstsq(x[most], y[most])[0])
+        size = self._sizes(x[most])
+        return np.asarray(np.linalg.lstsq(x[most] / size, y[most])[0] / size[:, None])
 
     def _model(self, key: Key) -> Regression:
         if key not in self._models:
             x, y = self._joined()
-            scale = x.std(axis=0) if self._standardise else np.ones(x.shape[1])
-            # a column that is constant, up to rounding errors, keeps its scale
-            scale = np.where(scale > 1e-9 * abs(x).max(), scale, 1.0)
+            scale = np.ones(x.shape[1])
+            if self._standardise:  # a column that is constant, up to rounding errors, by its size
+                scale, size = x.std(axis=0), self._sizes(x)
+                scale = np.where(scale > 1e-9 * size, scale, size)
             rows = self._rows[key]
             self._models[key] = Regression(x[rows], y[rows], scale=scale, **self._options)
         return self._models[key]
+
+    def _sizes(self, x: Floats) -> Floats:
+        """Return the largest size of the triple that each column is of, in the column's unit."""
+        largest = abs(x).max(axis=0).reshape(-1, 3)
+        lever = np.full(len(largest), self._reach)
+        lever[-1] = 1 / self._reach  # a torque is a force at the rim
+        size = np.maximum(largest[:, :2].max(axis=1), lever * largest[:, 2])
+        size = np.where(size > 0, size, 1.0)
+        return np.stack([size, size, size / lever], axis=1).ravel()
 
     def _joined(self) -> tuple[Floats, Floats]:
         self._x, self._y = [np.concatenate(self._x)], [np.concatenate(self._y)]

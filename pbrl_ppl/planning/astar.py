@@ -27,11 +27,12 @@ _BATCH = 32
 #: Share of the limits for the search under one draw that guides the search under all.
 _GUIDE = 0.5
 #: Cells of the closed set ten tolerances from the goal, in tolerances and, for speeds, tolerances a
-#: second; further away and nearer they grow and shrink in proportion, between these limits.
-_CELLS = np.array([4.0, 4.0, 5.0, 8.0, 8.0, 10.0])
+#: sampling interval; further away and nearer they grow and shrink in proportion, between limits.
+_CELLS = np.array([4.0, 4.0, 5.0, 2.0, 2.0, 2.5])
 _TEN, _NEAR, _FAR = 10.0, 0.25, 2.0
-#: The largest tolerance that cells are in proportion to (m, rad).
-_WIDEST = 0.1
+#: The largest tolerances that cells are in proportion to: of the position, as a share of the body's
+#: bounding radius, and of the angle (rad).
+_WIDEST, _WIDEST_ANGLE = 0.2, 0.1
 #: Times that the cells are halved where the search runs out of nodes.
 _REFINED = 8
 #: Seconds between reports of progress.
@@ -98,7 +99,7 @@ def astar(task: Task, *, weight: float = 3.0, improve: bool = False) -> Found:
             if now - reported > _REPORT:
                 reported = now
                 far = search.least_distance
-                task.progress(f"{search.generated} states, nearest to the goal {far:.2f} m")
+                task.progress(f"{search.generated} states, nearest to the goal {far:.3g} m")
     except KeyboardInterrupt:
         stopped = "interrupted"
     reached = search.best is not None
@@ -127,9 +128,11 @@ class _Search:
         self.to_go = TimeToGo(task.dynamics, task.goal, task.actions, task.start)
         self.root = np.repeat(task.start[None], task.dynamics.draws, axis=0)[None]
         self.generated = 1
-        self.near = min(_WIDEST, *(target.tolerance for target in self.goal.targets))
-        turn = min(_WIDEST, *(target.angle_tolerance for target in self.goal.targets))
+        reach = [self.scene.body(target.body).shape.bounding_radius for target in self.goal.targets]
+        self.near = min(_WIDEST * min(reach), *self.goal.tolerances(self.scene))
+        turn = min(_WIDEST_ANGLE, *(target.angle_tolerance for target in self.goal.targets))
         self.cells = _CELLS * np.array([self.near, self.near, turn] * 2)
+        self.cells[3:] /= self.scene.time_step
         self.refined = 0
         self.begin()
 
@@ -288,8 +291,11 @@ def played(task: Task, steps: list[tuple[int, int]]) -> Floats:
 
 
 #: Cells along the longer side of the grid on which distances around walls are found, and the margin
-#: of the grid (m): a body can go around the end of a wall.
-_GRID, _ROOM = 160, 2.0
+#: of the grid in bounding radii: a body can go around the end of a wall.
+_GRID, _ROOM = 160, 4.0
+#: Least acceleration, in bounding radii (or rad) an interval squared: without a push, the time to
+#: the goal is long but finite, because others may hit the body.
+_LEAST = 1e-6
 #: Moves on the grid: to neighbours, and as a knight does, which cuts the error of eight directions.
 _MOVES = [(1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)]
 
@@ -326,23 +332,26 @@ class TimeToGo:
         for target, i in zip(goal.targets, self._bodies, strict=True):
             force, torque = actions.strongest(target.body)
             push, turn = dynamics.acceleration(target.body, force or anyone, torque)
-            self._push.append(push)
-            self._turn.append(turn)
-            self._fields.append(_distances(scene, scene.body(target.body), target, start[i]))
+            body, least = scene.body(target.body), _LEAST / scene.time_step**2
+            self._push.append(np.maximum(push, least * body.shape.bounding_radius))
+            self._turn.append(np.maximum(turn, least))
+            self._fields.append(_distances(scene, body, target, start[i]))
 
     def __call__(self, states: Floats) -> Floats:
         """Return seconds, shape (draw, n), from states of shape (draw, n, body, 6)."""
         offset = self.goal.errors(self.scene, states)
         least = np.zeros(states.shape[:2])
+        tolerances = self.goal.tolerances(self.scene)
         for j, (target, i) in enumerate(zip(self.goal.targets, self._bodies, strict=True)):
             body = states[:, :, i]
             push, turn = self._push[j][:, None], self._turn[j][:, None]
             far = np.hypot(offset[..., j, 0], offset[..., j, 1])
-            towards = -(offset[..., j, :2] * body[..., 3:5]).sum(axis=-1) / np.maximum(far, 1e-9)
-            time = _time(far - target.tolerance, towards, push)
+            towards = -(offset[..., j, :2] * body[..., 3:5]).sum(axis=-1)
+            towards = towards / np.maximum(far, np.finfo(float).tiny)
+            time = _time(far - tolerances[j], towards, push)
             field = self._fields[j]
             if field is not None:
-                around = field(body[..., :2]) - target.tolerance
+                around = field(body[..., :2]) - tolerances[j]
                 time = np.maximum(time, _time(around, np.hypot(body[..., 3], body[..., 4]), push))
             angle = offset[..., j, 2]
             towards = -np.sign(angle) * body[..., 5]
@@ -358,8 +367,6 @@ class TimeToGo:
 def _time(way: Floats, speed: Floats, push: Floats) -> Floats:
     """Return the least time for a distance at a speed and a largest acceleration."""
     way = np.maximum(way, 0.0)
-    # without a push, at constant speed
-    push = np.maximum(push, 1e-6)
     return np.asarray(np.where(way > 0, np.sqrt(speed**2 + 2 * push * way) - speed, 0.0) / push)
 
 
@@ -385,7 +392,8 @@ def _distances(scene: Scene, body: Body, target: Target, start: Floats) -> _Fiel
     if scene.extent is not None:
         corners = np.reshape(scene.extent, (2, 2)).T
         points = np.vstack([points, corners])
-    low, high = points.min(axis=0) - _ROOM, points.max(axis=0) + _ROOM
+    room = _ROOM * body.shape.bounding_radius
+    low, high = points.min(axis=0) - room, points.max(axis=0) + room
     cell = float((high - low).max()) / _GRID
     shape = tuple(int(n) + 1 for n in np.ceil((high - low) / cell))
     centres = low + cell * np.indices(shape).reshape(2, -1).T

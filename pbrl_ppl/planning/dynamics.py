@@ -267,7 +267,8 @@ class Dynamics:
 
     def single(self) -> Dynamics:
         """Return dynamics of the draw nearest to the mean of all, in units of their spread."""
-        offset = (self.phi - self.phi.mean(axis=0)) / np.maximum(self.phi.std(axis=0), 1e-12)
+        spread = self.phi.std(axis=0)
+        offset = (self.phi - self.phi.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
         i = int(np.argmin((offset**2).sum(axis=1)))
         chosen = self.at(self.phi[i : i + 1])
         if self._noise is not None:

@@ -23,7 +23,7 @@ from pbrl_ppl.physics import touching
 from pbrl_ppl.planning.actions import ActionSet, Allowed, Bounds, allowed_wrenches
 from pbrl_ppl.planning.dynamics import Dynamics
 from pbrl_ppl.planning.planner import start_state
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, body_sizes
 from pbrl_ppl.state import WRENCH, WRENCH_UNITS, Bools, Floats
 
 if TYPE_CHECKING:  # with the samplers, which a plan does not need
@@ -192,7 +192,8 @@ class Separation:
         residual = cells.wrapped(cells.of(paths.end) - of_phi(mode.phi[None])[0])
         by_phi = differentiate(of_phi, mode.phi, _STEP * spread, lower, upper)
         c, n = len(cells.places), len(paths.begin)
-        size = np.maximum(cells.errors(rival.sigma), 1e-6)
+        natural = body_sizes(mode.problem.scene).ravel()[list(cells.places)]
+        size = np.maximum(cells.errors(rival.sigma), 1e-6 * natural)
         moved = np.tile(paths.begin, (2 * c, 1, 1, 1))
         flat = moved.reshape(2 * c, n, -1)
         for i, place in enumerate(cells.places):
@@ -414,7 +415,7 @@ def suggest_actions(
                 " such as effects=('linear_drag', 'quadratic_drag')"
             )
         effects = groups[0]
-    chosen = named_effects(effects, scene, catalogue)
+    chosen = [each.in_si(scene) for each in named_effects(effects, scene, catalogue)]
     if steps < 1 or (hold is not None and hold < 1):
         raise GoalError(f"steps is {steps} and hold {hold}; both must be at least 1")
     first = start_state(scene, start)

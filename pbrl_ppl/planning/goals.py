@@ -15,6 +15,9 @@ from pbrl_ppl.errors import GoalError
 from pbrl_ppl.scene import Scene, nearest
 from pbrl_ppl.state import POSE, Floats
 
+#: Position tolerance by default, as a share of the body's bounding radius.
+_TOLERANCE = 0.2
+
 
 @dataclass(frozen=True)
 class Target:
@@ -28,8 +31,11 @@ class Target:
         m, m, rad.
     weight : float
         Weight of the body in the L2 distance.
-    tolerance, angle_tolerance : float
-        Largest error at the goal (m, rad).
+    tolerance : float, optional
+        Largest error of the position at the goal (m); by default a fifth of the radius of the
+        body's bounding circle.
+    angle_tolerance : float
+        Largest error of the angle at the goal (rad).
     speed : float, optional
         Largest speed at the goal, that of the rim included (m/s); any speed by default.
 
@@ -44,7 +50,7 @@ class Target:
     y: float | None = None
     theta: float | None = None
     weight: float = 1.0
-    tolerance: float = 0.1
+    tolerance: float | None = None
     angle_tolerance: float = 0.1
     speed: float | None = None
 
@@ -85,7 +91,7 @@ class Goal:
     Examples
     --------
     >>> goal = Goal.of({"cart": (3.0, 1.0, None)})  # any heading
-    >>> goal.targets[0].tolerance
+    >>> goal.targets[0].angle_tolerance
     0.1
     """
 
@@ -166,6 +172,13 @@ class Goal:
         moving = [body.name for body in scene.moving]
         return [moving.index(target.body) for target in self.targets]
 
+    def tolerances(self, scene: Scene) -> list[float]:
+        """Return the position tolerance of each target (m)."""
+        return [
+            t.tolerance or _TOLERANCE * scene.body(t.body).shape.bounding_radius
+            for t in self.targets
+        ]
+
     def errors(self, scene: Scene, states: Floats) -> Floats:
         """Return offsets from the targets, 0 where free, shape (..., target, 3): m, m, rad.
 
@@ -196,8 +209,9 @@ class Goal:
         """Return the error of the worst target in units of its tolerances; 1 or less is reached."""
         offset = self.errors(scene, states)
         worst = np.zeros(offset.shape[:-2])
-        for i, (t, place) in enumerate(zip(self.targets, self.places(scene), strict=True)):
-            far = np.hypot(offset[..., i, 0], offset[..., i, 1]) / t.tolerance
+        each = zip(self.targets, self.places(scene), self.tolerances(scene), strict=True)
+        for i, (t, place, tolerance) in enumerate(each):
+            far = np.hypot(offset[..., i, 0], offset[..., i, 1]) / tolerance
             worst = np.maximum(worst, np.maximum(far, abs(offset[..., i, 2]) / t.angle_tolerance))
             if t.speed is not None:
                 body = states[..., place, :]

@@ -105,12 +105,12 @@ class Plan:
             "exhausted": "there was nothing left to try: the actions do not lead there",
             "interrupted": "it was interrupted",
         }
-        size = f"{len(self.wrenches)} intervals, {self.duration:.1f} s"
+        size = f"{len(self.wrenches)} intervals, {self.duration:.3g} s"
         if self.reached:
-            return f"the goal is reached: {size}, {self.distance:.3f} m from it at the end"
+            return f"the goal is reached: {size}, {self.distance:.3g} m from it at the end"
         return (
             f"the goal is not reached: {why.get(self.stopped, self.stopped)}; the best plan found"
-            f" ({size}) ends {self.distance:.3f} m from it"
+            f" ({size}) ends {self.distance:.3g} m from it"
         )
 
 
@@ -293,13 +293,13 @@ def start_state(scene: Scene, start: Mapping[str, Sequence[float]] | ArrayLike) 
 
 def _check_room(scene: Scene, goal: Goal) -> None:
     """Refuse targets inside walls or static bodies, by more than their tolerance."""
-    for target in goal.targets:
+    for target, tolerance in zip(goal.targets, goal.tolerances(scene), strict=True):
         if target.x is None or target.y is None or target.theta is None:
             continue
         alone = scene.subset([target.body]).replace(joints=())
         pose = np.array([[[target.x, target.y, target.theta]]])
         depth = float(overlap(alone, pose)[0])
-        if depth > target.tolerance:
+        if depth > tolerance:
             raise GoalError(
                 f"goal of {target.body}: there it is {depth:.2g} m inside a wall or a static body;"
                 " choose a free place"

@@ -16,8 +16,9 @@ _PERSISTENCE = 0.7
 _SPREAD = 0.5
 #: Share of the samples that have about as much weight as all others.
 _ELITE = 0.05
-#: Cost of a speed of 1 m/s at the end of the horizon (m): a fast body does not stay there.
-_ARRIVAL = 0.2
+#: Cost of the speed at the end of the horizon, in sampling intervals at it: a fast body does not
+#: stay there.
+_ARRIVAL = 0.8
 
 
 class Horizon:
@@ -54,6 +55,9 @@ class Horizon:
         self.most = np.array([(force, force, torque) for force, torque in strongest])
         self.mean = np.zeros((horizon, *self.most.shape))
         self.bodies = task.goal.places(scene)
+        # the penalty of contact is in seconds: over the horizon, they count as the way at the start
+        reach = min(scene.moving[i].shape.bounding_radius for i in self.bodies)
+        self.way = max(float(task.goal.distance(scene, task.start)), reach)
         self.generated = 0
 
     def improve(self, start: Floats, before: Floats) -> None:
@@ -78,9 +82,10 @@ class Horizon:
             tried[0] = self.mean
             cost = self._cost(start, tried, before)
             worst = np.max(cost[np.isfinite(cost)], initial=0.0)
-            cost = np.where(np.isfinite(cost), cost, worst + 1e3)
+            cost = np.where(np.isfinite(cost), cost, 1e3 * worst)
             few = np.sort(cost)[: max(2, int(_ELITE * self.samples))]
-            weight = np.exp(-(cost - few[0]) / max(few[-1] - few[0], 1e-9))
+            least = 1e-9 * few[-1] + np.finfo(float).tiny
+            weight = np.exp(-(cost - few[0]) / max(few[-1] - few[0], least))
             self.mean = np.tensordot(weight / weight.sum(), tried, axes=1)
 
     def advance(self) -> Floats:
@@ -102,9 +107,10 @@ class Horizon:
                 states = task.dynamics.noisy(states, self.rng)
             self.generated += len(tried) * task.dynamics.draws
             far = tail_mean(goal.distance(scene, states), task.tail)
-            cost += far / horizon + scene.time_step * contact_cost(goal, scene, states)
+            cost += (far + self.way * contact_cost(goal, scene, states)) / horizon
         speed = np.sqrt((states[..., self.bodies, 3:5] ** 2).sum(axis=(-2, -1)))
-        return np.asarray(cost + far + _ARRIVAL * tail_mean(speed, task.tail))
+        arrival = _ARRIVAL * scene.time_step * tail_mean(speed, task.tail)
+        return np.asarray(cost + far + arrival)
 
 
 def mppi(
@@ -161,7 +167,7 @@ def mppi(
             if ahead.generated >= nodes or time.monotonic() - begin > task.seconds:
                 stopped = "nodes" if ahead.generated >= nodes else "time"
                 break
-            task.progress(f"interval {len(wrenches)}, {far:.2f} m from the goal")
+            task.progress(f"interval {len(wrenches)}, {far:.3g} m from the goal")
             last = wrenches[-1] if wrenches else dynamics.before
             ahead.improve(states[:, 0], last)
             wrenches.append(ahead.advance())

@@ -16,8 +16,9 @@ from pbrl_ppl.state import Floats
 
 #: States that a search generates at most by default: 15 s or so for one body.
 NODES = 2_000_000
-#: Shapes this near touch (m): the engine lets bodies that rest on each other sink in a little.
-_TOUCH = 0.005
+#: Shapes this near touch, as a share of the smallest moving body's bounding radius: the engine lets
+#: bodies that rest on each other sink in a little.
+_TOUCH = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,5 +122,6 @@ def contact_cost(goal: Goal, scene: Scene, states: Floats) -> Floats:
     if not goal.contact_penalty:
         return np.zeros(states.shape[1])
     poses = np.nan_to_num(states[..., :3]).reshape(-1, states.shape[2], 3)
-    share = (overlap(scene, poses) > -_TOUCH).reshape(states.shape[:2]).mean(axis=0)
+    touch = _TOUCH * min(body.shape.bounding_radius for body in scene.moving)
+    share = (overlap(scene, poses) > -touch).reshape(states.shape[:2]).mean(axis=0)
     return np.where(share > 0, goal.contact_penalty * np.maximum(share, 1e-9), 0.0)

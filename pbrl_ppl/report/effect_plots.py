@@ -100,7 +100,8 @@ def plot_added(loop: Loop, width: float = WIDE) -> Figure:
         if added.effect in effects:
             sized = effects[added.effect].in_si(units_of(loop.scene, added.body))
             null = {parameter.name: parameter.null for parameter in sized.parameters}[name]
-            _mark_null(axes, null, estimate.mean, max(estimate.sd, 1e-12), top)
+            least = 1e-12 * abs(estimate.mean) + np.finfo(float).tiny
+            _mark_null(axes, null, estimate.mean, max(estimate.sd, least), top)
         axes.set_ylim(-0.14 * top, 1.15 * top)
         axes.set_yticks([])
         axes.set_title(f"{plain(added.effect)} on {added.body}", fontsize=10)

@@ -264,7 +264,7 @@ def find_laws(loop: Loop, most: int = 3) -> list[Law]:
         for (quantity, unit), x in zip(
             QUANTITIES.items(), recorded_quantities(problem, body).T, strict=True
         )
-        if np.ptp(x) > 1e-9
+        if np.ptp(x) > 1e-9 * abs(x).max()
     ]
     laws.sort(key=lambda law: (law.quantity != remains.depends_on, -law.curve.share))
     if not laws or laws[0].quantity != remains.depends_on:
@@ -333,9 +333,11 @@ def _simplest(x: Floats, y: Floats) -> Curve:
     best, result = np.inf, Curve("", np.zeros_like(x), 0.0)
     for form, terms in forms.items():
         columns = np.stack(terms, axis=1)
-        sizes, _, rank, _ = np.linalg.lstsq(columns, y, rcond=None)
+        largest = np.maximum(abs(columns).max(axis=0), np.finfo(float).tiny)
+        sizes, _, rank, _ = np.linalg.lstsq(columns / largest, y, rcond=None)
         if rank < len(terms):
             continue
+        sizes = sizes / largest
         rest = max(float(((y - columns @ sizes) ** 2).sum()), 1e-300)
         bic = len(y) * np.log(rest) + len(terms) * np.log(len(y))
         if bic < best:

@@ -51,6 +51,10 @@
     };
   });
   let motion, now = 0, timer = null, last = 0;
+  // seconds of the motion in a second: the whole lasts 1 to 60 s
+  const pace = () => end() / Math.min(60, Math.max(1, end())) || 1;
+  const seconds = (time) =>
+    time.toFixed(Math.min(20, Math.max(0, 2 - Math.floor(Math.log10(end() || 1)))));
   const turn = (a) => Math.atan2(Math.sin(a), Math.cos(a));
   // between two rows, so that slow recordings move smoothly too
   const at = (rows, time) => {
@@ -83,11 +87,12 @@
         far = Math.max(far, Math.hypot(predicted[b][0] - measured[b][0], predicted[b][1] - measured[b][1]));
         turned = Math.max(turned, Math.abs(turn(predicted[b][2] - measured[b][2])) * 180 / Math.PI);
       });
-      stage.off.textContent = `off by ${far.toFixed(3)} m and ${turned.toFixed(1)}°`;
+      stage.off.textContent = `off by ${far.toPrecision(3)} m and ${turned.toFixed(1)}°`;
     }
     scrub.value = now;
-    scrub.setAttribute("aria-valuetext", now.toFixed(2) + " seconds");
-    clock.textContent = `${now.toFixed(2)} s of ${end().toFixed(2)} s`;
+    scrub.setAttribute("aria-valuetext", seconds(now) + " seconds");
+    const slower = pace() === 1 ? "" : `, at ${pace().toPrecision(3)} times the real speed`;
+    clock.textContent = `${seconds(now)} s of ${seconds(end())} s${slower}`;
   };
   const end = () => motion.time[motion.time.length - 1];
   const stop = () => {
@@ -98,10 +103,10 @@
   };
   const frame = (stamp) => {
     if (!still.matches) {
-      now = Math.min(end(), now + (stamp - last) / 1000);
+      now = Math.min(end(), now + pace() * (stamp - last) / 1000);
       last = stamp;
     } else if (stamp - last > 700) { // one still picture after another
-      const next = motion.time.find((t) => t >= now + Math.max(end() / 12, 1e-9));
+      const next = motion.time.find((t) => t >= now + end() / 12);
       now = next === undefined ? end() : next;
       last = stamp;
     }

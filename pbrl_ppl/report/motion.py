@@ -109,7 +109,7 @@ def _predicted(
 def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, Any] | None:
     """Return what the page's script draws, as JSON values; None where there is no motion.
 
-    Lengths are in m with five digits, angles in rad.
+    Lengths are in m, to 1e-5 of the view, and angles in rad, to five decimals.
     """
     if not motions:
         return None
@@ -127,26 +127,34 @@ def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, Any] | None:
             if body.static and body.pose is not None
         ],
         "walls": [[list(wall.start), list(wall.end)] for wall in scene.walls],
-        "motions": [
-            {
-                "name": motion.name,
-                "box": _box(motion, 1.2 * reach),
-                "time": _rounded(motion.time),
-                "measured": _rounded(motion.measured),
-                "before": _rounded(motion.before),
-                "after": _rounded(motion.after),
-                "distance": [
-                    _rounded(np.array(distance(scene, motion, poses)))
-                    for poses in (motion.before, motion.after)
-                ],
-            }
-            for motion in motions
+        "motions": [_drawn(scene, motion, 1.2 * reach) for motion in motions],
+    }
+
+
+def _drawn(scene: Scene, motion: Motion, margin: float) -> dict[str, Any]:
+    """Return a motion, and the corners of its view, as JSON values."""
+    box = _box(motion, margin)
+    places = _decimals(1e-5 * float((box[1] - box[0]).max()))
+
+    def poses(given: Floats) -> Any:
+        return _listed(np.concatenate([given[..., :2].round(places), given[..., 2:].round(5)], -1))
+
+    return {
+        "name": motion.name,
+        "box": box.round(places).tolist(),
+        "time": _listed(motion.time.round(_decimals(1e-4 * scene.time_step))),
+        "measured": poses(motion.measured),
+        "before": poses(motion.before),
+        "after": poses(motion.after),
+        "distance": [
+            round(distance(scene, motion, predicted), places)
+            for predicted in (motion.before, motion.after)
         ],
     }
 
 
-def _box(motion: Motion, margin: float) -> list[list[float]]:
-    """Return the corners of the view: the measured positions, and a margin for predictions."""
+def _box(motion: Motion, margin: float) -> Floats:
+    """Return the corners of the view, (2, 2): measured positions, and a margin for predictions."""
     places = motion.measured[..., :2].reshape(-1, 2)
     low, high = np.nanmin(places, axis=0), np.nanmax(places, axis=0)
     spare = 0.7 * float((high - low).max()) + margin
@@ -154,14 +162,18 @@ def _box(motion: Motion, margin: float) -> list[list[float]]:
     every = np.clip(every, low - spare, high + spare)
     low = np.minimum(low, np.nanmin(every, axis=0)) - margin
     high = np.maximum(high, np.nanmax(every, axis=0)) + margin
-    return [low.round(5).tolist(), high.round(5).tolist()]
+    return np.array([low, high])
 
 
 def _outline(shape: Any) -> list[list[float]] | None:
     return None if shape.outline is None else [list(map(float, point)) for point in shape.outline]
 
 
-def _rounded(values: Floats) -> Any:
-    """Return nested lists of five decimals, with None for NaN."""
-    plain = np.round(values, 5).astype(object)
-    return np.where(np.isfinite(values), plain, np.array(None)).tolist()
+def _decimals(size: float) -> int:
+    """Return the decimals that show a size."""
+    return int(np.ceil(-np.log10(size)))
+
+
+def _listed(values: Floats) -> Any:
+    """Return nested lists, with None for NaN."""
+    return np.where(np.isfinite(values), values.astype(object), np.array(None)).tolist()

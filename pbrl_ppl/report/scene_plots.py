@@ -21,8 +21,10 @@ from pbrl_ppl.state import Floats
 #: Okabe and Ito's colours, one a moving body, in turn; what is static is grey.
 _COLOURS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00")
 _STATIC = "#777777"
-#: A body that moved less than this (m) has no track.
-_STILL = 0.05
+#: A body that moved less than this share of its bounding radius has no track.
+_STILL = 0.1
+#: Duration of a moving picture (s): a plan is shown at its real speed between these.
+_LASTS = 1.0, 20.0
 #: Draws in a moving picture, at most.
 _SHOWN = 12
 
@@ -76,9 +78,9 @@ def draw_motion(axes: Axes, scene: Scene, states: Floats) -> None:
     """
     draw_scene(axes, scene, states[0], faded=True)
     draw_scene(axes, scene, states[-1])
-    for i in range(states.shape[1]):
+    for i, body in enumerate(scene.moving):
         x, y = states[:, i, :2].T
-        if np.hypot(x - x[0], y - y[0]).max() > _STILL:
+        if np.hypot(x - x[0], y - y[0]).max() > _STILL * body.shape.bounding_radius:
             axes.plot(x, y, color=_colour(i), linewidth=1.5, zorder=3)
 
 
@@ -136,11 +138,12 @@ def draw_goal(axes: Axes, scene: Scene, goal: Goal) -> None:
     goal : Goal
         Targets.
     """
-    for place, target in zip(goal.places(scene), goal.targets, strict=True):
+    every = zip(goal.places(scene), goal.targets, goal.tolerances(scene), strict=True)
+    for place, target, tolerance in every:
         if target.x is None or target.y is None:
             continue
         how: dict[str, Any] = {"fill": False, "color": _colour(place), "hatch": "////"}
-        axes.add_patch(Circle((target.x, target.y), target.tolerance, **how))
+        axes.add_patch(Circle((target.x, target.y), tolerance, **how))
 
 
 def _colour(index: int) -> str:
@@ -166,7 +169,7 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
     path : str or Path
         Ends in ``.gif``; written whole or not at all.
     frames : int
-        Pictures a second at most; the plan is shown at its real speed.
+        Pictures a second at most; the plan is shown at its real speed, or so as to last 1 to 20 s.
 
     Raises
     ------
@@ -175,7 +178,9 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
     """
     states = plan.predicted["predicted"].to_numpy()[:_SHOWN]
     # at the speed of the plan, with no more pictures than the eye can tell apart
-    every = max(1, round(1.0 / (frames * plan.scene.time_step)))
+    intervals = max(states.shape[1] - 1, 1)
+    step = float(np.clip(intervals * plan.scene.time_step, *_LASTS)) / intervals  # shown (s)
+    every = max(1, round(1.0 / (frames * step)))
     times = [*range(0, states.shape[1] - 1, every), states.shape[1] - 1]
     figure = Figure(figsize=(6.0, 6.0), layout="constrained")
     axes = figure.add_subplot()
@@ -193,8 +198,8 @@ def animate_plan(plan: Plan, path: str | Path, *, frames: int = 20) -> None:
         draw_scene(axes, plan.scene, states[0, time])
         axes.set_xlim(middle[0] - half, middle[0] + half)
         axes.set_ylim(middle[1] - half, middle[1] + half)
-        axes.set_title(f"{time * plan.scene.time_step:.1f} s")
+        axes.set_title(f"{time * plan.scene.time_step:.3g} s")
 
     moving = FuncAnimation(figure, draw, frames=times, init_func=lambda: None)
-    rate: Any = 1.0 / (every * plan.scene.time_step)  # pictures a second; fractions are right
+    rate: Any = 1.0 / (every * step)  # pictures a second; fractions are right
     write_atomically(Path(path), lambda to: moving.save(to, PillowWriter(fps=rate), dpi=80))

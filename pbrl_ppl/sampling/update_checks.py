@@ -75,7 +75,7 @@ def check_history(idata: Any, record: PosteriorRecord, history: History) -> None
             f" {', '.join(names)}; load it with the posterior's scene"
         )
     step = float(history.dataset.attrs["time_step"])
-    if not np.isclose(step, scene.time_step):
+    if not np.isclose(step, scene.time_step, atol=0.0):
         raise HistoryError(
             f"update: the history has a row each {step:g} s, the posterior's each"
             f" {scene.time_step:g} s; load it with the posterior's scene"

@@ -12,6 +12,7 @@ from .shape import Shape as Shape
 from .units import MASS_PRIOR as MASS_PRIOR
 from .units import PLACES as PLACES
 from .units import Units as Units
+from .units import body_sizes as body_sizes
 from .units import check_product as check_product
 from .units import motion_time as motion_time
 from .units import smallest_radius as smallest_radius

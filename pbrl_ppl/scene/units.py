@@ -7,6 +7,9 @@ import re
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
+import numpy as np
+from numpy.typing import NDArray
+
 from pbrl_ppl.errors import SceneError
 from pbrl_ppl.scene.checks import Named, finite, nearest, positive, table
 
@@ -170,6 +173,16 @@ def state_sizes(scene: Scene) -> tuple[float, ...]:
 def smallest_radius(scene: Scene) -> float:
     """Return the bounding radius of the smallest moving body (m)."""
     return min(body.shape.bounding_radius for body in scene.moving)
+
+
+def body_sizes(scene: Scene) -> NDArray[np.float64]:
+    """Return natural sizes of the state of each moving body, shape (body, 6), SI units.
+
+    The radius of its bounding circle, 1 rad, and these in one sampling interval.
+    """
+    reach = np.array([body.shape.bounding_radius for body in scene.moving])
+    pose = np.stack([reach, reach, np.ones_like(reach)], axis=1)
+    return np.hstack([pose, pose / scene.time_step])
 
 
 def _levers(scene: Scene, name: str) -> list[float]:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from pbrl_ppl.planning import ActionSet, Dynamics
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal
 from pbrl_ppl.scene import Body, Scene, Shape, Wall
 
 MASS, FORCE = 2.0, 4.0
@@ -20,7 +20,7 @@ PUSHES = ActionSet.box(
     "puck", forces=(-FORCE, 0.0, FORCE), lateral=(-FORCE, 0.0, FORCE), frame="world",
     durations=(0.1, 0.3),
 )  # fmt: skip
-ACROSS = {"puck": (-1.5, -1.0, 0.0)}, {"puck": (1.5, -1.0, None)}
+ACROSS = {"puck": (-1.5, -1.0, 0.0)}, Goal.of({"puck": (1.5, -1.0, None)}, tolerance=0.1)
 
 
 def known(scene: Scene = FREE, *masses: float) -> Dynamics:

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.one_stack
 BOX = Shape.box(0.9, 0.5)
 #: Concave: a corner sofa.
 SOFA = Shape.polygon([(-1.0, -0.6), (1.4, -0.6), (1.4, 0.2), (-0.2, 0.2), (-0.2, 1.0), (-1.0, 1.0)])
-CONTACTS = SectorContacts(by_object=True)
+CONTACTS = SectorContacts(radius=0.2, by_object=True)
 
 
 def pair(shape: Shape = BOX, other: Shape | None = None) -> Scene:
@@ -54,7 +54,7 @@ def test_at_the_edge_between_two_sectors_both() -> None:
 @pytest.mark.parametrize("shape", ["circle", "box", "wall", "polygon"])
 def test_collision_radius_is_a_gap_along_the_ray(shape, gap, touches) -> None:
     """The one ray goes along x: the gap is known in closed form for every kind of thing."""
-    contacts = SectorContacts(sectors=4, rays=1)
+    contacts = SectorContacts(sectors=4, rays=1, radius=0.2)
     if shape == "wall":
         wall = Wall((0.45 + gap, -0.3), (0.45 + gap, 0.4))
         scene = Scene(time_step=0.1, bodies=(Body("body", BOX),), walls=(wall,))
@@ -138,7 +138,7 @@ def test_objects() -> None:
     assert flags.shape == (200, 3, 5, 4)
     assert flags.any(axis=(0, 3)).sum() == 3 * 5 - 3  # a body never touches itself
     assert not flags[:, [0, 1, 2], [0, 1, 2]].any()
-    merged = SectorContacts()  # as the paper has it: which sectors, not with what
+    merged = SectorContacts(radius=0.2)  # as the paper has it: which sectors, not with what
     np.testing.assert_array_equal(merged.of(scene, at)[:, :, 0], flags.any(axis=2))
     assert merged.objects(scene) == ("anything",)
     assert merged.labels(scene) == ("contact_0", "contact_1", "contact_2", "contact_3")

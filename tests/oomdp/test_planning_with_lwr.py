@@ -12,8 +12,6 @@ from tests.helpers.transitions import transitions
 
 pytestmark = pytest.mark.one_stack
 
-GOAL = {"puck": (-1.5, -1.0, 0.0)}, {"puck": (1.5, -1.0, None)}
-
 
 @pytest.fixture(scope="module")
 def free() -> OOLWR:
@@ -24,7 +22,7 @@ def free() -> OOLWR:
 
 def test_reaches_a_free_goal(free) -> None:
     """And the plan does in the world what the model says it does."""
-    found = plan(free, *GOAL, PUSHES)
+    found = plan(free, *ACROSS, PUSHES)
     assert found.reached and found.distance < 0.1
     played = known(FREE).rollout(found.start, found.wrenches)[0, -1, 0]
     np.testing.assert_allclose(found.predicted["predicted"].to_numpy()[0, -1, 0], played, atol=1e-9)
@@ -32,7 +30,7 @@ def test_reaches_a_free_goal(free) -> None:
 
 
 def test_mppi_takes_it_too(free) -> None:
-    found = plan(free, *GOAL, PUSHES, method="mppi", samples=64, horizon=12)
+    found = plan(free, *ACROSS, PUSHES, method="mppi", samples=64, horizon=12)
     assert found.reached
 
 
@@ -69,7 +67,7 @@ def test_acts_on_it(free) -> None:
         state = truth.step(state[None, None], wrench[None])[0, 0]
         return state
 
-    done = act(world, free, *GOAL, PUSHES, every=10, nodes=20_000)
+    done = act(world, free, *ACROSS, PUSHES, every=10, nodes=20_000)
     assert done.reached
     free_again = OOLWR(FREE)
     free_again.learn(done.history())
@@ -78,8 +76,8 @@ def test_acts_on_it(free) -> None:
 
 def test_bad_requests(free) -> None:
     with pytest.raises(GoalError, match="give actions"):
-        plan(free, *GOAL)
+        plan(free, *ACROSS)
     with pytest.raises(FitError, match="plan without noise"):
-        plan(free, *GOAL, PUSHES, noise=True)
+        plan(free, *ACROSS, PUSHES, noise=True)
     with pytest.raises(FitError, match="nothing was observed yet"):
-        plan(OOLWR(FREE), *GOAL, PUSHES)
+        plan(OOLWR(FREE), *ACROSS, PUSHES)

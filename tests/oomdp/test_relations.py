@@ -64,7 +64,7 @@ def test_relations_are_relations() -> None:
 def test_the_condition_depends_on_the_action() -> None:
     """A body that sticks until it is pushed: two conditions, each with a model."""
     scene = Scene(time_step=0.1, bodies=(Body("crate", DISC),), walls=(Wall((0.3, -1), (0.3, 1)),))
-    model = OOLWR(scene, relations=(SectorContacts(), Pushed()))
+    model = OOLWR(scene, relations=(SectorContacts(radius=0.2), Pushed()))
     assert model.labels == (*(f"contact_{i}" for i in range(4)), "pushed")
     at_wall, away = np.zeros((1, 6)), np.array([[-3.0, 0, 0, 0, 0, 0]])
     push = np.array([[0.0, 2.0, 0.0]])
@@ -105,7 +105,7 @@ def test_what_one_chair_met_the_other_knows() -> None:
     away[0, 1:, 1] = 5.0
     asked = at[None]
     for shared in (True, False):
-        model = OOLWR(scene, share_classes=shared)
+        model = OOLWR(scene, relations=(SectorContacts(radius=0.2),), share_classes=shared)
         model.observe(away, np.zeros((1, 4, 3)), away)
         known = np.isfinite(model.step(asked, np.zeros((1, 4, 3)))[0, 0, :, 0])
         assert known.tolist() == [True, shared, True, False]

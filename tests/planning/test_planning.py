@@ -1,5 +1,6 @@
 """Searches for plans: closed forms, symmetry, limits, uncertainty, and acting on plans."""
 
+from dataclasses import replace
 from itertools import count
 from types import SimpleNamespace
 from typing import Any
@@ -95,7 +96,7 @@ def test_bound_goes_around_walls(at) -> None:
 def test_bound_is_below_what_plans_take() -> None:
     """Along plans that were found, at every step: no plan is quicker than the bound says."""
     rng = np.random.default_rng(0)
-    dynamics, goal = known(ROOM), Goal.of({"puck": (1.5, -1.0, None)})
+    dynamics, goal = known(ROOM), ACROSS[1]
     for _ in range(5):
         start = {"puck": (*rng.uniform([-2.5, -2.5], [-0.5, 2.5]), 0.0, *rng.normal(size=3))}
         found = plan(dynamics, start, goal, PUSHES)
@@ -115,7 +116,7 @@ def test_a_straight_push_is_found_and_is_the_quickest() -> None:
     forward = ActionSet.box("puck", forces=(-FORCE, 0.0, FORCE), durations=(0.1, 0.2))
     found = plan(known(), {"puck": (0, 0, 0)}, {"puck": (3.0, 0.0, None)}, forward, weight=1.0)
     assert found.reached
-    least = np.sqrt(2 * 2.9 * MASS / FORCE)
+    least = np.sqrt(2 * (3.0 - 0.2 * 0.2) * MASS / FORCE)
     assert found.duration == pytest.approx(0.1 * np.ceil(least / 0.1))
 
 
@@ -137,9 +138,9 @@ def test_the_mirrored_task_costs_the_same() -> None:
         walls=tuple(Wall((-a.start[0], a.start[1]), (-a.end[0], a.end[1])) for a in ROOM.walls)
     )
     one = plan(known(ROOM), *ACROSS, PUSHES, weight=1.0)
+    back = replace(ACROSS[1].targets[0], x=-1.5)
     other = plan(
-        known(mirrored), {"puck": (1.5, -1.0, 0.0)}, {"puck": (-1.5, -1.0, None)}, PUSHES,
-        weight=1.0,
+        known(mirrored), {"puck": (1.5, -1.0, 0.0)}, Goal((back,)), PUSHES, weight=1.0
     )  # fmt: skip
     assert one.duration == pytest.approx(other.duration, abs=0.11)  # cells are not mirrored
 
@@ -249,7 +250,7 @@ def test_an_interrupt_keeps_the_best(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_already_there_is_a_plan_of_nothing() -> None:
-    found = plan(known(), {"puck": (0, 0, 0)}, {"puck": (0.05, 0.0, None)}, PUSHES)
+    found = plan(known(), {"puck": (0, 0, 0)}, {"puck": (0.03, 0.0, None)}, PUSHES)
     assert found.reached
     assert found.wrenches.shape == (0, 1, 3)
 
@@ -268,11 +269,11 @@ def test_draws_that_agree_are_one() -> None:
 
 
 def test_caution_reaches_under_the_worst_draw() -> None:
-    """A puck goes as far as it is light: 1.3 to 1.7 m must be right for masses of 1.8 to 2.2 kg.
+    """A puck goes as far as it is light: 1.25 to 1.65 m must be right for masses of 1.8 to 2.2 kg.
 
     With the worst draw alone counting, it is; a plan for the middle one stops at the near edge.
     """
-    goal = Goal.of({"puck": (1.5, 0.0, None)}, tolerance=0.2)
+    goal = Goal.of({"puck": (1.45, 0.0, None)}, tolerance=0.2)
     found = plan(known(FREE, 1.8, 2.0, 2.2), {"puck": (0, 0, 0)}, goal, PUSHES, tail=0.01)
     assert found.reached
     ends = found.predicted["predicted"].values[:, -1]

@@ -11,14 +11,14 @@ import pytest
 
 from pbrl_ppl.cli import main
 from pbrl_ppl.errors import GoalError, PosteriorError
-from pbrl_ppl.planning import ActionSet, Dynamics, plan
+from pbrl_ppl.planning import ActionSet, Dynamics, Goal, plan
 from pbrl_ppl.posterior import draws, from_groups, groups, load_posterior, save_posterior
 from tests.helpers.stacks import DATA, GENERATIONS, file, fitted
 
-START, GOAL = {"puck": (0.0, 0.0, 0.0)}, {"puck": (1.5, 0.5, None)}
+START, GOAL = {"puck": (0.0, 0.0, 0.0)}, Goal.of({"puck": (1.5, 0.5, None)}, tolerance=0.1)
 #: What PyMC 5 planned on the file that PyMC 5 wrote, and on that of PyMC 6.
 PLANS = {generation: DATA / f"puck-plan{generation}.csv" for generation in GENERATIONS}
-COMMAND = ["--start", "0,0,0", "--goal", "puck=1.5,0.5,-", "--quiet"]
+COMMAND = ["--start", "0,0,0", "--goal", "puck=1.5,0.5,-", "--tolerance", "0.1", "--quiet"]
 
 
 def planned(idata, **options):

@@ -23,11 +23,15 @@ angles = st.floats(-10, 10)
 
 def test_distance_is_l2_with_angles_at_the_rim() -> None:
     """By hand: 3 and 4 m off, and a quarter turn of a box whose corner is 0.5 m out."""
-    goal = Goal((Target("puck", 3.0, 4.0), Target("box", theta=np.pi / 2, weight=4.0)))
+    goal = Goal(
+        (Target("puck", 3.0, 4.0, tolerance=0.1), Target("box", theta=np.pi / 2, weight=4.0))
+    )
     states = np.stack([state(), state(x=7.0)])
     expected = math.sqrt(25 + 4 * (0.5 * np.pi / 2) ** 2)
     assert goal.distance(TWO, states) == pytest.approx(expected)
     assert goal.shortfall(TWO, states) == pytest.approx(50.0)
+    default = Goal.of({"puck": (3.0, 4.0, None)})  # a fifth of a radius of 0.2 m
+    assert default.tolerances(TWO) == pytest.approx([0.04])
 
 
 @given(theta=angles, wanted=angles)

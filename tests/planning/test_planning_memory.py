@@ -5,7 +5,7 @@ import pytest
 
 from pbrl_ppl.agents import act
 from pbrl_ppl.physics import Physics
-from pbrl_ppl.planning import Action, ActionSet, Dynamics, plan
+from pbrl_ppl.planning import Action, ActionSet, Dynamics, Goal, plan
 from pbrl_ppl.scene import Scene, Shape
 from tests.helpers.worlds import BY_NAME, body
 
@@ -38,9 +38,8 @@ def test_a_step_begins_with_what_acted_before() -> None:
 @pytest.mark.parametrize("method", ["astar", "mppi"])
 def test_the_plan_ends_where_it_says(method) -> None:
     """The predicted states are those of the whole sequence in one call, memory and all."""
-    late = dynamics(0.6)
-    found = plan(late, {"puck": (0, 0, 0)}, {"puck": (0.9, 0.3, None)}, PUSHES, method=method,
-                 nodes=200_000)  # fmt: skip
+    late, goal = dynamics(0.6), Goal.of({"puck": (0.9, 0.3, None)}, tolerance=0.2)
+    found = plan(late, {"puck": (0, 0, 0)}, goal, PUSHES, method=method, nodes=200_000)
     assert found.reached
     physics = Physics.declare(scene(), (BY_NAME["actuator_delay"],))
     whole = physics.predict(late.phi[0], np.zeros((1, 1, 6)), found.wrenches[None])[0]

@@ -1,6 +1,7 @@
 """Where the evidence is, which law is wanted, and the motions that a report plays."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from pbrl_ppl.posterior import compare
 from pbrl_ppl.report.effect_plots import plot_evidence, plot_laws
 from pbrl_ppl.report.evidence import bin_means, find_evidence, find_laws
 from pbrl_ppl.report.motion import animation, distance, held_out_motions
+from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.made_up import made_up
 from tests.helpers.revised import DRAG, recordings, revised, unexplained
 
@@ -114,3 +116,20 @@ def test_motions_are_those_of_the_recording_worst_first() -> None:
 def test_without_held_out_trajectories_nothing_is_played() -> None:
     assert held_out_motions(made_up()) == []
     assert animation(made_up(), []) is None
+
+
+def test_a_motion_of_millimetres_and_milliseconds_is_not_rounded_away() -> None:
+    """The same as that of metres, to 1e-5 of the view."""
+    here, seen = [], held_out_motions(revised())[0]
+    for size, pace in ((1.0, 1.0), (1e-3, 1e-2)):
+        puck = Body("puck", Shape.circle(0.2 * size))
+        loop = SimpleNamespace(scene=Scene(time_step=0.1 * pace, bodies=(puck,)), added=())
+        unit = np.array([size, size, 1.0])
+        poses = {name: unit * getattr(seen, name) for name in ("measured", "before", "after")}
+        (drawn,) = animation(loop, [replace(seen, time=pace * seen.time, **poses)])["motions"]
+        here.append(
+            [np.array(drawn["after"]) / unit, np.array(drawn["time"]) / pace]
+            + [np.array(drawn[name]) / size for name in ("box", "distance")]
+        )
+    for one, other in zip(*here, strict=True):
+        np.testing.assert_allclose(other, one, rtol=0, atol=1e-4)

@@ -172,7 +172,7 @@ def test_motion_plays_and_is_scrubbed_by_keyboard(browser: Any, files: dict[str,
     page.keyboard.press("Home")
     first = page.evaluate(moved)
     assert page.evaluate(clock).startswith("0.00 s")
-    assert page.inner_text("#off-before") == "off by 0.000 m and 0.0°"
+    assert page.inner_text("#off-before") == "off by 0.00 m and 0.0°"
     for _ in range(5):
         page.keyboard.press("ArrowRight")
     assert page.evaluate(clock).startswith("0.50 s")
