@@ -20,7 +20,7 @@ from pbrl_ppl.scene import Scene, motion_time, state_sizes
 from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Length of the forecasts in the error table, in motion times, if trajectories are as long.
-ROLLOUT_TIMES = 10.0
+ROLLOUT_TIMES = 4.0
 _DRAWS = 100
 
 

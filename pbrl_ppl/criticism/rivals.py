@@ -101,8 +101,9 @@ def named_effects(
             raise EffectError(
                 f"effect {name} is of the noise: experiments cannot identify noise effects"
             )
-        if effect.on(body or bodies[0]) not in found:
-            found.append(effect.on(body or bodies[0]))
+        attached = effect.on(body or bodies[0]).in_si(scene)
+        if attached not in found:
+            found.append(attached)
     if len(found) < 2:
         raise EffectError(
             f"effects: got {list(names)}, expected two or more to separate, such as"

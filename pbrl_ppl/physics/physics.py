@@ -20,11 +20,11 @@ from pbrl_ppl.state import Floats
 
 #: Engine steps of an interval for rough answers, and the longest of these steps as a share of the
 #: scene's motion time.
-COARSE, LONGEST_COARSE = 4, 0.3
+COARSE, LONGEST_COARSE = 4, 0.105
 #: Engine steps for derivatives and for what an effect changes, and the longest of these steps as a
 #: share of the scene's motion time: where rows are far apart, dry friction at a turning point shows
 #: with short steps alone.
-ROUGH, LONGEST = 10, 0.06
+ROUGH, LONGEST = 10, 0.021
 
 
 @dataclass(frozen=True)

@@ -153,9 +153,15 @@ def units_of(scene: Scene, name: str) -> Units:
 
 
 def motion_time(scene: Scene) -> float:
-    """Return the shortest time in which a typical force makes a body's typical speed (s)."""
+    """Return the shortest time in which a typical force changes a body's motion (s).
+
+    It makes the typical speed, or moves the body by its length, whichever takes longer.
+    """
     bodies = [units_of(scene, body.name) for body in scene.dynamic]
-    return min(units.of("mass speed/force") for units in bodies)
+    return min(
+        max(units.of("mass speed/force"), math.sqrt(units.of("mass length/force")))
+        for units in bodies
+    )
 
 
 def state_sizes(scene: Scene) -> tuple[float, ...]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import pbrl_ppl as pp
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import Problem, along_trajectories
 from pbrl_ppl.likelihood.log_posterior import log_posterior, log_prior
 from pbrl_ppl.parameters import ParameterLibrary
@@ -144,7 +144,7 @@ def test_file_prior_and_plan(tmp_path) -> None:
     idata = quick(physics_model(own, recorded()), method="laplace")
     pp.save_posterior(idata, tmp_path / "chairs.nc")
     loaded = pp.load_posterior(tmp_path / "chairs.nc")
-    assert pp.Scene.from_toml(loaded.attrs["scene"]) == own
+    assert pp.Scene.from_toml(loaded.attrs["scene"]) == with_units(own, recorded())
     new = updated_scene(loaded)
     first, second = (dict(body.prior) for body in new.bodies)
     assert first["mass"] == second["mass"] and dict(first["mass"])["sigma"] < 0.1

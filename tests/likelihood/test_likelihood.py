@@ -20,6 +20,7 @@ from pbrl_ppl.likelihood import (
     next_state_random,
 )
 from pbrl_ppl.model.density import next_state_logp
+from tests.helpers.carts import cart_scene
 
 EQ_11 = TransitionLikelihood()
 N, H, K = 7, 2, 2
@@ -186,7 +187,8 @@ def test_estimate_sigma_recovers_the_noise() -> None:
     measured = rng.random((n, CELLS)) < 0.9
     residual[~measured] = 0.0
     shape = (n, H, K, D)
-    found = estimate_sigma(residual.reshape(shape), measured.reshape(shape))
+    observations = Observations(np.where(measured, 0.0, np.nan).reshape(shape), tuple(range(D)))
+    found = estimate_sigma(residual.reshape(shape), observations, cart_scene())
     # the Fisher information of log sigma is 2 a measured cell
     error = np.sqrt(0.5 / measured.reshape(shape).sum((0, 1, 2)))
     # 3 numbers within 4 standard errors: false alarm 2e-4
@@ -195,7 +197,8 @@ def test_estimate_sigma_recovers_the_noise() -> None:
 
 def test_estimate_sigma_without_noise_still_gives_a_scale() -> None:
     shape = (5, 1, 1, 2)
-    found = estimate_sigma(np.zeros(shape), np.ones(shape, dtype=bool))
+    observations = Observations(np.ones(shape), (0, 1))
+    found = estimate_sigma(np.zeros(shape), observations, cart_scene())
     assert (found > 0).all()
 
 

@@ -11,7 +11,7 @@ from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.parameters import ParameterLibrary, prior_draws
 from pbrl_ppl.posterior import draws, parameter_draws, stored_mode, updated_mode
 from pbrl_ppl.sampling import fit, physics_model
-from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl.scene import Body, Joint, Scene, Shape, state_sizes
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.joints import scene as boxes
@@ -136,7 +136,9 @@ def test_an_exact_fit_has_the_prior_s_sigma(history) -> None:
     sigma = profile_sigma(problem, np.zeros_like(problem.observations.values))
     median, spread = problem.noise_prior
     count = problem.observations.measured.sum((0, 1, 2))
-    expected = np.maximum(median * np.exp(-(spread**2) * (count + 1)), 1e-9)
+    expected = np.maximum(
+        median * np.exp(-(spread**2) * (count + 1)), 1e-9 * np.array(state_sizes(problem.scene))
+    )
     np.testing.assert_allclose(sigma, expected, rtol=1e-6)
 
 
