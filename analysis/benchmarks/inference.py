@@ -30,7 +30,7 @@ from pytensor.graph.op import Op
 
 import pbrl_ppl as pp
 from pbrl_ppl.history import lever
-from pbrl_ppl.likelihood import Problem, sigma_prior
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.model.density import next_state_logp
 from pbrl_ppl.model.table1 import random_variable
 from pbrl_ppl.modes import find_mode
@@ -279,7 +279,7 @@ def plain_model(model: pm.Model) -> pm.Model:
         phi = pt.concatenate(
             [random_variable(b.name, b.priors, "body") for b in problem.layout.blocks]
         )
-        median, spread = sigma_prior(problem.observations, problem.segments)
+        median, spread = problem.noise_prior
         sigma = pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
         logp = next_state_logp(
             problem.observations.values, loop(phi), sigma, problem.observations, None

@@ -15,7 +15,6 @@ from scipy.special import logsumexp
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import FitError, ParameterError, PosteriorError, RefitWarning
-from pbrl_ppl.likelihood import sigma_prior
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.posterior import learned_library, library_probabilities, problem_of
 from pbrl_ppl.posterior import save_posterior as save
@@ -52,7 +51,7 @@ def brute_force(problem, library: ParameterLibrary) -> np.ndarray:
     """Probability of each combination of sets: sigma, a scalar, on a grid."""
     names = [body.name for body in problem.scene.dynamic]
     table = library.table(problem.layout, problem.scene)
-    median, spread = sigma_prior(problem.observations, problem.segments)
+    median, spread = problem.noise_prior
     grid = np.linspace(-12, 5, 4000)
     law = stats.norm(np.log(median).mean(), spread).logpdf(grid)
     sigma = np.exp(grid)[:, None] * np.ones(len(median))

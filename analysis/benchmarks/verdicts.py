@@ -1,0 +1,127 @@
+"""Verdicts of `pbrl-ppl close-loop` on similar rigs and on all recordings beside the project.
+
+    python analysis/benchmarks/verdicts.py similar --cache out/verdicts    # resumes after Ctrl-C
+    python analysis/benchmarks/verdicts.py recordings --cache out/verdicts
+    python analysis/benchmarks/verdicts.py similar --only cart-slope
+
+`similar` takes the five cart recordings and turns each into those of physically similar rigs: other
+units of length, mass and time, every dimensionless number the same. Verdict, names and sizes, in
+the cart's units, must be the cart's. `recordings` runs every folder with scene.toml, train.csv and
+test.csv. Both use ``--method laplace``, one loop at a time, each in a process of its own with
+``--limit`` seconds; seconds are this machine's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import pbrl_ppl as pp
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+from tests.helpers.similar import factor, similar, similar_history
+
+#: Recordings beside the project, which holds no copy.
+SHARED = Path(__file__).parents[3] / "shared"
+#: Factors of length, mass and time: as it is, a fast one, a small one, a car and a ship.
+SCALES = ((1, 1, 1), (1, 1, 0.01), (0.1, 0.001, 0.1), (10, 1000, 3), (100, 1e6, 10))
+
+
+def closed(folder: Path, limit: float) -> dict[str, Any]:
+    """Run the loop on a folder; return its report, or what the command said, and the seconds."""
+    begin = time.perf_counter()
+    with tempfile.TemporaryDirectory() as out:
+        command = [Path(sys.executable).parent / "pbrl-ppl", "close-loop", folder / "scene.toml"]
+        command += [folder / "train.csv", "--test", folder / "test.csv", "-o", Path(out) / "loop"]
+        options = ["--method", "laplace", "--seed", "1", "--quiet"]
+        try:
+            done = subprocess.run(
+                [*map(str, command), *options], capture_output=True, text=True, timeout=limit
+            )
+        except subprocess.TimeoutExpired:
+            return {"verdict": f"none in {limit:g} s", "seconds": limit}
+        seconds = time.perf_counter() - begin
+        report = Path(out) / "loop" / "report.json"
+        if not report.exists():
+            return {"verdict": f"exit {done.returncode}: {done.stderr[-300:]}", "seconds": seconds}
+        found = json.loads(report.read_text())
+    kept = ("verdict", "added", "error")
+    return {name: found[name] for name in kept} | {"seconds": seconds}
+
+
+def scaled(case: Path, scales: tuple[float, float, float], out: Path) -> Path:
+    """Write the recording of a similar rig; return its folder."""
+    scene = pp.Scene.load(case / "scene.toml")
+    for part in ("train", "test"):
+        history = pp.History.load(case / f"{part}.csv", scene)
+        similar_history(history, scene, *scales).save(out / f"{part}.csv")
+    (out / "scene.toml").write_text(similar(scene, *scales).to_toml())
+    return out
+
+
+def sizes(found: dict[str, Any], scales: tuple[float, float, float] = (1, 1, 1)) -> dict[str, str]:
+    """Return the added effects with their sizes in the units of the first rig, three digits."""
+    return {
+        f"{one['effect']} on {one['body']}": ", ".join(
+            f"{name} {each['mean'] / factor(each['unit'], *scales):.4g}"
+            for name, each in one["parameters"].items()
+        )
+        for one in found.get("added", [])
+    }
+
+
+def row(name: str, found: dict[str, Any], scales: tuple[float, float, float] = (1, 1, 1)) -> str:
+    """Return a row of the table."""
+    names = "; ".join(f"{name} ({size})" for name, size in sizes(found, scales).items())
+    error = found.get("error", {})
+    both = (error.get(each, {}).get("normalised_rmse") for each in ("before", "after"))
+    errors = " -> ".join("" if each is None else f"{each:.3g}" for each in both)
+    seconds = f"{found['seconds']:.0f}"
+    return f"| {name} | {found['verdict']} | {names or 'nothing'} | {errors} | {seconds} |"
+
+
+def main() -> None:
+    """Run the loops and print a table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("which", choices=["similar", "recordings"])
+    parser.add_argument("--only", nargs="+", metavar="NAME", help="those with this in their name")
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds for a loop")
+    parser.add_argument("--cache", type=Path, help="folder that keeps each result")
+    options = parser.parse_args()
+    if not SHARED.exists():
+        sys.exit("the recordings beside the project are missing")
+    folders = sorted(path.parent for path in SHARED.glob("*/**/scene.toml"))
+    jobs = [(folder, (1.0, 1.0, 1.0)) for folder in folders]
+    if options.which == "similar":
+        carts = [folder for folder in folders if folder.name.startswith("cart-")]
+        jobs = [(folder, scales) for scales in SCALES for folder in carts]
+    print(
+        "| recording | verdict | named | error in noises | s |\n|---|---|---|---|---|", flush=True
+    )
+    for folder, scales in jobs:
+        name = folder.name
+        if options.which == "similar":
+            name += " x " + " ".join(f"{scale:g}" for scale in scales)
+        if options.only and not any(part in name for part in options.only):
+            continue
+        kept = options.cache and options.cache / f"{name}.json"
+        if kept and kept.exists():
+            found = json.loads(kept.read_text())
+        else:
+            with tempfile.TemporaryDirectory() as out:
+                there = folder if scales == (1, 1, 1) else scaled(folder, scales, Path(out))
+                found = closed(there, options.limit)
+            if kept:
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                kept.write_text(json.dumps(found))
+        print(row(name, found, scales), flush=True)
+
+
+if __name__ == "__main__":
+    main()
