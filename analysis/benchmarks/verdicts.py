@@ -108,9 +108,8 @@ def main() -> None:
     if options.which == "similar":
         carts = [folder for folder in folders if folder.name.startswith("cart-")]
         jobs = [(folder, scales) for scales in SCALES for folder in carts]
-    print(
-        "| recording | verdict | named | error in noises | s |\n|---|---|---|---|---|", flush=True
-    )
+    print("| recording | verdict | named | error over noise | s | processor s |")
+    print("|---|---|---|---|---|---|", flush=True)
     for folder, scales in jobs:
         name = folder.name
         if options.which == "similar":
