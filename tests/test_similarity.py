@@ -137,6 +137,25 @@ def test_candidates_are_ranked_as_on_the_similar_rig(scales) -> None:
         assert same.estimate[name] == pytest.approx(expected, rel=0.02)
 
 
+@pytest.mark.slow
+def test_the_loop_of_a_ship_is_that_of_the_cart() -> None:
+    """The demo's recording: the same name, and its size within 1 %; as a ship, and as it is."""
+    scene, _ = cart()
+    files = [CART / "recorded" / f"{part}.csv" for part in ("train", "test")]
+    train, test = (pp.History.load(file, scene) for file in files)
+    found = []
+    for scales in ((1.0, 1.0, 1.0), (100.0, 1e6, 10.0)):
+        histories = (similar_history(each, scene, *scales) for each in (train, test))
+        loop = pp.close_loop(similar(scene, *scales), *histories, seed=1, method="laplace")
+        (added,) = loop.added
+        (estimate,) = added.parameters.values()
+        size = estimate.mean / factor(estimate.unit, *scales)
+        found.append((loop.verdict, added.effect, size, loop.after.normalised_rmse))
+    here, there = found
+    assert here[:2] == there[:2] == ("effects-added", "angular_drag")
+    assert there[2:] == pytest.approx(here[2:], rel=0.01)
+
+
 def _in_frame(history: pp.History, scene: Scene, turn: float, shift, later: float, turns: int):
     """Return the scene and the history in a turned and moved frame, with later time stamps."""
     c, s = np.cos(turn), np.sin(turn)

@@ -268,6 +268,9 @@ def test_check(capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     for words in ("puck", "2", "4 (2 in a trajectory)", "0.1 s, 4 engine steps", "2 of 6", "none"):
         assert words in out
+    # default priors, from the recording, in SI units
+    (line,) = (line for line in out.splitlines() if "linear_drag_coefficient" in line)
+    assert re.search(r"half-normal, [0-9.]+ kg/s", line)
 
 
 def test_version_and_help(capsys: pytest.CaptureFixture[str]) -> None:
