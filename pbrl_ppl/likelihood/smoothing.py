@@ -18,7 +18,7 @@ from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
 from pbrl_ppl.physics import touching
 from pbrl_ppl.state import STATE, Bools, Floats
 
-#: Prior scale of an unmeasured state, as a multiple of its range and typical size.
+#: Prior scale of an unmeasured state, as a multiple of its range, beside its typical size.
 _FAR = 10.0
 #: Largest change of states in the last round (in standard deviations), and most rounds.
 _SETTLED, _ROUNDS = 0.05, 4
@@ -288,7 +288,7 @@ def linearised(problem: Problem, cells: Cells, slope: Floats, sigma: Floats) -> 
     observed = problem.data.history.dataset["observed"].to_numpy()
     deviation = cells.wrapped(cells.of(observed) - cells.of(states))
     end, begin = deviation[trajectory, step + 1], deviation[trajectory, step]
-    far = _FAR * (np.ptp(cells.of(states), axis=(0, 1)) + cells.sizes(problem.scene))
+    far = _FAR * np.ptp(cells.of(states), axis=(0, 1)) + cells.sizes(problem.scene)
     return TrajectoryNoise(
         cells=cells,
         slope=np.ascontiguousarray(slope),

@@ -126,7 +126,8 @@ def climb(
     if not priors:
         return Peak(phi, sigma, value)
     # least squares over multiples of each parameter's scale, whatever its unit
-    origin, scale = phi, np.where(problem.layout.discrete, 1.0, problem.layout.scale(phi))
+    origin = problem.layout.origin
+    scale = np.where(problem.layout.discrete, 1.0, problem.layout.scale(phi))
     ends = (lower - origin) / scale, (upper - origin) / scale
     steps = np.where(problem.layout.discrete, 0.0, 1e-3)
     tails = list(problem.tails)
@@ -144,7 +145,8 @@ def climb(
             return whole(moved, sigma)
 
         def jacobian(moved: Floats, sigma: Floats = sigma, steps: Floats = steps) -> Floats:
-            return differentiate(lambda points: whole(points, sigma, slope), moved, steps, *ends)
+            size = np.minimum(steps, 0.1 * np.maximum(np.abs(moved), steps))
+            return differentiate(lambda points: whole(points, sigma, slope), moved, size, *ends)
 
         result = least_squares(
             residual, (phi - origin) / scale, jac=jacobian, bounds=ends, x_scale="jac",

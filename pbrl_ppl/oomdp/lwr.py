@@ -117,10 +117,10 @@ class OOLWR(Learner):
     Examples
     --------
     >>> from pbrl_ppl.scene import Body, Scene, Shape, Wall
-    >>> wall = Wall((0.3, -1.0), (0.3, 1.0))
+    >>> wall = Wall((0.25, -1.0), (0.25, 1.0))
     >>> scene = Scene(time_step=0.1, bodies=(Body("puck", Shape.circle(0.2)),), walls=(wall,))
     >>> model = OOLWR(scene)
-    >>> model.observe([[0, 0, 0, 1, 0, 0]], [[0, 0, 0]], [[0.1, 0, 0, 0, 0, 0]])  # stopped
+    >>> model.observe([[0, 0, 0, 1, 0, 0]], [[0, 0, 0]], [[0.05, 0, 0, 0, 0, 0]])  # stopped
     >>> model.conditions("puck")
     {frozenset({'contact_0'}): 1}
     >>> bool(np.isnan(model.step(np.full((1, 1, 1, 6), -5.0), np.zeros((1, 1, 3)))).all())

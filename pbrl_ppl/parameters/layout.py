@@ -154,9 +154,17 @@ class Layout:
     def scale(self, phi: Floats) -> Floats:
         """Return the scale of each entry of phi for step sizes, shape (p,); 0 if discrete."""
         least = np.array([prior.scale for prior in self.priors])
-        # places are counted from their prior's mean, whatever the origin of the scene
-        centre = np.array([prior.mu * (prior.family == "normal") for prior in self.priors])
-        return np.where(self.discrete, 0.0, np.maximum(np.abs(phi - centre), 0.1 * least))
+        counts = [block.unit == "1" for block in self.blocks for _ in block.owners]
+        least[counts] = np.minimum(least[counts], 1.0)
+        return np.where(self.discrete, 0.0, np.maximum(np.abs(phi - self.origin), 0.1 * least))
+
+    @property
+    def origin(self) -> Floats:
+        """Where each entry is counted from, shape (p,): a normal prior's mean, such as of a place.
+
+        Of others it is zero.
+        """
+        return np.array([prior.mu if prior.family == "normal" else 0.0 for prior in self.priors])
 
     def slices(self) -> Iterator[tuple[Block, slice]]:
         """Yield each block with its place in the vector."""

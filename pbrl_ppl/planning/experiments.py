@@ -415,7 +415,7 @@ def suggest_actions(
                 " such as effects=('linear_drag', 'quadratic_drag')"
             )
         effects = groups[0]
-    chosen = [each.in_si(scene) for each in named_effects(effects, scene, catalogue)]
+    chosen = named_effects(effects, scene, catalogue)
     if steps < 1 or (hold is not None and hold < 1):
         raise GoalError(f"steps is {steps} and hold {hold}; both must be at least 1")
     first = start_state(scene, start)

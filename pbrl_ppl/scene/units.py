@@ -21,6 +21,8 @@ MASS_PRIOR = 1.0, 1.5
 #: Range of the motion in body lengths, and its duration in samples, where neither the scene nor a
 #: recording shows them.
 _RANGE, _DURATION = 10.0, 100
+#: Larger exponents leave the floating-point numbers: such a prior is refused later.
+_LARGEST = 30.0
 
 
 @dataclass(frozen=True)
@@ -127,7 +129,8 @@ def units_of(scene: Scene, name: str) -> Units:
     body = scene.body(name)
     mass = dict(body.known).get("mass")
     if mass is None:  # the median of Table 1's log-normal
-        mass = math.exp(dict(dict(body.prior).get("mass", ())).get("mu", MASS_PRIOR[0]))
+        mu = dict(dict(body.prior).get("mass", ())).get("mu", MASS_PRIOR[0])
+        mass = math.exp(min(mu, _LARGEST))
     length = max([body.shape.bounding_radius, *_levers(scene, name)])
     gravity = max(math.hypot(*scene.gravity), scene.normal_gravity)
     speed = math.sqrt(gravity * length) or length / (_DURATION * scene.time_step)

@@ -59,7 +59,8 @@ def made_up_errors(times: float) -> Errors:
 def made_up(verdict: str = "effects-added", stuck: bool = False) -> Loop:
     """Small findings of each verdict, without a fit."""
     rng = np.random.default_rng(0)
-    scene = Scene(time_step=0.1, bodies=(Body("cart", Shape.box(1.0, 0.6)),))
+    typical = {"force": 20.0, "torque": 10.0, "speed": 1.5, "turn_rate": 1.5, "range": 5.0}
+    scene = Scene(time_step=0.1, bodies=(Body("cart", Shape.box(1.0, 0.6), typical=typical),))
     time = 0.1 * np.arange(31)
     turn = 2.8 + 1.5 * time
     motion = np.stack(

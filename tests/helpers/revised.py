@@ -34,9 +34,11 @@ def revised() -> Loop:
     before, after = (fit(m, method="laplace", seed=1, draws=100, progress=False) for m in models)
     size = Estimate(DRAG, 0.01, (DRAG - 0.02, DRAG + 0.02), "kg/s")
     added = Added("linear_drag", "puck", "a drag", 99.0, 1e-9, {"coefficient": size}, (), 9.0, 1.0)
+    found = made_up()
     return replace(
-        made_up(),
+        found,
         scene=DISC,
+        candidates=tuple(replace(one, body="puck") for one in found.candidates),
         added=(added,),
         posterior_before=before,
         posterior_after=after,
@@ -48,9 +50,11 @@ def unexplained() -> Loop:
     """The same where no effect has a name."""
     left = Unexplained("puck", "vx", "velocity x", 0.5, 0.001, "vx of puck depends on velocity x")
     before = revised().posterior_before
+    found = made_up("unexplained")
     return replace(
-        made_up("unexplained"),
+        found,
         scene=DISC,
+        candidates=tuple(replace(one, body="puck") for one in found.candidates),
         unexplained=left,
         posterior_before=before,
         posterior_after=before,

@@ -15,7 +15,7 @@ from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import Problem, along_trajectories
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.sampling import physics_model
-from pbrl_ppl.scene import Body, Joint, Scene, Shape
+from pbrl_ppl.scene import Body, Joint, Scene, Shape, units_of
 from pbrl_ppl.state import STATE, WRENCH
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
@@ -124,6 +124,10 @@ def test_logp_is_the_sum_of_priors_and_eq_11(cart, body, options, priors) -> Non
     _, history = cart
     model = physics_model(cart_scene(**body), history, **options)
     assert {variable.name for variable in model.free_RVs} == {*priors, "sigma"}
+    if "linear_drag_coefficient" in priors:  # in the recording's units: half-normal, force / speed
+        units = units_of(model.problem.scene, "cart")
+        scale = units.force / units.speed
+        priors = priors | {"linear_drag_coefficient": stats.halfnorm(scale=scale)}
     point = model.initial_point()
     moved = {name: value + 0.1 for name, value in point.items()}
     logp = model.compile_logp(jacobian=False, mode="FAST_COMPILE")

