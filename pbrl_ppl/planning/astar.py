@@ -32,7 +32,7 @@ _CELLS = np.array([4.0, 4.0, 5.0, 2.0, 2.0, 2.5])
 _TEN, _NEAR, _FAR = 10.0, 0.25, 2.0
 #: The largest tolerances that cells are in proportion to: of the position, as a share of the body's
 #: bounding radius, and of the angle (rad).
-_WIDEST, _WIDEST_ANGLE = 0.5, 0.1
+_WIDEST, _WIDEST_ANGLE = 0.2, 0.1
 #: Times that the cells are halved where the search runs out of nodes.
 _REFINED = 8
 #: Seconds between reports of progress.

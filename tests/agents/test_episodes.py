@@ -90,7 +90,8 @@ def test_finished_episodes_are_not_run_again(tmp_path) -> None:
     said: list[str] = []
     run = partial(run_episodes, {"true": known}, puck_world(), steps=30, folder=tmp_path)
     (first,) = run(seeds=[1], progress=said.append)["true"]
-    assert said == [f"1/1 true model, seed 1: reached the goal in {first.steps} steps, "
+    end = "reached" if first.reached else "did not reach"
+    assert said == [f"1/1 true model, seed 1: {end} the goal in {first.steps} steps, "
                     f"{first.bumps} with bumps"]  # fmt: skip
     said.clear()
     with ThreadPoolExecutor(1) as executor:

@@ -39,8 +39,8 @@ def unexplained(posterior) -> pp.Loop:
     """A loop that found no name for what is missing, without the search."""
     left = Unexplained("puck", "vx", "speed", 0.5, 0.001, "vx of puck depends on its speed")
     return replace(
-        made_up("unexplained"), scene=BOX, candidates=(), unexplained=left, posterior_before=posterior,
-        posterior_after=posterior,
+        made_up("unexplained"), scene=BOX, candidates=(), unexplained=left,
+        posterior_before=posterior, posterior_after=posterior,
     )  # fmt: skip
 
 

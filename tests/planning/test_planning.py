@@ -142,7 +142,8 @@ def test_the_mirrored_task_costs_the_same() -> None:
     other = plan(
         known(mirrored), {"puck": (1.5, -1.0, 0.0)}, Goal((back,)), PUSHES, weight=1.0
     )  # fmt: skip
-    assert one.duration == pytest.approx(other.duration, abs=0.11)  # cells are not mirrored
+    # cells are not mirrored: one plan may be a tenth longer than the other
+    assert one.duration == pytest.approx(other.duration, rel=0.12)
 
 
 def test_without_a_weight_no_plan_is_cheaper() -> None:

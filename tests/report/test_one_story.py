@@ -176,7 +176,7 @@ def test_limits_beyond_the_prior_are_no_limits() -> None:
     assert said(candidate("hidden_obstacle")) == ""
     # a gain of 1 does nothing: its limit is a distance from there
     assert said(candidate("force_gain", factor=0.05)) == "factor 1.00 ± 0.0500"
-    # a smaller cap is stronger: log-normal, median 20 N, sigma 1.5: one of a thousand is below 0.19 N
+    # a smaller cap is stronger: log-normal, median 20 N, sigma 1.5: 0.1 % are below 0.19 N
     assert said(candidate("saturation", True, limit=8.0)) == "limit up to 8.00 N"
     assert said(candidate("saturation", True, limit=0.1)) == "no plausible size"
     # of an effect that is looked up nowhere the size alone is known
