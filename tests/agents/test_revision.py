@@ -41,8 +41,8 @@ def pushed(agent: PBRLAgent, effect: str | None, *, sigma: float, steps: int, se
 
 @pytest.mark.parametrize("effect", ["constant_force", "actuator_rotation"])
 def test_names_what_is_missing(effect) -> None:
-    agent = PBRLAgent(CART, seed=1, revise=True, growth=0.5)
-    seen = pushed(agent, effect, sigma=0.0, steps=8, seed=1)
+    agent = PBRLAgent(CART, seed=2, revise=True, growth=0.5)
+    seen = pushed(agent, effect, sigma=0.0, steps=8, seed=2)
     assert seen[-1] == [effect]
     (found,) = agent.added
     assert found.body == "cart" and 4 <= found.transitions <= 8 and found.p_value < 0.01
