@@ -136,7 +136,7 @@ def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRem
     rng = np.random.default_rng(seed)
     chosen = np.sort(rng.permutation(len(x))[:_MOST])
     low, high = x.min(axis=0), x.max(axis=0)
-    size = np.maximum(high - low, 1e-9 * np.array(state_sizes(mode.problem.scene))[3:])
+    size = np.maximum(high - low, 1e-9 * state_sizes(mode.problem.scene)[3:])
     table: dict[str, list[Any]] = {"centre": [], "width": [], "output": []}
     blocks = []
     excess = unexplained_acceleration(mode, criteria)

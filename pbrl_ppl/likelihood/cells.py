@@ -116,7 +116,7 @@ class Cells:
 
     def sizes(self, scene: Scene) -> Floats:
         """Return typical sizes of the cells, shape (cell,); see :func:`state_sizes`."""
-        return np.array(state_sizes(scene))[self.places % len(STATE)]
+        return state_sizes(scene)[self.places % len(STATE)]
 
     def white(self, sigma: Floats) -> Floats:
         """Return the uncorrelated measurement noise of each cell, shape (cell,)."""
@@ -227,7 +227,7 @@ def cells_of(scene: Scene, history: History) -> Cells:
     places = np.flatnonzero(free)
     body, dimension = np.divmod(places, len(STATE))
     stated = dict(scene.noise)
-    exact = _EXACT * np.array(state_sizes(scene))
+    exact = _EXACT * state_sizes(scene)
     given = np.array([name in stated for name in STATE])
     sensed = free & measured & ~still & ~given
     sensors = np.flatnonzero(sensed.any(axis=0))

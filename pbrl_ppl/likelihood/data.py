@@ -92,7 +92,7 @@ LEAST_NOISE = 1e-9
 
 def least_noise(scene: Scene) -> Floats:
     """Return the least noise of each coordinate of a state, shape (6,)."""
-    return LEAST_NOISE * np.array(state_sizes(scene))
+    return LEAST_NOISE * state_sizes(scene)
 
 
 def sigma_prior(

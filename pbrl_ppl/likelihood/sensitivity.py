@@ -66,6 +66,11 @@ class Sensitivity:
         own = [self.before[row].reshape(-1, self.phi.shape[1]) for row in rows]
         return list(zip(sets, rows, own, strict=True))
 
+    @cached_property
+    def _far(self) -> Floats:
+        """Changes of the cells that count as divergence, shape (cell,)."""
+        return _FAR * self.cells.sizes(self.scene)
+
     def at(self, rows: NDArray[np.intp]) -> Sensitivity:
         """Return the sensitivity of these transitions alone."""
         return replace(self, slope=self.slope[rows], phi=self.phi[rows], before=self.before[rows])
@@ -98,8 +103,9 @@ class Sensitivity:
             What acts, shape (transition, 1, body, 3 or 9).
         """
         moved = self.moved(phi)
-        far = _FAR * self.cells.sizes(self.scene)
-        moved = np.where(np.abs(moved) < far, moved, np.nan)  # nothing is predicted from there
+        moved = np.where(
+            np.abs(moved) < self._far, moved, np.nan
+        )  # nothing is predicted from there
         states = engine(phi, self.begun(np.nan_to_num(moved), start), inputs)
         back = np.matmul(self.slope, moved[..., None])[..., 0]
         return self._added(states, -back[..., None, :])

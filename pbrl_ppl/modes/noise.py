@@ -35,7 +35,7 @@ _SECOND = 0.05
 
 def finite(problem: Problem, residual: Floats) -> Floats:
     """Return residuals in SI units with large ones where a prediction diverged, same shape."""
-    far = FAR_OFF * np.array(state_sizes(problem.scene))[list(problem.observations.columns)]
+    far = FAR_OFF * state_sizes(problem.scene)[list(problem.observations.columns)]
     return np.where(np.isfinite(residual), residual, far)
 
 

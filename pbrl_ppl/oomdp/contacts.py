@@ -10,7 +10,7 @@ import numpy as np
 from pbrl_ppl.errors import FitError, HistoryError
 from pbrl_ppl.oomdp.relations import Condition, condition
 from pbrl_ppl.physics import Scenery, circles, scenery
-from pbrl_ppl.scene import WORLD, Scene
+from pbrl_ppl.scene import WORLD, Scene, smallest_radius
 from pbrl_ppl.state import Bools, Floats
 
 #: A convex part of a solid: corners (k, 2) counter-clockwise, and a radius about them; one corner
@@ -153,7 +153,7 @@ class SectorContacts:
         # along a ray solids are no nearer than their bounding circles
         radius = self.radius
         if radius is None:
-            radius = _RADIUS * min(body.shape.bounding_radius for body in scene.moving)
+            radius = _RADIUS * smallest_radius(scene)
         near = circles(world.solids, world.pairs, poses) > -radius
         for (i, j), rows in zip(world.pairs, near.T, strict=True):
             at = np.flatnonzero(rows)

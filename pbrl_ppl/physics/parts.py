@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from pbrl_ppl.errors import SimulationError
 from pbrl_ppl.physics.coupling import SHARE, come_near
 from pbrl_ppl.physics.simulator import Simulator
-from pbrl_ppl.scene import smallest_radius
+from pbrl_ppl.scene import body_sizes
 from pbrl_ppl.state import Bools, Floats, Ints
 
 if TYPE_CHECKING:
@@ -187,8 +187,7 @@ class OneWorld:
         self.parted = physics.simulator
         # contacts are not extrapolated, nor is anything else in a transition that has one
         self._apart = physics.changed(extrapolate=False).simulator
-        size, dt = smallest_radius(physics.scene), physics.scene.time_step
-        self._rounding = _ROUNDING * np.array([size, size, 1.0, size / dt, size / dt, 1.0 / dt])
+        self._rounding = _ROUNDING * body_sizes(physics.scene).min(axis=0)
         self._reach = [body.shape.bounding_radius for body in physics.scene.moving]
         self._whole = Simulator(physics.changed(extrapolate=False, parts=None))
 

@@ -11,7 +11,7 @@ from pbrl_ppl.physics import overlap
 from pbrl_ppl.planning.actions import ActionSet
 from pbrl_ppl.planning.dynamics import TransitionModel
 from pbrl_ppl.planning.goals import Goal
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Scene, smallest_radius
 from pbrl_ppl.state import Floats
 
 #: States that a search generates at most by default: 15 s or so for one body.
@@ -122,6 +122,6 @@ def contact_cost(goal: Goal, scene: Scene, states: Floats) -> Floats:
     if not goal.contact_penalty:
         return np.zeros(states.shape[1])
     poses = np.nan_to_num(states[..., :3]).reshape(-1, states.shape[2], 3)
-    touch = _TOUCH * min(body.shape.bounding_radius for body in scene.moving)
+    touch = _TOUCH * smallest_radius(scene)
     share = (overlap(scene, poses) > -touch).reshape(states.shape[:2]).mean(axis=0)
     return np.where(share > 0, goal.contact_penalty * np.maximum(share, 1e-9), 0.0)

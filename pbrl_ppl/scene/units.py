@@ -167,8 +167,8 @@ def motion_time(scene: Scene) -> float:
     )
 
 
-def state_sizes(scene: Scene) -> tuple[float, ...]:
-    """Return typical sizes of the six coordinates of a state, those of the body that moves most.
+def state_sizes(scene: Scene) -> NDArray[np.float64]:
+    """Return typical sizes of a state, shape (6,): those of the body that moves most.
 
     In the order of :data:`pbrl_ppl.state.STATE`: m, m, rad, m/s, m/s, rad/s.
     """
@@ -176,7 +176,7 @@ def state_sizes(scene: Scene) -> tuple[float, ...]:
     place, speed, rate = (
         max(getattr(units, name) for units in bodies) for name in ("range", "speed", "turn_rate")
     )
-    return place, place, 1.0, speed, speed, rate
+    return np.array([place, place, 1.0, speed, speed, rate])
 
 
 def smallest_radius(scene: Scene) -> float:
