@@ -14,9 +14,11 @@ from .agents import World as World
 from .agents import act as act
 from .agents import run_episode as run_episode
 from .agents import run_episodes as run_episodes
+from .criticism import Attribution as Attribution
 from .criticism import Criteria as Criteria
 from .criticism import Loop as Loop
 from .criticism import PriorCheck as PriorCheck
+from .criticism import attribute as attribute
 from .criticism import close_loop as close_loop
 from .criticism import prior_predictive_check as prior_predictive_check
 from .effects import Attached as Attached

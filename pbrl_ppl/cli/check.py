@@ -15,7 +15,7 @@ from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
 
 if TYPE_CHECKING:
-    from pbrl_ppl.criticism import Candidate
+    from pbrl_ppl.criticism import Attribution, Candidate, Law
     from pbrl_ppl.history import History
     from pbrl_ppl.scene import Scene
 
@@ -175,13 +175,21 @@ def criticise(
     units: options.Units = None,
     time_step: options.TimeStep = None,
     trim: options.Trim = False,
+    simulate: Annotated[
+        bool,
+        typer.Option(
+            "--simulate",
+            help="Simulate whole trajectories, and name effects that take the error away.",
+        ),
+    ] = False,
     as_json: options.AsJson = False,
     quiet: options.Quiet = False,
 ) -> None:
     """Rank the effects that the declared model might lack by the score test: no refit, no verdict.
 
     The score test says which effect's signature the residual looks like; close-loop finds out
-    whether that effect helps on data that it has not seen.
+    whether that effect helps on data that it has not seen. With --simulate, effects are refitted
+    one by one and in pairs, and named if they take at least a fifth off the simulation error.
     """
     reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
@@ -193,8 +201,14 @@ def criticise(
         from pbrl_ppl import criticism
         from pbrl_ppl.physics import check_history
 
-        check_history(declared, loaded, loaded.segments(1))
-        found = criticism.criticise(declared, loaded, seed=seed, progress=progress)
+        if simulate:
+            simulated = criticism.attribute(declared, loaded, seed=seed, progress=progress)
+        else:
+            check_history(declared, loaded, loaded.segments(1))
+            found = criticism.criticise(declared, loaded, seed=seed, progress=progress)
+    if simulate:
+        _print_laws(simulated, as_json)
+        return
     if as_json:
         print_json(
             {
@@ -213,6 +227,39 @@ def criticise(
     typer.echo(
         "small p: the residual looks like that effect's signature; close-loop says whether it is"
         " missing"
+    )
+
+
+def _print_laws(found: Attribution, as_json: bool) -> None:
+    """Print the laws that simulation names, and the simulation error."""
+    if as_json:
+        print_json({**vars(found), "laws": [vars(law) for law in found.laws]})
+        return
+    print_table(
+        "effects that the simulation error of trajectories shows",
+        ["effect", "<body", "nats", "share of error", "<size"],
+        (
+            [law.effect, law.body, f"{law.nats:.0f}", f"{100 * law.share:.2g} %", _sizes(law)]
+            for law in found.laws
+        ),
+    )
+    print_table(
+        f"simulation error over {found.seconds:.3g} s (SI)",
+        ["state", "declared", "with them", "autocorrelation (rows)"],
+        (
+            [name, f"{error:.3g}", f"{found.after[name]:.3g}", f"{found.correlated[name]:.1f}"]
+            for name, error in found.before.items()
+        ),
+    )
+    for sentence in found.sentences:
+        typer.echo(sentence)
+
+
+def _sizes(law: Law) -> str:
+    """Return the parameters of a law with their standard deviations and units."""
+    return ", ".join(
+        f"{name} {value:.3g} ± {law.sd[name]:.2g} {law.units[name].removesuffix('1')}".rstrip()
+        for name, value in law.estimate.items()
     )
 
 

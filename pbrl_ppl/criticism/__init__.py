@@ -31,4 +31,7 @@ from .score import Signature as Signature
 from .score import inseparable as inseparable
 from .score import rank_candidates as rank_candidates
 from .score import twins as twins
+from .simulated import Attribution as Attribution
+from .simulated import Law as Law
+from .simulated import attribute as attribute
 from .stages import Stage as Stage

@@ -97,6 +97,55 @@ class SelectionCriteria:
 
 
 @dataclass(frozen=True)
+class SimulationCriteria:
+    """Which effects the simulation error of whole trajectories names.
+
+    Parameters
+    ----------
+    least_share : float
+        Share of the simulation error that an effect takes away, at least; those that take less are
+        left to the search by innovations.
+    least_share_alone : float
+        The same share in a recording of one trajectory, which a lasting random force or error
+        follows as well: more than what remains.
+    least_nats : float
+        Net log-evidence that it needs (nats); effects within this of the best are confounded.
+    least_score : float
+        Share of the squared error that a candidate must take away to first order to be refitted.
+    indistinguishable : float
+        Signatures with a larger cosine at every length are the same law: one of them is refitted.
+        Near ones, such as two drags in a fall, differ after a refit.
+    leaders : int
+        Candidates that are refitted for each length of pieces, at most.
+    refined : int
+        Leading candidates, and pairs, that are fitted until they gain no more, at most.
+    worth_refining : float
+        Share of the leader's evidence that one of them has, at least.
+    paired : int
+        Leading candidates of which pairs are tried.
+    white : float
+        A residual with a shorter integrated autocorrelation time (rows) hides no such effect.
+    long : int
+        Intervals of pieces from which on this is tested.
+    restarts : int
+        Times that a model may turn out not to have been at its optimum.
+    """
+
+    least_share: float = 0.2
+    least_share_alone: float = 0.5
+    least_nats: float = 3.0
+    least_score: float = 0.1
+    indistinguishable: float = 0.999999
+    leaders: int = 4
+    refined: int = 4
+    worth_refining: float = 0.6
+    paired: int = 4
+    white: float = 1.5
+    long: int = 16
+    restarts: int = 3
+
+
+@dataclass(frozen=True)
 class ResidualCriteria:
     """When a test of the residual can fail, and what it ignores.
 
@@ -225,7 +274,7 @@ class Criteria:
         Chains with a larger R-hat give no verdict.
     least_ess : float
         Chains with a smaller effective sample size give no verdict.
-    engine, score, selection, residual, outliers, prior
+    engine, score, selection, simulation, residual, outliers, prior
         Thresholds of single stages.
 
     Examples
@@ -255,6 +304,7 @@ class Criteria:
     engine: EngineCriteria = EngineCriteria()
     score: ScoreCriteria = ScoreCriteria()
     selection: SelectionCriteria = SelectionCriteria()
+    simulation: SimulationCriteria = SimulationCriteria()
     residual: ResidualCriteria = ResidualCriteria()
     outliers: OutlierCriteria = OutlierCriteria()
     prior: PriorCriteria = PriorCriteria()

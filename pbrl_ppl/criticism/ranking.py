@@ -91,17 +91,10 @@ def criticise(
     """
     say = progress or (lambda stage: None)
     catalogue = tuple(catalogue)
-    if substeps is not None:
-        scene.replace(substeps=substeps)  # it is checked there
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
-        history, _, unused, bad = checked_histories(scene, history, history)
-        for sentence in (*(velocity.sentence for velocity in unused), *bad):
-            say(sentence)
-        scene = with_units(scene, history)
-        effects = attach(scene, (), catalogue)
-        say(Stage.FIT)
-        mode = declared_mode(scene, history, effects, seed, substeps, say, criteria)
+        mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
+        scene, effects = mode.problem.scene, mode.problem.physics.effects
         say(Stage.SCORE)
         ranked = rank_candidates(mode, candidates(scene, effects, catalogue), criteria)
         excess = unexplained_acceleration(mode, criteria)
@@ -111,6 +104,35 @@ def criticise(
         excess.by_name(excess.size),
         mode.problem.physics.substeps,
     )
+
+
+def checked_mode(
+    scene: Scene,
+    history: History,
+    catalogue: tuple[Effect, ...],
+    seed: int,
+    substeps: int | None,
+    criteria: Criteria,
+    say: Callable[[str], None],
+) -> Mode:
+    """Return the declared model's mode on a history without bad frames and unused velocities.
+
+    Raises
+    ------
+    HistoryError
+        If the history does not fit the scene.
+    EffectError
+        If the scene declares an unknown effect.
+    """
+    if substeps is not None:
+        scene.replace(substeps=substeps)  # it is checked there
+    history, _, unused, bad = checked_histories(scene, history, history)
+    for sentence in (*(velocity.sentence for velocity in unused), *bad):
+        say(sentence)
+    scene = with_units(scene, history)
+    effects = attach(scene, (), catalogue)
+    say(Stage.FIT)
+    return declared_mode(scene, history, effects, seed, substeps, say, criteria)
 
 
 def declared_mode(

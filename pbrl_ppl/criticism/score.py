@@ -381,7 +381,11 @@ def inseparable(
         cosine = float(np.linalg.norm(signature.basis.T @ leader.direction))
         behind = leader.candidate.statistic - signature.candidate.statistic
         if cosine > limits.parallel and behind < limits.decisive:
-            same_body = signature.attached.body == leader.attached.body
-            name = signature.attached.effect.name
-            names.append(name if same_body else f"{name} on {signature.attached.body}")
+            names.append(named_beside(signature.attached, leader.attached))
     return tuple(names)
+
+
+def named_beside(attached: Attached, leader: Attached) -> str:
+    """Return an effect's name, with its body if the leader acts on another."""
+    name = attached.effect.name
+    return name if attached.body == leader.body else f"{name} on {attached.body}"

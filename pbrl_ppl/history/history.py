@@ -217,6 +217,30 @@ class History:
                 f"no segment of {horizon} intervals starts from a complete state; use another "
                 "horizon, or measure the states there"
             )
+        return self._segments(start, trajectory, step, int(horizon))
+
+    def pieces(self, states: Floats, horizon: int) -> Segments:
+        """Cut every trajectory into pieces of ``horizon`` intervals between given states.
+
+        A rest of at least a third of a piece is a piece, too: nothing is measured after its end.
+
+        Parameters
+        ----------
+        states : ndarray
+            Shape (trajectory, time, body, 6), SI units, complete where pieces start.
+        horizon : int
+            Intervals in each piece, at least 1.
+        """
+        intervals = self.dataset["n_rows"].to_numpy() - 1
+        begins = [
+            [b for b in range(0, n, horizon) if b == 0 or 3 * (n - b) >= horizon] for n in intervals
+        ]
+        trajectory = np.repeat(np.arange(len(begins)), [len(own) for own in begins])
+        return self._segments(states, trajectory, np.concatenate(begins).astype(int), horizon)
+
+    def _segments(self, start: Floats, trajectory: Ints, step: Ints, horizon: int) -> Segments:
+        """Return the segments of ``horizon`` intervals that start at these rows of ``start``."""
+        intervals = self.dataset["n_rows"].to_numpy() - 1
         follows = self.dataset["kinematic"].to_numpy()
         rows = step[:, None] + np.arange(horizon)
         after = rows >= intervals[trajectory][:, None]

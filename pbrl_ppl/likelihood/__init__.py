@@ -6,6 +6,7 @@ from .cells import DRIFT as DRIFT
 from .cells import Cells as Cells
 from .cells import cells_of as cells_of
 from .cells import check_moves as check_moves
+from .cells import first_states as first_states
 from .data import Observations as Observations
 from .data import estimate_sigma as estimate_sigma
 from .data import least_noise as least_noise
@@ -28,6 +29,11 @@ from .log_posterior import noise_prior_slope as noise_prior_slope
 from .noise_scales import bodies_acceleration as bodies_acceleration
 from .noise_scales import noise_medians as noise_medians
 from .noise_scales import ranges as ranges
+from .output_error import OutputErrorLikelihood as OutputErrorLikelihood
+from .output_error import in_pieces as in_pieces
+from .output_error import least_errors as least_errors
+from .output_error import linearised_pieces as linearised_pieces
+from .output_error import output_error as output_error
 from .problem import Problem as Problem
 from .sensitivity import Sensitivity as Sensitivity
 from .simulation import simulated_trajectories as simulated_trajectories

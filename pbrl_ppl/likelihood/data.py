@@ -147,7 +147,8 @@ class Data:
         Observed state dimensions; those measured anywhere by default.
     states : ndarray, optional
         Smoothed states, shape (trajectory, time, body, 6), SI units, which take the measured ones'
-        place; see :func:`pbrl_ppl.model.along_trajectories`.
+        place; see :func:`pbrl_ppl.model.along_trajectories`. With a longer horizon, pieces are
+        simulated from them; see :func:`pbrl_ppl.likelihood.in_pieces`.
     """
 
     scene: Scene
@@ -171,6 +172,8 @@ class Data:
         SimulationError
             If bodies start deep inside each other or a wall, or a hinge's bodies apart.
         """
+        if self.states is not None and self.horizon > 1:
+            return self.history.pieces(self.states, self.horizon)
         if self.states is not None:
             return self.history.transitions(self.states)
         segments = self.history.segments(self.horizon)

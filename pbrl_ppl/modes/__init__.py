@@ -9,6 +9,10 @@ from .configurations import joint_probabilities as joint_probabilities
 from .configurations import stored as stored
 from .evidence import trajectory_evidence as trajectory_evidence
 from .joint_search import weigh as weigh
+from .ladder import climb_ladder as climb_ladder
+from .ladder import fit_pieces as fit_pieces
+from .ladder import ladder as ladder
+from .ladder import refined as refined
 from .laplace import Mode as Mode
 from .laplace import posterior_steps as posterior_steps
 from .library_choice import choose_from_library as choose_from_library

@@ -170,6 +170,13 @@ def test_three_commands_from_a_recording_to_criticism(capsys: pytest.CaptureFixt
     # one step from a mode whose mass, 2.6 kg for 2, has taken up a part of it
     assert found["candidates"][0]["estimate"]["coefficient"] == pytest.approx(2.0, rel=0.3)
     assert found["mode"]["mass[puck]"] > 0
+    simulated = answer(capsys, "criticise", "scene.toml", "train.csv", "--quiet", "--simulate")
+    assert [law["effect"] for law in simulated["laws"]] == ["linear_drag"]
+    assert simulated["laws"][0]["estimate"]["coefficient"] == pytest.approx(2.0, rel=0.05)
+    assert simulated["before"]["vx"] > 2 * simulated["after"]["vx"]
+    assert main(["criticise", "scene.toml", "train.csv", "--quiet", "--simulate"]) == 0
+    printed = capsys.readouterr().out
+    assert "linear_drag" in printed and "simulation error over 0.5 s" in printed
 
 
 @pytest.mark.usefixtures("puck")

@@ -1,0 +1,441 @@
+"""Search for effects by simulation error: laws judged by simulating whole trajectories.
+
+Without process noise, which would follow whatever is smooth, a missing law piles up along a
+trajectory, and the right one takes the error away. Effects that take little of it away are left to
+the search by innovations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import combinations
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
+from pbrl_ppl.criticism.ranking import checked_mode
+from pbrl_ppl.criticism.refinement import with_effects
+from pbrl_ppl.criticism.score import named_beside, rank_candidates, twins
+from pbrl_ppl.criticism.stages import Stage
+from pbrl_ppl.effects import Attached, Effect, Noise, candidates
+from pbrl_ppl.effects import catalogue as full_catalogue
+from pbrl_ppl.history import History
+from pbrl_ppl.likelihood import output_error
+from pbrl_ppl.modes import Mode, climb_ladder, fit_pieces, ladder, refined
+from pbrl_ppl.parameters import prior_residual
+from pbrl_ppl.scene import Scene
+from pbrl_ppl.state import Floats
+
+
+@dataclass(frozen=True)
+class Law:
+    """An effect that takes a large share off the simulation error.
+
+    Parameters
+    ----------
+    effect, body, sentence : str
+        Names of the effect and of the body, and the effect in words.
+    estimate, sd, units : dict of str to float or str
+        Most probable value of each parameter, its standard deviation, which allows for the
+        residual's correlation, and its unit.
+    nats : float
+        Net log-evidence: what the simulation error loses without it, less its price.
+    share : float
+        Share of the simulation error (root mean square) that it takes away.
+    confounded : tuple of str
+        Effects that explain these data as well.
+    """
+
+    effect: str
+    body: str
+    sentence: str
+    estimate: dict[str, float]
+    sd: dict[str, float]
+    units: dict[str, str]
+    nats: float
+    share: float
+    confounded: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Attribution:
+    """Laws that the simulation error of whole trajectories shows.
+
+    Parameters
+    ----------
+    laws : tuple of Law
+        In the order in which they were found.
+    before, after : dict of str to float
+        Simulation error of the declared model and with the laws: root mean square of measured minus
+        simulated over pieces of ``seconds``, by state dimension, SI units.
+    correlated : dict of str to float
+        Integrated autocorrelation time of the last residual, in rows: 1 if it is white.
+    seconds : float
+        Length of the simulated pieces (s).
+    trajectories : int
+        How many there are.
+    """
+
+    laws: tuple[Law, ...]
+    before: dict[str, float]
+    after: dict[str, float]
+    correlated: dict[str, float]
+    seconds: float
+    trajectories: int
+
+    @property
+    def sentences(self) -> list[str]:
+        """What to know before relying on the laws."""
+        said = []
+        if self.laws and self.trajectories == 1:
+            said.append(
+                "a single trajectory cannot tell a law from a lasting random force: record a second"
+                " one"
+            )
+        for law in self.laws:
+            if law.confounded:
+                others = " or ".join(law.confounded)
+                said.append(f"these data cannot tell {law.effect} on {law.body} from {others}")
+        return said
+
+
+def attribute(
+    scene: Scene,
+    history: History,
+    *,
+    catalogue: Iterable[Effect] = full_catalogue,
+    seed: int = 0,
+    substeps: int | None = None,
+    criteria: Criteria = DEFAULT,
+    progress: Callable[[str], None] | None = None,
+) -> Attribution:
+    """Name the effects that take the simulation error of whole trajectories away.
+
+    The declared model is simulated from latent start states, without process noise, up a ladder of
+    lengths. Leading candidates and their pairs are refitted; one is added if the error's fall is
+    evidence by the effective sample size and at least a fifth of the error, and dropped if the
+    model does as well without it. There is no verdict and no held-out data: that is `close_loop`.
+
+    Parameters
+    ----------
+    scene : Scene
+        The declared model.
+    history : History
+        Measured trajectories.
+    catalogue : iterable of Effect
+        Effects to consider.
+    seed : int
+        Seed of the search for the declared model's mode.
+    substeps : int, optional
+        Engine steps an interval to begin with; the scene's by default.
+    criteria : Criteria
+        Thresholds; see :class:`SimulationCriteria`.
+    progress : callable, optional
+        Called with the name of each stage and with each law found.
+
+    Returns
+    -------
+    Attribution
+        The laws, and the simulation error before and after.
+
+    Raises
+    ------
+    HistoryError
+        If the history does not fit the scene, or no trajectory has three rows.
+    EffectError
+        If the scene declares an unknown effect.
+
+    Examples
+    --------
+    ::
+
+        found = pp.attribute(scene, history)
+        [law.effect for law in found.laws]  # ['linear_drag', 'sliding_friction']
+    """
+    say, catalogue = progress or (lambda stage: None), tuple(catalogue)
+    # matrices are small: threads of linear algebra only get in each other's way
+    with threadpool_limits(1, "blas"):
+        mode = checked_mode(scene, history, catalogue, seed, substeps, criteria, say)
+        say(Stage.SIMULATE)
+
+        def missing(now: Mode) -> tuple[Attached, ...]:
+            return candidates(mode.problem.scene, now.problem.physics.effects, catalogue)
+
+        found = SimulatedSearch(missing, criteria, say)(mode)
+    before, after = found.declared, found.after
+    problem = after.problem
+    names, likelihood = problem.observations.names, output_error(problem)
+    return Attribution(
+        laws=found.laws,
+        before=dict(zip(names, before.sigma.tolist(), strict=True)),
+        after=dict(zip(names, after.sigma.tolist(), strict=True)),
+        correlated=dict(zip(names, likelihood.tau, strict=True)),
+        seconds=problem.data.horizon * problem.scene.time_step,
+        trajectories=problem.data.history.n_trajectories,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """Result of a search: both models at the greatest length, and the laws added."""
+
+    declared: Mode
+    after: Mode
+    laws: tuple[Law, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Accepted:
+    """A law in the model, and the effects that explain the data as well."""
+
+    attached: Attached
+    confounded: tuple[Attached, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """A refit with one or two more laws."""
+
+    laws: tuple[Attached, ...]
+    modes: list[Mode]
+    net: float
+    share: float
+    same: tuple[Attached, ...] = ()
+
+
+def nats(before: Mode, after: Mode) -> tuple[float, float]:
+    """Return the log-evidence of a fall of the simulation error, and the effective sample size.
+
+    ``sum over dimensions of n / tau * log(sigma_before / sigma_after)``, with the integrated
+    autocorrelation time tau of the residual under the model with the smaller error.
+    """
+    likelihood = output_error(after.problem)
+    weight = likelihood.starts.counts / np.array(likelihood.tau)
+    return float((weight * np.log(before.sigma / after.sigma)).sum()), float(weight.sum())
+
+
+def share_taken(before: Mode, after: Mode) -> float:
+    """Return the share of the simulation error that is gone, over all dimensions by evidence."""
+    gained, effective = nats(before, after)
+    return 1.0 - float(np.exp(-gained / max(effective, 1.0)))
+
+
+@dataclass(eq=False)
+class SimulatedSearch:
+    """Stepwise search for effects by simulation error.
+
+    Parameters
+    ----------
+    missing : callable
+        Returns the candidate effects of a model, given its mode.
+    criteria : Criteria
+        Thresholds.
+    say : callable
+        Called with what was found.
+    """
+
+    missing: Callable[[Mode], tuple[Attached, ...]]
+    criteria: Criteria = DEFAULT
+    say: Callable[[str], None] = field(default=lambda sentence: None)
+
+    def __call__(self, mode: Mode) -> _Found:
+        """Return the laws that the simulation error of a model's trajectories shows.
+
+        Parameters
+        ----------
+        mode : Mode
+            Of whole trajectories.
+
+        Raises
+        ------
+        HistoryError
+            If no trajectory has three rows.
+        """
+        limits = self.criteria.simulation
+        now = ladder(mode)
+        declared = now[-1]
+        laws: list[_Accepted] = []
+        again = limits.restarts
+        while len(laws) < self.criteria.most_added and not self._white(now):
+            trials = self._trials(now)
+            best = self._best(trials)
+            if best is None:
+                break
+            without = _without(best.modes[-1], best.laws)
+            if again and nats(now[-1], without)[0] > 1.0:  # it was not at its optimum
+                again -= 1
+                now = [*now[:-1], without]
+                declared = declared if laws else without
+                continue
+            close = [
+                law for trial in trials for law in (*trial.laws, *trial.same)
+                if len(trial.laws) == 1 and trial.net > best.net - limits.least_nats
+            ]  # fmt: skip
+            now = best.modes
+            for law in best.laws:
+                others = tuple(each for each in close if each not in best.laws)
+                laws.append(_Accepted(law, others))
+                self.say(f"simulations name {law.effect.name} on {law.body}")
+        last, laws = self._pruned(now[-1], laws)
+        return _Found(declared, last, tuple(self._law(last, each) for each in laws))
+
+    def _law(self, mode: Mode, accepted: _Accepted) -> Law:
+        """Return an accepted law with what it is worth in the last model."""
+        attached = accepted.attached
+        effect, without = attached.effect, _without(mode, (attached,))
+        labels = mode.problem.layout.labels
+        places = [labels.index(label) for label in attached.labels]
+        sd = np.sqrt(np.diag(mode.covariance)[places])
+        names = [parameter.name for parameter in effect.parameters]
+        return Law(
+            effect=effect.name,
+            body=attached.body,
+            sentence=effect.sentence,
+            estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
+            sd=dict(zip(names, sd.tolist(), strict=True)),
+            units={parameter.name: parameter.unit for parameter in effect.parameters},
+            nats=self._net(without, mode, 1),
+            share=share_taken(without, mode),
+            confounded=tuple(named_beside(each, attached) for each in accepted.confounded),
+        )
+
+    def _white(self, now: list[Mode]) -> bool:
+        """Return whether the residual is white at every length: a law would leave it correlated.
+
+        Short trajectories do not show it: fitted start states take the correlation away.
+        """
+        limits = self.criteria.simulation
+        times = [max(output_error(mode.problem).tau, default=1.0) for mode in now]
+        return now[-1].problem.data.horizon >= limits.long and max(times) < limits.white
+
+    def _best(self, trials: list[_Trial]) -> _Trial | None:
+        """Return the trial to accept: of nearly equal ones the simpler, then the earlier."""
+        limits, share = self.criteria.simulation, self.criteria.simulation.least_share
+        if trials and trials[0].modes[-1].problem.data.history.n_trajectories == 1:
+            share = limits.least_share_alone
+        enough = [
+            each for each in trials if each.net >= limits.least_nats and each.share >= share
+        ]  # fmt: skip
+        if not enough:
+            return None
+        highest = max(trial.net for trial in enough)
+        single = [trial for trial in enough if len(trial.laws) == 1]
+        if single and max(trial.net for trial in single) > highest - limits.least_nats:
+            enough, highest = single, max(trial.net for trial in single)
+        tied = [trial for trial in enough if trial.net > highest - self.criteria.selection.tie]
+        return max(tied, key=lambda trial: (-len(trial.modes[-1].phi), trial.net))
+
+    def _trials(self, now: list[Mode]) -> list[_Trial]:
+        """Return refits with leading candidates and, if the best leaves a law, with their pairs."""
+        limits = self.criteria.simulation
+        candidates = [
+            each for each in self.missing(now[-1]) if not isinstance(each.effect.stage, Noise)
+        ]
+        ranked = [rank_candidates(mode, candidates, self.criteria) for mode in now]
+        scores = [{signature.attached: signature for signature in own} for own in ranked]
+        exact = replace(
+            self.criteria, score=replace(self.criteria.score, same=limits.indistinguishable)
+        )
+
+        def same(one: Attached) -> tuple[Attached, ...]:
+            """Return the candidates that are the same law here, to rounding."""
+            return tuple(
+                other for other in candidates
+                if other is one
+                or (
+                    len(other.labels) == len(one.labels)
+                    and all(twins(own[one], own[other], exact) for own in scores)
+                )
+            )  # fmt: skip
+
+        leaders: dict[Attached, Floats] = {}
+        for signatures in ranked:
+            found = 0
+            for signature in sorted(signatures, key=lambda own: -own.fall):
+                if 2 * signature.fall < limits.least_score or found == limits.leaders:
+                    break
+                if leaders.keys().isdisjoint((signature.attached, *same(signature.attached))):
+                    estimate = np.array(list(signature.candidate.estimate.values()))
+                    leaders[signature.attached] = estimate
+                    found += 1
+        n = len(candidates)
+        trials = []
+        for law, size in leaders.items():
+            trial = self._trial(now, {law: size}, n)
+            trials.append(replace(trial, same=tuple(o for o in same(law) if o != law)))
+        trials = self._refined(now, trials, n)
+        if trials and not self._white(trials[0].modes):
+            pairs = []
+            for pair in combinations(trials[: limits.paired], 2):
+                begin = {each.laws[0]: _sizes(each.modes[0], each.laws[0]) for each in pair}
+                pairs.append(self._trial(now, begin, n))
+            trials += self._refined(now, pairs, n)
+        return trials
+
+    def _refined(self, now: list[Mode], trials: list[_Trial], candidates: int) -> list[_Trial]:
+        """Return trials, best first, the leading ones fitted until they gain no more."""
+        limits = self.criteria.simulation
+        trials.sort(key=lambda trial: -trial.net)
+        for i, trial in enumerate(trials[: limits.refined]):
+            if trial.net > limits.worth_refining * max(trials[0].net, 0.0):
+                modes = refined(trial.modes)
+                trials[i] = self._judged(now, trial.laws, modes, candidates, trial.same)
+        return sorted(trials, key=lambda trial: -trial.net)
+
+    def _trial(self, now: list[Mode], begin: dict[Attached, Floats], candidates: int) -> _Trial:
+        """Return the refit with some laws, at every length."""
+        laws = tuple(begin)
+        starts = [with_effects(m, (*m.problem.physics.effects, *laws), begin) for m in now]
+        return self._judged(now, laws, climb_ladder(starts), candidates)
+
+    def _judged(
+        self,
+        now: list[Mode],
+        laws: tuple[Attached, ...],
+        modes: list[Mode],
+        candidates: int,
+        same: tuple[Attached, ...] = (),
+    ) -> _Trial:
+        """Return the trial of fitted modes."""
+        net = self._net(now[-1], modes[-1], len(laws), candidates)
+        return _Trial(laws, modes, net, share_taken(now[-1], modes[-1]), same)
+
+    def _net(self, before: Mode, after: Mode, laws: int, candidates: int = 1) -> float:
+        """Return the evidence less its price: parameters, their prior, and candidates tried."""
+        gained, effective = nats(before, after)
+        more = len(after.phi) - len(before.phi)
+        price = 0.5 * more * np.log(max(effective, 2.0)) + laws * np.log(max(candidates, 1))
+        return float(gained - price - max(_prior(after) - _prior(before), 0.0))
+
+    def _pruned(self, mode: Mode, laws: list[_Accepted]) -> tuple[Mode, list[_Accepted]]:
+        """Drop laws that later ones have made needless."""
+        while len(laws) > 1:
+            without = [_without(mode, (law.attached,)) for law in laws]
+            worth = [self._net(each, mode, 1) for each in without]
+            taken = [share_taken(each, mode) for each in without]
+            least = int(np.argmin(worth))
+            enough = worth[least] > self.criteria.simulation.least_nats
+            if enough and taken[least] > self.criteria.negligible:
+                break
+            mode = without[least]
+            laws = [law for law in laws if law is not laws[least]]
+        return mode, laws
+
+
+def _without(mode: Mode, laws: Sequence[Attached]) -> Mode:
+    """Return the mode without some laws, refitted from where they were."""
+    kept = tuple(each for each in mode.problem.physics.effects if each not in laws)
+    return fit_pieces(*with_effects(mode, kept))
+
+
+def _sizes(mode: Mode, law: Attached) -> Floats:
+    """Return the parameters of a law at a mode, shape (q,)."""
+    labels = mode.problem.layout.labels
+    return mode.phi[[labels.index(label) for label in law.labels]]
+
+
+def _prior(mode: Mode) -> float:
+    """Return the negative log-prior of a mode's parameters, up to a constant."""
+    return 0.5 * float((prior_residual(mode.problem.layout.priors, mode.phi) ** 2).sum())

@@ -1,0 +1,302 @@
+"""Output-error likelihood: pieces of trajectories simulated from latent start states.
+
+No process noise is assumed: a law that is missing piles up along a piece, and the estimate is
+consistent whatever the correlation of the residual. See L. Ljung, System Identification (2nd ed.,
+1999), section 4.3. The start states are eliminated by projection (G. H. Golub and V. Pereyra, The
+differentiation of pseudo-inverses and nonlinear least squares problems whose variables separate,
+1973).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import final
+
+import numpy as np
+
+from pbrl_ppl.likelihood.cells import Cells, cells_of
+from pbrl_ppl.likelihood.data import Observations, least_noise
+from pbrl_ppl.likelihood.likelihood import Likelihood, TransitionLikelihood, log_norm, robust
+from pbrl_ppl.likelihood.problem import Problem
+from pbrl_ppl.physics import Memory
+from pbrl_ppl.state import STATE, Bools, Floats, Ints
+
+#: Directions of a start state with a smaller singular value move nothing that was measured.
+_SEEN = 1e-7
+#: Rounds of sigma and projection, which depend on each other.
+_ROUNDS = 6
+#: Correlations below this end the sum of an integrated autocorrelation time.
+_UNCORRELATED = 0.05
+#: Pairs of residuals that an autocorrelation is taken over, at least.
+_LEAST_PAIRS = 10
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Starts:
+    """Linearisation of pieces about their start states.
+
+    Parameters
+    ----------
+    cells : Cells
+        Coordinates of the start states that are inferred.
+    slope : ndarray
+        Derivative of the observed states by the start, shape (piece, H, body, state, cell).
+    seen : ndarray of bool
+        What was measured, shape (piece, H, body, state).
+    begin : ndarray
+        Measured minus latent start, shape (piece, cell); NaN where not measured.
+    column : ndarray of int
+        Place among the observed dimensions of each cell, -1 if it is not one; shape (cell,).
+    """
+
+    cells: Cells
+    slope: Floats
+    seen: Bools
+    begin: Floats
+    column: Ints
+    memory: Memory
+
+    @cached_property
+    def counts(self) -> Floats:
+        """Numbers of measurements of each observed dimension, shape (state,)."""
+        counts = self.seen.sum((0, 1, 2)).astype(float)
+        begun = np.isfinite(self.begin).sum(axis=0)
+        np.add.at(counts, self.column[self.column >= 0], begun[self.column >= 0])
+        return np.asarray(counts)
+
+    def rows(self, residual: Floats, weight: Floats) -> Floats:
+        """Return weighted residuals with those of the start, shape (..., piece, row).
+
+        ``residual`` has shape (..., piece, H, body, state), ``weight`` (state,).
+        """
+        z = (residual * weight).reshape(*residual.shape[:-3], -1)
+        begin = np.nan_to_num(self.begin) * self._weights(weight)
+        return np.concatenate([z, np.broadcast_to(begin, (*z.shape[:-1], begin.shape[-1]))], -1)
+
+    def basis(self, weight: Floats) -> tuple[Floats, Floats]:
+        """Return what start states can take up, and how: orthonormal rows and the way back.
+
+        Shapes (piece, row, direction) and (piece, cell, direction).
+        """
+        return self.memory.recall((weight,), self._basis)
+
+    def _basis(self, weight: Floats) -> tuple[Floats, Floats]:
+        pieces, cells = self.begin.shape
+        moved = np.where(self.seen[..., None], self.slope, 0.0) * weight[:, None]
+        own = np.isfinite(self.begin)[:, :, None] * np.diag(self._weights(weight))
+        rows = np.concatenate([moved.reshape(pieces, -1, cells), own], axis=1)
+        scale = np.linalg.norm(rows, axis=1)
+        scale = np.where(scale > 0, scale, 1.0)
+        u, s, vt = np.linalg.svd(rows / scale[:, None], full_matrices=False)
+        kept = s > _SEEN * s.max(axis=1, keepdims=True, initial=1e-300)
+        inverse = np.where(kept, 1.0 / np.where(kept, s, 1.0), 0.0)
+        back = np.swapaxes(vt, 1, 2) * inverse[:, None] / scale[:, :, None]
+        return u * kept[:, None], back
+
+    def _weights(self, weight: Floats) -> Floats:
+        """Return the weight of each cell, 0 where it is not observed, shape (cell,)."""
+        return np.where(self.column >= 0, weight[self.column], 0.0)
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class OutputErrorLikelihood(Likelihood):
+    """Likelihood of simulated pieces, whose latent start states are eliminated.
+
+    A residual that is correlated counts as fewer measurements: the log-density of each dimension is
+    divided by its integrated autocorrelation time (a composite likelihood's adjustment).
+
+    Parameters
+    ----------
+    starts : Starts
+        The linearisation about the start states.
+    tau : tuple of float
+        Integrated autocorrelation time of each observed dimension, in rows.
+    nu, prior
+        As of :class:`Likelihood`.
+    """
+
+    starts: Starts
+    tau: tuple[float, ...]
+
+    def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
+        """Return ``sigma`` with the measured dimensions."""
+        return {"sigma": observations.names}
+
+    def of_data(self) -> TransitionLikelihood:
+        """Return Eq. 11 with the same tails and prior."""
+        return TransitionLikelihood(nu=self.nu, prior=self.prior)
+
+    def whiten(self, residual: Floats, sigma: Floats) -> Floats:
+        """Return residuals over sigma and the root of tau, without what start states take up."""
+        weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
+        if weight.ndim > 1:
+            flat = weight.reshape(-1, weight.shape[-1])
+            own = residual.reshape(len(flat), *residual.shape[weight.ndim - 1 :])
+            each = [self._projected(r, w) for r, w in zip(own, flat, strict=True)]
+            return np.reshape(each, (*weight.shape[:-1], *each[0].shape))
+        return self._projected(residual, weight)
+
+    def _projected(self, residual: Floats, weight: Floats) -> Floats:
+        z, (u, _) = self.starts.rows(residual, weight), self.starts.basis(weight)
+        taken = np.matmul(np.matmul(z[..., None, :], u), np.swapaxes(u, 1, 2))[..., 0, :]
+        return np.asarray(z - taken)
+
+    def whitened_nu(
+        self, nu: float | Floats | None, shape: tuple[int, ...]
+    ) -> float | Floats | None:
+        """Return one number for all; that of a body's cells, shape (..., piece, row)."""
+        if not isinstance(nu, np.ndarray) or nu.ndim == 0:
+            return nu
+        own = np.broadcast_to(nu, shape).reshape(*shape[:-3], -1)
+        begin = np.full((*own.shape[:-1], len(self.starts.column)), np.inf)
+        return np.concatenate([own, begin], axis=-1)
+
+    def log_density(
+        self, residual: Floats, sigma: Floats, measured: Bools, nu: float | Floats | None = None
+    ) -> Floats:
+        """Return the tempered log-likelihood of each piece, shape (..., piece)."""
+        z = robust(self.whiten(residual, sigma), self.whitened_nu(nu, residual.shape))
+        share = self.starts.counts / np.array(self.tau) / len(self.starts.begin)
+        norm = (share * (np.max(log_norm(nu)) - np.log(sigma))).sum(axis=-1)[..., None]
+        return np.where(np.isnan(z).any(axis=-1), -np.inf, norm - 0.5 * (z**2).sum(axis=-1))
+
+    def random(
+        self,
+        predicted: Floats,
+        linearised: Floats,
+        sigma: Floats,
+        rng: np.random.Generator,
+        nu: float | Floats | None = None,
+    ) -> Floats:
+        """Draw measurements with white errors about simulated states."""
+        return np.asarray(predicted + sigma * rng.standard_normal(predicted.shape))
+
+    def unwhitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+        """Return projected residuals of the pieces and of their starts, SI units.
+
+        Shapes (piece, H, body, state) and (piece, cell).
+        """
+        z = self._projected(residual, 1.0 / np.asarray(sigma))
+        cut = z.shape[-1] - len(self.starts.column)
+        own = z[..., :cut].reshape(residual.shape) * sigma
+        return own, z[..., cut:] * np.where(self.starts.column >= 0, sigma[self.starts.column], 0.0)
+
+    def profile(self, residual: Floats, least: Floats) -> Floats:
+        """Return the maximum-likelihood sigma of each dimension, shape (state,).
+
+        ``least`` are the least that they may be, shape (state,), SI units.
+        """
+        sigma = np.maximum(np.sqrt((residual**2).sum((0, 1, 2)) / self.starts.counts), least)
+        for _ in range(_ROUNDS):
+            own, begin = self.unwhitened(residual, sigma)
+            square = (own**2).sum((0, 1, 2))
+            seen = self.starts.column >= 0
+            np.add.at(square, self.starts.column[seen], (begin**2).sum(axis=0)[seen])
+            better = np.maximum(np.sqrt(square / self.starts.counts), least)
+            done = np.all(abs(better - sigma) < 1e-3 * sigma)
+            sigma = better
+            if done:
+                break
+        return np.asarray(sigma)
+
+    def correlation_times(self, residual: Floats, sigma: Floats) -> Floats:
+        """Return the integrated autocorrelation time of each dimension in rows, shape (state,).
+
+        Of the projected residuals, without pairs from different pieces (Geyer's initial sequence).
+        """
+        own, _ = self.unwhitened(residual, sigma)
+        seen, tau = self.starts.seen, np.ones(own.shape[-1])
+        for d in range(len(tau)):
+            x, there = own[..., d], seen[..., d]
+            variance = (x**2).sum() / max(there.sum(), 1)
+            for lag in range(1, x.shape[1]):
+                pair = there[:, lag:] & there[:, :-lag]
+                if pair.sum() < _LEAST_PAIRS or not variance > 0:
+                    break
+                correlation = (x[:, lag:] * x[:, :-lag])[pair].mean() / variance
+                if correlation < _UNCORRELATED:
+                    break
+                tau[d] += 2 * correlation
+        return tau
+
+
+def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
+    """Return the problem of pieces that are simulated from latent start states.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of any likelihood.
+    length : int
+        Intervals of a piece, at least 2.
+    states : ndarray
+        Start states, shape (trajectory, time, body, 6), SI units.
+    """
+    data = replace(problem.data, horizon=length, states=states, columns=None)
+    problem = problem.on(data)
+    cells, columns = cells_of(problem.scene, data.history), problem.observations.columns
+    dimension = cells.places % len(STATE)
+    column = np.array([columns.index(d) if d in columns else -1 for d in dimension])
+    seen = problem.observations.measured
+    slope = np.zeros((*seen.shape, len(cells.places)))
+    starts = Starts(cells, slope, seen, _begin(problem, cells, column), column, Memory())
+    tau = (1.0,) * len(columns)
+    return replace(
+        problem, likelihood=OutputErrorLikelihood(starts=starts, tau=tau, nu=problem.likelihood.nu)
+    )
+
+
+def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Floats) -> Problem:
+    """Return the problem of pieces with other start states and what was linearised there.
+
+    Parameters
+    ----------
+    problem : Problem
+        Result of :func:`in_pieces`.
+    start : ndarray
+        Start states, shape (piece, body, 6), SI units.
+    slope : ndarray
+        Derivative of the observed states by them, shape (piece, H, body, state, cell).
+    tau : ndarray
+        Integrated autocorrelation time of each dimension, shape (state,).
+    """
+    segments, states = problem.segments, problem.data.smoothed_states.copy()
+    states[segments.trajectory, segments.step] = start
+    likelihood = output_error(problem)
+    data = replace(problem.data, states=states)
+    problem = replace(problem, data=data)
+    old = likelihood.starts
+    starts = replace(
+        old, slope=slope, begin=_begin(problem, old.cells, old.column), memory=Memory()
+    )
+    return replace(
+        problem, likelihood=replace(likelihood, starts=starts, tau=tuple(np.asarray(tau).tolist()))
+    )
+
+
+def output_error(problem: Problem) -> OutputErrorLikelihood:
+    """Return the likelihood of a problem of pieces.
+
+    Raises
+    ------
+    TypeError
+        If it is another.
+    """
+    if isinstance(problem.likelihood, OutputErrorLikelihood):
+        return problem.likelihood
+    raise TypeError("the problem has another likelihood, expected that of simulated pieces")
+
+
+def _begin(problem: Problem, cells: Cells, column: Ints) -> Floats:
+    """Return measured minus latent start states, shape (piece, cell); NaN where not measured."""
+    segments = problem.segments
+    observed = problem.data.history.dataset["observed"].to_numpy()
+    off = cells.of(observed[segments.trajectory, segments.step]) - cells.of(segments.start)
+    return np.where(column >= 0, cells.wrapped(off), np.nan)
+
+
+def least_errors(problem: Problem) -> Floats:
+    """Return the least sigma of each observed dimension, shape (state,)."""
+    return least_noise(problem.scene)[list(problem.observations.columns)]
