@@ -17,11 +17,11 @@ from threadpoolctl import threadpool_limits
 from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.ranking import checked_mode
 from pbrl_ppl.criticism.refinement import with_effects
-from pbrl_ppl.criticism.score import named_beside, rank_candidates, twins
+from pbrl_ppl.criticism.score import Signature, named_beside, rank_candidates, twins
 from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.effects import Attached, Effect, Noise, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.likelihood import output_error
 from pbrl_ppl.modes import Mode, climb_ladder, fit_pieces, ladder, refined
 from pbrl_ppl.parameters import prior_residual
@@ -304,11 +304,12 @@ class SimulatedSearch:
     def _white(self, now: list[Mode]) -> bool:
         """Return whether the residual is white at every length: a law would leave it correlated.
 
-        Short trajectories do not show it: fitted start states take the correlation away.
+        Short or sparse trajectories do not show it: fitted start states take the correlation away.
         """
-        limits = self.criteria.simulation
+        limits, data = self.criteria.simulation, now[-1].problem.data
+        shown = data.horizon >= limits.long and longest_gap(data.history) == 1
         times = [max(output_error(mode.problem).tau, default=1.0) for mode in now]
-        return now[-1].problem.data.horizon >= limits.long and max(times) < limits.white
+        return shown and max(times) < limits.white
 
     def _best(self, trials: list[_Trial]) -> _Trial | None:
         """Return the trial to accept: of nearly equal ones the simpler, then the earlier."""
@@ -357,8 +358,7 @@ class SimulatedSearch:
                 if 2 * signature.fall < limits.least_score or found == limits.leaders:
                     break
                 if leaders.keys().isdisjoint((signature.attached, *same(signature.attached))):
-                    estimate = np.array(list(signature.candidate.estimate.values()))
-                    leaders[signature.attached] = estimate
+                    leaders[signature.attached] = self._first_size(signature)
                     found += 1
         n = len(candidates)
         trials = []
@@ -373,6 +373,20 @@ class SimulatedSearch:
                 pairs.append(self._trial(now, begin, n))
             trials += self._refined(now, pairs, n)
         return trials
+
+    def _first_size(self, signature: Signature) -> Floats:
+        """Return where a candidate's refit begins, shape (q,).
+
+        The score's estimate, no farther out than an effect's size may be: one that the declared
+        parameters nearly absorb has no finite estimate.
+        """
+        effect = signature.attached.effect
+        size = np.array(list(signature.candidate.estimate.values()))
+        if effect.scan is not None:
+            return size
+        most = self.criteria.far_out * np.array([p.prior.scale for p in effect.parameters])
+        null = np.array(effect.null)
+        return np.asarray(null + np.clip(size - null, -most, most))
 
     def _refined(self, now: list[Mode], trials: list[_Trial], candidates: int) -> list[_Trial]:
         """Return trials, best first, the leading ones fitted until they gain no more."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.history import longest_gap
 from pbrl_ppl.likelihood import (
     Problem,
     in_pieces,
@@ -64,7 +65,8 @@ def ladder(mode: Mode) -> list[Mode]:
     HistoryError
         If no trajectory has three rows.
     """
-    longest = int(mode.problem.data.history.dataset["n_rows"].max()) - 1
+    history = mode.problem.data.history
+    longest = int(history.dataset["n_rows"].max()) - 1
     if longest < 2:
         raise HistoryError(
             f"history: its longest trajectory has {longest + 1} rows, a simulation is judged by at"
@@ -72,7 +74,7 @@ def ladder(mode: Mode) -> list[Mode]:
         )
     found: list[Mode] = []
     states, phi = mode.problem.data.smoothed_states, mode.phi
-    for length in lengths(longest):
+    for length in lengths(longest, longest_gap(history)):
         problem = in_pieces(mode.problem, length, states)
         fitted = fit_pieces(problem, phi)
         if found and growth(fitted.problem) > MOST_GROWTH:
@@ -82,15 +84,17 @@ def ladder(mode: Mode) -> list[Mode]:
     return found
 
 
-def lengths(longest: int) -> list[int]:
+def lengths(longest: int, gap: int = 1) -> list[int]:
     """Return the lengths of pieces for trajectories of so many intervals.
+
+    Pieces are longer than a gap of unmeasured rows, or some would have no measurement.
 
     Examples
     --------
-    >>> lengths(30), lengths(100), lengths(3)
-    ([4, 30], [4, 16, 100], [3])
+    >>> lengths(30), lengths(100), lengths(3), lengths(100, gap=11)
+    ([4, 30], [4, 16, 100], [3], [22, 100])
     """
-    shorter, length = [], SHORTEST
+    shorter, length = [], max(SHORTEST, 2 * gap if gap > 1 else 1)
     while 2 * length <= longest:
         shorter.append(length)
         length *= RATIO

@@ -49,6 +49,18 @@ def test_one_fall_is_said_to_be_one() -> None:
     assert any("record a second" in sentence for sentence in found.sentences)
 
 
+def test_gaps_longer_than_the_shortest_pieces() -> None:
+    """Every eleventh row measured, as of a block that is seen between pushes: the drag is named."""
+    dataset = fall(5, terminal=TERMINAL, trajectories=8, sd=1e-3).dataset.copy()
+    for name in ("observed", "start"):
+        values = dataset[name].to_numpy().copy()
+        hidden = np.arange(values.shape[1]) % 11 > 0
+        values[:, hidden, :, 1] = np.nan
+        dataset[name] = dataset[name].copy(data=values)
+    found = attribute(BALL, History(dataset), catalogue=some("linear_drag", "quadratic_drag"))
+    assert [law.effect for law in found.laws] == ["quadratic_drag"]
+
+
 def test_two_rows_are_refused() -> None:
     with pytest.raises(HistoryError, match="at least 3"):
         attribute(BALL, fall(0, rows=2, trajectories=8))
