@@ -143,7 +143,8 @@ def attribute(
     Raises
     ------
     HistoryError
-        If the history does not fit the scene, or no trajectory has three rows.
+        If the history does not fit the scene, no trajectory has three rows, or start states can
+        follow all that was measured.
     EffectError
         If the scene declares an unknown effect.
 
@@ -251,7 +252,7 @@ class SimulatedSearch:
         Raises
         ------
         HistoryError
-            If no trajectory has three rows.
+            If no trajectory has three rows, or start states can follow all that was measured.
         """
         limits = self.criteria.simulation
         now = ladder(mode)

@@ -63,7 +63,7 @@ def ladder(mode: Mode) -> list[Mode]:
     Raises
     ------
     HistoryError
-        If no trajectory has three rows.
+        If no trajectory has three rows, or start states can follow all that was measured.
     """
     history = mode.problem.data.history
     longest = int(history.dataset["n_rows"].max()) - 1
@@ -74,6 +74,14 @@ def ladder(mode: Mode) -> list[Mode]:
         )
     found: list[Mode] = []
     states, phi = mode.problem.data.smoothed_states, mode.phi
+    starts = output_error(in_pieces(mode.problem, longest, states)).starts
+    measured, unknown = int(starts.counts.sum()), starts.begin.size + len(phi)
+    if measured <= unknown:
+        raise HistoryError(
+            f"history: it has {measured} measurements, and simulations of its trajectories have"
+            f" {unknown} unknown start coordinates and parameters; record more rows of each"
+            " trajectory"
+        )
     for length in lengths(longest, longest_gap(history)):
         problem = in_pieces(mode.problem, length, states)
         fitted = fit_pieces(problem, phi)
@@ -303,9 +311,9 @@ class _Step:
         if len(phi):
             sd = 1.0 / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
             scaled = self.precision * np.outer(sd, sd) + damping * np.eye(len(sd))
-            phi = inside(
-                self.problem.layout.priors, phi + sd * np.linalg.solve(scaled, sd * self.gradient)
-            )
+            step = sd * np.linalg.solve(scaled, sd * self.gradient)
+            if np.isfinite(step).all():  # where the engine diverges there is no slope
+                phi = inside(self.problem.layout.priors, phi + step)
         left = self.rows - self.by_phi @ (phi - self.phi)
         change = (self.back @ (np.swapaxes(self.u, 1, 2) @ left[..., None]))[..., 0]
         states = start.copy()

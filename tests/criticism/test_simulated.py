@@ -66,6 +66,17 @@ def test_two_rows_are_refused() -> None:
         attribute(BALL, fall(0, rows=2, trajectories=8))
 
 
+def test_start_states_that_can_follow_everything_are_refused() -> None:
+    """Positions before and after, as of a pushed block: a start velocity explains both."""
+    dataset = fall(0, trajectories=6).dataset.copy()
+    for name in ("observed", "start"):
+        values = dataset[name].to_numpy().copy()
+        values[:, 1:-1, :, 1] = np.nan
+        dataset[name] = dataset[name].copy(data=values)
+    with pytest.raises(HistoryError, match="record more rows of each"):
+        attribute(BALL, History(dataset))
+
+
 def carriage(seed: int, viscous: float, dry: float, push: float) -> tuple[Scene, History]:
     """A carriage of 95 kg that known forces drive along x, its position alone measured."""
     rng, mass, dt, rows = np.random.default_rng(seed), 95.0, 0.02, 51
