@@ -32,6 +32,7 @@ from .noise_scales import ranges as ranges
 from .output_error import OutputErrorLikelihood as OutputErrorLikelihood
 from .output_error import in_pieces as in_pieces
 from .output_error import least_errors as least_errors
+from .output_error import linearised_about as linearised_about
 from .output_error import linearised_pieces as linearised_pieces
 from .output_error import output_error as output_error
 from .problem import Problem as Problem

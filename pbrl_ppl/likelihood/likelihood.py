@@ -46,9 +46,12 @@ class Likelihood(ABC):
         """Derivative of the start states by phi, where they follow the parameters."""
         return None
 
-    @abstractmethod
     def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
-        """Return the noise variables with the state dimensions of each, in the order of sigma."""
+        """Return the noise variables with the state dimensions of each, in the order of sigma.
+
+        ``sigma`` with the measured dimensions, unless the likelihood has others.
+        """
+        return {"sigma": observations.names}
 
     def free(self, sigma: Floats) -> Floats:
         """Return the noise parameters that are inferred, shape (..., free)."""
@@ -66,9 +69,12 @@ class Likelihood(ABC):
         """Return which of n noise parameters have an exponential prior, shape (n,)."""
         return np.zeros(n, dtype=bool)
 
-    @abstractmethod
     def of_data(self) -> TransitionLikelihood:
-        """Return the likelihood for other data, without what was linearised along these."""
+        """Return the likelihood for other data, without what was linearised along these.
+
+        Eq. 11 with the same tails and prior, unless it is Eq. 11 already.
+        """
+        return TransitionLikelihood(nu=self.nu, prior=self.prior)
 
     def of_parameters(self) -> Self:
         """Return the likelihood for other parameters, without what follows from these."""
@@ -167,10 +173,6 @@ class TransitionLikelihood(Likelihood):
             )
         return cls(scalar=sigma == "scalar", nu=nu)
 
-    def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
-        """Return ``sigma`` with the measured dimensions."""
-        return {"sigma": observations.names}
-
     def free(self, sigma: Floats) -> Floats:
         """Return the first of equal ones where sigma is a scalar."""
         return sigma[..., :1] if self.scalar else sigma
@@ -252,10 +254,6 @@ class TrajectoryLikelihood(Likelihood):
         mask = super().exponential(n)
         mask[[*self.noise.cells.accelerations, *self.noise.cells.drift_parameters]] = True
         return mask
-
-    def of_data(self) -> TransitionLikelihood:
-        """Return Eq. 11 with the same tails and prior."""
-        return TransitionLikelihood(nu=self.nu, prior=self.prior)
 
     def of_parameters(self) -> TrajectoryLikelihood:
         """Return the same with smoothed states that do not follow the parameters."""

@@ -9,15 +9,15 @@ differentiation of pseudo-inverses and nonlinear least squares problems whose va
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import final
 
 import numpy as np
 
 from pbrl_ppl.likelihood.cells import Cells, cells_of
-from pbrl_ppl.likelihood.data import Observations, least_noise
-from pbrl_ppl.likelihood.likelihood import Likelihood, TransitionLikelihood, log_norm, robust
+from pbrl_ppl.likelihood.data import least_noise
+from pbrl_ppl.likelihood.likelihood import Likelihood, log_norm, robust
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.physics import Memory
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
@@ -55,7 +55,7 @@ class Starts:
     seen: Bools
     begin: Floats
     column: Ints
-    memory: Memory
+    memory: Memory = field(init=False, default_factory=Memory)
 
     @cached_property
     def counts(self) -> Floats:
@@ -119,14 +119,6 @@ class OutputErrorLikelihood(Likelihood):
 
     starts: Starts
     tau: tuple[float, ...]
-
-    def variables(self, observations: Observations) -> dict[str, tuple[str, ...]]:
-        """Return ``sigma`` with the measured dimensions."""
-        return {"sigma": observations.names}
-
-    def of_data(self) -> TransitionLikelihood:
-        """Return Eq. 11 with the same tails and prior."""
-        return TransitionLikelihood(nu=self.nu, prior=self.prior)
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return residuals over sigma and the root of tau, without what start states take up."""
@@ -241,7 +233,8 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     column = np.array([columns.index(d) if d in columns else -1 for d in dimension])
     seen = problem.observations.measured
     slope = np.zeros((*seen.shape, len(cells.places)))
-    starts = Starts(cells, slope, seen, _begin(problem, cells, column), column, Memory())
+    begin = _begin(problem, cells, column, problem.segments.start)
+    starts = Starts(cells, slope, seen, begin, column)
     tau = (1.0,) * len(columns)
     return replace(
         problem, likelihood=OutputErrorLikelihood(starts=starts, tau=tau, nu=problem.likelihood.nu)
@@ -264,16 +257,19 @@ def linearised_pieces(problem: Problem, start: Floats, slope: Floats, tau: Float
     """
     segments, states = problem.segments, problem.data.smoothed_states.copy()
     states[segments.trajectory, segments.step] = start
-    likelihood = output_error(problem)
-    data = replace(problem.data, states=states)
-    problem = replace(problem, data=data)
-    old = likelihood.starts
-    starts = replace(
-        old, slope=slope, begin=_begin(problem, old.cells, old.column), memory=Memory()
-    )
-    return replace(
-        problem, likelihood=replace(likelihood, starts=starts, tau=tuple(np.asarray(tau).tolist()))
-    )
+    problem = linearised_about(problem, start, slope)
+    problem = problem.with_likelihood(tau=tuple(np.asarray(tau).tolist()))
+    return replace(problem, data=replace(problem.data, states=states))
+
+
+def linearised_about(problem: Problem, start: Floats, slope: Floats) -> Problem:
+    """Return the problem with the likelihood about other start states; its data stay.
+
+    Arguments are those of :func:`linearised_pieces`.
+    """
+    old = output_error(problem).starts
+    begin = _begin(problem, old.cells, old.column, start)
+    return problem.with_likelihood(starts=replace(old, slope=slope, begin=begin))
 
 
 def output_error(problem: Problem) -> OutputErrorLikelihood:
@@ -289,11 +285,11 @@ def output_error(problem: Problem) -> OutputErrorLikelihood:
     raise TypeError("the problem has another likelihood, expected that of simulated pieces")
 
 
-def _begin(problem: Problem, cells: Cells, column: Ints) -> Floats:
+def _begin(problem: Problem, cells: Cells, column: Ints, start: Floats) -> Floats:
     """Return measured minus latent start states, shape (piece, cell); NaN where not measured."""
     segments = problem.segments
     observed = problem.data.history.dataset["observed"].to_numpy()
-    off = cells.of(observed[segments.trajectory, segments.step]) - cells.of(segments.start)
+    off = cells.of(observed[segments.trajectory, segments.step]) - cells.of(start)
     return np.where(column >= 0, cells.wrapped(off), np.nan)
 
 

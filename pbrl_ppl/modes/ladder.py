@@ -18,10 +18,11 @@ from pbrl_ppl.likelihood import (
     Problem,
     in_pieces,
     least_errors,
+    linearised_about,
     linearised_pieces,
     output_error,
 )
-from pbrl_ppl.modes.laplace import Mode
+from pbrl_ppl.modes.laplace import Mode, covariance_of
 from pbrl_ppl.modes.noise import finite
 from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
@@ -171,9 +172,8 @@ def fit_pieces(problem: Problem, phi: Floats, rounds: int = 20, tolerance: float
         residuals = _residual(problem, points, starts)
         costs = []
         for point, begin, residual in zip(points, starts, residuals, strict=True):
-            begun = linearised_pieces(problem, begin, linear.by_start, _tau(problem))
-            least = least_errors(problem)
-            noise = output_error(begun).profile(residual, least)
+            begun = linearised_about(problem, begin, linear.by_start)
+            noise = output_error(begun).profile(residual, least_errors(problem))
             costs.append(_cost(begun, residual, noise, point))
         best = int(np.argmin(costs))
         gain = cost - costs[best]
@@ -191,6 +191,7 @@ def fit_pieces(problem: Problem, phi: Floats, rounds: int = 20, tolerance: float
     linear = _linearise(problem, phi, start, steps)
     problem, sigma = _with_noise(problem, start, linear)
     step = _Step(problem, linear, sigma, phi)
+    problem = linearised_pieces(problem, start, linear.by_start, _tau(problem))
     return Mode(
         problem, phi, sigma, step.jacobian, step.covariance,
         -_cost(problem, linear.residual, sigma, phi),
@@ -246,7 +247,7 @@ def _linearise(
 
 def _with_noise(problem: Problem, start: Floats, linear: _Linear) -> tuple[Problem, Floats]:
     """Return the problem linearised there, and sigma."""
-    problem = linearised_pieces(problem, start, linear.by_start, _tau(problem))
+    problem = linearised_about(problem, start, linear.by_start)
     likelihood, least = output_error(problem), least_errors(problem)
     sigma = likelihood.profile(linear.residual, least)
     tau = likelihood.correlation_times(linear.residual, sigma)
@@ -291,10 +292,7 @@ class _Step:
     @property
     def covariance(self) -> Floats:
         """Laplace covariance of phi, shape (p, p)."""
-        sd = 1.0 / np.sqrt(np.maximum(np.diag(self.precision), 1e-300))
-        return np.asarray(
-            np.linalg.pinv(self.precision * np.outer(sd, sd), hermitian=True) * np.outer(sd, sd)
-        )
+        return covariance_of(self.precision)
 
     def differences(self, scale: Floats, sizes: Floats) -> tuple[Floats, Floats]:
         """Return steps of the next derivatives, shapes (p,) and (cell,)."""

@@ -205,9 +205,13 @@ def finish(problem: Problem, peak: Peak) -> Mode:
         precision[tails, tails] = tail_precision(problem, phi, sigma)
     angles = [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
     precision[angles, angles] += _CIRCLE  # no angle is wider than its circle
-    sd = 1.0 / np.sqrt(np.maximum(np.diag(precision), 1e-300))
-    covariance = np.linalg.pinv(precision * np.outer(sd, sd), hermitian=True) * np.outer(sd, sd)
+    covariance = covariance_of(precision)
     n_cells = len(jacobian) - len(phi)
-    return Mode(
-        problem, phi, sigma, jacobian[:n_cells], np.asarray(covariance, dtype=float), log_posterior
-    )
+    return Mode(problem, phi, sigma, jacobian[:n_cells], covariance, log_posterior)
+
+
+def covariance_of(precision: Floats) -> Floats:
+    """Return the pseudo-inverse of a precision, shape (p, p), whatever the parameters' units."""
+    sd = 1.0 / np.sqrt(np.maximum(np.diag(precision), 1e-300))
+    scaled = np.linalg.pinv(precision * np.outer(sd, sd), hermitian=True)
+    return np.asarray(scaled * np.outer(sd, sd), dtype=float)
