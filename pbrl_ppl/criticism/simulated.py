@@ -23,7 +23,7 @@ from pbrl_ppl.effects import Attached, Effect, Noise, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.likelihood import output_error
-from pbrl_ppl.modes import Mode, climb_ladder, fit_pieces, ladder, refined
+from pbrl_ppl.modes import Linear, Mode, climb_ladder, derivatives, fit_pieces, ladder, refined
 from pbrl_ppl.parameters import prior_residual
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -262,14 +262,18 @@ class SimulatedSearch:
         while len(laws) < self.criteria.most_added and not self._white(now):
             trials = self._trials(now)
             best = self._best(trials)
-            if best is None:
-                break
-            without = _without(best.modes[-1], best.laws)
-            if again and nats(now[-1], without)[0] > 1.0:  # it was not at its optimum
-                again -= 1
+            while best is not None and again:
+                without = _without(best.modes[-1], best.laws)
+                if nats(now[-1], without)[0] <= 1.0:
+                    break
+                again -= 1  # it was not at its optimum
                 now = [*now[:-1], without]
                 declared = declared if laws else without
-                continue
+                n = len(self.missing(without))
+                trials = [self._judged(now, t.laws, t.modes, n, t.same) for t in trials]
+                best = self._best(trials)
+            if best is None:
+                break
             close = [
                 law for trial in trials for law in (*trial.laws, *trial.same)
                 if len(trial.laws) == 1 and trial.net > best.net - limits.least_nats
@@ -352,6 +356,7 @@ class SimulatedSearch:
                 )
             )  # fmt: skip
 
+        parents = [derivatives(mode) for mode in now]
         leaders: dict[Attached, Floats] = {}
         for signatures in ranked:
             found = 0
@@ -364,14 +369,14 @@ class SimulatedSearch:
         n = len(candidates)
         trials = []
         for law, size in leaders.items():
-            trial = self._trial(now, {law: size}, n)
+            trial = self._trial(now, parents, {law: size}, n)
             trials.append(replace(trial, same=tuple(o for o in same(law) if o != law)))
         trials = self._refined(now, trials, n)
         if trials and not self._white(trials[0].modes):
             pairs = []
             for pair in combinations(trials[: limits.paired], 2):
                 begin = {each.laws[0]: _sizes(each.modes[0], each.laws[0]) for each in pair}
-                pairs.append(self._trial(now, begin, n))
+                pairs.append(self._trial(now, parents, begin, n))
             trials += self._refined(now, pairs, n)
         return trials
 
@@ -399,11 +404,17 @@ class SimulatedSearch:
                 trials[i] = self._judged(now, trial.laws, modes, candidates, trial.same)
         return sorted(trials, key=lambda trial: -trial.net)
 
-    def _trial(self, now: list[Mode], begin: dict[Attached, Floats], candidates: int) -> _Trial:
+    def _trial(
+        self,
+        now: list[Mode],
+        parents: list[Linear],
+        begin: dict[Attached, Floats],
+        candidates: int,
+    ) -> _Trial:
         """Return the refit with some laws, at every length."""
         laws = tuple(begin)
         starts = [with_effects(m, (*m.problem.physics.effects, *laws), begin) for m in now]
-        return self._judged(now, laws, climb_ladder(starts), candidates)
+        return self._judged(now, laws, climb_ladder(starts, parents), candidates)
 
     def _judged(
         self,

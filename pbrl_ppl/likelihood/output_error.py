@@ -23,7 +23,7 @@ from pbrl_ppl.physics import Memory
 from pbrl_ppl.state import STATE, Bools, Floats, Ints
 
 #: Directions of a start state with a smaller singular value move nothing that was measured.
-_SEEN = 1e-7
+_SEEN = 1e-5
 #: Rounds of sigma and projection, which depend on each other.
 _ROUNDS = 6
 #: Correlations below this end the sum of an integrated autocorrelation time.
@@ -88,11 +88,11 @@ class Starts:
         rows = np.concatenate([moved.reshape(pieces, -1, cells), own], axis=1)
         scale = np.linalg.norm(rows, axis=1)
         scale = np.where(scale > 0, scale, 1.0)
-        u, s, vt = np.linalg.svd(rows / scale[:, None], full_matrices=False)
-        kept = s > _SEEN * s.max(axis=1, keepdims=True, initial=1e-300)
-        inverse = np.where(kept, 1.0 / np.where(kept, s, 1.0), 0.0)
-        back = np.swapaxes(vt, 1, 2) * inverse[:, None] / scale[:, :, None]
-        return u * kept[:, None], back
+        rows = rows / scale[:, None]
+        square, v = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)
+        kept = square > _SEEN**2 * square.max(axis=1, keepdims=True, initial=1e-300)
+        inverse = np.where(kept, 1.0 / np.sqrt(np.where(kept, square, 1.0)), 0.0)
+        return rows @ v * inverse[:, None], v * inverse[:, None] / scale[:, :, None]
 
     def _weights(self, weight: Floats) -> Floats:
         """Return the weight of each cell, 0 where it is not observed, shape (cell,)."""

@@ -8,7 +8,8 @@ simulated there.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -26,7 +27,7 @@ from pbrl_ppl.modes.laplace import Mode, covariance_of
 from pbrl_ppl.modes.noise import finite
 from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import Floats, Ints
 
 #: Intervals of the shortest pieces, and the ratio of a length to the one before.
 SHORTEST, RATIO = 4, 4
@@ -41,10 +42,12 @@ _WIDER = (3.0, 0.1)
 #: the least and the largest, as shares of each scale.
 _FIRST, _OF_PHI, _OF_START = 1e-4, 0.5, 0.3
 _LEAST, _MOST = 1e-6, 2e-2
-#: Rounds of a candidate's first fit, and the gain (nats) that ends it at lower lengths.
-_FEW, _LOOSE = 4, 1.0
+#: Gain (nats) that ends a fit, and a candidate's first one at lower lengths; rounds of that one.
+_TIGHT, _LOOSE, _FEW = 0.1, 1.0, 4
 #: Rounds of a leading candidate's fit.
 _MANY = 10
+#: Steps from one linearisation; one that gains less than this share of all of them is the last.
+_STEPS, _MUCH = 3, 0.2
 
 
 @one_blas_thread
@@ -110,7 +113,7 @@ def lengths(longest: int, gap: int = 1) -> list[int]:
     return [*shorter, longest]
 
 
-def climb_ladder(start: Sequence[tuple[Problem, Floats]]) -> list[Mode]:
+def climb_ladder(start: Sequence[tuple[Problem, Floats]], parents: Sequence[Linear]) -> list[Mode]:
     """Return first modes of another model at the lengths of its parent, after few rounds.
 
     Parameters
@@ -118,30 +121,83 @@ def climb_ladder(start: Sequence[tuple[Problem, Floats]]) -> list[Mode]:
     start : sequence of (Problem, ndarray)
         The model's problem at each length, linearised at the parent's start states, and where it
         may begin, shape (p,).
+    parents : sequence of Linear
+        Result of :func:`derivatives` of the parent at each length: those by the parameters that
+        both models have, and by the start states, are not taken anew.
     """
     found: list[Mode] = []
-    for problem, phi in start[:-1]:  # few rounds: the next length corrects it
-        begin = found[-1].phi if found else phi
-        found.append(fit_pieces(problem, begin, rounds=_FEW, tolerance=_LOOSE))
-    problem, phi = start[-1]
-    begins = [phi, *(mode.phi for mode in found[-1:])]
-    costs = [_start_cost(problem, each) for each in begins]
-    return [*found, fit_pieces(problem, begins[int(np.argmin(costs))], rounds=_FEW)]
+    for i, ((problem, phi), parent) in enumerate(zip(start, parents, strict=True)):
+        begins = [(problem, phi)]
+        if found:
+            begins += [(problem, found[-1].phi), (_along(problem, found[-1]), found[-1].phi)]
+        costs = [_start_cost(*each) for each in begins]
+        known = parent.of(problem.layout.labels)
+        tolerance = _LOOSE if i + 1 < len(start) else _TIGHT  # the next length corrects it
+        found.append(fit_pieces(*begins[int(np.argmin(costs))], _FEW, tolerance, known))
+    return found
+
+
+def _along(problem: Problem, shorter: Mode) -> Problem:
+    """Return the problem of pieces that begin on the simulations of shorter ones."""
+    segments, likelihood = problem.segments, output_error(problem)
+    start = simulated_states(shorter)[segments.trajectory, segments.step]
+    return linearised_pieces(problem, start, likelihood.starts.slope, np.array(likelihood.tau))
 
 
 @dataclass(frozen=True, eq=False)
-class _Linear:
-    """Residual and derivatives at phi and start states.
+class Linear:
+    """Residual and derivatives of simulated pieces at phi and start states.
 
-    Shapes: residual (piece, H, body, state), phi (.., p) and start (.., cell) as last axes.
+    Parameters
+    ----------
+    labels : tuple of str
+        Labels of the parameters.
+    residual : ndarray
+        Measured minus simulated, shape (piece, H, body, state), SI units.
+    by_phi, by_start : ndarray
+        Derivatives of the simulated states, shapes (piece, H, body, state, p) and (piece, H, body,
+        state, cell).
+    unknown : ndarray of int
+        Places of parameters whose derivatives are missing.
     """
 
+    labels: tuple[str, ...]
     residual: Floats
     by_phi: Floats
     by_start: Floats
+    unknown: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.intp))
+
+    def of(self, labels: tuple[str, ...]) -> Linear:
+        """Return the same with the parameters of another model, new ones unknown."""
+        places = [self.labels.index(label) if label in self.labels else -1 for label in labels]
+        unknown = np.array([i for i, place in enumerate(places) if place < 0], dtype=np.intp)
+        return replace(self, labels=labels, by_phi=self.by_phi[..., places], unknown=unknown)
 
 
-def fit_pieces(problem: Problem, phi: Floats, rounds: int = 20, tolerance: float = 0.1) -> Mode:
+@one_blas_thread
+def derivatives(mode: Mode) -> Linear:
+    """Return residual and derivatives of simulated pieces at their mode."""
+    problem, slope = mode.problem, output_error(mode.problem).starts.slope
+    none = np.zeros((*slope.shape[:-1], len(mode.phi)))
+    labels, every = problem.layout.labels, np.arange(len(mode.phi))
+    slopes = prior_slopes(problem.layout.priors, mode.phi) if len(every) else np.zeros(0)
+    precision = (mode.jacobian**2).sum(axis=0) + slopes**2
+    scale = problem.layout.scale(mode.phi)
+    width = np.clip(
+        _OF_PHI / np.sqrt(np.maximum(precision, 1e-300)), _LEAST * scale, _MOST * scale
+    )
+    steps = np.where(problem.layout.discrete, 0.0, width), np.zeros(0)
+    known = Linear(labels, none[..., 0], none, slope, every)
+    return _linearise(problem, mode.phi, problem.segments.start, steps, known)
+
+
+def fit_pieces(
+    problem: Problem,
+    phi: Floats,
+    rounds: int = 20,
+    tolerance: float = _TIGHT,
+    known: Linear | None = None,
+) -> Mode:
     """Return a mode of simulated pieces by Gauss-Newton steps, start states projected out.
 
     Parameters
@@ -154,6 +210,8 @@ def fit_pieces(problem: Problem, phi: Floats, rounds: int = 20, tolerance: float
         Linearisations, at most.
     tolerance : float
         Gain in log-posterior (nats) below which it ends.
+    known : Linear, optional
+        Derivatives that are not taken anew, of a smaller model nearby.
     """
     priors, layout = problem.layout.priors, problem.layout
     scale, sizes = layout.scale(phi), output_error(problem).starts.cells.sizes(problem.scene)
@@ -161,40 +219,41 @@ def fit_pieces(problem: Problem, phi: Floats, rounds: int = 20, tolerance: float
     steps = _FIRST * np.where(layout.discrete, 0.0, scale), _FIRST * sizes
     damping, failed = 1e-3, 0
     for _ in range(rounds):
-        linear = _linearise(problem, phi, start, steps)
+        linear = _linearise(problem, phi, start, steps, known)
         problem, sigma = _with_noise(problem, start, linear)
-        cost = _cost(problem, linear.residual, sigma, phi)
-        step = _Step(problem, linear, sigma, phi)
+        step = _Step(problem, linear, sigma, phi, start)
         if not failed:
             steps = step.differences(scale, sizes)
-        tried = [step.moved(damping * factor, start) for factor in _DAMPINGS]
-        points, starts = np.array([own[0] for own in tried]), np.array([own[1] for own in tried])
-        residuals = _residual(problem, points, starts)
-        costs = []
-        for point, begin, residual in zip(points, starts, residuals, strict=True):
-            begun = linearised_about(problem, begin, linear.by_start)
-            noise = output_error(begun).profile(residual, least_errors(problem))
-            costs.append(_cost(begun, residual, noise, point))
-        best = int(np.argmin(costs))
-        gain = cost - costs[best]
-        if gain > 0:
-            phi, start = points[best], starts[best]
-        if gain > tolerance:
-            failed = 0
+        gained = 0.0
+        for _ in range(_STEPS):
+            tried = [step.moved(damping * factor) for factor in _DAMPINGS]
+            points, starts = (np.array(own) for own in zip(*tried, strict=True))
+            residuals = _residual(problem, points, starts)
+            costs = [step.cost(*each) for each in zip(points, starts, residuals, strict=True)]
+            best = int(np.argmin(costs))
+            gain = step.cost_before - costs[best]
+            if gain > 0:
+                phi, start = points[best], starts[best]
+                step = step.at(phi, start, residuals[best])
+            gained += max(gain, 0.0)
+            if gain <= max(tolerance, _MUCH * gained):
+                break
             damping = min(max(damping * _DAMPINGS[best], _LEAST_DAMPING), 1.0)
+        if gained > tolerance:
+            failed = 0
             continue
-        if failed == len(_WIDER):
+        if known is not None or failed == len(_WIDER):
             break
         # friction makes kinks: over another width the derivative sees others
         steps = steps[0] * _WIDER[failed], steps[1] * _WIDER[failed]
         damping, failed = 1e-3, failed + 1
-    linear = _linearise(problem, phi, start, steps)
+    linear = _linearise(problem, phi, start, steps, known)
     problem, sigma = _with_noise(problem, start, linear)
-    step = _Step(problem, linear, sigma, phi)
+    step = _Step(problem, linear, sigma, phi, start)
     problem = linearised_pieces(problem, start, linear.by_start, _tau(problem))
     return Mode(
         problem, phi, sigma, step.jacobian, step.covariance,
-        -_cost(problem, linear.residual, sigma, phi),
+        -_cost(problem, sigma, phi),
     )  # fmt: skip
 
 
@@ -207,7 +266,7 @@ def _start_cost(problem: Problem, phi: Floats) -> float:
     """Return the cost at phi with the start states taken along to first order."""
     likelihood = output_error(problem)
     residual = _residual(problem, phi[None], problem.segments.start[None])[0]
-    return _cost(problem, residual, likelihood.profile(residual, least_errors(problem)), phi)
+    return _cost(problem, likelihood.profile(residual, least_errors(problem)), phi)
 
 
 def _tau(problem: Problem) -> Floats:
@@ -222,27 +281,36 @@ def _residual(problem: Problem, points: Floats, starts: Floats) -> Floats:
 
 
 def _linearise(
-    problem: Problem, phi: Floats, start: Floats, steps: tuple[Floats, Floats]
-) -> _Linear:
+    problem: Problem,
+    phi: Floats,
+    start: Floats,
+    steps: tuple[Floats, Floats],
+    known: Linear | None = None,
+) -> Linear:
     """Return residual and derivatives by central differences, all in one call of the engine."""
     cells = output_error(problem).starts.cells
     lower, upper = box(problem.layout.priors)
     ahead, behind = np.minimum(phi + steps[0], upper), np.maximum(phi - steps[0], lower)
-    p, c = len(phi), len(cells.places)
+    new = np.arange(len(phi)) if known is None else known.unknown
+    p, c = len(new), len(cells.places) if known is None else 0
     points = np.tile(phi, (1 + 2 * p + 2 * c, 1))
-    points[1 + np.arange(p), np.arange(p)] = ahead
-    points[1 + p + np.arange(p), np.arange(p)] = behind
+    points[1 + np.arange(p), new] = ahead[new]
+    points[1 + p + np.arange(p), new] = behind[new]
     starts = np.tile(start, (len(points), 1, 1, 1))
     flat = starts.reshape(len(points), len(start), -1)
-    for i, place in enumerate(cells.places):
+    for i, place in enumerate(cells.places[:c]):
         flat[1 + 2 * p + i, :, place] += steps[1][i]
         flat[1 + 2 * p + c + i, :, place] -= steps[1][i]
     residual = _residual(problem, points, cells.completed(problem.scene, starts))
-    width = np.maximum(ahead - behind, 1e-300)
+    width = np.maximum(ahead - behind, 1e-300)[new]
     by_phi = np.moveaxis(residual[1 : 1 + p] - residual[1 + p : 1 + 2 * p], 0, -1) / -width
+    if known is not None:
+        by_every = known.by_phi.copy()
+        by_every[..., new] = by_phi
+        return replace(known, residual=residual[0], by_phi=by_every)
     begun = residual[1 + 2 * p :]
     by_start = np.moveaxis(begun[:c] - begun[c:], 0, -1) / (-2 * steps[1])
-    return _Linear(residual[0], by_phi, by_start)
+    return Linear(problem.layout.labels, residual[0], by_phi, by_start)
 
 
 def _with_noise(problem: Problem, start: Floats, linear: _Linear) -> tuple[Problem, Floats]:
@@ -254,7 +322,7 @@ def _with_noise(problem: Problem, start: Floats, linear: _Linear) -> tuple[Probl
     return problem.with_likelihood(tau=tuple(tau.tolist())), sigma
 
 
-def _cost(problem: Problem, residual: Floats, sigma: Floats, phi: Floats) -> float:
+def _cost(problem: Problem, sigma: Floats, phi: Floats) -> float:
     """Return the negative log-posterior, the noise at its profile, up to a constant."""
     likelihood = output_error(problem)
     weight = likelihood.starts.counts / np.array(likelihood.tau)
@@ -263,31 +331,57 @@ def _cost(problem: Problem, residual: Floats, sigma: Floats, phi: Floats) -> flo
 
 
 class _Step:
-    """Gauss-Newton steps from one linearisation."""
+    """Gauss-Newton steps from one linearisation, with fixed weights and projection."""
 
-    def __init__(self, problem: Problem, linear: _Linear, sigma: Floats, phi: Floats) -> None:
+    def __init__(
+        self, problem: Problem, linear: Linear, sigma: Floats, phi: Floats, start: Floats
+    ) -> None:
         likelihood = output_error(problem)
-        self.problem, self.phi, self.starts = problem, phi, likelihood.starts
-        priors = problem.layout.priors
-        weight = 1.0 / (sigma * np.sqrt(likelihood.tau))
-        self.u, self.back = self.starts.basis(weight)
-        self.rows = self.starts.rows(linear.residual, weight)
-        by_phi = np.moveaxis(linear.by_phi, -1, 0) * weight
-        pieces, rows = len(self.rows), linear.residual[0].size
+        self.problem, self.starts, self.tau = problem, likelihood.starts, likelihood.tau
+        self.least, self.by_start = least_errors(problem), linear.by_start
+        self.weight = 1.0 / (sigma * np.sqrt(likelihood.tau))
+        self.u, self.back = self.starts.basis(self.weight)
+        by_phi = np.moveaxis(linear.by_phi, -1, 0) * self.weight
+        pieces, rows = len(linear.residual), linear.residual[0].size
         by_phi = by_phi.reshape(len(phi), pieces, rows)
-        n = self.rows.shape[-1] - rows
+        n = self.u.shape[1] - rows
         self.by_phi = np.moveaxis(np.pad(by_phi, ((0, 0), (0, 0), (0, n))), 0, -1)
         projected = self.by_phi - self.u @ (np.swapaxes(self.u, 1, 2) @ self.by_phi)
-        taken = (self.u @ (np.swapaxes(self.u, 1, 2) @ self.rows[..., None]))[..., 0]
-        self.jacobian = projected.reshape(self.rows.size, len(phi))
+        self.jacobian = projected.reshape(-1, len(phi))
+        self.normal = self.jacobian.T @ self.jacobian
+        self._move(phi, start, linear.residual)
+
+    def _move(self, phi: Floats, start: Floats, residual: Floats) -> None:
+        self.phi, self.start = phi, start
+        self.rows = self._rows(start, residual)
+        left = self.rows - (self.u @ (np.swapaxes(self.u, 1, 2) @ self.rows[..., None]))[..., 0]
+        priors = self.problem.layout.priors
         slopes = prior_slopes(priors, phi) if priors else np.zeros(0)
-        self.gradient = self.jacobian.T @ (self.rows - taken).ravel()
-        self.gradient = self.gradient - slopes * prior_residual(priors, phi)
-        self.precision = self.jacobian.T @ self.jacobian + np.diag(slopes**2)
-        own = np.where(self.starts.seen[..., None], linear.by_start, 0.0) * weight[:, None]
-        self.of_start = (own**2).sum((1, 2, 3)) + np.isfinite(self.starts.begin) * np.where(
-            self.starts.column >= 0, weight[self.starts.column], 0.0
-        ) ** 2
+        self.gradient = self.jacobian.T @ left.ravel() - slopes * prior_residual(priors, phi)
+        self.precision = self.normal + np.diag(slopes**2)
+        self.cost_before = self.cost(phi, start, residual)
+
+    def at(self, phi: Floats, start: Floats, residual: Floats) -> _Step:
+        """Return the steps from another point, with the same derivatives."""
+        other = copy(self)
+        other._move(phi, start, residual)
+        return other
+
+    def _rows(self, start: Floats, residual: Floats) -> Floats:
+        """Return weighted residuals with those of the start states, shape (piece, row)."""
+        begun = linearised_about(self.problem, start, self.by_start)
+        return output_error(begun).starts.rows(residual, self.weight)
+
+    def cost(self, phi: Floats, start: Floats, residual: Floats) -> float:
+        """Return the negative log-posterior at a point, the noise at its profile."""
+        rows = self._rows(start, residual)
+        left = rows - (self.u @ (np.swapaxes(self.u, 1, 2) @ rows[..., None]))[..., 0]
+        cut = residual[0].size
+        square = (left[:, :cut].reshape(residual.shape) ** 2).sum((0, 1, 2))
+        seen = self.starts.column >= 0
+        np.add.at(square, self.starts.column[seen], (left[:, cut:] ** 2).sum(axis=0)[seen])
+        sigma = np.sqrt(square / self.starts.counts) / self.weight
+        return _cost(self.problem, np.maximum(sigma, self.least), phi)
 
     @property
     def covariance(self) -> Floats:
@@ -300,10 +394,16 @@ class _Step:
         width = np.where(
             self.problem.layout.discrete, 0.0, np.clip(width, _LEAST * scale, _MOST * scale)
         )
-        own = _OF_START / np.sqrt(np.maximum(np.median(self.of_start, axis=0), 1e-300))
-        return width, np.clip(own, _LEAST * sizes, _MOST * sizes)
+        begun = self.starts.column >= 0
+        by_start = np.where(self.starts.seen[..., None], self.by_start, 0.0)
+        of_start = ((by_start * self.weight[:, None]) ** 2).sum((1, 2, 3))
+        of_start += np.isfinite(self.starts.begin) * np.where(
+            begun, self.weight[self.starts.column], 0.0
+        ) ** 2  # fmt: skip
+        begin = _OF_START / np.sqrt(np.maximum(np.median(of_start, axis=0), 1e-300))
+        return width, np.clip(begin, _LEAST * sizes, _MOST * sizes)
 
-    def moved(self, damping: float, start: Floats) -> tuple[Floats, Floats]:
+    def moved(self, damping: float) -> tuple[Floats, Floats]:
         """Return phi and start states a damped step on, shapes (p,) and (piece, body, 6)."""
         phi, cells = self.phi, self.starts.cells
         if len(phi):
@@ -314,8 +414,8 @@ class _Step:
                 phi = inside(self.problem.layout.priors, phi + step)
         left = self.rows - self.by_phi @ (phi - self.phi)
         change = (self.back @ (np.swapaxes(self.u, 1, 2) @ left[..., None]))[..., 0]
-        states = start.copy()
-        states.reshape(len(start), -1)[:, cells.places] += change / (1.0 + damping)
+        states = self.start.copy()
+        states.reshape(len(states), -1)[:, cells.places] += change / (1.0 + damping)
         return phi, cells.completed(self.problem.scene, states)
 
 
