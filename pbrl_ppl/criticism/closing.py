@@ -38,16 +38,16 @@ from pbrl_ppl.criticism.results import (
 from pbrl_ppl.criticism.rivals import keep_groups
 from pbrl_ppl.criticism.score import Signature
 from pbrl_ppl.criticism.selection import Selection, Step
+from pbrl_ppl.criticism.simulated import Simulated, SimulatedSearch
 from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
     noise_alone,
     unexplained_acceleration,
-    without_acceleration,
 )
 from pbrl_ppl.effects import Attached, Effect, attach
 from pbrl_ppl.effects import catalogue as full_catalogue
-from pbrl_ppl.errors import ConvergenceWarning, PriorWarning, UninformedWarning
+from pbrl_ppl.errors import ConvergenceWarning, HistoryError, PriorWarning, UninformedWarning
 from pbrl_ppl.history import History, with_units, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
@@ -167,11 +167,15 @@ class _Model:
 
 
 class _Search(NamedTuple):
-    """Result of a search for effects: the declared model's ranking, the mode, the added effects."""
+    """Result of a search for effects: the declared model's ranking, the mode, the added effects.
+
+    ``simulated`` is the mode with the effects that simulations name alone.
+    """
 
     first: list[Signature]
     mode: Mode
     steps: list[Step]
+    simulated: Mode
 
 
 def _closed(task: _Task, train: History, test: History) -> Loop:
@@ -199,22 +203,24 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         say(Stage.FIT)
         declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
         compiled()
-    search = _add_effects(declared, selection, provisional=True)
+    found = _simulated(declared, selection)
+    search = _add_effects(declared, selection, found)
     # with the right noise model effects may show that were hidden before
-    for again in reversed(range(criteria.noise_rounds)):
+    for _ in range(criteria.noise_rounds):
         train, frames = without_measurements(train, outliers(search.mode, criteria))
         if frames:
             for sentence in map(str, frames):
                 say(sentence)
             bad += tuple(map(str, frames))
             declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
+            found = _simulated(declared, selection)
         else:
             correlated = with_correlated_errors(search.mode, criteria)
             if correlated is None:
                 break
             say(Stage.REPEAT)
             declared = same_noise(declared, correlated)
-        search = _add_effects(declared, selection, provisional=again > 0)
+        search = _add_effects(declared, selection, found)
     revised, steps = search.mode, search.steps
     tested = replace(revised, problem=HeldOut.of(revised, test).problem)
     test, frames = without_measurements(test, outliers(tested, criteria))
@@ -235,9 +241,16 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         if share > criteria.large_if_small or not followed:
             # any effect takes up a part of a misfit, so no name follows from that
             say(Stage.WITHDRAW)
-            selection.withdraw(steps)
-            steps, revised, after = [], declared, before
-            misfit = without.with_test(prior)
+            small = [step for step in steps if not step.simulated]
+            selection.withdraw(small)
+            steps = [step for step in steps if step.simulated]
+            if small and steps:
+                revised = search.simulated
+                after = unexplained_acceleration(revised, criteria)
+                without = find_misfit(revised, after, horizon=horizon, seed=seed)
+                misfit = without.with_test(with_added)
+            elif small:
+                revised, after, misfit = declared, before, without.with_test(prior)
     if steps:
         misfit = with_negligible_acceleration(misfit, revised, after)
     say(Stage.SAMPLE)
@@ -265,23 +278,25 @@ def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> Non
     Problem.of(physics, train).predict(phi)
 
 
-def _add_effects(declared: Mode, selection: Selection, *, provisional: bool) -> _Search:
-    """Rank candidates and add effects one by one, each ranked beside those before.
+def _simulated(declared: Mode, selection: Selection) -> Simulated:
+    """Return the laws that the simulation error of whole trajectories shows; none if too short."""
+    selection.say(Stage.SIMULATE)
+    search = SimulatedSearch(selection.missing, selection.criteria, selection.say)
+    try:
+        return search(declared)
+    except HistoryError:  # start states could follow all that was measured
+        return Simulated(declared, declared, (), {})
 
-    If ``provisional``, the search ends where outliers show, the last effect unconfirmed.
-    """
+
+def _add_effects(declared: Mode, selection: Selection, found: Simulated) -> _Search:
+    """Add the effects that simulations name, then smaller ones by innovations, one by one."""
     criteria, say = selection.criteria, selection.say
     say(Stage.SCORE)
     first = selection.rank(declared)
-    mode, ranked = declared, first
-    steps: list[Step] = []
+    simulated, steps = selection.adopted(declared, found, first)
+    mode, ranked = simulated, selection.rank(simulated) if steps else first
     while ranked and len(steps) < criteria.most_added:
-        if provisional and np.isfinite(outliers(mode, criteria)).any():
-            return _Search(first, mode, steps)
-        step = selection.best_addition(mode, ranked, provisional=provisional)
-        if step is None and unexplained_acceleration(mode, criteria).remains.any():
-            # a random force follows smooth effects, whose scores are small beside it
-            step = selection.best_addition(mode, selection.rank(mode, without_acceleration(mode)))
+        step = selection.best_addition(mode, ranked)
         if step is None:
             break
         say(f"added {step.signature.candidate.effect} on {step.signature.candidate.body}")
@@ -291,7 +306,7 @@ def _add_effects(declared: Mode, selection: Selection, *, provisional: bool) -> 
     if len(steps) > 1:
         say(Stage.PRUNE)
         mode, steps = selection.prune(mode, steps)
-    return _Search(first, mode, steps)
+    return _Search(first, mode, steps, simulated)
 
 
 def _prior_test(

@@ -21,10 +21,10 @@ from pbrl_ppl.criticism.cross_validation import (
 )
 from pbrl_ppl.criticism.forecast import longest_forecast
 from pbrl_ppl.criticism.promise import forecast_change, promised_share
-from pbrl_ppl.criticism.recordings import outliers
 from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
+from pbrl_ppl.criticism.simulated import Simulated
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, trajectory_evidence, trajectory_mode
@@ -35,13 +35,17 @@ from pbrl_ppl.state import Floats
 
 @dataclass(frozen=True, eq=False)
 class Step:
-    """An added effect: its signature, the new mode and the gain in log predictive density."""
+    """An added effect: its signature, the new mode and the gain in log predictive density.
+
+    ``simulated`` says whether the simulation error of whole trajectories named it.
+    """
 
     signature: Signature
     not_separable_from: tuple[str, ...]
     after: Mode
     elpd_difference: float
     elpd_difference_se: float
+    simulated: bool = False
 
 
 @dataclass(eq=False)
@@ -82,13 +86,52 @@ class Selection:
         """Return the scores of a model's candidates, at its mode or with other noise parameters."""
         return rank_candidates(at or mode, self.missing(mode), self.criteria)
 
-    def best_addition(
-        self, mode: Mode, ranked: list[Signature], *, provisional: bool = False
-    ) -> Step | None:
-        """Refit with the leading candidates and return the best that is confirmed, or None.
+    def adopted(
+        self, mode: Mode, simulated: Simulated, ranked: list[Signature]
+    ) -> tuple[Mode, list[Step]]:
+        """Return the mode with the laws that simulations name, and a step for each of them.
 
-        If ``provisional``, one whose fit shows outliers is returned without being confirmed.
+        Parameters
+        ----------
+        mode : Mode
+            Of the declared model, fitted to whole trajectories.
+        simulated : Simulated
+            The laws, and the parameters that were found with them.
+        ranked : list of Signature
+            Scores of the declared model's candidates.
         """
+        scored = {signature.attached: signature for signature in ranked}
+        for attached, (nats, share) in simulated.tried.items():
+            told = (
+                f"takes {100 * share:.2g} % off the error of whole trajectories ({nats:.0f} nats)"
+            )
+            self._note(scored[attached], told)
+        if not simulated.laws:
+            return mode, []
+        problem = mode.problem.with_physics(effects=simulated.after.problem.physics.effects)
+        phi = problem.layout.from_layout(simulated.after.problem.layout, simulated.after.phi)
+        after = with_enough_substeps(trajectory_mode(problem, phi), self.say, self.criteria)
+        steps = []
+        for law in simulated.laws:
+            without = self._without(after, law.attached) if len(simulated.laws) > 1 else mode
+            gained, _ = _gains(without, after, self.criteria)
+            self._note(scored[law.attached], "added")
+            steps.append(
+                Step(
+                    scored[law.attached], law.confounded_names, after, gained.total, gained.error,
+                    simulated=True,
+                )
+            )  # fmt: skip
+        return after, steps
+
+    @staticmethod
+    def _without(mode: Mode, attached: Attached) -> Mode:
+        """Return the mode of the model without an effect."""
+        kept = tuple(each for each in mode.problem.physics.effects if each != attached)
+        return trajectory_mode(*with_effects(mode, kept), mode.sigma)
+
+    def best_addition(self, mode: Mode, ranked: list[Signature]) -> Step | None:
+        """Refit with the leading candidates and return the best that is confirmed, or None."""
         order = [attached.effect.name for attached in self.missing(mode)]
         limits = self.criteria.selection
         self.small.clear()
@@ -112,8 +155,6 @@ class Selection:
                 tied = [each for each, value in scores.items() if value > best - limits.tie]
                 signature = min(tied, key=lambda each: order.index(each.attached.effect.name))
                 height, fitted = scores.pop(signature), fits[signature]
-                if provisional and np.isfinite(outliers(fitted, self.criteria)).any():
-                    return Step(signature, (), fitted, np.nan, np.nan)
                 step = self._confirm(mode, signature, fitted, ranked)
                 if step is None:
                     continue
@@ -255,9 +296,9 @@ class Selection:
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
         """Drop effects that later ones have made unnecessary; sort the rest by their gain."""
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
-            effects = mode.problem.physics.effects
-            kept = tuple(each for each in effects if each != step.signature.attached)
-            without = trajectory_mode(*with_effects(mode, kept), mode.sigma)
+            if step.simulated:
+                continue
+            without = self._without(mode, step.signature.attached)
             gains = _gains(without, mode, self.criteria)
             if why := self._uncertain(without, mode, *gains):
                 self._note(step.signature, f"needless beside later ones: {why}")

@@ -7,7 +7,7 @@ the search by innovations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
@@ -169,7 +169,7 @@ def attribute(
     problem = after.problem
     names, likelihood = problem.observations.names, output_error(problem)
     return Attribution(
-        laws=found.laws,
+        laws=found.described(),
         before=dict(zip(names, before.sigma.tolist(), strict=True)),
         after=dict(zip(names, after.sigma.tolist(), strict=True)),
         correlated=dict(zip(names, likelihood.tau, strict=True)),
@@ -179,20 +179,41 @@ def attribute(
 
 
 @dataclass(frozen=True, eq=False)
-class _Found:
-    """Result of a search: both models at the greatest length, and the laws added."""
+class Simulated:
+    """Result of a search by simulation error.
+
+    Parameters
+    ----------
+    declared, after : Mode
+        The declared model and the one with the laws, at the greatest length.
+    laws : tuple of Accepted
+        In the order in which they were found.
+    tried : dict of Attached to (float, float)
+        Net log-evidence (nats) of candidates that were refitted beside the declared model, and the
+        share of the simulation error that they take away.
+    """
 
     declared: Mode
     after: Mode
-    laws: tuple[Law, ...]
+    laws: tuple[Accepted, ...]
+    tried: Mapping[Attached, tuple[float, float]]
+
+    def described(self) -> tuple[Law, ...]:
+        """Return the laws with what each is worth in the last model."""
+        return tuple(_law(self.after, law) for law in self.laws)
 
 
 @dataclass(frozen=True, eq=False)
-class _Accepted:
+class Accepted:
     """A law in the model, and the effects that explain the data as well."""
 
     attached: Attached
     confounded: tuple[Attached, ...]
+
+    @property
+    def confounded_names(self) -> tuple[str, ...]:
+        """Names of these effects, with their bodies where they act on another."""
+        return tuple(named_beside(each, self.attached) for each in self.confounded)
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,6 +236,14 @@ def nats(before: Mode, after: Mode) -> tuple[float, float]:
     likelihood = output_error(after.problem)
     weight = likelihood.starts.counts / np.array(likelihood.tau)
     return float((weight * np.log(before.sigma / after.sigma)).sum()), float(weight.sum())
+
+
+def net_evidence(before: Mode, after: Mode, laws: int, candidates: int = 1) -> float:
+    """Return the evidence less its price: parameters, their prior, and candidates tried."""
+    gained, effective = nats(before, after)
+    more = len(after.phi) - len(before.phi)
+    price = 0.5 * more * np.log(max(effective, 2.0)) + laws * np.log(max(candidates, 1))
+    return float(gained - price - max(_prior(after) - _prior(before), 0.0))
 
 
 def share_taken(before: Mode, after: Mode) -> float:
@@ -241,7 +270,7 @@ class SimulatedSearch:
     criteria: Criteria = DEFAULT
     say: Callable[[str], None] = field(default=lambda sentence: None)
 
-    def __call__(self, mode: Mode) -> _Found:
+    def __call__(self, mode: Mode) -> Simulated:
         """Return the laws that the simulation error of a model's trajectories shows.
 
         Parameters
@@ -257,10 +286,17 @@ class SimulatedSearch:
         limits = self.criteria.simulation
         now = ladder(mode)
         declared = now[-1]
-        laws: list[_Accepted] = []
+        laws: list[Accepted] = []
+        tried: dict[Attached, tuple[float, float]] = {}
         again = limits.restarts
         while len(laws) < self.criteria.most_added and not self._white(now):
             trials = self._trials(now)
+            if not laws:
+                tried = {
+                    law: (trial.net, trial.share)
+                    for trial in trials if len(trial.laws) == 1
+                    for law in (*trial.laws, *trial.same)
+                }  # fmt: skip
             best = self._best(trials)
             while best is not None and again:
                 without = _without(best.modes[-1], best.laws)
@@ -281,30 +317,10 @@ class SimulatedSearch:
             now = best.modes
             for law in best.laws:
                 others = tuple(each for each in close if each not in best.laws)
-                laws.append(_Accepted(law, others))
+                laws.append(Accepted(law, others))
                 self.say(f"simulations name {law.effect.name} on {law.body}")
         last, laws = self._pruned(now[-1], laws)
-        return _Found(declared, last, tuple(self._law(last, each) for each in laws))
-
-    def _law(self, mode: Mode, accepted: _Accepted) -> Law:
-        """Return an accepted law with what it is worth in the last model."""
-        attached = accepted.attached
-        effect, without = attached.effect, _without(mode, (attached,))
-        labels = mode.problem.layout.labels
-        places = [labels.index(label) for label in attached.labels]
-        sd = np.sqrt(np.diag(mode.covariance)[places])
-        names = [parameter.name for parameter in effect.parameters]
-        return Law(
-            effect=effect.name,
-            body=attached.body,
-            sentence=effect.sentence,
-            estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
-            sd=dict(zip(names, sd.tolist(), strict=True)),
-            units={parameter.name: parameter.unit for parameter in effect.parameters},
-            nats=self._net(without, mode, 1),
-            share=share_taken(without, mode),
-            confounded=tuple(named_beside(each, attached) for each in accepted.confounded),
-        )
+        return Simulated(declared, last, tuple(laws), tried)
 
     def _white(self, now: list[Mode]) -> bool:
         """Return whether the residual is white at every length: a law would leave it correlated.
@@ -425,21 +441,14 @@ class SimulatedSearch:
         same: tuple[Attached, ...] = (),
     ) -> _Trial:
         """Return the trial of fitted modes."""
-        net = self._net(now[-1], modes[-1], len(laws), candidates)
+        net = net_evidence(now[-1], modes[-1], len(laws), candidates)
         return _Trial(laws, modes, net, share_taken(now[-1], modes[-1]), same)
 
-    def _net(self, before: Mode, after: Mode, laws: int, candidates: int = 1) -> float:
-        """Return the evidence less its price: parameters, their prior, and candidates tried."""
-        gained, effective = nats(before, after)
-        more = len(after.phi) - len(before.phi)
-        price = 0.5 * more * np.log(max(effective, 2.0)) + laws * np.log(max(candidates, 1))
-        return float(gained - price - max(_prior(after) - _prior(before), 0.0))
-
-    def _pruned(self, mode: Mode, laws: list[_Accepted]) -> tuple[Mode, list[_Accepted]]:
+    def _pruned(self, mode: Mode, laws: list[Accepted]) -> tuple[Mode, list[Accepted]]:
         """Drop laws that later ones have made needless."""
         while len(laws) > 1:
             without = [_without(mode, (law.attached,)) for law in laws]
-            worth = [self._net(each, mode, 1) for each in without]
+            worth = [net_evidence(each, mode, 1) for each in without]
             taken = [share_taken(each, mode) for each in without]
             least = int(np.argmin(worth))
             enough = worth[least] > self.criteria.simulation.least_nats
@@ -448,6 +457,27 @@ class SimulatedSearch:
             mode = without[least]
             laws = [law for law in laws if law is not laws[least]]
         return mode, laws
+
+
+def _law(mode: Mode, accepted: Accepted) -> Law:
+    """Return an accepted law with what it is worth in the last model."""
+    attached = accepted.attached
+    effect, without = attached.effect, _without(mode, (attached,))
+    labels = mode.problem.layout.labels
+    places = [labels.index(label) for label in attached.labels]
+    sd = np.sqrt(np.diag(mode.covariance)[places])
+    names = [parameter.name for parameter in effect.parameters]
+    return Law(
+        effect=effect.name,
+        body=attached.body,
+        sentence=effect.sentence,
+        estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
+        sd=dict(zip(names, sd.tolist(), strict=True)),
+        units={parameter.name: parameter.unit for parameter in effect.parameters},
+        nats=net_evidence(without, mode, 1),
+        share=share_taken(without, mode),
+        confounded=accepted.confounded_names,
+    )
 
 
 def _without(mode: Mode, laws: Sequence[Attached]) -> Mode:

@@ -183,9 +183,7 @@ def derivatives(mode: Mode) -> Linear:
     slopes = prior_slopes(problem.layout.priors, mode.phi) if len(every) else np.zeros(0)
     precision = (mode.jacobian**2).sum(axis=0) + slopes**2
     scale = problem.layout.scale(mode.phi)
-    width = np.clip(
-        _OF_PHI / np.sqrt(np.maximum(precision, 1e-300)), _LEAST * scale, _MOST * scale
-    )
+    width = np.clip(_OF_PHI / np.sqrt(np.maximum(precision, 1e-300)), _LEAST * scale, _MOST * scale)
     steps = np.where(problem.layout.discrete, 0.0, width), np.zeros(0)
     known = Linear(labels, none[..., 0], none, slope, every)
     return _linearise(problem, mode.phi, problem.segments.start, steps, known)
@@ -313,7 +311,7 @@ def _linearise(
     return Linear(problem.layout.labels, residual[0], by_phi, by_start)
 
 
-def _with_noise(problem: Problem, start: Floats, linear: _Linear) -> tuple[Problem, Floats]:
+def _with_noise(problem: Problem, start: Floats, linear: Linear) -> tuple[Problem, Floats]:
     """Return the problem linearised there, and sigma."""
     problem = linearised_about(problem, start, linear.by_start)
     likelihood, least = output_error(problem), least_errors(problem)
