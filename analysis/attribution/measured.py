@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,8 @@ from pbrl_ppl.state import STATE
 SHARED = Path(__file__).parents[3] / "shared"
 #: State dimensions whose errors are told together, and their unit.
 QUANTITIES = {"angle": (("theta",), "rad"), "position": (("x", "y"), "m")}
+#: The same by a reference's name.
+_NAMED = {"theta": "angle"}
 _VELOCITIES = list(STATE[3:])
 
 
@@ -46,7 +49,8 @@ class Ahead:
     quantity : str
         ``angle`` (rad) or ``position`` (m, in the plane).
     declared, best : float, optional
-        Root mean square errors of independent fits of the declared physics and of the best law.
+        Root mean square errors of independent fits of the declared physics and of the best law in
+        the catalogue.
     law : str
         What the best law is.
     """
@@ -74,10 +78,18 @@ class Recording:
         State dimensions that are used; all that were recorded by default.
     ahead : tuple of Ahead
         Forecasts to judge by; without them as far as the loop's own.
-    right : tuple of str
-        Effects that are physically there, of which at least one should be named.
-    possible : tuple of str
-        Effects that may be there too, which no independent fit is sure of; other names are false.
+    start_rows : int, optional
+        Rows that the start state of a forecast is fitted to; filtered states by default.
+    laws : tuple of str
+        Effects that are physically there.
+    also : tuple of str
+        Effects that are as good a name, or may be there too.
+    same_data : mapping of str to sequence of str
+        Effects that make the same data as another.
+    outside : tuple of str
+        What is physically there and in no catalogue.
+    expected : str
+        The right verdict, where it was stated.
     sizes : dict of (str, str) to float
         Independent estimates by effect and parameter, in the catalogue's units.
     """
@@ -88,11 +100,48 @@ class Recording:
     declared: str = ""
     coordinates: tuple[str, ...] | None = None
     ahead: tuple[Ahead, ...] = ()
-    right: tuple[str, ...] = ()
-    possible: tuple[str, ...] = ()
+    start_rows: int | None = None
+    laws: tuple[str, ...] = ()
+    also: tuple[str, ...] = ()
+    same_data: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    outside: tuple[str, ...] = ()
+    expected: str = ""
     sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
+    def names_of(self, law: str) -> set[str]:
+        """Return the names of a law: its own, and those of the same data."""
+        return {law, *self.same_data.get(law, ())}
 
+    @property
+    def right(self) -> set[str]:
+        """The names that are right."""
+        return {name for law in (*self.laws, *self.also) for name in self.names_of(law)}
+
+
+def with_reference(recording: Recording) -> Recording:
+    """Return a recording with the independent fits of its reference.json; itself without one."""
+    path = recording.folder / "reference.json"
+    if not path.is_file():
+        return recording
+    known = json.loads(path.read_text())
+    best = known.get("catalogue", known["law"])
+    law = next(name for name, own in known["steps"].items() if best.items() <= own.items())
+    rows = re.search(r"fitted by the model to (\d+) rows", known["start"])
+    return replace(
+        recording,
+        ahead=tuple(
+            Ahead(seconds, _NAMED[known["quantity"]], known["declared"][key], best[key], law)
+            for seconds in known["horizons_s"]
+            for key in [f"{seconds:g}"]
+        ),
+        start_rows=int(rows[1]) if rows else None,
+        same_data=known["same_data"],
+        expected=known["expected"],
+        **{name: tuple(known[name]) for name in ("laws", "also", "outside")},
+    )
+
+
+#: Independent fits of recordings without a reference.json are stated here; see their PROVENANCE.md.
 _SWING = Recording(
     name="pendulum-swing-velocities",
     folder=SHARED / "data" / "real" / "pendulum-swing",
@@ -103,11 +152,11 @@ _SWING = Recording(
         Ahead(1.0, "angle", 0.0130, 0.0025, "viscous, dry and quadratic friction"),
         Ahead(2.0, "angle", 0.0354, 0.0037, "viscous, dry and quadratic friction"),
     ),
-    right=("pivot_damping", "pivot_friction", "quadratic_drag"),
-    possible=("sensor_bias",),  # an encoder's zero is set by hand
+    laws=("pivot_damping", "pivot_friction", "quadratic_drag"),
+    also=("sensor_bias",),  # an encoder's zero is set by hand
+    same_data={"pivot_damping": ("angular_drag", "linear_drag")},
 )
-#: The measured recordings, the quick ones first.
-MEASURED = (
+_RECORDINGS = (
     _SWING,
     replace(
         _SWING,
@@ -123,15 +172,37 @@ MEASURED = (
         " 50 Hz. Train and test are of two controllers.",
         declared="a hinge and an arm, mass and moment of inertia free; no friction",
         coordinates=("theta",),
-        ahead=(
-            Ahead(0.2, "angle", 0.086, 0.035, "dry friction (0.029 rad with a late command too)"),
-        ),
-        right=("pivot_friction",),
-        possible=("actuator_delay", "sensor_bias"),
+        ahead=(Ahead(0.2, "angle", 0.086, 0.029, "dry friction and a command 8 ms late"),),
+        laws=("pivot_friction",),
+        also=("actuator_delay", "sensor_bias"),
         sizes={("pivot_friction", "torque"): 0.143},
     ),
     Recording(
-        name="double-pendulum",
+        name="phy180-pendulum-tt",
+        folder=SHARED / "measured" / "phy180-pendulum-tt",
+        about="Coins in a cup on a string, swinging freely (T. Lian, phy180_lab): angle from a"
+        " phone's video by colour tracking, 20 Hz.",
+        declared="a hinge, a weighed cup, centre of mass free within 2 cm; no drag",
+    ),
+    Recording(
+        name="bam-xl330",
+        folder=SHARED / "measured" / "bam-xl330",
+        about="A hobby servo (Dynamixel XL330) that turns a weight at the end of an arm"
+        " (Duclusaud et al., arXiv 2410.08650): encoder angle, and the stall torque at the"
+        " voltage that was applied, 100 Hz. Back-EMF is not in that torque.",
+        declared="a hinge and a weighed arm, moment of inertia and torque gain free; no"
+        " back-EMF, no friction",
+    ),
+    Recording(
+        name="quarter-drone",
+        folder=SHARED / "measured" / "quarter-drone",
+        about="A balanced arm on a hinge with a propeller at its end (PUC-Rio, quarter drone):"
+        " angle, and the command of the propeller as a torque, 50 Hz.",
+        declared="a hinge and an arm, mass and centre of mass free, torque in proportion to the"
+        " command; no friction, no threshold of thrust",
+    ),
+    Recording(
+        name="double-pendulum-driven",
         folder=SHARED / "data" / "real" / "double-pendulum-driven",
         about="Two arms with a motor in each hinge (DFKI double pendulum, design C.1; Wiebe et al.,"
         " doi 10.1109/MRA.2023.3341257): angles, velocities by a local polynomial, torques from"
@@ -139,8 +210,8 @@ MEASURED = (
         declared="two hinges, two arms with free mass, moment of inertia and centre of mass; no"
         " friction",
         ahead=(Ahead(0.1, "angle", 0.0641, 0.0095, "dry friction in both hinges"),),
-        right=("pivot_friction",),
-        possible=("sensor_bias",),
+        laws=("pivot_friction",),
+        also=("sensor_bias",),
     ),
     Recording(
         name="planar-push",
@@ -153,9 +224,11 @@ MEASURED = (
             Ahead(6.7, "position", 0.0050, 0.00149, "quasi-static ellipsoidal limit surface"),
             Ahead(6.7, "angle", 0.0419, 0.0241, "quasi-static ellipsoidal limit surface"),
         ),
-        right=("sliding_friction",),
+        laws=("sliding_friction",),
     ),
 )
+#: The measured recordings, in the order of the page.
+MEASURED = tuple(map(with_reference, _RECORDINGS))
 
 
 @dataclass(frozen=True)
