@@ -10,7 +10,10 @@ import pandas as pd
 import pytest
 
 import pbrl_ppl as pp
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.state import STATE
+from tests.helpers.falls import BALL, GRAVITY, fall
 from tests.helpers.places import ROOT
 
 for engine in ("Box2D", "mujoco"):
@@ -263,6 +266,53 @@ def test_a_folder_is_run_once(benchmark, measured, result, folder, tmp_path, mon
     assert runs[1:] == [("disc", 1, "laplace")] * 2
 
 
+def test_forecasts_from_fitted_starts_by_hand(measured) -> None:
+    """A fall without drag: a straight line through 7 rows, of what gravity leaves."""
+    from attribution.fitted_starts import forecast_errors
+
+    history = fall(0, trajectories=3, memory=0.0)
+    problem = Problem.of(Physics(BALL, substeps=40), history, horizon=2)
+    found = forecast_errors(problem, np.zeros(0), history, 7, 20)
+    time = np.arange(45) / 30
+    line = history.dataset["observed"].to_numpy()[:, :, 0, 1] + 0.5 * GRAVITY * time**2
+    errors = [
+        own[begin + 26] - np.polyval(np.polyfit(time[:7], own[begin : begin + 7], 1), time[26])
+        for own in line
+        for begin in (0, 10)
+    ]
+    assert found == {"y": pytest.approx(np.sqrt(np.mean(np.square(errors))), rel=0.02)}
+    assert forecast_errors(problem, np.zeros(0), history, 7, 40) == {}
+
+
+def test_errors_of_an_independent_fit_are_those_of_its_parameters(measured) -> None:
+    """A servo with the friction that another integrator fitted: errors within 3 %."""
+    from attribution.fitted_starts import forecast_errors
+
+    (recording,) = (each for each in measured.MEASURED if each.name == "bam-xl330")
+    if not recording.folder.is_dir():
+        pytest.skip(f"no recording at {recording.folder}")
+    known = json.loads((recording.folder / "reference.json").read_text())
+    gravity, gain, viscous, dry = known["steps"]["viscous + dry"]["parameters"]
+    mass, length, sides = 0.49, 0.1, (0.04, 0.14)
+    inertia = mass * 9.81 * length / gravity  # about the hinge; parameters are over it
+    given = {
+        "inertia_scale_scale": (inertia - mass * length**2) * 12 / mass / np.dot(sides, sides),
+        "torque_gain_factor": gain * inertia,
+        "pivot_damping_coefficient": viscous * inertia,
+        "pivot_friction_torque": dry * inertia,
+    }
+    scene, train, test = measured.load_recording(recording)
+    by_name = {effect.name: effect for effect in pp.catalogue}
+    added = [by_name[name].on("arm") for name in ("pivot_damping", "pivot_friction")]
+    problem = Problem.of(Physics.declare(scene, added, substeps=20, threads=1), train)
+    labels = [label.removesuffix("[arm]") for label in problem.layout.labels]
+    phi = np.array([given.get(label, 0.1) for label in labels])  # no wheel: the others do nothing
+    for ahead in recording.ahead:
+        intervals = round(ahead.seconds / scene.time_step)
+        found = forecast_errors(problem, phi, test, recording.start_rows, intervals)
+        assert found == {"theta": pytest.approx(ahead.best, rel=0.03)}
+
+
 def test_recordings_that_are_not_there_are_left_out(
     benchmark, result, tmp_path, monkeypatch, capsys
 ) -> None:
@@ -318,6 +368,9 @@ def test_a_simulated_folder_is_run_as_a_measured_one(measured, folder, monkeypat
     train, test = measured.load_recording(own)[1:]
     half, long = measured.errors_ahead(asked, found, train, test)
     assert half["after"] < place["after"] * 3
+    assert long["before"] is None and long["after"] is None
+    fitted, long = measured.errors_ahead(replace(asked, start_rows=9), found, train, test)
+    assert fitted["after"] < 0.1 * fitted["before"]
     assert long["before"] is None and long["after"] is None
 
 

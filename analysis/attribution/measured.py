@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from running import sources
 
 import pbrl_ppl as pp
+from attribution.fitted_starts import forecast_errors
 from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
@@ -362,24 +364,19 @@ def errors_ahead(
     models = [(found.posterior_before, ())]
     if added:
         models.append((found.posterior_after, added))
-    fitted = []
+    forecasts = []
     for posterior, effects in models:
-        problem = Problem.of(
-            Physics.declare(scene, effects, substeps=found.numerical.substeps_used, threads=2),
-            train,
-        )
-        vectors = problem.layout.to_vectors(draws(posterior), len(draws(posterior)["sigma"]))
-        mode = trajectory_mode(problem, vectors.mean(axis=0))
-        fitted.append((HeldOut.of(mode, test).problem, mode))
+        physics = Physics.declare(scene, effects, substeps=found.numerical.substeps_used, threads=2)
+        problem, drawn = Problem.of(physics, train), draws(posterior)
+        phi = problem.layout.to_vectors(drawn, len(drawn["sigma"])).mean(axis=0)
+        forecasts.append(_forecasts(problem, phi, test, recording.start_rows))
     own = found.rollout_horizon * scene.time_step
     asked = recording.ahead or tuple(Ahead(own, quantity) for quantity in QUANTITIES)
     rows = []
     for each in asked:
         dimensions, unit = QUANTITIES[each.quantity]
-        intervals = round(each.seconds / scene.time_step)
         errors = []
-        for problem, mode in fitted:
-            rmse = forecast(problem, mode.phi, mode.sigma, intervals).rmse()
+        for rmse in (ahead(round(each.seconds / scene.time_step)) for ahead in forecasts):
             square = [rmse[name] ** 2 for name in dimensions if name in rmse]
             errors.append(float(np.sqrt(sum(square))) if square else None)
         row = {"seconds": each.seconds, "quantity": each.quantity, "unit": unit}
@@ -387,6 +384,17 @@ def errors_ahead(
     if recording.ahead:
         return tuple(rows)
     return tuple(row for row in rows if row["before"] is not None)
+
+
+def _forecasts(
+    problem: Problem, phi: NDArray[np.float64], test: pp.History, start_rows: int | None
+) -> Callable[[int], dict[str, float]]:
+    """Return the function of a forecast's intervals that gives errors by state dimension."""
+    if start_rows is not None:
+        return partial(forecast_errors, problem, phi, test, start_rows)
+    mode = trajectory_mode(problem, phi)
+    held_out = HeldOut.of(mode, test).problem
+    return lambda intervals: forecast(held_out, mode.phi, mode.sigma, intervals).rmse()
 
 
 def picture(found: Loop) -> bytes:
