@@ -1,7 +1,9 @@
 """Measured recordings: the script that runs the loop on them, and the page On hardware."""
 
 import json
+import os
 import shutil
+import time
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -79,7 +81,7 @@ def folder(tmp_path):
 def settings(**changed):
     """The command line's options."""
     usual = {"folder": None, "only": None, "list": False, "write_page": False, "cache": None}
-    usual |= {"seed": 0, "method": None, "verbose": False, "json": None}
+    usual |= {"seed": 0, "method": None, "verbose": False, "json": None, "limit": 300}
     return SimpleNamespace(**usual | changed)
 
 
@@ -197,7 +199,7 @@ def test_a_table_has_a_row_a_recording(page, result) -> None:
     recording, made = result
     own = replace(recording, name="own", laws=(), also=(), ahead=())
     others = [replace(recording, name=name) for name in ("leg", "head")]
-    broken = replace(made, verdict="failed", added=(), errors=(), error="no end", seconds=300.0)
+    broken = replace(made, verdict="failed", added=(), errors=(), error="a | b\nc", seconds=300)
     found = {"arm": made, "head": broken, "own": made}
     table = page.markdown_table([recording, *others, own], found).splitlines()
     assert len(table) == 6
@@ -207,7 +209,7 @@ def test_a_table_has_a_row_a_recording(page, result) -> None:
     assert "| **no** | 0.0900 → 0.0360 rad at 0.2 s: 1.20 times |" in arm
     assert arm.endswith("| 0.0900 → 0.0300 rad at 0.2 s | effects-added | 12 |")
     assert leg.endswith("| not run | – | – | 0.0900 → 0.0300 rad at 0.2 s | – | – |")
-    assert head.endswith("| – | **no** | – | 0.0900 → 0.0300 rad at 0.2 s | **failed** | **300** |")
+    assert head.endswith("rad at 0.2 s | **failed** | **300** |")
     assert "| – | 0.0900 → 0.0360 rad at 0.2 s | – | effects-added | 12 |" in own_row
 
 
@@ -247,12 +249,12 @@ def test_a_folder_is_run_once(benchmark, measured, result, folder, tmp_path, mon
     _, made = result
     runs = []
 
-    def quick(recording, *, seed, method, progress):
+    def quick(function, recording, seed, method, progress, *, limit):
         runs.append((recording.name, seed, method))
         now = {"sources": benchmark.sources(), "seed": seed, "method": method}
         return replace(made, name=recording.name, **now), b"picture"
 
-    monkeypatch.setattr(benchmark, "run", quick)
+    monkeypatch.setattr(benchmark, "apart", quick)
     given = settings(folder=folder, cache=tmp_path / "kept", json=str(tmp_path / "all.json"))
     for _ in range(2):
         benchmark.measure(given)
@@ -325,6 +327,52 @@ def test_recordings_that_are_not_there_are_left_out(
     assert capsys.readouterr().out.count("not run") == 2
     with pytest.raises(SystemExit, match="no recording has tail in its name"):
         benchmark.measure(settings(only=["tail"]))
+
+
+def test_a_process_that_does_not_end_or_crashes_is_told(benchmark) -> None:
+    assert benchmark.apart(abs, -3, limit=0) == 3
+    with pytest.raises(TimeoutError, match="no end after 1 s; allow more with --limit"):
+        benchmark.apart(time.sleep, 60, limit=1)
+    with pytest.raises(ChildProcessError, match="ended with exit code 3"):
+        benchmark.apart(os._exit, 3, limit=0)
+
+
+@pytest.mark.parametrize("error", [TimeoutError("no end"), ChildProcessError("exit code -9")])
+def test_a_recording_that_does_not_end_or_crashes_is_a_row(
+    benchmark, result, folder, tmp_path, monkeypatch, capsys, error
+) -> None:
+    """The recordings after it are run all the same."""
+    recording, made = result
+    here = [replace(recording, name=name, folder=folder) for name in ("arm", "leg")]
+
+    def apart(function, one, *given, limit):
+        assert limit == 300
+        if one.name == "arm":
+            raise error
+        return replace(made, name=one.name), b"picture"
+
+    monkeypatch.setattr(benchmark, "MEASURED", here)
+    monkeypatch.setattr(benchmark, "apart", apart)
+    benchmark.measure(settings(cache=tmp_path))
+    arm, leg = capsys.readouterr().out.splitlines()[2:]
+    assert f"| {type(error).__name__}: {error} | **no** |" in arm
+    assert "| effects-added | 12 |" in leg
+    kept = benchmark.Result.load(tmp_path / "arm.json")
+    assert kept.error == f"{type(error).__name__}: {error}"
+
+
+def test_what_is_there_is_shown_after_an_interruption(
+    benchmark, result, folder, tmp_path, monkeypatch, capsys
+) -> None:
+    recording, _ = result
+
+    def apart(*given, limit):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(benchmark, "MEASURED", [replace(recording, folder=folder)])
+    monkeypatch.setattr(benchmark, "apart", apart)
+    benchmark.measure(settings(cache=tmp_path))
+    assert "| not run |" in capsys.readouterr().out
 
 
 def test_a_failure_is_a_result(measured, folder) -> None:

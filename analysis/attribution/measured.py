@@ -270,6 +270,15 @@ class Result:
     error: str | None = None
     seconds: float = 0.0
 
+    @classmethod
+    def failed(
+        cls, recording: Recording, seed: int, method: str, error: Exception, seconds: float
+    ) -> Result:
+        """Return the result of a loop that failed."""
+        why = f"{type(error).__name__}: {error}"
+        about = (recording.name, method, seed, sources(), pp.__version__)
+        return cls(*about, error=why, seconds=seconds)
+
     def save(self, path: Path) -> None:
         """Write the result as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -305,7 +314,6 @@ def load_recording(recording: Recording) -> tuple[pp.Scene, pp.History, pp.Histo
 
 def run(
     recording: Recording,
-    *,
     seed: int = 0,
     method: str = "laplace",
     progress: Callable[[str], None] | None = None,
@@ -330,7 +338,6 @@ def run(
     picture : bytes or None
         PNG of a held-out trajectory, measured and forecast; None of a failure.
     """
-    result = Result(recording.name, method, seed, sources(), pp.__version__)
     begin = time.perf_counter()
     try:
         with warnings.catch_warnings():
@@ -339,18 +346,23 @@ def run(
             found = close_loop(scene, train, test, seed=seed, method=method, progress=progress)
             seconds = time.perf_counter() - begin
             errors = errors_ahead(recording, found, train, test)
+            shown = picture(found)
     except Exception as error:  # the other recordings are run all the same
-        why = f"{type(error).__name__}: {error}"
-        return replace(result, error=why, seconds=time.perf_counter() - begin), None
-    done = replace(
-        result,
+        seconds = time.perf_counter() - begin
+        return Result.failed(recording, seed, method, error, seconds), None
+    done = Result(
+        recording.name,
+        method,
+        seed,
+        sources(),
+        pp.__version__,
         verdict=found.verdict,
         sentence=verdict_in_words(found),
         added=tuple(found.to_dict()["added"]),
         errors=errors,
         seconds=seconds,
     )
-    return done, picture(found)
+    return done, shown
 
 
 def errors_ahead(

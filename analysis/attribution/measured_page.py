@@ -106,7 +106,7 @@ def _cells(recording: Recording, result: Result | None) -> list[str]:
             error += f": {_bold(_times(ratio), ratio <= AS_GOOD)}"
         errors.append(error)
     return [
-        "<br>".join(map(_added, result.added)),
+        "<br>".join(map(_added, result.added)) if result.error is None else _reason(result.error),
         _bold("yes" if right else "no", right) if recording.laws else "",
         "<br>".join(errors),
         best,
@@ -215,6 +215,11 @@ def _beside(recording: Recording, result: Result) -> Iterator[tuple[Ahead, dict[
     for row in result.errors:
         which = row["seconds"], row["quantity"]
         yield known.get(which, Ahead(*which)), row
+
+
+def _reason(error: str) -> str:
+    """Return an error for a cell: one line, no column marks."""
+    return " ".join(error.split()).replace("|", "/")
 
 
 def _bold(text: str, passed: bool) -> str:
