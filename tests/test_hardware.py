@@ -209,6 +209,7 @@ def test_a_table_has_a_row_a_recording(page, result) -> None:
     assert "| **no** | 0.0900 → 0.0360 rad at 0.2 s: 1.20 times |" in arm
     assert arm.endswith("| 0.0900 → 0.0300 rad at 0.2 s | effects-added | 12 |")
     assert leg.endswith("| not run | – | – | 0.0900 → 0.0300 rad at 0.2 s | – | – |")
+    assert "| a / b c | **no** | – |" in head
     assert head.endswith("rad at 0.2 s | **failed** | **300** |")
     assert "| – | 0.0900 → 0.0360 rad at 0.2 s | – | effects-added | 12 |" in own_row
 
