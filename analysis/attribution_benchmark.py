@@ -15,9 +15,11 @@ one removed from it, one outside it, or none; some logs are nonsense. An oracle 
 effect tests which cases are detectable; scores are over those. Every tenth case uses the loop's
 default sampler, the others Laplace's approximation.
 
-``--measured`` runs the loop on the measured recordings beside the project, minutes each, and prints
-a Markdown table of errors on held-out data beside those of independent fits. Each result is a JSON
-file and a picture in the ``--cache`` (out/measured by default); those of the same code are kept.
+``--measured`` runs the loop on the measured recordings beside the project, one after another, each
+in its own process, and prints a Markdown table of names and held-out errors beside those of
+independent fits. One that crashes or takes longer than ``--limit`` is a row with its reason. Each
+result is a JSON file and a picture in the ``--cache`` (out/measured by default); those of the same
+code are kept. After Ctrl-C the table and the page have what is there.
 """
 
 from __future__ import annotations
@@ -26,48 +28,36 @@ import argparse
 import json
 import multiprocessing
 import os
-import signal
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from attribution.cases import METHODS, Case, a_tenth, all_cases
-from attribution.measured import MEASURED, Recording, Result, run
+from attribution.measured import MEASURED, SHARED, Recording, Result, run
 from attribution.measured_page import PAGE, RESULTS, kept_results, markdown_table, write_page
 from attribution.one_case import Row, about, cache_path, load, run_case
 from attribution.scores import score
 from attribution.words import plain, score_table, table, told
 from rich.console import Console
-from running import part, save, sources
+from running import apart, begin_worker, part, save, sources
 
 #: Seconds that a case takes a worker, before any has been timed.
 SECONDS_A_CASE = 25.0
 #: Cases after which a worker starts anew: compiled models add up in its memory.
 CASES_A_WORKER = 20
+#: Seconds after which a case, and a measured recording, fail.
+CASE_LIMIT, RECORDING_LIMIT = 180, 300
 _WIDTH = 170
 
-say = partial(print, file=sys.stderr, flush=True)
 
-
-def begin_worker() -> None:
-    """Leave Ctrl-C to the process that stops the workers, and start chains as anywhere else."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.signal(signal.SIGTERM, end_worker)
-    # a spawned process would spawn its chains too, and each would load PyMC anew
-    multiprocessing.set_start_method(None, force=True)
-
-
-def end_worker(number: int, frame: object) -> None:
-    """End a worker and the chains that it started, which would wait for it forever."""
-    for child in multiprocessing.active_children():
-        child.terminate()
-    os._exit(1)
+def say(text: str) -> None:
+    """Print progress."""
+    print(text, file=sys.stderr, flush=True)
 
 
 def results(cases: list[Case], executor: Executor, options: argparse.Namespace) -> Iterator[Row]:
@@ -195,13 +185,17 @@ def parsed() -> argparse.Namespace:
         help="run the I-th of N parts; all write to the same --cache, and --json has what is there",
     )  # fmt: skip
     parser.add_argument(
-        "--limit", type=int, default=180, help="seconds after which a case fails; 0 is none"
-    )
+        "--limit", type=int,
+        help=f"seconds after which a case ({CASE_LIMIT} by default) or a measured recording"
+        f" ({RECORDING_LIMIT}) fails; 0 is none",
+    )  # fmt: skip
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--cache", type=Path, help="folder that keeps each case's result")
     parser.add_argument("--json", metavar="FILE", help="write scores and rows; - is stdout")
     parser.add_argument("--verbose", action="store_true", help="tell each case in full")
     options = parser.parse_args()
+    if options.limit is None:
+        options.limit = RECORDING_LIMIT if options.measured else CASE_LIMIT
     for name, least in (("workers", 1), ("limit", 0), ("seed", 0)):
         if getattr(options, name) < least:
             parser.error(f"--{name} is {getattr(options, name)}, expected {least} or more")
@@ -244,23 +238,14 @@ def measure(options: argparse.Namespace) -> None:
     if options.list:
         print("\n".join(each.name for each in chosen))
         return
+    if options.write_page and not SHARED.is_dir():
+        sys.exit(f"--write-page needs the independent fits of the recordings at {SHARED}")
     folder = RESULTS if options.write_page else options.cache or Path("out/measured")
-    for recording in chosen:
-        path = folder / f"{recording.name}.json"
-        if not recording.folder.is_dir():
-            say(f"{recording.name}: no recording at {recording.folder}")
-        elif is_fresh(Result.load(path), options):
-            say(f"{recording.name}: kept in {path}; delete it to run the loop anew")
-        else:
-            say(f"{recording.name}: running")
-            result, picture = run(
-                recording, seed=options.seed, method=options.method or "laplace",
-                progress=say if options.verbose else None,
-            )  # fmt: skip
-            result.save(path)
-            if picture is not None:
-                path.with_suffix(".png").write_bytes(picture)
-            say(f"{recording.name}: {result.error or result.verdict}, {result.seconds:.0f} s")
+    try:
+        for recording in chosen:
+            run_once(recording, folder / f"{recording.name}.json", options)
+    except KeyboardInterrupt:
+        say("interrupted")
     shown = chosen if options.folder else list(MEASURED)
     found = kept_results(folder, shown)
     if options.json != "-":
@@ -269,6 +254,33 @@ def measure(options: argparse.Namespace) -> None:
     if options.write_page:
         write_page()
         say(f"wrote {PAGE}")
+
+
+def run_once(recording: Recording, path: Path, options: argparse.Namespace) -> None:
+    """Run the loop on a recording and save the result, unless one of the same code is there."""
+    if not recording.folder.is_dir():
+        say(f"{recording.name}: no recording at {recording.folder}")
+    elif is_fresh(Result.load(path), options):
+        say(f"{recording.name}: kept in {path}; delete it to run the loop anew")
+    else:
+        say(f"{recording.name}: running")
+        result, picture = run_apart(recording, options)
+        result.save(path)
+        path.with_suffix(".png").unlink(missing_ok=True)
+        if picture is not None:
+            path.with_suffix(".png").write_bytes(picture)
+        say(f"{recording.name}: {result.error or result.verdict}, {result.seconds:.0f} s")
+
+
+def run_apart(recording: Recording, options: argparse.Namespace) -> tuple[Result, bytes | None]:
+    """Run the loop on a recording in its own process; one that does not end gives a failure."""
+    method, begin = options.method or "laplace", time.monotonic()
+    progress = say if options.verbose else None
+    try:
+        return apart(run, recording, options.seed, method, progress, limit=options.limit)
+    except (TimeoutError, ChildProcessError) as error:
+        seconds = time.monotonic() - begin
+        return Result.failed(recording, options.seed, method, error, seconds), None
 
 
 def is_fresh(kept: Result | None, options: argparse.Namespace) -> bool:

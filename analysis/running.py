@@ -1,20 +1,26 @@
-"""Shared code of the benchmarks: a time limit, the code's hash, parts, and stored rows."""
+"""Shared code of the benchmarks: time limits, processes, the code's hash, parts, stored rows."""
 
 from __future__ import annotations
 
 import argparse
 import hashlib
 import json
+import multiprocessing
+import os
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from functools import cache
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
 import pbrl_ppl as pp
+
+#: Seconds in which a process ends after it was asked to.
+_PATIENCE = 5.0
 
 
 @contextmanager
@@ -38,6 +44,59 @@ def limited(limit: int, cure: str) -> Iterator[None]:
     finally:
         signal.alarm(0)
         signal.signal(signal.SIGALRM, before)
+
+
+def begin_worker() -> None:
+    """Leave Ctrl-C to the process that stops the workers, and start chains as anywhere else."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, end_worker)
+    # a spawned process would spawn its chains too, and each would load PyMC anew
+    multiprocessing.set_start_method(None, force=True)
+
+
+def end_worker(number: int, frame: object) -> None:
+    """End a worker and the chains that it started, which would wait for it forever."""
+    for child in multiprocessing.active_children():
+        child.terminate()
+    os._exit(1)
+
+
+def apart(function: Callable[..., Any], *arguments: Any, limit: int) -> Any:
+    """Return what a function returns in a process of its own; ``limit`` is in seconds, 0 is none.
+
+    Raises
+    ------
+    TimeoutError
+        If it takes longer.
+    ChildProcessError
+        If the process ends without a result.
+    """
+    context = multiprocessing.get_context("spawn")
+    receiver, sender = context.Pipe(duplex=False)
+    process = context.Process(target=_send, args=(sender, function, arguments))
+    process.start()
+    sender.close()
+    try:
+        if not receiver.poll(limit or None):
+            raise TimeoutError(f"no end after {limit} s; allow more with --limit")
+        found = receiver.recv()
+        process.join(_PATIENCE)
+        return found
+    except EOFError:
+        process.join(_PATIENCE)
+        raise ChildProcessError(
+            f"its process ended with exit code {process.exitcode}; it may be short of memory"
+        ) from None
+    finally:
+        process.terminate()
+        process.join(_PATIENCE)
+        process.kill()
+        process.join()
+
+
+def _send(sender: Connection, function: Callable[..., Any], arguments: tuple[Any, ...]) -> None:
+    begin_worker()
+    sender.send(function(*arguments))
 
 
 @cache

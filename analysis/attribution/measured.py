@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from numpy.typing import NDArray
 from running import sources
 
 import pbrl_ppl as pp
+from attribution.fitted_starts import forecast_errors
 from pbrl_ppl.criticism import Loop, close_loop
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.held_out import HeldOut
@@ -32,6 +35,8 @@ from pbrl_ppl.state import STATE
 SHARED = Path(__file__).parents[3] / "shared"
 #: State dimensions whose errors are told together, and their unit.
 QUANTITIES = {"angle": (("theta",), "rad"), "position": (("x", "y"), "m")}
+#: The same by a reference's name.
+_NAMED = {"theta": "angle"}
 _VELOCITIES = list(STATE[3:])
 
 
@@ -46,7 +51,8 @@ class Ahead:
     quantity : str
         ``angle`` (rad) or ``position`` (m, in the plane).
     declared, best : float, optional
-        Root mean square errors of independent fits of the declared physics and of the best law.
+        Root mean square errors of independent fits of the declared physics and of the best law in
+        the catalogue.
     law : str
         What the best law is.
     """
@@ -74,10 +80,18 @@ class Recording:
         State dimensions that are used; all that were recorded by default.
     ahead : tuple of Ahead
         Forecasts to judge by; without them as far as the loop's own.
-    right : tuple of str
-        Effects that are physically there, of which at least one should be named.
-    possible : tuple of str
-        Effects that may be there too, which no independent fit is sure of; other names are false.
+    start_rows : int, optional
+        Rows that the start state of a forecast is fitted to; filtered states by default.
+    laws : tuple of str
+        Effects that are physically there.
+    also : tuple of str
+        Effects that are as good a name, or may be there too.
+    same_data : mapping of str to sequence of str
+        Effects that make the same data as another.
+    outside : tuple of str
+        What is physically there and in no catalogue.
+    expected : str
+        The right verdict, where it was stated.
     sizes : dict of (str, str) to float
         Independent estimates by effect and parameter, in the catalogue's units.
     """
@@ -88,11 +102,48 @@ class Recording:
     declared: str = ""
     coordinates: tuple[str, ...] | None = None
     ahead: tuple[Ahead, ...] = ()
-    right: tuple[str, ...] = ()
-    possible: tuple[str, ...] = ()
+    start_rows: int | None = None
+    laws: tuple[str, ...] = ()
+    also: tuple[str, ...] = ()
+    same_data: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    outside: tuple[str, ...] = ()
+    expected: str = ""
     sizes: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
+    def names_of(self, law: str) -> set[str]:
+        """Return the names of a law: its own, and those of the same data."""
+        return {law, *self.same_data.get(law, ())}
 
+    @property
+    def right(self) -> set[str]:
+        """The names that are right."""
+        return {name for law in (*self.laws, *self.also) for name in self.names_of(law)}
+
+
+def with_reference(recording: Recording) -> Recording:
+    """Return a recording with the independent fits of its reference.json; itself without one."""
+    path = recording.folder / "reference.json"
+    if not path.is_file():
+        return recording
+    known = json.loads(path.read_text())
+    best = known.get("catalogue", known["law"])
+    law = next(name for name, own in known["steps"].items() if best.items() <= own.items())
+    rows = re.search(r"fitted by the model to (\d+) rows", known["start"])
+    return replace(
+        recording,
+        ahead=tuple(
+            Ahead(seconds, _NAMED[known["quantity"]], known["declared"][key], best[key], law)
+            for seconds in known["horizons_s"]
+            for key in [f"{seconds:g}"]
+        ),
+        start_rows=int(rows[1]) if rows else None,
+        same_data=known["same_data"],
+        expected=known["expected"],
+        **{name: tuple(known[name]) for name in ("laws", "also", "outside")},
+    )
+
+
+#: Independent fits of recordings without a reference.json are stated here; see their PROVENANCE.md.
 _SWING = Recording(
     name="pendulum-swing-velocities",
     folder=SHARED / "data" / "real" / "pendulum-swing",
@@ -103,11 +154,11 @@ _SWING = Recording(
         Ahead(1.0, "angle", 0.0130, 0.0025, "viscous, dry and quadratic friction"),
         Ahead(2.0, "angle", 0.0354, 0.0037, "viscous, dry and quadratic friction"),
     ),
-    right=("pivot_damping", "pivot_friction", "quadratic_drag"),
-    possible=("sensor_bias",),  # an encoder's zero is set by hand
+    laws=("pivot_damping", "pivot_friction", "quadratic_drag"),
+    also=("sensor_bias",),  # an encoder's zero is set by hand
+    same_data={"pivot_damping": ("angular_drag", "linear_drag")},
 )
-#: The measured recordings, the quick ones first.
-MEASURED = (
+_RECORDINGS = (
     _SWING,
     replace(
         _SWING,
@@ -123,15 +174,37 @@ MEASURED = (
         " 50 Hz. Train and test are of two controllers.",
         declared="a hinge and an arm, mass and moment of inertia free; no friction",
         coordinates=("theta",),
-        ahead=(
-            Ahead(0.2, "angle", 0.086, 0.035, "dry friction (0.029 rad with a late command too)"),
-        ),
-        right=("pivot_friction",),
-        possible=("actuator_delay", "sensor_bias"),
+        ahead=(Ahead(0.2, "angle", 0.086, 0.029, "dry friction and a command 8 ms late"),),
+        laws=("pivot_friction",),
+        also=("actuator_delay", "sensor_bias"),
         sizes={("pivot_friction", "torque"): 0.143},
     ),
     Recording(
-        name="double-pendulum",
+        name="phy180-pendulum-tt",
+        folder=SHARED / "measured" / "phy180-pendulum-tt",
+        about="Coins in a cup on a string, swinging freely (T. Lian, phy180_lab): angle from a"
+        " phone's video by colour tracking, 20 Hz.",
+        declared="a hinge, a weighed cup, centre of mass free within 2 cm; no drag",
+    ),
+    Recording(
+        name="bam-xl330",
+        folder=SHARED / "measured" / "bam-xl330",
+        about="A hobby servo (Dynamixel XL330) that turns a weight at the end of an arm"
+        " (Duclusaud et al., arXiv 2410.08650): encoder angle, and the stall torque at the"
+        " voltage that was applied, 100 Hz. Back-EMF is not in that torque.",
+        declared="a hinge and a weighed arm, moment of inertia and torque gain free; no"
+        " back-EMF, no friction",
+    ),
+    Recording(
+        name="quarter-drone",
+        folder=SHARED / "measured" / "quarter-drone",
+        about="A balanced arm on a hinge with a propeller at its end (PUC-Rio, quarter drone):"
+        " angle, and the command of the propeller as a torque, 50 Hz.",
+        declared="a hinge and an arm, mass and centre of mass free, torque in proportion to the"
+        " command; no friction, no threshold of thrust",
+    ),
+    Recording(
+        name="double-pendulum-driven",
         folder=SHARED / "data" / "real" / "double-pendulum-driven",
         about="Two arms with a motor in each hinge (DFKI double pendulum, design C.1; Wiebe et al.,"
         " doi 10.1109/MRA.2023.3341257): angles, velocities by a local polynomial, torques from"
@@ -139,8 +212,8 @@ MEASURED = (
         declared="two hinges, two arms with free mass, moment of inertia and centre of mass; no"
         " friction",
         ahead=(Ahead(0.1, "angle", 0.0641, 0.0095, "dry friction in both hinges"),),
-        right=("pivot_friction",),
-        possible=("sensor_bias",),
+        laws=("pivot_friction",),
+        also=("sensor_bias",),
     ),
     Recording(
         name="planar-push",
@@ -153,9 +226,11 @@ MEASURED = (
             Ahead(6.7, "position", 0.0050, 0.00149, "quasi-static ellipsoidal limit surface"),
             Ahead(6.7, "angle", 0.0419, 0.0241, "quasi-static ellipsoidal limit surface"),
         ),
-        right=("sliding_friction",),
+        laws=("sliding_friction",),
     ),
 )
+#: The measured recordings, in the order of the page.
+MEASURED = tuple(map(with_reference, _RECORDINGS))
 
 
 @dataclass(frozen=True)
@@ -195,6 +270,15 @@ class Result:
     error: str | None = None
     seconds: float = 0.0
 
+    @classmethod
+    def failed(
+        cls, recording: Recording, seed: int, method: str, error: Exception, seconds: float
+    ) -> Result:
+        """Return the result of a loop that failed."""
+        why = f"{type(error).__name__}: {error}"
+        about = (recording.name, method, seed, sources(), pp.__version__)
+        return cls(*about, error=why, seconds=seconds)
+
     def save(self, path: Path) -> None:
         """Write the result as JSON."""
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -230,7 +314,6 @@ def load_recording(recording: Recording) -> tuple[pp.Scene, pp.History, pp.Histo
 
 def run(
     recording: Recording,
-    *,
     seed: int = 0,
     method: str = "laplace",
     progress: Callable[[str], None] | None = None,
@@ -255,7 +338,6 @@ def run(
     picture : bytes or None
         PNG of a held-out trajectory, measured and forecast; None of a failure.
     """
-    result = Result(recording.name, method, seed, sources(), pp.__version__)
     begin = time.perf_counter()
     try:
         with warnings.catch_warnings():
@@ -264,18 +346,23 @@ def run(
             found = close_loop(scene, train, test, seed=seed, method=method, progress=progress)
             seconds = time.perf_counter() - begin
             errors = errors_ahead(recording, found, train, test)
+            shown = picture(found)
     except Exception as error:  # the other recordings are run all the same
-        why = f"{type(error).__name__}: {error}"
-        return replace(result, error=why, seconds=time.perf_counter() - begin), None
-    done = replace(
-        result,
+        seconds = time.perf_counter() - begin
+        return Result.failed(recording, seed, method, error, seconds), None
+    done = Result(
+        recording.name,
+        method,
+        seed,
+        sources(),
+        pp.__version__,
         verdict=found.verdict,
         sentence=verdict_in_words(found),
         added=tuple(found.to_dict()["added"]),
         errors=errors,
         seconds=seconds,
     )
-    return done, picture(found)
+    return done, shown
 
 
 def errors_ahead(
@@ -289,24 +376,19 @@ def errors_ahead(
     models = [(found.posterior_before, ())]
     if added:
         models.append((found.posterior_after, added))
-    fitted = []
+    forecasts = []
     for posterior, effects in models:
-        problem = Problem.of(
-            Physics.declare(scene, effects, substeps=found.numerical.substeps_used, threads=2),
-            train,
-        )
-        vectors = problem.layout.to_vectors(draws(posterior), len(draws(posterior)["sigma"]))
-        mode = trajectory_mode(problem, vectors.mean(axis=0))
-        fitted.append((HeldOut.of(mode, test).problem, mode))
+        physics = Physics.declare(scene, effects, substeps=found.numerical.substeps_used, threads=2)
+        problem, drawn = Problem.of(physics, train), draws(posterior)
+        phi = problem.layout.to_vectors(drawn, len(drawn["sigma"])).mean(axis=0)
+        forecasts.append(_forecasts(problem, phi, test, recording.start_rows))
     own = found.rollout_horizon * scene.time_step
     asked = recording.ahead or tuple(Ahead(own, quantity) for quantity in QUANTITIES)
     rows = []
     for each in asked:
         dimensions, unit = QUANTITIES[each.quantity]
-        intervals = round(each.seconds / scene.time_step)
         errors = []
-        for problem, mode in fitted:
-            rmse = forecast(problem, mode.phi, mode.sigma, intervals).rmse()
+        for rmse in (ahead(round(each.seconds / scene.time_step)) for ahead in forecasts):
             square = [rmse[name] ** 2 for name in dimensions if name in rmse]
             errors.append(float(np.sqrt(sum(square))) if square else None)
         row = {"seconds": each.seconds, "quantity": each.quantity, "unit": unit}
@@ -314,6 +396,17 @@ def errors_ahead(
     if recording.ahead:
         return tuple(rows)
     return tuple(row for row in rows if row["before"] is not None)
+
+
+def _forecasts(
+    problem: Problem, phi: NDArray[np.float64], test: pp.History, start_rows: int | None
+) -> Callable[[int], dict[str, float]]:
+    """Return the function of a forecast's intervals that gives errors by state dimension."""
+    if start_rows is not None:
+        return partial(forecast_errors, problem, phi, test, start_rows)
+    mode = trajectory_mode(problem, phi)
+    held_out = HeldOut.of(mode, test).problem
+    return lambda intervals: forecast(held_out, mode.phi, mode.sigma, intervals).rmse()
 
 
 def picture(found: Loop) -> bytes:
