@@ -278,17 +278,17 @@ def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> Non
     Problem.of(physics, train).predict(phi)
 
 
-def _simulated(declared: Mode, selection: Selection) -> Simulated:
-    """Return the laws that the simulation error of whole trajectories shows; none if too short."""
+def _simulated(declared: Mode, selection: Selection) -> Simulated | None:
+    """Return the laws that the simulation error of whole trajectories shows; None if too short."""
     selection.say(Stage.SIMULATE)
     search = SimulatedSearch(selection.missing, selection.criteria, selection.say)
     try:
         return search(declared)
     except HistoryError:  # start states could follow all that was measured
-        return Simulated(declared, declared, (), {})
+        return None
 
 
-def _add_effects(declared: Mode, selection: Selection, found: Simulated) -> _Search:
+def _add_effects(declared: Mode, selection: Selection, found: Simulated | None) -> _Search:
     """Add the effects that simulations name, then smaller ones by innovations, one by one."""
     criteria, say = selection.criteria, selection.say
     say(Stage.SCORE)

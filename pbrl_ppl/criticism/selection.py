@@ -20,14 +20,14 @@ from pbrl_ppl.criticism.cross_validation import (
     trajectory_count,
 )
 from pbrl_ppl.criticism.forecast import longest_forecast
-from pbrl_ppl.criticism.promise import forecast_change, promised_share
+from pbrl_ppl.criticism.promise import forecast_change
 from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
-from pbrl_ppl.criticism.simulated import Simulated
+from pbrl_ppl.criticism.simulated import Simulated, sizes_of, worth_of
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
-from pbrl_ppl.modes import Mode, trajectory_evidence, trajectory_mode
+from pbrl_ppl.modes import Mode, fit_pieces, trajectory_evidence, trajectory_mode
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -65,6 +65,8 @@ class Selection:
 
     Attributes
     ----------
+    simulated : Mode or None
+        The model so far, fitted to whole trajectories that are simulated without process noise.
     why : dict of (str, str) to str
         Why an effect on a body was added or not, from the last round that tried it.
     small : list of Candidate
@@ -75,6 +77,7 @@ class Selection:
     catalogue: tuple[Effect, ...]
     criteria: Criteria
     say: Callable[[str], None]
+    simulated: Mode | None = field(default=None, init=False)
     why: dict[tuple[str, str], str] = field(default_factory=dict, init=False)
     small: list[Candidate] = field(default_factory=list, init=False)
 
@@ -87,7 +90,7 @@ class Selection:
         return rank_candidates(at or mode, self.missing(mode), self.criteria)
 
     def adopted(
-        self, mode: Mode, simulated: Simulated, ranked: list[Signature]
+        self, mode: Mode, simulated: Simulated | None, ranked: list[Signature]
     ) -> tuple[Mode, list[Step]]:
         """Return the mode with the laws that simulations name, and a step for each of them.
 
@@ -95,11 +98,15 @@ class Selection:
         ----------
         mode : Mode
             Of the declared model, fitted to whole trajectories.
-        simulated : Simulated
-            The laws, and the parameters that were found with them.
+        simulated : Simulated or None
+            The laws, and the parameters that were found with them; None where nothing can be
+            simulated.
         ranked : list of Signature
             Scores of the declared model's candidates.
         """
+        if simulated is None:
+            return mode, []
+        self.simulated = simulated.after
         scored = {signature.attached: signature for signature in ranked}
         for attached, (nats, share) in simulated.tried.items():
             told = (
@@ -191,15 +198,24 @@ class Selection:
         most = self.criteria.selection.refits
         for signature in kept[most:]:
             self._note(signature, f"behind the {most} that are refitted in a round")
-        least = self.criteria.selection.promise * self.criteria.negligible
-        promising = []
-        for signature in kept[:most]:
-            share = promised_share(mode, signature)
-            if share < least:
-                self._negligible(signature, share)
-            else:
-                promising.append(signature)
-        return promising
+        return [signature for signature in kept[:most] if self._is_supported(mode, signature)]
+
+    def _is_supported(self, mode: Mode, signature: Signature) -> bool:
+        """Return whether a candidate takes anything off the simulation error of trajectories.
+
+        Innovations alone take what is no law of motion for one: an error of the sensor that lasts.
+        """
+        if self.simulated is None:
+            return True
+        effects = mode.problem.physics.effects
+        if self.simulated.problem.physics.effects != effects:
+            begin = {each: sizes_of(mode, each) for each in effects}
+            self.simulated = fit_pieces(*with_effects(self.simulated, effects, begin))
+        sizes = np.array(list(signature.candidate.estimate.values()))
+        worth = worth_of(self.simulated, signature.attached, sizes)
+        if worth <= 0:
+            self._note(signature, f"takes nothing off simulation errors ({worth:.1f} nats)")
+        return worth > 0
 
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]

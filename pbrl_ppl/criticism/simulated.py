@@ -246,6 +246,16 @@ def net_evidence(before: Mode, after: Mode, laws: int, candidates: int = 1) -> f
     return float(gained - price - max(_prior(after) - _prior(before), 0.0))
 
 
+def worth_of(mode: Mode, attached: Attached, sizes: Floats) -> float:
+    """Return the net evidence of one more law, its first sizes given, shape (q,): credit by drop.
+
+    ``mode`` is of simulated pieces.
+    """
+    effects = (*mode.problem.physics.effects, attached)
+    within = fit_pieces(*with_effects(mode, effects, {attached: sizes}))
+    return net_evidence(_without(within, (attached,)), within, 1)
+
+
 def share_taken(before: Mode, after: Mode) -> float:
     """Return the share of the simulation error that is gone, over all dimensions by evidence."""
     gained, effective = nats(before, after)
@@ -391,7 +401,7 @@ class SimulatedSearch:
         if trials and not self._white(trials[0].modes):
             pairs = []
             for pair in combinations(trials[: limits.paired], 2):
-                begin = {each.laws[0]: _sizes(each.modes[0], each.laws[0]) for each in pair}
+                begin = {each.laws[0]: sizes_of(each.modes[0], each.laws[0]) for each in pair}
                 pairs.append(self._trial(now, parents, begin, n))
             trials += self._refined(now, pairs, n)
         return trials
@@ -486,7 +496,7 @@ def _without(mode: Mode, laws: Sequence[Attached]) -> Mode:
     return fit_pieces(*with_effects(mode, kept))
 
 
-def _sizes(mode: Mode, law: Attached) -> Floats:
+def sizes_of(mode: Mode, law: Attached) -> Floats:
     """Return the parameters of a law at a mode, shape (q,)."""
     labels = mode.problem.layout.labels
     return mode.phi[[labels.index(label) for label in law.labels]]
