@@ -112,15 +112,11 @@ class SimulationCriteria:
         Net log-evidence that it needs (nats); effects within this of the best are confounded.
     least_score : float
         Share of the squared error that a candidate must take away to first order to be refitted.
-    indistinguishable : float
-        Signatures with a larger cosine at every length are the same law: one of them is refitted.
-        Near ones, such as two drags in a fall, differ after a refit.
     leaders : int
         Candidates that are refitted for each length of pieces, at most.
-    refined : int
-        Leading candidates, and pairs, that are fitted until they gain no more, at most.
     worth_refining : float
-        Share of the leader's evidence that one of them has, at least.
+        Candidates with at least this share of the leader's evidence are fitted until they gain no
+        more.
     paired : int
         Leading candidates of which pairs are tried.
     white : float
@@ -135,10 +131,8 @@ class SimulationCriteria:
     least_share_alone: float = 0.5
     least_nats: float = 3.0
     least_score: float = 0.1
-    indistinguishable: float = 0.999999
-    leaders: int = 4
-    refined: int = 4
-    worth_refining: float = 0.6
+    leaders: int = 3
+    worth_refining: float = 0.8
     paired: int = 4
     white: float = 1.5
     long: int = 16

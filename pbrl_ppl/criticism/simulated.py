@@ -300,7 +300,7 @@ class SimulatedSearch:
         tried: dict[Attached, tuple[float, float]] = {}
         again = limits.restarts
         while len(laws) < self.criteria.most_added and not self._white(now):
-            trials = self._trials(now)
+            trials = self._trials(now, pairs=not laws)
             if not laws:
                 tried = {
                     law: (trial.net, trial.share)
@@ -359,17 +359,17 @@ class SimulatedSearch:
         tied = [trial for trial in enough if trial.net > highest - self.criteria.selection.tie]
         return max(tied, key=lambda trial: (-len(trial.modes[-1].phi), trial.net))
 
-    def _trials(self, now: list[Mode]) -> list[_Trial]:
-        """Return refits with leading candidates and, if the best leaves a law, with their pairs."""
+    def _trials(self, now: list[Mode], pairs: bool) -> list[_Trial]:
+        """Return refits with leading candidates and, where the best leaves a law, with their pairs.
+
+        Pairs are tried if ``pairs`` says so, and where no candidate alone is good enough.
+        """
         limits = self.criteria.simulation
         candidates = [
             each for each in self.missing(now[-1]) if not isinstance(each.effect.stage, Noise)
         ]
         ranked = [rank_candidates(mode, candidates, self.criteria) for mode in now]
         scores = [{signature.attached: signature for signature in own} for own in ranked]
-        exact = replace(
-            self.criteria, score=replace(self.criteria.score, same=limits.indistinguishable)
-        )
 
         def same(one: Attached) -> tuple[Attached, ...]:
             """Return the candidates that are the same law here, to rounding."""
@@ -378,7 +378,7 @@ class SimulatedSearch:
                 if other is one
                 or (
                     len(other.labels) == len(one.labels)
-                    and all(twins(own[one], own[other], exact) for own in scores)
+                    and all(twins(own[one], own[other], self.criteria) for own in scores)
                 )
             )  # fmt: skip
 
@@ -398,12 +398,14 @@ class SimulatedSearch:
             trial = self._trial(now, parents, {law: size}, n)
             trials.append(replace(trial, same=tuple(o for o in same(law) if o != law)))
         trials = self._refined(now, trials, n)
-        if trials and not self._white(trials[0].modes):
-            pairs = []
+        if trials and not self._white(trials[0].modes) and (pairs or self._best(trials) is None):
+            both = []
             for pair in combinations(trials[: limits.paired], 2):
+                if twins(*(scores[-1][each.laws[0]] for each in pair), self.criteria):
+                    continue
                 begin = {each.laws[0]: sizes_of(each.modes[0], each.laws[0]) for each in pair}
-                pairs.append(self._trial(now, parents, begin, n))
-            trials += self._refined(now, pairs, n)
+                both.append(self._trial(now, parents, begin, n))
+            trials += self._refined(now, both, n)
         return trials
 
     def _first_size(self, signature: Signature) -> Floats:
@@ -422,13 +424,15 @@ class SimulatedSearch:
 
     def _refined(self, now: list[Mode], trials: list[_Trial], candidates: int) -> list[_Trial]:
         """Return trials, best first, the leading ones fitted until they gain no more."""
-        limits = self.criteria.simulation
-        trials.sort(key=lambda trial: -trial.net)
-        for i, trial in enumerate(trials[: limits.refined]):
-            if trial.net > limits.worth_refining * max(trials[0].net, 0.0):
-                modes = refined(trial.modes)
-                trials[i] = self._judged(now, trial.laws, modes, candidates, trial.same)
-        return sorted(trials, key=lambda trial: -trial.net)
+        rough, done = sorted(trials, key=lambda trial: -trial.net), list[_Trial]()
+        while rough:
+            trial = rough.pop(0)
+            best = max((other.net for other in done), default=trial.net)
+            if trial.net <= self.criteria.simulation.worth_refining * max(best, 0.0):
+                return sorted([*done, trial, *rough], key=lambda trial: -trial.net)
+            modes = refined(trial.modes)
+            done.append(self._judged(now, trial.laws, modes, candidates, trial.same))
+        return sorted(done, key=lambda trial: -trial.net)
 
     def _trial(
         self,

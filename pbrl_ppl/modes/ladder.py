@@ -35,19 +35,21 @@ SHORTEST, RATIO = 4, 4
 #: piece too long to tell a law from.
 MOST_GROWTH = 30.0
 #: Dampings that are tried at once, as multiples of the last good one, and the least.
-_DAMPINGS, _LEAST_DAMPING = (0.25, 1.0, 10.0, 100.0, 1e4), 1e-8
+_DAMPINGS, _LEAST_DAMPING = (0.2, 4.0, 100.0), 1e-8
 #: Widths of derivatives that are tried where no step gains, as shares of the usual ones.
 _WIDER = (3.0, 0.1)
 #: Steps of derivatives: first, then shares of a posterior standard deviation of phi and of a start;
 #: the least and the largest, as shares of each scale.
 _FIRST, _OF_PHI, _OF_START = 1e-4, 0.5, 0.3
 _LEAST, _MOST = 1e-6, 2e-2
-#: Gain (nats) that ends a fit, and a candidate's first one at lower lengths; rounds of that one.
-_TIGHT, _LOOSE, _FEW = 0.1, 1.0, 4
+#: Gain (nats) that ends a fit, and a candidate's first one at lower lengths.
+_TIGHT, _LOOSE = 0.1, 1.0
+#: Rounds of a candidate's first fit at the greatest length, and at lower ones.
+_FEW, _FEWER = 4, 2
 #: Rounds of a leading candidate's fit.
 _MANY = 10
 #: Steps from one linearisation; one that gains less than this share of all of them is the last.
-_STEPS, _MUCH = 3, 0.2
+_STEPS, _MUCH = 2, 0.2
 
 
 @one_blas_thread
@@ -132,8 +134,9 @@ def climb_ladder(start: Sequence[tuple[Problem, Floats]], parents: Sequence[Line
             begins += [(problem, found[-1].phi), (_along(problem, found[-1]), found[-1].phi)]
         costs = [_start_cost(*each) for each in begins]
         known = parent.of(problem.layout.labels)
-        tolerance = _LOOSE if i + 1 < len(start) else _TIGHT  # the next length corrects it
-        found.append(fit_pieces(*begins[int(np.argmin(costs))], _FEW, tolerance, known))
+        last = i + 1 == len(start)  # it corrects those before
+        rounds, tolerance = (_FEW, _TIGHT) if last else (_FEWER, _LOOSE)
+        found.append(fit_pieces(*begins[int(np.argmin(costs))], rounds, tolerance, known))
     return found
 
 
