@@ -20,6 +20,7 @@ from pbrl_ppl.criticism.misfit import (
     PRIOR,
     Misfit,
     find_misfit,
+    held_out_forecasts,
     with_negligible_acceleration,
 )
 from pbrl_ppl.criticism.prior_check import prior_predictive_check, telling_horizon
@@ -42,6 +43,7 @@ from pbrl_ppl.criticism.simulated import Simulated, SimulatedSearch
 from pbrl_ppl.criticism.stages import Stage
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
+    measurement_noise,
     noise_alone,
     unexplained_acceleration,
 )
@@ -253,15 +255,19 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
                 revised, after, misfit = declared, before, without.with_test(prior)
     if steps:
         misfit = with_negligible_acceleration(misfit, revised, after)
+    tested = replace(revised, problem=HeldOut.of(revised, test).problem)
+    longest = longest_rollout(test, horizon)
+    misfit = misfit.with_test(
+        held_out_forecasts(tested, noise_alone(revised, after), longest, criteria)
+    )
     say(Stage.SAMPLE)
     posteriors = _posteriors(task, [declared, revised] if steps else [declared])
     first = last = _Model(declared, before, posteriors[0], HeldOut.of(declared, test))
     if revised is not declared:
         last = _Model(revised, after, posteriors[-1], HeldOut.of(revised, test))
     say(Stage.COMPARE)
-    rollout = longest_rollout(test, horizon)
     return replace(
-        _put_together(task, train, first, last, steps, misfit, rollout),
+        _put_together(task, train, first, last, steps, misfit, longest),
         candidates=selection.explained(search.first),
         small=tuple(selection.small),
         velocities_not_used=unused,
@@ -418,10 +424,11 @@ def _put_together(
     """Return the result of the stages; errors are forecasts of ``rollout`` intervals."""
     scene, held_out, criteria = task.scene, revised.held_out, task.criteria
     test = held_out.problem.data.history
-    before = declared.held_out.errors(held_out, declared.posterior, rollout, task.seed)
-    after = before
-    if revised is not declared:
-        after = held_out.errors(held_out, revised.posterior, rollout, task.seed)
+    unit = held_out, measurement_noise(revised.mode, revised.excess)
+    before, after = (
+        model.held_out.errors(unit[0], model.posterior, rollout, task.seed, unit[1])
+        for model in (declared, revised)
+    )
     verdict = EFFECTS_ADDED if steps else ADEQUATE
     unexplained = misfit.unexplained
     # added effects that leave an acceleration unexplained are at best near the right ones

@@ -90,21 +90,28 @@ class HeldOut:
             if seen[:, dimension == d].any()
         }
 
-    def errors(self, unit: HeldOut, posterior: Any, rollout: int, seed: int) -> Errors:
+    def errors(
+        self, unit: HeldOut, posterior: Any, rollout: int, seed: int, noise: Floats
+    ) -> Errors:
         """Return the model's errors.
 
         Parameters
         ----------
         unit : HeldOut
-            The model whose noise is the unit of the normalised error.
+            The model with which innovations are filtered.
         posterior : InferenceData or DataTree
             Posterior of this model.
         rollout : int
             Intervals of the forecasts.
         seed : int
             Chooses the posterior draws of the predictive density.
+        noise : ndarray
+            Noise parameters of ``unit`` without any unexplained acceleration, shape (parameter,):
+            the unit of the normalised error.
         """
-        mode, seen = self.mode, unit.problem.trajectory_noise.seen
+        mode, own = self.mode, unit.problem.trajectory_noise
+        seen = own.seen
+        whitened = self.whitened(unit) * own.scale(unit.mode.sigma) / own.scale(noise)
         phi, sigma = parameter_draws(mode.problem, posterior)
         rng = np.random.default_rng(seed)
         chosen = rng.choice(len(phi), min(_DRAWS, len(phi)), replace=False)
@@ -114,7 +121,7 @@ class HeldOut:
         return Errors(
             one_step_rmse=forecast(self.problem, mode.phi, mode.sigma, 1).rmse(),
             rollout_rmse=forecast(self.problem, mode.phi, mode.sigma, rollout).rmse(),
-            normalised_rmse=float(np.sqrt((self.whitened(unit) ** 2).sum() / seen.sum())),
+            normalised_rmse=float(np.sqrt((whitened[seen] ** 2).sum() / seen.sum())),
             elpd=float((logsumexp(density, axis=0) - np.log(len(phi))).sum()),
         )
 

@@ -19,6 +19,7 @@ from pbrl_ppl.state import STATE, Floats
 
 #: Names of the tests that a model must pass to predict well.
 ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior"
+HELD_OUT = "held-out forecasts"
 #: What an unexplained residual depends on where no quantity predicts it.
 NOTHING_RECORDED = "nothing that was recorded"
 #: Lengths of forecasts that a picture shows, at most.
@@ -48,8 +49,11 @@ class Misfit:
 
     @property
     def predicts(self) -> bool:
-        """Return whether the tests of acceleration, forecasts and prior are passed."""
-        needed = (ACCELERATION, FORECASTS, PRIOR)
+        """Return whether forecasts are as good as noise lets them be, and the prior is possible.
+
+        What remains is then small: significant one step ahead, and not over a forecast.
+        """
+        needed = (FORECASTS, HELD_OUT, PRIOR)
         return all(test.passed for test in self.tests if test.name in needed)
 
     @property
@@ -139,6 +143,16 @@ def _acceleration(excess: UnexplainedAcceleration) -> ResidualTest:
             sentence += ", which is negligible"
     p_value = float(min(1.0, excess.p_value[worst] * len(excess.names)))
     return ResidualTest(ACCELERATION, p_value, float(excess.relative[worst]), passed, sentence)
+
+
+def held_out_forecasts(mode: Mode, sigma: Floats, horizon: int, criteria: Criteria) -> ResidualTest:
+    """Return the test of forecasts on held-out trajectories.
+
+    Arguments as of :func:`find_misfit`; ``mode`` has the problem of the held-out trajectories, and
+    ``sigma`` is the noise alone.
+    """
+    test, _ = _forecasts(mode, sigma, horizon, criteria)
+    return replace(test, name=HELD_OUT, sentence=f"held out: {test.sentence}")
 
 
 def _forecasts(

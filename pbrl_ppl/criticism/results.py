@@ -41,6 +41,9 @@ class Candidate:
         Whether smaller is stronger, as for a limit: larger ones than ``detectable`` are not seen.
     why : str
         Why the loop added it or did not; empty if it did not decide.
+    simulated_nats, simulated_share : float or None
+        The same candidate by simulation: net log-evidence (nats) of a refit to whole trajectories,
+        and the share of their simulation error that it takes away; None if it was not refitted.
     """
 
     effect: str
@@ -56,6 +59,8 @@ class Candidate:
     detectable: Mapping[str, float] = field(default_factory=dict)
     caps: bool = False
     why: str = ""
+    simulated_nats: float | None = None
+    simulated_share: float | None = None
 
 
 @dataclass(frozen=True)
@@ -213,7 +218,7 @@ class Errors:
     rollout_rmse : dict of str to float
         The same at the end of a rollout of several intervals.
     normalised_rmse : float
-        Root mean square of the residual in units of the noise: 1 if the model is perfect.
+        Root mean square innovation in units of what measurement noise alone makes.
     elpd : float
         Log predictive density, summed over held-out transitions.
     """

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
@@ -67,6 +67,8 @@ class Selection:
     ----------
     simulated : Mode or None
         The model so far, fitted to whole trajectories that are simulated without process noise.
+    tried : dict of (str, str) to (float, float)
+        Net evidence (nats) of an effect on a body by simulation, and its share of the error.
     why : dict of (str, str) to str
         Why an effect on a body was added or not, from the last round that tried it.
     small : list of Candidate
@@ -78,6 +80,7 @@ class Selection:
     criteria: Criteria
     say: Callable[[str], None]
     simulated: Mode | None = field(default=None, init=False)
+    tried: Mapping[tuple[str, str], tuple[float, float]] = field(default_factory=dict, init=False)
     why: dict[tuple[str, str], str] = field(default_factory=dict, init=False)
     small: list[Candidate] = field(default_factory=list, init=False)
 
@@ -329,8 +332,16 @@ class Selection:
         self.small.clear()  # it was found beside the effects that are withdrawn
 
     def explained(self, ranked: list[Signature]) -> tuple[Candidate, ...]:
-        """Return candidates with the decision on each."""
-        return tuple(replace(one.candidate, why=self.why.get(_key(one), "")) for one in ranked)
+        """Return candidates with the decision on each, and what simulations say of it."""
+        return tuple(
+            replace(
+                one.candidate,
+                why=self.why.get(_key(one), ""),
+                simulated_nats=self.tried.get(_key(one), (None, None))[0],
+                simulated_share=self.tried.get(_key(one), (None, None))[1],
+            )
+            for one in ranked
+        )
 
     def _note(self, signature: Signature, why: str) -> None:
         """Record the decision on a candidate."""

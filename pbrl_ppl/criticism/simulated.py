@@ -28,6 +28,11 @@ from pbrl_ppl.parameters import prior_residual
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
+#: What to know of laws that a recording of one trajectory shows.
+ONE_TRAJECTORY = (
+    "a single trajectory cannot tell a law from a lasting random force: record a second one"
+)
+
 
 @dataclass(frozen=True)
 class Law:
@@ -88,12 +93,7 @@ class Attribution:
     @property
     def sentences(self) -> list[str]:
         """What to know before relying on the laws."""
-        said = []
-        if self.laws and self.trajectories == 1:
-            said.append(
-                "a single trajectory cannot tell a law from a lasting random force: record a second"
-                " one"
-            )
+        said = [ONE_TRAJECTORY] if self.laws and self.trajectories == 1 else []
         for law in self.laws:
             if law.confounded:
                 others = " or ".join(law.confounded)
@@ -401,7 +401,8 @@ class SimulatedSearch:
         if trials and not self._white(trials[0].modes) and (pairs or self._best(trials) is None):
             both = []
             for pair in combinations(trials[: limits.paired], 2):
-                if twins(*(scores[-1][each.laws[0]] for each in pair), self.criteria):
+                first, second = (scores[-1][each.laws[0]] for each in pair)
+                if twins(first, second, self.criteria):
                     continue
                 begin = {each.laws[0]: sizes_of(each.modes[0], each.laws[0]) for each in pair}
                 both.append(self._trial(now, parents, begin, n))

@@ -102,6 +102,16 @@ def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
     return _without(mode, negligible, mode.problem.residual(mode.phi))
 
 
+def measurement_noise(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
+    """Return the noise parameters with the measurement noise alone, shape (parameter,).
+
+    A significant acceleration is left out, and the measurement noise stays beside it.
+    """
+    sigma = noise_alone(mode, excess)
+    sigma[mode.problem.trajectory_noise.cells.accelerations] = NOTHING
+    return sigma
+
+
 def without_acceleration(mode: Mode) -> Mode:
     """Return the mode with the noise parameters that it has without unexplained acceleration.
 

@@ -205,7 +205,8 @@ def candidate_table(loop: Loop) -> Table:
     return Table(
         "Candidates of the first round, best first",
         ("Effect", "Score", "Degrees of freedom", "p (corrected)", "First estimate",
-         "Identifiable", "Detection limit", "Decision"),
+         "Identifiable", "Simulation error taken", "Its evidence (nats)", "Detection limit",
+         "Decision"),
         [
             (
                 (plain(candidate.effect), candidate.body),
@@ -214,12 +215,14 @@ def candidate_table(loop: Loop) -> Table:
                 chance(candidate.p_value),
                 _estimates(candidate, measured_parameters(candidate, loop)),
                 percent(candidate.identifiable),
+                "–" if candidate.simulated_share is None else percent(candidate.simulated_share),
+                "–" if candidate.simulated_nats is None else number(candidate.simulated_nats),
                 limits_in_words(candidate, loop) or "–",
                 candidate.why or "–",
             )
             for candidate in loop.candidates
         ],
-        words=(4, 6, 7),
+        words=(4, 8, 9),
         marks=[
             "added" if (each.effect, each.body) in added else "" for each in loop.candidates
         ],
