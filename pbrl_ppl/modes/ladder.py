@@ -16,6 +16,7 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import longest_gap
 from pbrl_ppl.likelihood import (
     Problem,
+    autocovariance,
     in_pieces,
     least_errors,
     linearised_about,
@@ -193,7 +194,7 @@ def fit_pieces(problem: Problem, phi: Floats, rounds: int = 20, tolerance: float
     step = _Step(problem, linear, sigma, phi)
     problem = linearised_pieces(problem, start, linear.by_start, _tau(problem))
     return Mode(
-        problem, phi, sigma, step.jacobian, step.covariance,
+        problem, phi, sigma, step.jacobian, step.covariance(),
         -_cost(problem, linear.residual, sigma, phi),
     )  # fmt: skip
 
@@ -269,7 +270,7 @@ class _Step:
         likelihood = output_error(problem)
         self.problem, self.phi, self.starts = problem, phi, likelihood.starts
         priors = problem.layout.priors
-        weight = 1.0 / (sigma * np.sqrt(likelihood.tau))
+        self.weight = weight = 1.0 / (sigma * np.sqrt(likelihood.tau))
         self.u, self.back = self.starts.basis(weight)
         self.rows = self.starts.rows(linear.residual, weight)
         by_phi = np.moveaxis(linear.by_phi, -1, 0) * weight
@@ -280,19 +281,34 @@ class _Step:
         projected = self.by_phi - self.u @ (np.swapaxes(self.u, 1, 2) @ self.by_phi)
         taken = (self.u @ (np.swapaxes(self.u, 1, 2) @ self.rows[..., None]))[..., 0]
         self.jacobian = projected.reshape(self.rows.size, len(phi))
-        slopes = prior_slopes(priors, phi) if priors else np.zeros(0)
-        self.gradient = self.jacobian.T @ (self.rows - taken).ravel()
-        self.gradient = self.gradient - slopes * prior_residual(priors, phi)
-        self.precision = self.jacobian.T @ self.jacobian + np.diag(slopes**2)
+        self.residual = self.rows - taken
+        self.slopes = prior_slopes(priors, phi) if priors else np.zeros(0)
+        self.gradient = self.jacobian.T @ self.residual.ravel()
+        self.gradient = self.gradient - self.slopes * prior_residual(priors, phi)
+        self.precision = self.jacobian.T @ self.jacobian + np.diag(self.slopes**2)
         own = np.where(self.starts.seen[..., None], linear.by_start, 0.0) * weight[:, None]
         self.of_start = (own**2).sum((1, 2, 3)) + np.isfinite(self.starts.begin) * np.where(
             self.starts.column >= 0, weight[self.starts.column], 0.0
         ) ** 2
 
-    @property
     def covariance(self) -> Floats:
-        """Laplace covariance of phi, shape (p, p)."""
-        return covariance_of(self.precision)
+        """Return the covariance of phi under errors as correlated as the residual, shape (p, p).
+
+        A sandwich: the inverse precision, the variance of the score, the inverse precision.
+        """
+        residual, jacobian, start = map(
+            self.starts.series,
+            (self.residual, self.jacobian.reshape(*self.rows.shape, len(self.phi)), self.u),
+        )
+        seen, score = self.starts.seen_series, np.diag(self.slopes**2)
+        lags = np.abs(np.subtract.outer(np.arange(seen.shape[1]), np.arange(seen.shape[1])))
+        for d, least in enumerate(least_errors(self.problem) * self.weight):
+            own = jacobian[..., d, :]
+            errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], own)
+            errors[0] += least**2
+            score = score + np.einsum("arbp,rs,asbq->pq", own, errors[lags], own, optimize=True)
+        inverse = covariance_of(self.precision)
+        return np.asarray(inverse @ score @ inverse)
 
     def differences(self, scale: Floats, sizes: Floats) -> tuple[Floats, Floats]:
         """Return steps of the next derivatives, shapes (p,) and (cell,)."""

@@ -33,20 +33,13 @@ def test_recovers_a_drag_from_a_wrong_start(begin) -> None:
 
 
 def test_intervals_allow_for_correlated_errors() -> None:
-    """AR(0.9) errors of four falls, 40 recordings: 94 % intervals hold the truth in 32 of them.
+    """AR(0.9) errors of four falls, 40 recordings: 94 % intervals hold the truth in 33 at least.
 
-    They are too narrow by about 1.4, because the correlation that is left beside fitted start
-    states is less than that of the errors. Intervals of white noise would hold it in half.
+    False alarm 0.2 %. The residual's own correlation time gave intervals that held it in 32.
     """
-    held, white = 0, 0
-    for seed in range(40):
-        mode = fitted(seed, TRUTH, trajectories=4)
-        sd = np.sqrt(mode.covariance[0, 0])
-        tau = mode.problem.likelihood.tau[0]
-        held += abs(mode.phi[0] - TRUTH) < 1.88 * sd
-        white += abs(mode.phi[0] - TRUTH) < 1.88 * sd / np.sqrt(tau)
-    assert held >= 30, held
-    assert held >= white + 8, (held, white)
+    modes = [fitted(seed, TRUTH, trajectories=4) for seed in range(40)]
+    held = sum(abs(m.phi[0] - TRUTH) < 1.88 * np.sqrt(m.covariance[0, 0]) for m in modes)
+    assert held >= 33, held
 
 
 def test_lengths_end_with_whole_trajectories() -> None:
