@@ -46,6 +46,8 @@ _LEAST, _MOST = 1e-6, 2e-2
 _FEW, _LOOSE = 4, 1.0
 #: Rounds of a leading candidate's fit.
 _MANY = 10
+#: Trajectories whose scores' scatter is a variance, at least.
+_MANY_TRAJECTORIES = 8
 
 
 @one_blas_thread
@@ -294,21 +296,31 @@ class _Step:
     def covariance(self) -> Floats:
         """Return the covariance of phi under errors as correlated as the residual, shape (p, p).
 
-        A sandwich: the inverse precision, the variance of the score, the inverse precision.
+        A sandwich: the inverse precision, the variance of the score, the inverse precision. With
+        many trajectories, no parameter's is less than by the scatter of the trajectories' scores
+        (a cluster-robust covariance), which what differs from one to the other widens.
         """
-        residual, jacobian, start = map(
-            self.starts.series,
-            (self.residual, self.jacobian.reshape(*self.rows.shape, len(self.phi)), self.u),
-        )
+        jacobian = self.jacobian.reshape(*self.rows.shape, len(self.phi))
+        residual, start, by_phi = map(self.starts.series, (self.residual, self.u, jacobian))
         seen, score = self.starts.seen_series, np.diag(self.slopes**2)
         lags = np.abs(np.subtract.outer(np.arange(seen.shape[1]), np.arange(seen.shape[1])))
-        for d, least in enumerate(least_errors(self.problem) * self.weight):
-            own = jacobian[..., d, :]
+        for d, white in enumerate(least_errors(self.problem) * self.weight):
+            own = by_phi[..., d, :]
             errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], own)
-            errors[0] += least**2
+            errors[0] += white**2
             score = score + np.einsum("arbp,rs,asbq->pq", own, errors[lags], own, optimize=True)
         inverse = covariance_of(self.precision)
-        return np.asarray(inverse @ score @ inverse)
+        found = inverse @ score @ inverse
+        _, cluster = np.unique(self.problem.segments.trajectory, return_inverse=True)
+        n = cluster.max() + 1
+        if n >= _MANY_TRAJECTORIES:
+            scores = np.zeros((n, len(self.phi)))
+            np.add.at(scores, cluster, np.einsum("arp,ar->ap", jacobian, self.residual))
+            score = n / (n - 1) * scores.T @ scores + np.diag(self.slopes**2)
+            least = np.diag(inverse @ score @ inverse)
+            wider = np.sqrt(np.maximum(least / np.maximum(np.diag(found), 1e-300), 1.0))
+            found = found * np.outer(wider, wider)
+        return np.asarray(found)
 
     def differences(self, scale: Floats, sizes: Floats) -> tuple[Floats, Floats]:
         """Return steps of the next derivatives, shapes (p,) and (cell,)."""

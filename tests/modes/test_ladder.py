@@ -8,6 +8,8 @@ from pbrl_ppl.likelihood import Problem, first_states, in_pieces
 from pbrl_ppl.modes import fit_pieces
 from pbrl_ppl.modes.ladder import growth, lengths
 from pbrl_ppl.physics import Physics
+from tests.helpers.coloured import RIGS, standardised
+from tests.helpers.coloured import fitted as coloured_mode
 from tests.helpers.falls import BALL, GRAVITY, MASS, fall
 
 pytestmark = pytest.mark.one_stack  # nothing is sampled here
@@ -40,6 +42,17 @@ def test_intervals_allow_for_correlated_errors() -> None:
     modes = [fitted(seed, TRUTH, trajectories=4) for seed in range(40)]
     held = sum(abs(m.phi[0] - TRUTH) < 1.88 * np.sqrt(m.covariance[0, 0]) for m in modes)
     assert held >= 33, held
+
+
+def test_intervals_allow_for_what_only_other_trajectories_show() -> None:
+    """A slow ripple of 5 % of the weight, eight falls: 94 % intervals hold the truth in 16 of 20.
+
+    False alarm 0.6 %. Intervals by the correlation within falls alone held it in 23 of 40.
+    """
+    rig = RIGS["falls"]
+    z = [standardised(rig, coloured_mode(rig, "ripple", seed)) for seed in range(20)]
+    held = np.sum(np.abs(z) < 1.88)
+    assert held >= 16, held
 
 
 def test_lengths_end_with_whole_trajectories() -> None:
