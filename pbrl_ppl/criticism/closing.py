@@ -169,15 +169,11 @@ class _Model:
 
 
 class _Search(NamedTuple):
-    """Result of a search for effects: the declared model's ranking, the mode, the added effects.
-
-    ``simulated`` is the mode with the effects that simulations name alone.
-    """
+    """Result of a search for effects: the declared model's ranking, the mode, the added effects."""
 
     first: list[Signature]
     mode: Mode
     steps: list[Step]
-    simulated: Mode
 
 
 def _closed(task: _Task, train: History, test: History) -> Loop:
@@ -236,23 +232,16 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         held = {label: values[label] for step in steps for label in step.signature.attached.labels}
         with_added = _prior_test(task, train, revised.problem.physics.effects, held)
     misfit = find_misfit(revised, after, horizon=horizon, seed=seed).with_test(with_added)
-    if steps and _too_much_remains(misfit, before, after):
+    if steps and found is None and _too_much_remains(misfit, before, after):
         without = find_misfit(declared, before, horizon=horizon, seed=seed)
         share = after.square / before.square
         followed = misfit.predictable < criteria.most_predictable * without.predictable
         if share > criteria.large_if_small or not followed:
             # any effect takes up a part of a misfit, so no name follows from that
             say(Stage.WITHDRAW)
-            small = [step for step in steps if not step.simulated]
-            selection.withdraw(small)
-            steps = [step for step in steps if step.simulated]
-            if small and steps:
-                revised = search.simulated
-                after = unexplained_acceleration(revised, criteria)
-                without = find_misfit(revised, after, horizon=horizon, seed=seed)
-                misfit = without.with_test(with_added)
-            elif small:
-                revised, after, misfit = declared, before, without.with_test(prior)
+            selection.withdraw(steps)
+            steps, revised, after = [], declared, before
+            misfit = without.with_test(prior)
     if steps:
         misfit = with_negligible_acceleration(misfit, revised, after)
     tested = replace(revised, problem=HeldOut.of(revised, test).problem)
@@ -299,8 +288,8 @@ def _add_effects(declared: Mode, selection: Selection, found: Simulated | None) 
     criteria, say = selection.criteria, selection.say
     say(Stage.SCORE)
     first = selection.rank(declared)
-    simulated, steps = selection.adopted(declared, found, first)
-    mode, ranked = simulated, selection.rank(simulated) if steps else first
+    mode, steps = selection.adopted(declared, found, first)
+    ranked = selection.rank(mode) if steps else first
     while ranked and len(steps) < criteria.most_added:
         step = selection.best_addition(mode, ranked)
         if step is None:
@@ -312,7 +301,7 @@ def _add_effects(declared: Mode, selection: Selection, found: Simulated | None) 
     if len(steps) > 1:
         say(Stage.PRUNE)
         mode, steps = selection.prune(mode, steps)
-    return _Search(first, mode, steps, simulated)
+    return _Search(first, mode, steps)
 
 
 def _prior_test(

@@ -216,9 +216,10 @@ class Selection:
             self.simulated = fit_pieces(*with_effects(self.simulated, effects, begin))
         sizes = np.array(list(signature.candidate.estimate.values()))
         worth = worth_of(self.simulated, signature.attached, sizes)
-        if worth <= 0:
-            self._note(signature, f"takes nothing off simulation errors ({worth:.1f} nats)")
-        return worth > 0
+        if worth < self.criteria.simulation.least_nats:
+            self._note(signature, f"takes too little off simulation errors ({worth:.1f} nats)")
+            return False
+        return True
 
     def _confirm(
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]

@@ -23,7 +23,16 @@ from pbrl_ppl.effects import Attached, Effect, Noise, candidates
 from pbrl_ppl.effects import catalogue as full_catalogue
 from pbrl_ppl.history import History, longest_gap
 from pbrl_ppl.likelihood import output_error
-from pbrl_ppl.modes import Linear, Mode, climb_ladder, derivatives, fit_pieces, ladder, refined
+from pbrl_ppl.modes import (
+    Linear,
+    Mode,
+    climb_ladder,
+    derivatives,
+    fit_pieces,
+    ladder,
+    refined,
+    with_robust_covariance,
+)
 from pbrl_ppl.parameters import prior_residual
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -200,7 +209,8 @@ class Simulated:
 
     def described(self) -> tuple[Law, ...]:
         """Return the laws with what each is worth in the last model."""
-        return tuple(_law(self.after, law) for law in self.laws)
+        after = with_robust_covariance(self.after)
+        return tuple(_law(after, law) for law in self.laws)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,5 +1,6 @@
 """Likelihoods in numpy: data, noise, Eq. 11, whole trajectories and the log-posterior."""
 
+from .autocovariance import autocovariance as autocovariance
 from .cells import ACCELERATION as ACCELERATION
 from .cells import CONTACT as CONTACT
 from .cells import DRIFT as DRIFT

@@ -74,6 +74,25 @@ class Starts:
         begin = np.nan_to_num(self.begin) * self._weights(weight)
         return np.concatenate([z, np.broadcast_to(begin, (*z.shape[:-1], begin.shape[-1]))], -1)
 
+    def series(self, rows: Floats) -> Floats:
+        """Return rows as series that begin with the start, shape (piece, 1 + H, body, state, ...).
+
+        ``rows`` has shape (piece, row, ...); a start that is not observed is 0.
+        """
+        pieces, horizon, bodies, state = self.seen.shape
+        cut, own = horizon * bodies * state, self.column >= 0
+        out = np.zeros((pieces, 1 + horizon, bodies, state, *rows.shape[2:]))
+        out[:, 1:] = rows[:, :cut].reshape(pieces, horizon, bodies, state, *rows.shape[2:])
+        body = self.cells.places // len(STATE)
+        out[:, 0, body[own], self.column[own]] = rows[:, cut:][:, own]
+        return out
+
+    @property
+    def seen_series(self) -> Bools:
+        """What was measured of :meth:`series`, shape (piece, 1 + H, body, state)."""
+        seen = self.seen.reshape(len(self.seen), -1)
+        return self.series(np.concatenate([seen, np.isfinite(self.begin)], axis=1)) > 0
+
     def basis(self, weight: Floats) -> tuple[Floats, Floats]:
         """Return what start states can take up, and how: orthonormal rows and the way back.
 

@@ -15,6 +15,7 @@ from .ladder import derivatives as derivatives
 from .ladder import fit_pieces as fit_pieces
 from .ladder import ladder as ladder
 from .ladder import refined as refined
+from .ladder import with_robust_covariance as with_robust_covariance
 from .laplace import Mode as Mode
 from .laplace import posterior_steps as posterior_steps
 from .library_choice import choose_from_library as choose_from_library

@@ -17,6 +17,7 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import longest_gap
 from pbrl_ppl.likelihood import (
     Problem,
+    autocovariance,
     in_pieces,
     least_errors,
     linearised_about,
@@ -35,7 +36,7 @@ SHORTEST, RATIO = 4, 4
 #: piece too long to tell a law from.
 MOST_GROWTH = 30.0
 #: Dampings that are tried at once, as multiples of the last good one, and the least.
-_DAMPINGS, _LEAST_DAMPING = (0.2, 4.0, 100.0), 1e-8
+_DAMPINGS, _LEAST_DAMPING = (0.2, 10.0, 1e4), 1e-8
 #: Widths of derivatives that are tried where no step gains, as shares of the usual ones.
 _WIDER = (3.0, 0.1)
 #: Steps of derivatives: first, then shares of a posterior standard deviation of phi and of a start;
@@ -48,6 +49,8 @@ _TIGHT, _LOOSE = 0.1, 1.0
 _FEW, _FEWER = 4, 2
 #: Rounds of a leading candidate's fit.
 _MANY = 10
+#: Trajectories whose scores' scatter is a variance, at least.
+_MANY_TRAJECTORIES = 8
 #: Steps from one linearisation; one that gains less than this share of all of them is the last.
 _STEPS, _MUCH = 2, 0.2
 
@@ -95,7 +98,7 @@ def ladder(mode: Mode) -> list[Mode]:
             break
         found.append(fitted)
         phi, states = fitted.phi, simulated_states(fitted)
-    return found
+    return [*found[:-1], with_robust_covariance(found[-1])]
 
 
 def lengths(longest: int, gap: int = 1) -> list[int]:
@@ -145,6 +148,42 @@ def _along(problem: Problem, shorter: Mode) -> Problem:
     segments, likelihood = problem.segments, output_error(problem)
     start = simulated_states(shorter)[segments.trajectory, segments.step]
     return linearised_pieces(problem, start, likelihood.starts.slope, np.array(likelihood.tau))
+
+
+def with_robust_covariance(mode: Mode) -> Mode:
+    """Return a mode of simulated pieces with the covariance under errors as correlated as they are.
+
+    A sandwich: the inverse precision, the variance of the score, the inverse precision. With many
+    trajectories, no parameter's is less than by the scatter of the trajectories' scores (a
+    cluster-robust covariance), which what differs from one to the other widens.
+    """
+    problem, likelihood, p = mode.problem, output_error(mode.problem), len(mode.phi)
+    if not p:
+        return mode
+    starts, weight = likelihood.starts, 1.0 / (mode.sigma * np.sqrt(likelihood.tau))
+    slopes = prior_slopes(problem.layout.priors, mode.phi)
+    jacobian = mode.jacobian.reshape(*mode.whitened_residual.shape, p)
+    u = starts.basis(weight)[0]
+    residual, start, by_phi = map(starts.series, (mode.whitened_residual, u, jacobian))
+    seen, score = starts.seen_series, np.diag(slopes**2)
+    lags = np.abs(np.subtract.outer(np.arange(seen.shape[1]), np.arange(seen.shape[1])))
+    for d, white in enumerate(least_errors(problem) * weight):
+        own = by_phi[..., d, :]
+        errors = autocovariance(residual[..., d], seen[..., d], start[..., d, :], own)
+        errors[0] += white**2
+        score = score + np.einsum("arbp,rs,asbq->pq", own, errors[lags], own, optimize=True)
+    inverse = covariance_of((mode.jacobian.T @ mode.jacobian) + np.diag(slopes**2))
+    found = inverse @ score @ inverse
+    _, cluster = np.unique(problem.segments.trajectory, return_inverse=True)
+    n = cluster.max() + 1
+    if n >= _MANY_TRAJECTORIES:
+        scores = np.zeros((n, p))
+        np.add.at(scores, cluster, np.einsum("arp,ar->ap", jacobian, mode.whitened_residual))
+        score = n / (n - 1) * scores.T @ scores + np.diag(slopes**2)
+        least = np.diag(inverse @ score @ inverse)
+        wider = np.sqrt(np.maximum(least / np.maximum(np.diag(found), 1e-300), 1.0))
+        found = found * np.outer(wider, wider)
+    return replace(mode, covariance=found)
 
 
 @dataclass(frozen=True, eq=False)
@@ -348,7 +387,7 @@ class _Step:
         n = self.u.shape[1] - rows
         self.by_phi = np.moveaxis(np.pad(by_phi, ((0, 0), (0, 0), (0, n))), 0, -1)
         projected = self.by_phi - self.u @ (np.swapaxes(self.u, 1, 2) @ self.by_phi)
-        self.jacobian = projected.reshape(-1, len(phi))
+        self.jacobian = projected.reshape(pieces * self.u.shape[1], len(phi))
         self.normal = self.jacobian.T @ self.jacobian
         self._move(phi, start, linear.residual)
 

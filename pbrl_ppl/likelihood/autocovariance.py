@@ -1,0 +1,116 @@
+"""Autocovariance of measurement errors, from residuals of fitted start states and parameters.
+
+The fit takes low frequencies out of the residual, so that the residual's own autocovariance is too
+small. Restricted maximum likelihood allows for that: H. D. Patterson and R. Thompson, Recovery of
+inter-block information when block sizes are unequal, 1971.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pbrl_ppl.state import Bools, Floats
+
+#: Time constants of correlated errors (rows): the least, and how many up to a piece's length.
+_SHORTEST, _TIMES = 0.5, 12
+#: Shares of correlated errors in the variance.
+_SHARES = (0.0, 0.02, 0.1, 0.3, 0.6, 0.9, 1.0)
+#: Directions with a smaller singular value, relative to the largest, change no residual.
+_RANK = 1e-6
+#: Fewer degrees of freedom do not show a correlation.
+_LEAST_FREEDOM = 5
+#: Share of the variance that is white in any case.
+_NUGGET = 1e-9
+#: Numbers that an array over grid points may hold.
+_CHUNK = 4e6
+
+
+def autocovariance(residual: Floats, seen: Bools, by_start: Floats, by_phi: Floats) -> Floats:
+    """Return the expected autocovariance of the errors of a dimension by lag, shape (row,).
+
+    Errors are white noise plus an AR(1) process. The memory and the share of the latter are
+    averaged over a grid, weighted by their restricted likelihood, so that their uncertainty counts.
+
+    Parameters
+    ----------
+    residual : ndarray
+        Residuals of the fit, shape (piece, row, body).
+    seen : ndarray of bool
+        What was measured, shape (piece, row, body).
+    by_start, by_phi : ndarray
+        Derivatives by the start states and by the parameters, shape (piece, row, body, column).
+    """
+    pieces, rows, bodies = residual.shape
+    start, phi, last = (
+        np.where(seen[..., None], own, 0.0).reshape(pieces, rows * bodies, -1)
+        for own in (by_start, by_phi, residual[..., None])
+    )
+    start = _orthonormal(start)
+    phi, last = (own - start @ (np.swapaxes(start, 1, 2) @ own) for own in (phi, last))
+    phi = _orthonormal(phi.reshape(1, pieces * rows * bodies, -1)).reshape(*last.shape[:2], -1)
+    freedom = seen.sum() - (start**2).sum() - (phi**2).sum()
+    if freedom < _LEAST_FREEDOM:
+        return np.append((residual[seen] ** 2).mean(), np.zeros(rows - 1))
+    columns = np.concatenate([start, phi, last], axis=2).reshape(*residual.shape, -1)
+    times = np.geomspace(_SHORTEST, max(rows, 1.0), _TIMES)
+    grid = np.array([(np.exp(-1 / t), share) for t in times for share in _SHARES])
+    chunks = np.ceil(len(grid) * pieces * columns.shape[-1] ** 2 / _CHUNK)
+    found = [
+        _restricted(columns, seen, start.shape[2], *own.T)
+        for own in np.array_split(grid, min(int(chunks), len(grid)))
+    ]
+    square, log_det = (np.concatenate(own) for own in zip(*found, strict=True))
+    square = np.maximum(square, 1e-300)
+    log_weight = -0.5 * (log_det + freedom * np.log(square))
+    weight = np.exp(log_weight - log_weight.max())
+    correlation = grid[:, 1:] * grid[:, :1] ** np.arange(rows)
+    correlation[:, 0] = 1.0
+    return np.asarray(weight * square @ correlation / weight.sum() / (freedom - 2))
+
+
+def _orthonormal(columns: Floats) -> Floats:
+    """Return orthonormal columns of the same span, shape (piece, row, rank); spare ones are 0."""
+    u, s, _ = np.linalg.svd(columns, full_matrices=False)
+    kept = s > _RANK * s.max(axis=1, keepdims=True, initial=1e-300)
+    return np.asarray((u * kept[:, None])[:, :, kept.any(axis=0)])
+
+
+def _restricted(
+    columns: Floats, seen: Bools, starts: int, memory: Floats, share: Floats
+) -> tuple[Floats, Floats]:
+    """Return whitened sums of squares and log-determinants at grid points, shapes (grid,).
+
+    ``columns`` are of start states, ``starts`` many, of parameters, and the residual.
+    """
+    gram, log_det = _whitened(columns, seen, memory[:, None, None], share[:, None, None])
+    spare = 1.0 - (columns**2).sum((1, 2))  # (piece, column)
+    own = gram[..., :starts, :starts] + spare[:, :starts, None] * np.eye(starts)
+    across = gram[..., :starts, starts:]
+    left = gram[..., starts:, starts:] - np.swapaxes(across, 2, 3) @ np.linalg.solve(own, across)
+    log_det = log_det + np.linalg.slogdet(own)[1].sum(axis=1)
+    left = left.sum(axis=1)
+    own, across = left[:, :-1, :-1], left[:, :-1, -1:]
+    taken = (across * np.linalg.solve(own, across)).sum((1, 2))
+    return left[:, -1, -1] - taken, log_det + np.linalg.slogdet(own)[1]
+
+
+def _whitened(columns: Floats, seen: Bools, memory: Floats, share: Floats) -> tuple[Floats, Floats]:
+    """Return inner products of whitened columns and log-determinants of the errors' correlation.
+
+    Shapes (grid, piece, column, column) and (grid,). A Kalman filter of the AR(1) process, of all
+    pieces, columns and grid points at once.
+    """
+    pieces, rows, bodies, n = columns.shape
+    mean = np.zeros((len(share), pieces, bodies, n))
+    variance = np.broadcast_to(share, mean.shape[:-1])
+    gram, log_det = np.zeros((len(share), pieces, n, n)), np.zeros(len(share))
+    for row in range(rows):
+        there = seen[:, row]
+        total = np.where(there, variance + 1.0 - share + _NUGGET, 1.0)
+        off = np.where(there[..., None], columns[:, row] - mean, 0.0)
+        gram += np.swapaxes(off, 2, 3) @ (off / total[..., None])
+        log_det += np.log(total).sum((1, 2))
+        gain = np.where(there, variance / total, 0.0)
+        mean = memory[..., None] * (mean + gain[..., None] * off)
+        variance = memory**2 * variance * (1.0 - gain) + (1.0 - memory**2) * share
+    return gram, log_det
