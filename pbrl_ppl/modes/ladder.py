@@ -211,9 +211,11 @@ class Linear:
 
     def of(self, labels: tuple[str, ...]) -> Linear:
         """Return the same with the parameters of another model, new ones unknown."""
-        places = [self.labels.index(label) if label in self.labels else -1 for label in labels]
-        unknown = np.array([i for i, place in enumerate(places) if place < 0], dtype=np.intp)
-        return replace(self, labels=labels, by_phi=self.by_phi[..., places], unknown=unknown)
+        known = [i for i, label in enumerate(labels) if label in self.labels]
+        by_phi = np.zeros((*self.residual.shape, len(labels)))
+        by_phi[..., known] = self.by_phi[..., [self.labels.index(labels[i]) for i in known]]
+        unknown = np.setdiff1d(np.arange(len(labels)), known)
+        return replace(self, labels=labels, by_phi=by_phi, unknown=unknown)
 
 
 @one_blas_thread
@@ -227,7 +229,7 @@ def derivatives(mode: Mode) -> Linear:
     scale = problem.layout.scale(mode.phi)
     width = np.clip(_OF_PHI / np.sqrt(np.maximum(precision, 1e-300)), _LEAST * scale, _MOST * scale)
     steps = np.where(problem.layout.discrete, 0.0, width), np.zeros(0)
-    known = Linear(labels, none[..., 0], none, slope, every)
+    known = Linear(labels, slope[..., 0], none, slope, every)
     return _linearise(problem, mode.phi, problem.segments.start, steps, known)
 
 
