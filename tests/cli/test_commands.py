@@ -327,7 +327,7 @@ def test_fit_without_convergence_exits_with_3(capsys: pytest.CaptureFixture[str]
         capsys, *fit[:4], "a.nc", "--method", "metropols"
     )
     said = message(capsys, *fit[:4], "a.nc", "--horizon", "3")
-    assert "--transitions" in said
+    assert "--likelihood transitions" in said
 
 
 @pytest.mark.usefixtures("puck")
