@@ -99,7 +99,7 @@ def fit(
     reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
-        if trajectories is not None:  # their short spelling
+        if trajectories is not None:  # older spellings
             likelihood = "trajectories" if trajectories else "transitions"
         if likelihood != "transitions" and (horizon > 1 or scalar):
             raise FitError(

@@ -455,7 +455,7 @@ def test_cures_are_options(
     Path("poses.csv").write_text(HEADER + "\n".join(positions) + "\n")
     fit = ("fit", "scene.toml", "poses.csv", "-o", "a.nc", "--transitions")
     said = message(capsys, *fit)
-    assert "fit whole trajectories (--trajectories)" in said
+    assert "fit whole trajectories (--likelihood trajectories)" in said
     assert "pass --estimate-velocities (" in said and "=True" not in said
     Path("out").mkdir()
     Path("out/a").touch()

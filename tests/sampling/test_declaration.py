@@ -120,13 +120,13 @@ def test_around_a_mode_or_a_posterior(model, half, history, monkeypatch) -> None
 
 
 def test_around_what_is_of_something_else(half, history) -> None:
-    with pytest.raises(ValueError, match="around is given without trajectories"):
+    with pytest.raises(ValueError, match="around is given with likelihood 'transitions'"):
         pp.physics_model(SCENE, history, around=half)
     other = history.select(range(9))
     with pytest.raises(PosteriorError, match="50 transitions that are not the model's 45"):
         pp.physics_model(SCENE, other, trajectories=True, around=half)
     single = pp.physics_model(SCENE, history)
-    with pytest.raises(PosteriorError, match="of whole trajectories, expected single transitions"):
+    with pytest.raises(PosteriorError, match="of trajectories, the model's of transitions"):
         pp.fit(single, resume=half)
 
 
