@@ -77,8 +77,8 @@ def update(
     are worth less than half of the draws, or fewer than 400 effective draws are left, at most 1000
     draws are kept and moved by Metropolis steps under all data. When the weights are worth next to
     nothing, or too uneven to be relied on, all data are fitted anew, with the defaults of fit. So
-    are they always where the likelihood is of simulations, whose start states are fitted with the
-    parameters.
+    are they always, by the posterior's own method, where the likelihood is of simulations, whose
+    start states are fitted with the parameters.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def update(
         model = build_model(_simulated(idata, record, history, effects))
         chains = group(idata, "posterior").sizes["chain"]
         with _relayed():
-            result = fit(model, seed=seed, chains=chains, progress=progress)
+            result = fit(model, method=record.method, seed=seed, chains=chains, progress=progress)
         entry = {"transitions": history.n_transitions, "share": None, "pareto_k": None}
         return _entered(result, record, history, {**entry, "seed": seed, "did": "refitted"})
     problem = problem_of(idata, effects, history)

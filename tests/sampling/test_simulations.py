@@ -1,7 +1,6 @@
 """The likelihood of simulated trajectories by name: model, fit, file, update, plan and command."""
 
 import json
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from pbrl_ppl.cli import main
 from pbrl_ppl.errors import FitError, PosteriorError, RefitWarning
 from pbrl_ppl.likelihood import log_posterior
 from pbrl_ppl.posterior import PosteriorRecord, group, parameter_draws, problem_of
-from pbrl_ppl.sampling import physics_model, updating
+from pbrl_ppl.sampling import physics_model
 from tests.helpers.falls import BALL, GRAVITY, MASS, fall
 from tests.helpers.marks import OBJECT_MODE
 
@@ -114,13 +113,13 @@ def test_a_file_plans_as_memory_does(idata, tmp_path) -> None:
     np.testing.assert_array_equal(dynamics.noisy(states, np.random.default_rng(0)), states)
 
 
-def test_an_update_refits_all_data(idata, monkeypatch) -> None:
-    monkeypatch.setattr(updating, "fit", partial(updating.fit, method="laplace"))
+def test_an_update_refits_all_data(idata) -> None:
     with pytest.warns(RefitWarning, match="fitted with the parameters"):
         new = pp.update(idata, history(1, 2), seed=1, progress=False)
     (entry,) = json.loads(new.attrs["updates"])
     assert (entry["did"], entry["transitions"]) == ("refitted", 58)
     record = PosteriorRecord.of(new)
+    assert record.method == "laplace"
     assert record.likelihood == "simulation"
     assert record.sigma_prior == PosteriorRecord.of(idata).sigma_prior
     assert problem_of(new).data.history.n_trajectories == 5
