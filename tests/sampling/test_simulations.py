@@ -142,8 +142,10 @@ def test_options_that_do_not_go_together_are_refused(options, says) -> None:
         physics_model(SCENE, history(0, 1), **options)
 
 
-def test_a_mode_of_another_likelihood_is_refused(model) -> None:
-    other = physics_model(SCENE, history(0, 1), likelihood="trajectories")
+def test_a_mode_of_another_likelihood_is_for_around_alone(model) -> None:
+    other = physics_model(SCENE, history(0, 3), likelihood="trajectories")
+    near = physics_model(SCENE, history(0, 3), likelihood="simulation", around=other.mode)
+    assert abs(near.mode.phi - model.mode.phi) < 0.1 * np.sqrt(near.mode.covariance[0, 0])
     with pytest.raises(FitError, match="likelihood simulation, the model's is trajectories"):
         pp.fit(other, start=model.mode, **QUICK)
 
