@@ -36,19 +36,25 @@ def fit(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help="The posterior file (.nc).")
     ],
-    trajectories: Annotated[
-        bool,
+    likelihood: Annotated[
+        str,
         typer.Option(
-            "--trajectories/--transitions",
-            help="Likelihood of whole trajectories, as of close-loop, or of single transitions"
-            " from exact states (the paper's Eq. 11).",
+            metavar="NAME",
+            help="trajectories (whole ones with process noise, as of close-loop), transitions"
+            " (single ones from exact states, the paper's Eq. 11) or simulation (trajectories"
+            " without process noise, as of criticise --simulate).",
         ),
-    ] = True,
+    ] = "trajectories",
+    trajectories: Annotated[
+        bool | None, typer.Option("--trajectories/--transitions", hidden=True)
+    ] = None,
     horizon: Annotated[
-        int, typer.Option(min=1, help="Intervals that are predicted, with --transitions.")
+        int,
+        typer.Option(min=1, help="Intervals that are predicted, with --likelihood transitions."),
     ] = 1,
     scalar: Annotated[
-        bool, typer.Option("--scalar-sigma", help="One sigma for all, with --transitions.")
+        bool,
+        typer.Option("--scalar-sigma", help="One sigma for all, with --likelihood transitions."),
     ] = False,
     nu: Annotated[
         float | None,
@@ -93,8 +99,12 @@ def fit(
     reading = options.Reading(columns, units, estimate_velocities, trim, time_step is not None)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
-        if trajectories and (horizon > 1 or scalar):
-            raise FitError("--horizon and --scalar-sigma are of single transitions: --transitions")
+        if trajectories is not None:  # older spellings
+            likelihood = "trajectories" if trajectories else "transitions"
+        if likelihood != "transitions" and (horizon > 1 or scalar):
+            raise FitError(
+                "--horizon and --scalar-sigma are of single transitions: --likelihood transitions"
+            )
         progress("reading the scene and the history")
         declared, (loaded,) = options.load(
             scene, [history], reading, time_step=time_step, noise=noise, substeps=substeps
@@ -109,9 +119,9 @@ def fit(
         progress("looking for the mode, then sampling")
         try:
             model = sampling.physics_model(
-                declared, loaded, horizon=horizon, nu=nu, trajectories=trajectories, seed=seed,
+                declared, loaded, likelihood=likelihood, horizon=horizon, nu=nu, seed=seed,
                 sigma="scalar" if scalar else "per_dimension",
-                around=earlier if trajectories else None,
+                around=None if likelihood == "transitions" else earlier,
             )  # fmt: skip
         except ValueError as error:  # an option that the model refuses
             raise FitError(f"fit: {error}") from None
@@ -233,12 +243,13 @@ def update(
         save_posterior(idata, output)
         (*_, last) = json.loads(idata.attrs["updates"])
     converged = not any(issubclass(category, ConvergenceWarning) for category in caught)
+    share = last["share"]
     print_result(
         as_json,
         last | {"posterior": output, "converged": converged},
         [
-            f"{last['did']}: {last['transitions']} transitions, the weights worth"
-            f" {last['share']:.0%} of the draws",
+            f"{last['did']}: {last['transitions']} transitions"
+            + (f", the weights worth {share:.0%} of the draws" if share is not None else ""),
             f"posterior: {output}",
         ],
     )

@@ -34,7 +34,7 @@ FAILED, BAD_INPUT, UNDECIDED, INTERRUPTED = 1, 2, 3, 130
 #: command that has no such option.
 _ADVICE = {"thin": " or thin=", "resume": ", or go on with resume= this posterior"}
 #: An argument named in a message for Python.
-_ARGUMENT = re.compile(r"\b([a-z_]+)=(?:True\b)?(?=[\s,;.)]|$)")
+_ARGUMENT = re.compile(r"\b([a-z_]+)=(?:True\b|'(\w+)')?(?=[\s,;.)]|$)")
 
 
 @contextmanager
@@ -106,7 +106,7 @@ def in_options(message: str, options: Collection[str]) -> str:
     Parameters
     ----------
     message : str
-        It names arguments as ``draws=`` or ``estimate_velocities=True``.
+        It names arguments as ``draws=``, ``estimate_velocities=True`` or ``likelihood='name'``.
     options : collection of str
         Those of the command, such as ``--draws``.
 
@@ -122,7 +122,9 @@ def in_options(message: str, options: Collection[str]) -> str:
 
     def option(match: re.Match[str]) -> str:
         name = f"--{match[1].replace('_', '-')}"
-        return name if name in options else match[0]
+        if name not in options:
+            return match[0]
+        return f"{name} {match[2]}" if match[2] else name
 
     return _ARGUMENT.sub(option, message)
 

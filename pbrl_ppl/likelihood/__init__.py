@@ -12,9 +12,11 @@ from .data import Observations as Observations
 from .data import estimate_sigma as estimate_sigma
 from .data import least_noise as least_noise
 from .data import sigma_prior as sigma_prior
+from .declared import KINDS as KINDS
 from .declared import declared_problem as declared_problem
 from .likelihood import GAUSSIAN as GAUSSIAN
 from .likelihood import Likelihood as Likelihood
+from .likelihood import NoisePrior as NoisePrior
 from .likelihood import TrajectoryLikelihood as TrajectoryLikelihood
 from .likelihood import TransitionLikelihood as TransitionLikelihood
 from .likelihood import log_norm as log_norm

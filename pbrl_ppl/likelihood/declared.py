@@ -6,11 +6,17 @@ import numpy as np
 
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, check_start, measured_alone
-from pbrl_ppl.likelihood.likelihood import TransitionLikelihood
+from pbrl_ppl.likelihood.likelihood import TrajectoryLikelihood, TransitionLikelihood
+from pbrl_ppl.likelihood.output_error import OutputErrorLikelihood, in_pieces
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.likelihood.smoothing import along_trajectories
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics
+
+#: Names of the likelihoods.
+KINDS = tuple(
+    each.name for each in (TransitionLikelihood, TrajectoryLikelihood, OutputErrorLikelihood)
+)
 
 
 def declared_problem(
@@ -20,24 +26,27 @@ def declared_problem(
     horizon: int = 1,
     likelihood: TransitionLikelihood | None = None,
     library: ParameterLibrary | None = None,
-    trajectories: bool = False,
+    kind: str = TransitionLikelihood.name,
 ) -> Problem:
     """Return the problem of a history; see :func:`pbrl_ppl.physics_model`.
 
-    Whole trajectories are linearised at the prior's centre, which is no place to sample about: a
-    mode has to be found first.
+    ``kind`` is a name of a likelihood, one of :data:`KINDS`. Trajectories are linearised at the
+    prior's centre, which is no place to sample about: a mode has to be found first.
     """
     likelihood = likelihood or TransitionLikelihood()
+    if kind not in KINDS:
+        raise ValueError(f"likelihood is {kind!r}, expected one of {', '.join(KINDS)}")
     if horizon < 1:
         raise ValueError(f"horizon is {horizon}, expected at least 1")
-    if trajectories and (horizon > 1 or library is not None):
+    whole = kind != TransitionLikelihood.name
+    if whole and (horizon > 1 or library is not None):
         raise ValueError(
-            "trajectories is given with horizon or library; whole trajectories need neither: leave"
-            " it out"
+            f"likelihood is {kind!r}, with horizon or library, which are for 'transitions': leave"
+            " them out"
         )
-    if trajectories and likelihood.scalar:
-        raise ValueError("sigma is 'scalar', expected 'per_dimension' with trajectories")
-    if trajectories:
+    if whole and likelihood.scalar:
+        raise ValueError(f"sigma is 'scalar', expected 'per_dimension' with likelihood {kind!r}")
+    if whole:
         history = measured_alone(history)
     else:
         check_start(history, physics.scene)
@@ -48,7 +57,19 @@ def declared_problem(
             " shorter horizon"
         )
     problem = Problem.of(physics, history, horizon=horizon, likelihood=likelihood, library=library)
-    if trajectories:
+    if whole:
         centre = np.array([prior.centre for prior in problem.layout.priors])
         problem = along_trajectories(problem, centre)
-    return problem
+    if kind != OutputErrorLikelihood.name:
+        return problem
+    if likelihood.nu is not None or problem.tails:
+        raise ValueError(
+            "likelihood is 'simulation', whose noise is Gaussian: leave out nu and effects on the"
+            " noise's tails, or choose 'trajectories'"
+        )
+    if problem.layout.discrete.any():
+        raise ValueError(
+            "likelihood is 'simulation' and which bodies a joint joins is unknown: name them in the"
+            " scene, or choose 'trajectories'"
+        )
+    return in_pieces(problem, longest, problem.data.smoothed_states)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
-from typing import Any, Self, final
+from typing import Any, ClassVar, Self, final
 
 import numpy as np
 from scipy.special import gammaln
@@ -24,7 +24,7 @@ GAUSSIAN = 1e7
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Likelihood(ABC):
-    """How measured next states scatter about predictions; one of two final classes.
+    """How measured next states scatter about predictions; one of three final classes.
 
     Arguments ``sigma`` hold all noise parameters, shape (..., parameter), and ``nu`` the degrees of
     freedom of Student-t noise, broadcasting against residuals; None or infinite for a Gaussian.
@@ -36,7 +36,14 @@ class Likelihood(ABC):
     prior : tuple, optional
         Medians of the noise parameters' prior, and its log-scale; by default :func:`sigma_prior`
         takes them from the data.
+
+    Attributes
+    ----------
+    name : str
+        As users choose it; see :func:`pbrl_ppl.physics_model`.
     """
+
+    name: ClassVar[str]
 
     nu: float | None = None
     prior: NoisePrior | None = None
@@ -52,6 +59,10 @@ class Likelihood(ABC):
         ``sigma`` with the measured dimensions, unless the likelihood has others.
         """
         return {"sigma": observations.names}
+
+    def counts(self, observations: Observations) -> Floats:
+        """Return the effective number of measurements of each dimension, shape (state,)."""
+        return np.asarray(observations.measured.sum((0, 1, 2)), dtype=float)
 
     def free(self, sigma: Floats) -> Floats:
         """Return the noise parameters that are inferred, shape (..., free)."""
@@ -78,6 +89,13 @@ class Likelihood(ABC):
 
     def of_parameters(self) -> Self:
         """Return the likelihood for other parameters, without what follows from these."""
+        return self
+
+    def measuring(self, deviation: Floats) -> Self:
+        """Return the likelihood of measurements that deviate so much from where it is linearised.
+
+        ``deviation`` has shape (transition, H, body, state).
+        """
         return self
 
     @abstractmethod
@@ -153,6 +171,8 @@ class TransitionLikelihood(Likelihood):
     nu, prior
         As of :class:`Likelihood`.
     """
+
+    name: ClassVar[str] = "transitions"
 
     scalar: bool = False
 
@@ -238,6 +258,8 @@ class TrajectoryLikelihood(Likelihood):
         As of :class:`Likelihood`.
     """
 
+    name: ClassVar[str] = "trajectories"
+
     noise: TrajectoryNoise
 
     @property
@@ -258,6 +280,29 @@ class TrajectoryLikelihood(Likelihood):
     def of_parameters(self) -> TrajectoryLikelihood:
         """Return the same with smoothed states that do not follow the parameters."""
         return replace(self, noise=replace(self.noise, sensitivity=None))
+
+    def measuring(self, deviation: Floats) -> TrajectoryLikelihood:
+        """Return the same for other measurements; itself, with its gains, for these."""
+        measured = self.noise.cells.of_residual(deviation)
+        if np.array_equal(measured, self.noise.measured):
+            return self
+        return replace(self, noise=replace(self.noise, measured=measured))
+
+    def slopes(self, residual: Floats, pull: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+        """Return derivatives of the log-density by deviation and residual, shapes of the latter.
+
+        ``pull`` is minus its derivative by the whitened residuals, shape as of :meth:`whiten`.
+        """
+        noise = self.noise
+        by_cell = noise.pulled(pull, sigma)
+        by_deviation, by_residual = np.zeros_like(residual), np.zeros_like(residual)
+        body, place = noise.cells.in_residual
+        by_residual[:, 0, body, place] = by_cell
+        # a measurement moved is a linearised state moved: this residual grows, the next shrinks
+        following = np.where(noise.last[:, None], 0.0, np.roll(by_cell, -1, axis=0))
+        slope = np.roll(noise.slope, -1, axis=0)
+        by_deviation[:, 0, body, place] = by_cell - np.einsum("kab,ka->kb", slope, following)
+        return by_deviation, by_residual
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return the innovations over their standard deviations."""

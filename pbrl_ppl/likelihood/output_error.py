@@ -11,16 +11,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import final
+from typing import ClassVar, final
 
 import numpy as np
 
 from pbrl_ppl.likelihood.cells import Cells, cells_of
-from pbrl_ppl.likelihood.data import least_noise
+from pbrl_ppl.likelihood.data import Observations, least_noise
 from pbrl_ppl.likelihood.likelihood import Likelihood, log_norm, robust
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.physics import Memory
-from pbrl_ppl.state import STATE, Bools, Floats, Ints
+from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
 
 #: Directions of a start state with a smaller singular value move nothing that was measured.
 _SEEN = 1e-5
@@ -98,7 +98,9 @@ class Starts:
 
         Shapes (piece, row, direction) and (piece, cell, direction).
         """
-        return self.memory.recall((weight,), self._basis)
+        unit = weight.max()  # the basis depends on the weights' ratios alone
+        u, back = self.memory.recall((weight / unit,), self._basis)
+        return u, back / unit
 
     def _basis(self, weight: Floats) -> tuple[Floats, Floats]:
         pieces, cells = self.begin.shape
@@ -136,8 +138,14 @@ class OutputErrorLikelihood(Likelihood):
         As of :class:`Likelihood`.
     """
 
+    name: ClassVar[str] = "simulation"
+
     starts: Starts
     tau: tuple[float, ...]
+
+    def counts(self, observations: Observations) -> Floats:
+        """Return the numbers of measurements over their autocorrelation times, shape (state,)."""
+        return np.asarray(self.starts.counts / np.array(self.tau))
 
     def whiten(self, residual: Floats, sigma: Floats) -> Floats:
         """Return residuals over sigma and the root of tau, without what start states take up."""
@@ -181,8 +189,24 @@ class OutputErrorLikelihood(Likelihood):
         rng: np.random.Generator,
         nu: float | Floats | None = None,
     ) -> Floats:
-        """Draw measurements with white errors about simulated states."""
-        return np.asarray(predicted + sigma * rng.standard_normal(predicted.shape))
+        """Draw measurements with white errors about states from the most probable starts."""
+        starts = self.starts
+        residual = np.where(starts.seen, linearised - predicted, 0.0)
+        angle = starts.column[starts.cells.places % len(STATE) == THETA]
+        residual[..., angle[angle >= 0]] = wrapped(residual[..., angle[angle >= 0]])
+        weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
+        u, back = starts.basis(weight)
+        change = back @ (np.swapaxes(u, 1, 2) @ starts.rows(residual, weight)[..., None])
+        moved = np.einsum("phkdc,pc->phkd", starts.slope, change[..., 0])
+        return np.asarray(predicted + moved + sigma * rng.standard_normal(predicted.shape))
+
+    def slopes(self, residual: Floats, pull: Floats, sigma: Floats) -> tuple[Floats, Floats]:
+        """Return derivatives by deviation (none) and residual; see `TrajectoryLikelihood`."""
+        weight = 1.0 / (np.asarray(sigma) * np.sqrt(self.tau))
+        u, _ = self.starts.basis(weight)
+        kept = pull - (u @ (np.swapaxes(u, 1, 2) @ pull[..., None]))[..., 0]
+        kept = kept[:, : kept.shape[1] - len(self.starts.column)]
+        return np.zeros_like(residual), -kept.reshape(residual.shape) * weight
 
     def unwhitened(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return projected residuals of the pieces and of their starts, SI units.

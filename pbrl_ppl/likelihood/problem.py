@@ -227,7 +227,9 @@ class Problem:
         """
         if isinstance(self.likelihood, TrajectoryLikelihood):
             return self.likelihood.noise
-        raise TypeError("the problem is one of single transitions, expected whole trajectories")
+        raise TypeError(
+            f"the problem's likelihood is of {self.likelihood.name}, expected trajectories"
+        )
 
     def quiet(self, sigma: Floats, share: float) -> Floats:
         """Return sigma with unexplained accelerations of at most a share of their prior median."""
@@ -261,7 +263,7 @@ class Problem:
     @property
     def measured(self) -> Floats:
         """Measured next states, shape (transition, H, body, state), NaN where missing."""
-        if isinstance(self.likelihood, TransitionLikelihood):
+        if not isinstance(self.likelihood, TrajectoryLikelihood):
             return self.observations.values
         segments = self.segments
         observed = self.data.history.dataset["observed"].to_numpy()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pymc as pm
@@ -17,6 +17,7 @@ from pbrl_ppl.likelihood import (
     DRIFT,
     Likelihood,
     Observations,
+    OutputErrorLikelihood,
     Problem,
     TrajectoryLikelihood,
     TransitionLikelihood,
@@ -24,7 +25,7 @@ from pbrl_ppl.likelihood import (
 from pbrl_ppl.model.density import difference, next_state_logp, tail_tensor
 from pbrl_ppl.model.op import OneWorldOp, SimulatorOp
 from pbrl_ppl.model.table1 import random_variable
-from pbrl_ppl.model.trajectory_op import TrajectoryDensityOp
+from pbrl_ppl.model.trajectory_op import Correlated, TrajectoryDensityOp
 from pbrl_ppl.parameters import Block, Layout, ParameterLibrary
 from pbrl_ppl.state import INPUT, STATE
 
@@ -42,7 +43,7 @@ class PhysicsModel(pm.Model):  # type: ignore[misc]  # untyped
     problem : Problem
         Data, physics, likelihood and prior, which samplers evaluate in numpy.
     mode : Mode, optional
-        The mode that whole trajectories are linearised at, where a fit may begin.
+        The mode that trajectories are linearised at, where a fit may begin.
     """
 
     def __init__(self, problem: Problem, mode: Any = None) -> None:
@@ -147,7 +148,7 @@ def _noise(problem: Problem) -> Any:
     if problem.scalar_sigma:
         scalar = pm.LogNormal("sigma", mu=np.log(median).mean(), sigma=spread)
         return pt.ones(len(median)) * scalar
-    if isinstance(problem.likelihood, TransitionLikelihood):
+    if not isinstance(problem.likelihood, TrajectoryLikelihood):
         return pm.LogNormal("sigma", mu=np.log(median), sigma=spread, dims="state")
     parts, mu = [pt.zeros(0)], np.log(median)
     for name, own in problem.noise_variables.items():
@@ -174,9 +175,9 @@ def _index(block: Block, layout: Layout, variables: dict[str, Any]) -> Any:
 def _signature(problem: Problem) -> str:
     """Return core dimensions: of one transition, or of all where they are correlated."""
     tail = ",(k)" * bool(problem.tails)
-    if isinstance(problem.likelihood, TrajectoryLikelihood):
-        return f"(n,h,k,d),(n,h,k,d),(m){tail}->(n,h,k,d)"
-    return f"(h,k,d),(h,k,d),(d){tail}->(h,k,d)"
+    if isinstance(problem.likelihood, TransitionLikelihood):
+        return f"(h,k,d),(h,k,d),(d){tail}->(h,k,d)"
+    return f"(n,h,k,d),(n,h,k,d),(m){tail}->(n,h,k,d)"
 
 
 def _log_density(
@@ -190,14 +191,16 @@ def _log_density(
 ) -> Any:
     """Return the log-density of measurements about predictions in parts; ``whole`` is for draws."""
     nu = likelihood.nu
-    if not isinstance(likelihood, TrajectoryLikelihood):
+    if isinstance(likelihood, TransitionLikelihood):
         return next_state_logp(value, predicted, sigma, observations, nu, tail)
     if tail is None:
         tail = np.full(observations.values.shape[2], 0.0 if nu is None else 1.0 / nu)
     linearised = pt.as_tensor(np.nan_to_num(observations.values))
+    if isinstance(likelihood, OutputErrorLikelihood):  # states follow the simulation
+        linearised, predicted = value, pt.switch(observations.measured, predicted, value)
     deviation = difference(value, linearised, observations)
     residual = difference(linearised, predicted, observations)
-    return TrajectoryDensityOp(likelihood)(deviation, residual, sigma, tail)
+    return TrajectoryDensityOp(cast(Correlated, likelihood))(deviation, residual, sigma, tail)
 
 
 def _random(
@@ -239,7 +242,7 @@ def _coords(problem: Problem) -> dict[str, Any]:
 
 
 def _noise_coords(problem: Problem) -> dict[str, Any]:
-    if isinstance(problem.likelihood, TransitionLikelihood):
+    if not isinstance(problem.likelihood, TrajectoryLikelihood):
         return {}
     return {_NOISE_DIMS[name]: list(own) for name, own in problem.noise_variables.items()}
 

@@ -1,9 +1,8 @@
-"""The log-density of whole trajectories as a pytensor Op, with its derivative."""
+"""The log-density of correlated residuals as a pytensor Op, with its derivative."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numba
@@ -13,8 +12,11 @@ from pytensor.graph.basic import Apply
 from pytensor.graph.op import Op
 from pytensor.link.numba.dispatch.basic import numba_funcify
 
-from pbrl_ppl.likelihood import TrajectoryLikelihood
+from pbrl_ppl.likelihood import OutputErrorLikelihood, TrajectoryLikelihood
 from pbrl_ppl.state import Floats
+
+#: Likelihoods of residuals that are correlated within a trajectory.
+Correlated = TrajectoryLikelihood | OutputErrorLikelihood
 
 #: Step of a derivative by the logarithm of a noise parameter.
 _STEP = 1e-5
@@ -24,22 +26,19 @@ class _DensityOp(Op):
     """Base class of the density and its derivative.
 
     Inputs are measured minus linearised next states, linearised minus predicted ones, both of shape
-    (transition, 1, body, state), noise parameters (parameter,) and reciprocal degrees of freedom,
+    (transition, H, body, state), noise parameters (parameter,) and reciprocal degrees of freedom,
     one a body (body,).
     """
 
     __props__ = ("likelihood",)
 
-    def __init__(self, likelihood: TrajectoryLikelihood) -> None:
+    def __init__(self, likelihood: Correlated) -> None:
         self.likelihood = likelihood
         self._given = likelihood
 
-    def given(self, deviation: Floats) -> TrajectoryLikelihood:
+    def given(self, deviation: Floats) -> Correlated:
         """Return the likelihood of these measurements; the last one is kept with its gains."""
-        noise = self.likelihood.noise
-        measured = noise.cells.of_residual(deviation)
-        if not np.array_equal(measured, self._given.noise.measured):
-            self._given = replace(self.likelihood, noise=replace(noise, measured=measured))
+        self._given = self._given.measuring(deviation)
         return self._given
 
     def density(self, deviation: Floats, residual: Floats, sigma: Floats, tail: Floats) -> Floats:
@@ -59,8 +58,8 @@ class TrajectoryDensityOp(_DensityOp):
 
     Parameters
     ----------
-    likelihood : TrajectoryLikelihood
-        Of the linearised trajectories.
+    likelihood : TrajectoryLikelihood or OutputErrorLikelihood
+        Of the linearised trajectories or of simulated pieces.
     """
 
     def make_node(self, deviation: Any, residual: Any, sigma: Any, tail: Any) -> Apply:
@@ -74,13 +73,13 @@ class TrajectoryDensityOp(_DensityOp):
         return [(arguments[-1][0][0],)]
 
     def perform(self, node: Apply, inputs: Any, outputs: Any) -> None:
-        """Run the filter."""
+        """Evaluate the density."""
         outputs[0][0] = self.density(*inputs)
 
     def pullback(
         self, inputs: Sequence[Any], outputs: Sequence[Any], cotangents: Sequence[Any]
     ) -> list[Any]:
-        """Return the vector-Jacobian product: the filter's adjoint, differences for the noise."""
+        """Return the vector-Jacobian product: by the adjoint, by differences for the noise."""
         return list(_DerivativeOp(self.likelihood)(*inputs, cotangents[0], return_list=True))
 
     L_op = pullback  # its name in pytensor 2
@@ -106,25 +105,17 @@ class _DerivativeOp(_DensityOp):
         self, deviation: Floats, residual: Floats, sigma: Floats, tail: Floats, weights: Floats
     ) -> tuple[Floats, Floats, Floats, Floats]:
         """Return the derivatives by the inputs, in their order."""
-        noise = self.given(deviation).noise
-        white = noise.filtered(noise.cells.of_residual(residual)[None], sigma)[0][0]
+        likelihood = self.given(deviation)
+        white = likelihood.whiten(residual, sigma)
         pull = white
         if tail.any():
             with np.errstate(divide="ignore"):
                 nu = np.broadcast_to(1.0 / tail[:, None], residual.shape)
-            nus = noise.cells.of_residual(nu)
+            nus = np.asarray(likelihood.whitened_nu(nu, residual.shape))
             heavy = np.isfinite(nus)
             nus = np.where(heavy, nus, 1.0)
             pull = np.where(heavy, (nus + 1) * white / (nus + white**2), white)
-        by_cell = noise.pulled(pull * weights[:, None], sigma)
-        by_residual = np.zeros_like(residual)
-        body, place = noise.cells.in_residual
-        by_residual[:, 0, body, place] = by_cell
-        # a measurement moved is a linearised state moved: this residual grows, the next shrinks
-        following = np.where(noise.last[:, None], 0.0, np.roll(by_cell, -1, axis=0))
-        slope = np.roll(noise.slope, -1, axis=0)
-        by_deviation = np.zeros_like(residual)
-        by_deviation[:, 0, body, place] = by_cell - np.einsum("kab,ka->kb", slope, following)
+        by_deviation, by_residual = likelihood.slopes(residual, pull * weights[:, None], sigma)
 
         def total(sigma: Floats, tail: Floats) -> float:
             return float(self.density(deviation, residual, sigma, tail) @ weights)

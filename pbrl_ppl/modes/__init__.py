@@ -22,6 +22,8 @@ from .library_choice import choose_from_library as choose_from_library
 from .noise import NOTHING as NOTHING
 from .noise import profile_sigma as profile_sigma
 from .search import find_mode as find_mode
+from .simulation import find_simulation_mode as find_simulation_mode
+from .simulation import simulation_mode as simulation_mode
 from .trajectories import find_trajectory_mode as find_trajectory_mode
 from .trajectories import following as following
 from .trajectories import nearby_mode as nearby_mode

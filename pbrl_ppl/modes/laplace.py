@@ -81,7 +81,7 @@ class Mode:
             residual = self.problem.residual(self.phi)
             return noise_gaussian(self.problem, residual, self.sigma, self.phi)
         # half the inverse of the number of measurements
-        counts = self.problem.observations.measured.sum((0, 1, 2))
+        counts = self.problem.likelihood.counts(self.problem.observations)
         return np.log(self.sigma), np.diag(0.5 / np.maximum(counts, 1))
 
     def draws(self, rng: np.random.Generator, n: int) -> Floats:

@@ -10,10 +10,12 @@ from scipy.optimize import minimize
 from scipy.special import wrightomega
 
 from pbrl_ppl.likelihood import (
+    OutputErrorLikelihood,
     Problem,
     TrajectoryLikelihood,
     TrajectoryNoise,
     exponential,
+    least_errors,
     least_noise,
     log_noise_prior,
     noise_law,
@@ -62,9 +64,12 @@ def profile_sigma(
         return _of_trajectories(problem, problem.likelihood.noise, residual, phi, held or {})
     residual = finite(problem, residual)
     ones = np.ones(residual.shape[-1])
-    begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
-    if problem.nu(phi) is None:
-        return np.asarray(np.exp(begin) * ones)
+    if isinstance(problem.likelihood, OutputErrorLikelihood):
+        begin = np.log(problem.likelihood.profile(residual, least_errors(problem)))
+    else:
+        begin = gaussian_log_sigma(problem, (residual**2).sum((0, 1, 2)))
+        if problem.nu(phi) is None:
+            return np.asarray(np.exp(begin) * ones)
 
     bounds = [(b - 6, b + 6) for b in begin]
     found = minimize(

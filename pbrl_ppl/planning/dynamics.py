@@ -250,6 +250,8 @@ class Dynamics:
             nu: float | Floats | None = record.nu
             if tail_places(physics):
                 nu = degrees_of_freedom(physics, phi, record.nu)
+            if record.likelihood == "simulation":  # measurement errors disturb no body
+                sigma = np.zeros_like(sigma)
             noise = StateNoise(sigma, tuple(STATE.index(name) for name in record.measured), nu)
         return cls(
             record.scene,

@@ -19,6 +19,7 @@ from .cross_validation import separate as separate
 from .data import CELLS as CELLS
 from .data import both_places as both_places
 from .data import both_recordings as both_recordings
+from .data import likelihood_name as likelihood_name
 from .data import linearised_as as linearised_as
 from .data import placed as placed
 from .data import problem_of as problem_of

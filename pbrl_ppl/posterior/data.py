@@ -15,13 +15,16 @@ from pbrl_ppl.effects import Effect, LearnedRemainder, catalogue
 from pbrl_ppl.errors import PosteriorError
 from pbrl_ppl.history import History, Segments, from_segments
 from pbrl_ppl.likelihood import (
+    OutputErrorLikelihood,
     Problem,
     Sensitivity,
     TrajectoryLikelihood,
     TransitionLikelihood,
     along_trajectories,
     cells_of,
+    in_pieces,
     linearised,
+    linearised_pieces,
     with_sensitivity,
 )
 from pbrl_ppl.physics import Physics
@@ -33,8 +36,10 @@ from pbrl_ppl.state import INPUT, STATE
 PACKAGES = ("pbrl_ppl", "pymc", "pytensor", "arviz", "pymunk", "numpy", "numba", "xarray")
 #: Dimensions of measured next states.
 CELLS = ("transition", "step", "body", "state")
-#: Name of the smoothed states; a posterior of single transitions has none.
+#: Name of the smoothed or simulated states; a posterior of single transitions has none.
 SMOOTHED = "smoothed"
+#: Names of the derivative of simulated states by their start, and of autocorrelation times.
+_BY_START, _TAU = "by_start", "tau"
 #: Names of the parameters that the states were smoothed at, and of the states' derivative by them.
 _ORIGIN, _SENSITIVITY = "smoothed_at", "sensitivity"
 #: Prefix of the recording's variables and dimensions.
@@ -68,6 +73,7 @@ def record_of(problem: Problem, seed: int, method: str) -> PosteriorRecord:
         seed=seed,
         versions=versions(),
         method=method,
+        likelihood=likelihood.name,
         nu=problem.likelihood.nu,
         library=problem.library,
         learned_remainder=tables[-1] if tables else None,
@@ -138,8 +144,8 @@ def problem_of(
         library=record.library,
     )
     stored = with_recording(problem, given, record.data_sha256)
-    if not other or isinstance(stored.likelihood, TransitionLikelihood):
-        return stored
+    if not other or not isinstance(stored.likelihood, TrajectoryLikelihood):
+        return stored if not other or SMOOTHED not in given else problem
     # linearised at the posterior's best draw
     phi, sigma = vectors(idata, problem.layout, stored.noise_variables)
     best = best_draw(idata)
@@ -160,17 +166,18 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
     Raises
     ------
     PosteriorError
-        If one is of whole trajectories and the other of single transitions, or the data or the
-        parameters are others.
+        If the likelihood, the data or the parameters are others.
     """
     given, posterior = group(idata, "constant_data"), group(idata, "posterior")
-    kind = {True: "whole trajectories", False: "single transitions"}
-    whole = isinstance(problem.likelihood, TrajectoryLikelihood)
-    if (SMOOTHED in given) != whole:
+    held, kind = likelihood_name(idata), problem.likelihood.name
+    if held != kind:
         raise PosteriorError(
-            f"posterior: it is of {kind[not whole]}, expected {kind[whole]} as the model; make"
-            f" that with trajectories={not whole}"
+            f"posterior: its likelihood is of {held}, the model's of {kind}; make the model with"
+            f" likelihood={held!r}"
         )
+    record = PosteriorRecord.of(idata)
+    if isinstance(problem.likelihood, OutputErrorLikelihood):
+        problem = in_pieces(problem, record.horizon, problem.data.smoothed_states)
     measured = group(idata, "observed_data")["next_state"].transpose(*CELLS).to_numpy()
     if not np.array_equal(measured, problem.measured, equal_nan=True):
         raise PosteriorError(
@@ -180,17 +187,23 @@ def linearised_as(problem: Problem, idata: Any) -> Problem:
     names = [*(block.name for block in problem.layout.blocks), *problem.noise_variables]
     if missing := [name for name in names if name not in posterior]:
         raise PosteriorError(f"posterior: it has no {', '.join(missing)}; of another model?")
-    if not whole:
+    if SMOOTHED not in given:
         return problem
     problem = with_recording(problem, given, problem.data.history.data_sha256)
-    return problem.with_likelihood(prior=PosteriorRecord.of(idata).sigma_prior)
+    return problem.with_likelihood(prior=record.sigma_prior)
+
+
+def likelihood_name(idata: Any) -> str:
+    """Return the name of a posterior's likelihood, of files that do not say it too."""
+    record = PosteriorRecord.of(idata)
+    named = TransitionLikelihood if record.cells is None else TrajectoryLikelihood
+    return record.likelihood or named.name
 
 
 def recording(problem: Problem) -> xr.Dataset:
-    """Return the recording and linearisation of whole trajectories; empty for other problems."""
+    """Return the recording and linearisation of trajectories; empty for single transitions."""
     if isinstance(problem.likelihood, TransitionLikelihood):
         return xr.Dataset()
-    noise = problem.trajectory_noise
     dataset = problem.data.history.dataset
     kept = dataset.rename(
         {name: f"{_PREFIX}{name}" for name in (*dataset.dims, *dataset.data_vars)}
@@ -198,6 +211,11 @@ def recording(problem: Problem) -> xr.Dataset:
     kept = kept.drop_vars([name for name in kept.coords if name not in kept.dims])
     dims = tuple(f"{_PREFIX}{name}" for name in ("trajectory", "time", "body", "state"))
     kept[SMOOTHED] = (dims, problem.data.smoothed_states)
+    if isinstance(problem.likelihood, OutputErrorLikelihood):
+        kept[_BY_START] = ((*CELLS, "cell_before"), problem.likelihood.starts.slope)
+        kept[_TAU] = (("state",), np.array(problem.likelihood.tau), {"units": "rows"})
+        return kept.assign_attrs({})
+    noise = problem.trajectory_noise
     kept["slope"] = (("transition", "cell_after", "cell_before"), noise.slope)
     kept["linearised_at"] = (("noise_parameter",), noise.sigma)
     if noise.cells.drifts:
@@ -210,12 +228,18 @@ def recording(problem: Problem) -> xr.Dataset:
 
 
 def with_recording(problem: Problem, given: xr.Dataset, data_sha256: str) -> Problem:
-    """Return a problem with the whole trajectories of a posterior's constant data, if it has."""
+    """Return a problem with the trajectories of a posterior's constant data, if it has."""
     if SMOOTHED not in given:
         return problem
     history = recorded(problem.scene, given, data_sha256)
-    cells = recorded_cells(problem.scene, given)
     states = given[SMOOTHED].to_numpy()
+    if _BY_START in given:
+        length, prior = given[_BY_START].sizes["step"], problem.likelihood.prior
+        problem = in_pieces(problem.with_data(history=history), length, states)
+        start = problem.segments.start
+        slope, tau = given[_BY_START].to_numpy(), given[_TAU].to_numpy()
+        return linearised_pieces(problem, start, slope, tau).with_likelihood(prior=prior)
+    cells = recorded_cells(problem.scene, given)
     data = replace(problem.data, history=history, horizon=1, states=states, columns=cells.columns)
     problem, slope = problem.on(data), given["slope"].to_numpy()
     noise = linearised(problem, cells, slope, given["linearised_at"].to_numpy())

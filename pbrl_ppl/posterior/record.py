@@ -75,6 +75,8 @@ class PosteriorRecord:
         Versions of Python and of the packages that the fit depends on.
     method : str
         The sampler's name.
+    likelihood : str, optional
+        Name of the likelihood; see :func:`pbrl_ppl.physics_model`.
     nu : float, optional
         Degrees of freedom of Student-t noise; Gaussian without it.
     library : ParameterLibrary, optional
@@ -117,6 +119,7 @@ class PosteriorRecord:
     seed: int
     versions: Mapping[str, str]
     method: str
+    likelihood: str | None = None
     nu: float | None = None
     library: ParameterLibrary | None = None
     learned_remainder: str | None = None

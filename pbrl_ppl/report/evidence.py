@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.criticism import QUANTITIES, Loop, recorded_quantities
 from pbrl_ppl.likelihood import Problem
-from pbrl_ppl.posterior import group, problem_of
+from pbrl_ppl.posterior import problem_of
 from pbrl_ppl.report.motion import best_vectors
 from pbrl_ppl.report.style import acceleration_unit
 from pbrl_ppl.report.words import depends_on_records
@@ -130,8 +130,7 @@ def find_evidence(loop: Loop) -> Evidence | None:
 def recorded(*posteriors: Any) -> bool:
     """Return whether posteriors hold their recording, of whole trajectories."""
     return all(
-        "scene" in posterior.attrs and "smoothed" in group(posterior, "constant_data")
-        for posterior in posteriors
+        "scene" in posterior.attrs and "cells" in posterior.attrs for posterior in posteriors
     )
 
 

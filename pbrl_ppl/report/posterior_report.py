@@ -19,6 +19,7 @@ from pbrl_ppl.posterior import (
     group,
     groups,
     identify,
+    likelihood_name,
     scalars,
     scene_of,
 )
@@ -194,12 +195,13 @@ def _warned(posterior: Any, identified: bool) -> list[str]:
 
 def _about(posterior: Any) -> str:
     attrs, sizes = posterior.attrs, group(posterior, "posterior").sizes
-    given = group(posterior, "constant_data")
     transitions = group(posterior, "observed_data").sizes["transition"]
     horizon = int(attrs.get("horizon", 1))
-    likelihood = "whole trajectories" if "smoothed" in given else "transitions, Eq. 11"
+    names = {"trajectories": "whole trajectories", "transitions": "transitions, Eq. 11"}
+    likelihood = names.get(likelihood_name(posterior), "simulations")
     if horizon > 1:
-        likelihood = f"segments of {horizon} intervals"
+        kind = "simulations" if likelihood == "simulations" else "segments"
+        likelihood = f"{kind} of {horizon} intervals"
     return (
         f"{transitions} transitions; likelihood of {likelihood}; sampler"
         f" {attrs.get('method', 'unknown')}, {sizes['chain']} chains of {sizes['draw']} draws."
@@ -221,9 +223,10 @@ def _refit(posterior: Any) -> str:
     """Return the lines of Python that make the posterior again from its recording."""
     attrs, draws = posterior.attrs, group(posterior, "posterior")
     options = []
-    if "smoothed" in group(posterior, "constant_data"):
-        options.append("trajectories=True")
-    if int(attrs.get("horizon", 1)) > 1:
+    name = likelihood_name(posterior)
+    if name != "transitions":
+        options.append(f'likelihood="{name}"')
+    elif int(attrs.get("horizon", 1)) > 1:
         options.append(f"horizon={int(attrs['horizon'])}")
     if attrs.get("scalar_sigma"):
         options.append('sigma="scalar"')

@@ -131,7 +131,7 @@ def calibrate(
         history,
         horizon=horizon,
         likelihood=TransitionLikelihood.declare(sigma, nu),
-        trajectories=trajectories,
+        kind="trajectories" if trajectories else "transitions",
     )
     if design.layout.discrete.any():
         raise FitError(

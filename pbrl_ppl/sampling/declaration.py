@@ -1,4 +1,4 @@
-"""Declaration of the model: Eq. 11, or whole trajectories linearised at their mode."""
+"""Declaration of the model: Eq. 11, or trajectories linearised at their mode."""
 
 from __future__ import annotations
 
@@ -9,9 +9,21 @@ import pymc as pm
 
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.history import History, with_units
-from pbrl_ppl.likelihood import TrajectoryLikelihood, TransitionLikelihood, declared_problem
+from pbrl_ppl.likelihood import (
+    OutputErrorLikelihood,
+    TrajectoryLikelihood,
+    TransitionLikelihood,
+    declared_problem,
+)
 from pbrl_ppl.model import build_model
-from pbrl_ppl.modes import Mode, find_trajectory_mode, following, trajectory_mode
+from pbrl_ppl.modes import (
+    Mode,
+    find_simulation_mode,
+    find_trajectory_mode,
+    following,
+    simulation_mode,
+    trajectory_mode,
+)
 from pbrl_ppl.parameters import ParameterLibrary
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import linearised_as
@@ -23,6 +35,7 @@ def physics_model(
     history: History,
     effects: Iterable[Effect | Attached] = (),
     *,
+    likelihood: str = TransitionLikelihood.name,
     horizon: int = 1,
     sigma: str = "per_dimension",
     nu: float | None = None,
@@ -43,8 +56,24 @@ def physics_model(
         Measured transitions.
     effects : iterable of Effect or Attached
         Effects beside those that the scene declares.
+    likelihood : str
+        ``transitions`` (Eq. 11): measured start states are exact.
+
+        ``trajectories``: whole trajectories are whitened together, with two noises: ``sigma``, the
+        error of measuring a state, ``unexplained_acceleration``, what a step adds, and where bodies
+        touch ``contact_acceleration``, what comes on top of it there.
+
+        ``simulation``: trajectories are simulated from latent start states without process noise
+        (output error), in pieces as long as a simulation does not magnify its start. ``sigma`` is
+        the error of measuring a state; the log-likelihood is divided by its autocorrelation time.
+
+        The latter two are linearised about the states at the posterior's mode, which is searched
+        for here, is the initial point of ``pm.sample`` and is kept as the model's ``mode`` for
+        :func:`pbrl_ppl.fit`. Where a joint's bodies are unknown there is no one mode:
+        ``trajectories`` are then linearised about the prior's centre, and ``simulation`` is
+        refused.
     horizon : int
-        Intervals predicted from one measured state; 1 is Eq. 11.
+        Intervals predicted from one measured state, of ``transitions``; 1 is Eq. 11.
     sigma : str
         ``per_dimension`` or ``scalar`` (the paper's Eq. 11).
     nu : float, optional
@@ -58,16 +87,11 @@ def physics_model(
         Pre-learned parameter sets of which each body has one, in place of Table 1: the variable
         ``library_index`` holds the bodies' choices, and the parameters follow from it.
     trajectories : bool
-        Whether whole trajectories are whitened together, with two noises: ``sigma``, the error of
-        measuring a state, ``unexplained_acceleration``, what a step adds, and where bodies touch
-        ``contact_acceleration``, what comes on top of it there. Neighbours share a measured state,
-        which Eq. 11 takes as exact. The transitions are linearised about the states smoothed at the
-        posterior's mode, which is searched for here, is the initial point of ``pm.sample`` and is
-        kept as the model's ``mode`` for :func:`pbrl_ppl.fit`. Where a joint's bodies are unknown
-        there is no one mode: then about the prior's centre.
+        True is the same as ``likelihood="trajectories"``.
     around : Mode, InferenceData or DataTree, optional
-        Where whole trajectories are linearised in place of a search: a mode, from which the mode is
-        climbed to, or a posterior of the same data, whose linearisation is taken as it is.
+        Where trajectories are linearised in place of a search: a mode of whole trajectories, from
+        which the mode is climbed to, or a posterior of the same data and likelihood, whose
+        linearisation is taken as it is.
     seed : int
         Of the search; the same seed gives the same model.
 
@@ -82,15 +106,17 @@ def physics_model(
     EffectError
         If an effect is unknown or does not apply.
     HistoryError
-        If the history has nothing to fit at this horizon, or nothing moves in whole trajectories.
+        If the history has nothing to fit at this horizon, or nothing moves in whole trajectories,
+        or start states of simulations can follow all that was measured.
     SimulationError
         If bodies start deep inside each other or a wall, or a hinge's bodies apart.
     ValueError
-        If ``sigma`` is neither option, ``horizon`` is below 1 or ``nu`` is not above 0, or
-        ``trajectories`` is given with a horizon, a library or a scalar sigma, or ``around`` without
-        it.
+        If ``likelihood`` or ``sigma`` is no option, ``horizon`` is below 1 or ``nu`` is not above
+        0, or an option does not go with the likelihood: a horizon, a library and a scalar sigma are
+        for ``transitions``, ``around`` is for the others, and ``simulation`` has Gaussian noise and
+        joints of known bodies.
     PosteriorError
-        If ``around`` is a posterior of other data, or of single transitions.
+        If ``around`` is a posterior of other data, or of another likelihood.
     ParameterError
         If the library does not fit the scene's bodies.
 
@@ -106,24 +132,30 @@ def physics_model(
     >>> [variable.name for variable in model.free_RVs]
     ['mass', 'r', 'mu_c', 'sigma']
     """
-    if around is not None and not trajectories:
-        raise ValueError("around is given without trajectories, expected with trajectories=True")
+    if trajectories:
+        likelihood = TrajectoryLikelihood.name
+    if around is not None and likelihood == TransitionLikelihood.name:
+        raise ValueError(
+            "around is given with likelihood 'transitions', expected 'trajectories' or 'simulation'"
+        )
     problem = declared_problem(
         Physics.declare(with_units(scene, history), effects, substeps=substeps, threads=threads),
         history,
         horizon=horizon,
         likelihood=TransitionLikelihood.declare(sigma, nu),
         library=library,
-        trajectories=trajectories,
+        kind=likelihood,
     )
     mode = None
     if around is not None and not isinstance(around, Mode):
         problem = linearised_as(problem, around)
-    elif isinstance(problem.likelihood, TrajectoryLikelihood) and not problem.layout.discrete.any():
+    elif likelihood != TransitionLikelihood.name and not problem.layout.discrete.any():
+        simulated = likelihood == OutputErrorLikelihood.name
         if around is None:
-            mode = find_trajectory_mode(problem, seed)
+            mode = (find_simulation_mode if simulated else find_trajectory_mode)(problem, seed)
         else:  # the mode that is reached from the given one
             mode = following(trajectory_mode(problem, around.phi))
+            mode = simulation_mode(mode) if simulated else mode
         problem = mode.problem
     model = build_model(problem, mode)
     if mode is not None:  # chains of pm.sample begin there

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import warnings
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any
 
@@ -12,9 +13,16 @@ import pymc as pm
 import xarray as xr
 
 from pbrl_ppl.errors import FitError, MeetingWarning
-from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.model import build_model
-from pbrl_ppl.modes import Mode, find_mode, find_trajectory_mode, following, weigh
+from pbrl_ppl.modes import (
+    Mode,
+    find_mode,
+    find_simulation_mode,
+    find_trajectory_mode,
+    following,
+    weigh,
+)
 from pbrl_ppl.posterior import (
     PARETO_K,
     SIZE,
@@ -34,6 +42,12 @@ from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, prior_s
 from pbrl_ppl.sampling.starts import dispersed, from_posterior
 from pbrl_ppl.state import Floats
 
+#: Searches for the mode, by the likelihood's name.
+_SEARCHES: Mapping[str, Callable[..., Mode]] = {
+    "transitions": find_mode,
+    "trajectories": find_trajectory_mode,
+    "simulation": find_simulation_mode,
+}
 #: The default sampler.
 DEFAULT = "importance"
 #: The sampler where the default one does not suit the posterior.
@@ -207,11 +221,10 @@ def fit(
         point = stored_mode(problem, resume)
     else:
         held: Mode | None = model.mode
-        whole = isinstance(problem.likelihood, TrajectoryLikelihood)
-        search = find_trajectory_mode if whole else find_mode
-        mode = start or held or search(problem, seed=seed)
-        if isinstance(mode.problem.likelihood, TrajectoryLikelihood) and mode is not held:
-            mode = mode if start is None else following(start)
+        mode = start or held or _SEARCHES[problem.likelihood.name](problem, seed=seed)
+        if not isinstance(mode.problem.likelihood, TransitionLikelihood) and mode is not held:
+            if start is not None and isinstance(start.problem.likelihood, TrajectoryLikelihood):
+                mode = following(start)
             problem = mode.problem  # linearised at the mode
             model = build_model(problem)
         if joined := _joined_model(problem, mode.phi[None], mode.sigma[None]):
@@ -248,6 +261,12 @@ def _checked_problem(model: pm.Model, method: str, start: Any, resume: Any) -> P
         raise FitError(
             f"fit: start is a {type(start).__name__}, expected a Mode; pass a posterior to go on"
             " with as resume="
+        )
+    names = [] if start is None else [each.likelihood.name for each in (start.problem, problem)]
+    if "simulation" in names and names[0] != names[1]:
+        raise FitError(
+            f"fit: start is a mode of the likelihood {names[0]}, the model's is {names[1]}; leave"
+            " out start=, or pass it to physics_model as around="
         )
     given = "start" if start is not None else "resume" if resume is not None else None
     if problem.library is not None and (method not in (DEFAULT, "paper") or given):

@@ -61,7 +61,7 @@ def noise_block(mode: Mode) -> tuple[Floats, Floats]:
     if isinstance(problem.likelihood, TrajectoryLikelihood):
         return mode.noise_gaussian()
     # the variance of log sigma is half the inverse of the number of measurements
-    counts = problem.likelihood.pooled(problem.observations.measured.sum((0, 1, 2)))
+    counts = problem.likelihood.pooled(problem.likelihood.counts(problem.observations))
     covariance = np.diag(0.5 / np.maximum(counts, 1))
     return problem.likelihood.free(np.log(mode.sigma)), covariance
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 
 from pbrl_ppl import posterior as files
@@ -17,12 +18,15 @@ from pbrl_ppl.effects import Effect, catalogue
 from pbrl_ppl.errors import RefitWarning
 from pbrl_ppl.history import History
 from pbrl_ppl.likelihood import (
+    OutputErrorLikelihood,
     Problem,
     TrajectoryLikelihood,
     along_trajectories,
+    declared_problem,
     single_transitions,
 )
 from pbrl_ppl.model import build_model
+from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior import (
     CELLS,
     MIN_ESS,
@@ -72,7 +76,9 @@ def update(
     Chopin, 2002). Only the new transitions are simulated. Weights add up over updates; when they
     are worth less than half of the draws, or fewer than 400 effective draws are left, at most 1000
     draws are kept and moved by Metropolis steps under all data. When the weights are worth next to
-    nothing, or too uneven to be relied on, all data are fitted anew, with the defaults of fit.
+    nothing, or too uneven to be relied on, all data are fitted anew, with the defaults of fit. So
+    are they always, by the posterior's own method, where the likelihood is of simulations, whose
+    start states are fitted with the parameters.
 
     Parameters
     ----------
@@ -93,10 +99,11 @@ def update(
     InferenceData or DataTree
         A whole posterior of all data, with the prior of the first fit, noise's included. In
         ``attrs``, ``updates`` lists (as JSON) for each update the transitions, what the weights
-        were worth (``share``), ``pareto_k``, and what was done: ``reweighted``, ``moved`` or
-        ``refitted``. The group ``before_updates`` holds the draws that the next update starts from.
-        The stored mode is climbed to anew from the old one under all data; over a library or joints
-        of unknown bodies, it is the most probable of reweighted draws.
+        were worth (``share``; None without weights), ``pareto_k``, and what was done:
+        ``reweighted``, ``moved`` or ``refitted``. The group ``before_updates`` holds the draws that
+        the next update starts from. The stored mode is climbed to anew from the old one under all
+        data; over a library or joints of unknown bodies, it is the most probable of reweighted
+        draws.
 
     Raises
     ------
@@ -127,6 +134,20 @@ def update(
     record = check_posterior(idata, history)
     history = as_recorded(idata, history)
     check_history(idata, record, history)
+    if record.likelihood == OutputErrorLikelihood.name:
+        check_engine(idata, problem_of(idata, effects))
+        warnings.warn(
+            "update: start states of simulations are fitted with the parameters, so that all data"
+            " are fitted anew, which takes as long as a fit",
+            RefitWarning,
+            stacklevel=2,
+        )
+        model = build_model(_simulated(idata, record, history, effects))
+        chains = group(idata, "posterior").sizes["chain"]
+        with _relayed():
+            result = fit(model, method=record.method, seed=seed, chains=chains, progress=progress)
+        entry = {"transitions": history.n_transitions, "share": None, "pareto_k": None}
+        return _entered(result, record, history, {**entry, "seed": seed, "did": "refitted"})
     problem = problem_of(idata, effects, history)
     check_engine(idata, problem)
     rng = np.random.default_rng(seed)
@@ -154,25 +175,39 @@ def update(
             result = fit(build_model(whole), seed=seed, chains=chains, progress=progress)
         result = files.placed(result, new.base.coords)
         did = {"did": "refitted"}
-    entry = {
-        "transitions": problem.segments.n,
-        "data_sha256": history.data_sha256,
-        "before_sha256": record.data_sha256,
-        "seed": seed,
-        **how,
-        **did,
-    }
-    updated = PosteriorRecord.of(result)
     if did["did"] != "refitted":
-        updated = replace(updated, mode=_mode(idata, result, effects))
+        mode = _mode(idata, result, effects)
+        result.attrs.update(replace(PosteriorRecord.of(result), mode=mode).attributes())
+    entry = {"transitions": problem.segments.n, "seed": seed, **how, **did}
+    return _entered(result, record, history, entry)
+
+
+def _entered(result: Any, record: PosteriorRecord, history: History, entry: dict[str, Any]) -> Any:
+    """Return an updated posterior, with the update entered in its record."""
+    hashes = {"data_sha256": history.data_sha256, "before_sha256": record.data_sha256}
     chained = f"{record.data_sha256}{history.data_sha256}"
     updated = replace(
-        updated,
-        updates=(*(record.updates or ()), entry),
+        PosteriorRecord.of(result),
+        updates=(*(record.updates or ()), {**entry, **hashes}),
         data_sha256=hashlib.sha256(chained.encode()).hexdigest(),
     )
     result.attrs.update(updated.attributes())
     return result
+
+
+def _simulated(
+    idata: Any, record: PosteriorRecord, history: History, effects: tuple[Effect, ...]
+) -> Problem:
+    """Return the problem of simulations of a posterior's data and new ones, not yet fitted."""
+    held = files.recorded(record.scene, group(idata, "constant_data"))
+    rows, new = held.to_dataframe(), history.to_dataframe()
+    for each, first in ((rows, 0), (new, held.n_trajectories)):
+        each["trajectory"] = first + pd.factorize(each["trajectory"])[0]
+    attached = record.attached(effects)
+    physics = Physics(record.scene, attached, substeps=record.substeps, together=record.together)
+    both = History.from_dataframe(pd.concat([rows, new]), record.scene)
+    problem = declared_problem(physics, both, kind=OutputErrorLikelihood.name)
+    return problem.with_likelihood(prior=record.sigma_prior)
 
 
 @contextmanager

@@ -327,7 +327,7 @@ def test_fit_without_convergence_exits_with_3(capsys: pytest.CaptureFixture[str]
         capsys, *fit[:4], "a.nc", "--method", "metropols"
     )
     said = message(capsys, *fit[:4], "a.nc", "--horizon", "3")
-    assert "--transitions" in said
+    assert "--likelihood transitions" in said
 
 
 @pytest.mark.usefixtures("puck")
@@ -455,7 +455,7 @@ def test_cures_are_options(
     Path("poses.csv").write_text(HEADER + "\n".join(positions) + "\n")
     fit = ("fit", "scene.toml", "poses.csv", "-o", "a.nc", "--transitions")
     said = message(capsys, *fit)
-    assert "fit whole trajectories (--trajectories)" in said
+    assert "fit whole trajectories (--likelihood trajectories)" in said
     assert "pass --estimate-velocities (" in said and "=True" not in said
     Path("out").mkdir()
     Path("out/a").touch()

@@ -49,7 +49,7 @@ def simulated(
     design = simulated_history(
         scene, truth, seed=seed, trajectories=6, intervals=8, noise=0.0, substeps=scene.substeps
     )
-    problem = declared_problem(Physics.declare(scene), design, trajectories=True)
+    problem = declared_problem(Physics.declare(scene), design, kind="trajectories")
     phi = problem.layout.to_vector(truth)
     measured = simulated_trajectories(problem, phi, noise, np.random.default_rng(seed))
     problem = along_trajectories(with_measurements(problem, measured), phi, noise)
@@ -140,7 +140,7 @@ def test_hung_bodies_stay_in_their_hinges() -> None:
             {"trajectory": 0, "step": step, "time": 0.05 * step, "body": "arm"} | row | acted
         )
     history = History.from_dataframe(pd.DataFrame(rows), scene)
-    problem = declared_problem(Physics.declare(scene), history, trajectories=True)
+    problem = declared_problem(Physics.declare(scene), history, kind="trajectories")
     phi = np.array([1.0])
     sigma = problem.noise_prior[0]
     follows = with_sensitivity(along_trajectories(problem, phi, sigma), phi, sigma)

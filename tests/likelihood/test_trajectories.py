@@ -316,7 +316,7 @@ def test_computed_velocities_are_left_out_of_the_model() -> None:
             angles = np.unwrap(frame.loc[rows, position])
             frame.loc[rows, rate] = np.gradient(angles, PUCK.time_step)
     computed = History.from_dataframe(frame, PUCK)
-    problem = declared_problem(Physics.declare(PUCK), computed, trajectories=True)
+    problem = declared_problem(Physics.declare(PUCK), computed, kind="trajectories")
     assert problem.noise_variables["sigma"] == ("x", "y", "theta")
     eq_11 = physics_model(PUCK, computed).problem
     assert len(eq_11.noise_variables["sigma"]) == 6  # the paper's likelihood takes what it is given

@@ -304,7 +304,7 @@ def test_refused_fits(apartment, monkeypatch) -> None:
     monkeypatch.setattr("pbrl_ppl.modes.library_choice._MOST", 10)
     with pytest.raises(FitError, match=r"2 combinations of parameter sets.*give some"):
         quick(model)
-    with pytest.raises(ValueError, match="trajectories is given with horizon or library"):
+    with pytest.raises(ValueError, match="with horizon or library"):
         physics_model(scene, history, library=library, trajectories=True)
     near = tuple(replace(body, pose=(0.5 * i, 0.0, 0.0)) for i, body in enumerate(scene.bodies))
     jointed = scene.replace(bodies=near, joints=(Joint("distance", ("a", "b"), known=False),))

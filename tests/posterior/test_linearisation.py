@@ -43,7 +43,7 @@ def test_a_fit_says_where_it_does_not_hold() -> None:
     found = json.loads(idata.attrs["linearisation"])
     assert found["draws"] == 16 and found["sd"] <= MOST
     assert found["sd"] <= found["largest"] and 0 <= found["trajectory"] < 6
-    centre = declared_problem(Physics.declare(scene), history, trajectories=True)
+    centre = declared_problem(Physics.declare(scene), history, kind="trajectories")
     phi, sigma = parameter_draws(model.problem, idata)
     assert linearisation(centre, phi, sigma)["sd"] > 10 * MOST
     data = groups(idata)

@@ -55,7 +55,7 @@ def test_page_of_whole_trajectories() -> None:
     assert "Posterior of puck with linear drag of puck. The data inform 2 of 2 parameters." in text
     assert "likelihood of whole trajectories; sampler laplace" in text
     assert "No chains. Independent draws" in text and "Not converged" not in text
-    assert "trajectories=True" in text and "no draws from the prior" not in text
+    assert 'likelihood="trajectories"' in text and "no draws from the prior" not in text
     for shares in coverage(revised().posterior_after).values():
         assert shares[1] == pytest.approx(0.94, abs=0.08) and shares[2] == 72
 

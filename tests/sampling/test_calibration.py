@@ -562,7 +562,7 @@ def test_whole_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (truth[:, :-1] > 0).all()
     assert (truth[0] != truth[1]).all()
     # what was simulated is the design's, all but its numbers
-    problem = declared_problem(Physics.declare(scene), history, trajectories=True)
+    problem = declared_problem(Physics.declare(scene), history, kind="trajectories")
     (one,), _ = draw_truths(problem, 1, seed=1)
     again = simulated(problem, one.values)
     assert again.noise_prior[0] == pytest.approx(problem.noise_prior[0])

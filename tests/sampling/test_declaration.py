@@ -38,7 +38,7 @@ FIT = {"tune": 200, "cores": 1, "progress": False}
 def history() -> History:
     """Ten trajectories with both noises."""
     design = simulated_history(SCENE, TRUTH, seed=1, trajectories=10, intervals=5, noise=0.0)
-    problem = declared_problem(Physics.declare(SCENE), design, trajectories=True)
+    problem = declared_problem(Physics.declare(SCENE), design, kind="trajectories")
     rng = np.random.default_rng(2)
     measured = simulated_trajectories(problem, np.array([2.0, 0.8]), np.array(STEP), rng)
     errors = rng.normal(size=measured.shape) * SENSOR
@@ -87,7 +87,7 @@ def test_the_model_is_linearised_at_its_mode() -> None:
     assert model.compile_logp(vars=model.observed_RVs)(point) == pytest.approx(found)
     anew = smoothed(mode.problem, mode.phi, mode.sigma)
     assert likelihood(anew, mode.phi, mode.sigma) == pytest.approx(found, abs=0.5)
-    centre = declared_problem(Physics.declare(scene), history, trajectories=True)
+    centre = declared_problem(Physics.declare(scene), history, kind="trajectories")
     assert likelihood(centre, mode.phi, mode.sigma) < found - 100
 
 
@@ -120,13 +120,13 @@ def test_around_a_mode_or_a_posterior(model, half, history, monkeypatch) -> None
 
 
 def test_around_what_is_of_something_else(half, history) -> None:
-    with pytest.raises(ValueError, match="around is given without trajectories"):
+    with pytest.raises(ValueError, match="around is given with likelihood 'transitions'"):
         pp.physics_model(SCENE, history, around=half)
     other = history.select(range(9))
     with pytest.raises(PosteriorError, match="50 transitions that are not the model's 45"):
         pp.physics_model(SCENE, other, trajectories=True, around=half)
     single = pp.physics_model(SCENE, history)
-    with pytest.raises(PosteriorError, match="of whole trajectories, expected single transitions"):
+    with pytest.raises(PosteriorError, match="of trajectories, the model's of transitions"):
         pp.fit(single, resume=half)
 
 

@@ -53,7 +53,7 @@ def both() -> History:
     """Fourteen trajectories with both noises, some of them shorter."""
     truth = {"mass": PHI[0], "linear_drag_coefficient": PHI[1]}
     design = simulated_history(SCENE, truth, seed=1, trajectories=14, intervals=5, noise=0.0)
-    problem = declared_problem(Physics.declare(SCENE), design, trajectories=True)
+    problem = declared_problem(Physics.declare(SCENE), design, kind="trajectories")
     measured = simulated_trajectories(problem, PHI, NOISE, np.random.default_rng(2))
     dataset = design.dataset.copy()
     dataset["observed"] = dataset["observed"].copy(data=measured)
@@ -142,7 +142,8 @@ def test_an_update_is_the_fit_of_all(both, first, whole, way, monkeypatch) -> No
         problem.log_density(problem.residual(phi[some]), sigma[some]), stored[some], rtol=1e-9
     )
     np.testing.assert_array_equal(
-        problem.measured, declared_problem(Physics.declare(SCENE), both, trajectories=True).measured
+        problem.measured,
+        declared_problem(Physics.declare(SCENE), both, kind="trajectories").measured,
     )
 
 
