@@ -83,9 +83,6 @@ class SelectionCriteria:
         catalogue does.
     least_trajectories : int
         With fewer trajectories, cross-validation leaves out runs of them, and evidence decides.
-    promise : float
-        A candidate is refitted only if, by its score, it changes predictions by at least this
-        share of ``negligible``.
     """
 
     refits: int = 4
@@ -93,7 +90,6 @@ class SelectionCriteria:
     informed: float = 0.7
     tie: float = 1.0
     least_trajectories: int = 8
-    promise: float = 0.75
 
 
 @dataclass(frozen=True)
@@ -257,8 +253,8 @@ class Criteria:
     min_remainder : float
         Log marginal likelihood (nats) that a learned force must gain over noise alone.
     large_remainder : float
-        Added effects are withdrawn if a larger share of the unexplained acceleration's square
-        remains: any effect takes up a part of a misfit.
+        Where nothing can be simulated, added effects are withdrawn if a larger share of the
+        unexplained acceleration's square remains: any effect takes up a part of a misfit.
     large_if_small : float
         The same share where the remaining acceleration is negligible.
     most_predictable : float

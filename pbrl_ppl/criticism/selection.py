@@ -19,8 +19,7 @@ from pbrl_ppl.criticism.cross_validation import (
     relative_fall,
     trajectory_count,
 )
-from pbrl_ppl.criticism.forecast import longest_forecast
-from pbrl_ppl.criticism.promise import forecast_change
+from pbrl_ppl.criticism.forecast import forecast_change, longest_forecast
 from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
@@ -225,12 +224,6 @@ class Selection:
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
         """Return the step if its gain is significant in cross-validation and not negligible."""
-        negligible = self.criteria.negligible
-        least = self.criteria.selection.promise * negligible
-        share = max(_share(mode, fitted), forecast_change(mode, fitted))
-        if share < least:  # before the cost of more engine steps
-            self._negligible(signature, share)
-            return None
         fitted = with_enough_substeps(fitted, self.say, self.criteria)
         if why := self._implausible(fitted, signature):
             self._note(signature, why)
@@ -242,7 +235,7 @@ class Selection:
         share = _share(mode, fitted)
         if forecasts.certain(self.criteria.min_elpd_se):
             share = max(share, min(forecasts.total, forecast_change(mode, fitted)))
-        if share < negligible:
+        if share < self.criteria.negligible:
             self._negligible(signature, share)
             return None
         self._note(signature, "added")

@@ -10,7 +10,6 @@ from pbrl_ppl.criticism.criteria import DEFAULT
 from pbrl_ppl.criticism.cross_validation import LeftOut, forecast_squares
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.misfit import _forecasts
-from pbrl_ppl.criticism.promise import promised_share
 from pbrl_ppl.criticism.score import rank_candidates
 from pbrl_ppl.effects import candidates, catalogue
 from pbrl_ppl.history import History
@@ -64,12 +63,6 @@ def test_a_pivot_is_inferred_from_an_angle_alone(unknown_pivot) -> None:
     assert np.isfinite(mode.log_posterior)
     assert np.isfinite(mode.whitened_residual).all()
     assert all(np.isfinite(one.candidate.statistic) for one in ranked)
-
-
-def test_a_score_promises_something_where_its_forecasts_diverge(unknown_pivot) -> None:
-    """Sizes to first order may be unphysical, so that no forecast with them is finite."""
-    mode, ranked = unknown_pivot
-    assert np.isfinite([promised_share(mode, signature) for signature in ranked]).all()
 
 
 @pytest.fixture(scope="module")
