@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -168,9 +169,15 @@ class _Model:
     held_out: HeldOut
 
 
-class _Search(NamedTuple):
-    """Result of a search for effects: the declared model's ranking, the mode, the added effects."""
+@dataclass(frozen=True, eq=False)
+class _Search:
+    """Search for effects: declared model, laws of simulations, ranking, model found, its effects.
 
+    ``found`` is None where nothing can be simulated.
+    """
+
+    declared: Mode
+    found: Simulated | None
     first: list[Signature]
     mode: Mode
     steps: list[Step]
@@ -201,8 +208,7 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         say(Stage.FIT)
         declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
         compiled()
-    found = _simulated(declared, selection)
-    search = _add_effects(declared, selection, found)
+    search = _searched(declared, selection)
     # with the right noise model effects may show that were hidden before
     for _ in range(criteria.noise_rounds):
         train, frames = without_measurements(train, outliers(search.mode, criteria))
@@ -211,14 +217,15 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
                 say(sentence)
             bad += tuple(map(str, frames))
             declared = declared_mode(scene, train, effects, seed, task.substeps, say, criteria)
-            found = _simulated(declared, selection)
-        else:
-            correlated = with_correlated_errors(search.mode, criteria)
-            if correlated is None:
-                break
-            say(Stage.REPEAT)
-            declared = same_noise(declared, correlated)
-        search = _add_effects(declared, selection, found)
+            search = _searched(declared, selection)
+            continue
+        correlated = with_correlated_errors(search.mode, criteria)
+        if correlated is None:
+            break
+        say(Stage.REPEAT)
+        declared = same_noise(search.declared, correlated)
+        search = _grown(replace(search, declared=declared, mode=correlated), selection)
+    declared, found = search.declared, search.found
     revised, steps = search.mode, search.steps
     tested = replace(revised, problem=HeldOut.of(revised, test).problem)
     test, frames = without_measurements(test, outliers(tested, criteria))
@@ -273,23 +280,24 @@ def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> Non
     Problem.of(physics, train).predict(phi)
 
 
-def _simulated(declared: Mode, selection: Selection) -> Simulated | None:
-    """Return the laws that the simulation error of whole trajectories shows; None if too short."""
-    selection.say(Stage.SIMULATE)
-    search = SimulatedSearch(selection.missing, selection.criteria, selection.say)
-    try:
-        return search(declared)
-    except HistoryError:  # start states could follow all that was measured
-        return None
-
-
-def _add_effects(declared: Mode, selection: Selection, found: Simulated | None) -> _Search:
-    """Add the effects that simulations name, then smaller ones by innovations, one by one."""
-    criteria, say = selection.criteria, selection.say
+def _searched(declared: Mode, selection: Selection) -> _Search:
+    """Add the effects that simulations name, then smaller ones by innovations."""
+    say = selection.say
+    say(Stage.SIMULATE)
+    found = None
+    with suppress(HistoryError):  # start states could follow all that was measured
+        found = SimulatedSearch(selection.missing, selection.criteria, say)(declared)
     say(Stage.SCORE)
     first = selection.rank(declared)
     mode, steps = selection.adopted(declared, found, first)
-    ranked = selection.rank(mode) if steps else first
+    return _grown(_Search(declared, found, first, mode, steps), selection)
+
+
+def _grown(search: _Search, selection: Selection) -> _Search:
+    """Add effects by innovations, each ranked beside those before; drop what is then needless."""
+    criteria, say = selection.criteria, selection.say
+    mode, steps = search.mode, list(search.steps)
+    ranked = search.first if mode is search.declared else selection.rank(mode)
     while ranked and len(steps) < criteria.most_added:
         step = selection.best_addition(mode, ranked)
         if step is None:
@@ -298,10 +306,10 @@ def _add_effects(declared: Mode, selection: Selection, found: Simulated | None) 
         steps.append(step)
         mode = step.after
         ranked = selection.rank(mode)
-    if len(steps) > 1:
+    if len(steps) > 1 or search.steps:
         say(Stage.PRUNE)
         mode, steps = selection.prune(mode, steps)
-    return _Search(first, mode, steps)
+    return replace(search, mode=mode, steps=steps)
 
 
 def _prior_test(

@@ -25,7 +25,7 @@ class Stage(StrEnum):
 
     CHECK_PRIOR = "comparing the data with the prior", 0.02
     FIT = "fitting the declared model", 0.03
-    REPEAT = "measurement noise is correlated: starting again with that"
+    REPEAT = "measurement noise is correlated: going on with that"
     SCORE = "scoring what the model might lack", 0.04
     PRUNE = "checking that each added effect is still needed", 0.29
     TEST = "testing the residual", 0.38
