@@ -26,7 +26,7 @@ from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, tw
 from pbrl_ppl.criticism.simulated import Simulated, sizes_of, worth_of
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
-from pbrl_ppl.modes import Mode, fit_pieces, trajectory_evidence, trajectory_mode
+from pbrl_ppl.modes import Mode, fit_pieces, nearby_mode, trajectory_evidence, trajectory_mode
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -137,7 +137,7 @@ class Selection:
     def _without(mode: Mode, attached: Attached) -> Mode:
         """Return the mode of the model without an effect."""
         kept = tuple(each for each in mode.problem.physics.effects if each != attached)
-        return trajectory_mode(*with_effects(mode, kept), mode.sigma)
+        return nearby_mode(*with_effects(mode, kept), mode.sigma)
 
     def best_addition(self, mode: Mode, ranked: list[Signature]) -> Step | None:
         """Refit with the leading candidates and return the best that is confirmed, or None."""

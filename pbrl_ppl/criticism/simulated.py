@@ -262,8 +262,11 @@ def worth_of(mode: Mode, attached: Attached, sizes: Floats) -> float:
     ``mode`` is of simulated pieces.
     """
     effects = (*mode.problem.physics.effects, attached)
-    within = fit_pieces(*with_effects(mode, effects, {attached: sizes}))
-    return net_evidence(_without(within, (attached,)), within, 1)
+    begin = with_effects(mode, effects, {attached: sizes})
+    (within,) = climb_ladder([begin], [derivatives(mode)])
+    without = with_effects(within, mode.problem.physics.effects)
+    (dropped,) = climb_ladder([without], [derivatives(mode)])
+    return net_evidence(dropped if nats(mode, dropped)[0] > 0 else mode, within, 1)
 
 
 def share_taken(before: Mode, after: Mode) -> float:
