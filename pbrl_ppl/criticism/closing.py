@@ -518,4 +518,6 @@ def _added(step: Step, revised: _Model) -> Added:
         not_separable_from=step.not_separable_from,
         elpd_difference=step.elpd_difference,
         elpd_difference_se=step.elpd_difference_se,
+        simulated_nats=step.simulated.nats if step.simulated else None,
+        simulated_share=step.simulated.share if step.simulated else None,
     )

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+import numpy as np
+
 from pbrl_ppl.state import Floats
 
 
@@ -185,6 +187,9 @@ class Added:
         Effects that would explain these data as well.
     elpd_difference, elpd_difference_se : float
         Gain of log predictive density on held-out transitions, and its standard error.
+    simulated_nats, simulated_share : float or None
+        What the simulation error of whole trajectories loses without it: net log-evidence (nats),
+        and the share of that error; None if innovations alone named it.
     """
 
     effect: str
@@ -196,6 +201,13 @@ class Added:
     not_separable_from: tuple[str, ...]
     elpd_difference: float
     elpd_difference_se: float
+    simulated_nats: float | None = None
+    simulated_share: float | None = None
+
+    @property
+    def chance(self) -> float:
+        """The smaller of the p-value and, by simulations, the odds against the effect."""
+        return min(self.p_value, float(np.exp(-(self.simulated_nats or 0.0))))
 
 
 @dataclass(frozen=True)

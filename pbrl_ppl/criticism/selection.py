@@ -23,7 +23,7 @@ from pbrl_ppl.criticism.forecast import forecast_change, longest_forecast
 from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, twins
-from pbrl_ppl.criticism.simulated import Simulated, sizes_of, worth_of
+from pbrl_ppl.criticism.simulated import Law, Simulated, sizes_of, worth_of
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
 from pbrl_ppl.modes import Mode, fit_pieces, nearby_mode, trajectory_evidence, trajectory_mode
@@ -36,7 +36,7 @@ from pbrl_ppl.state import Floats
 class Step:
     """An added effect: its signature, the new mode and the gain in log predictive density.
 
-    ``simulated`` says whether the simulation error of whole trajectories named it.
+    ``simulated`` is what the simulation error of whole trajectories says of it, if that named it.
     """
 
     signature: Signature
@@ -44,7 +44,7 @@ class Step:
     after: Mode
     elpd_difference: float
     elpd_difference_se: float
-    simulated: bool = False
+    simulated: Law | None = None
 
 
 @dataclass(eq=False)
@@ -121,14 +121,14 @@ class Selection:
         phi = problem.layout.from_layout(simulated.after.problem.layout, simulated.after.phi)
         after = with_enough_substeps(trajectory_mode(problem, phi), self.say, self.criteria)
         steps = []
-        for law in simulated.laws:
+        for law, described in zip(simulated.laws, simulated.described(), strict=True):
+            signature = scored[law.attached]
             without = self._without(after, law.attached) if len(simulated.laws) > 1 else mode
             gained, _ = _gains(without, after, self.criteria)
-            self._note(scored[law.attached], "added")
+            self._note(signature, "added")
             steps.append(
                 Step(
-                    scored[law.attached], law.confounded_names, after, gained.total, gained.error,
-                    simulated=True,
+                    signature, law.confounded_names, after, gained.total, gained.error, described
                 )
             )  # fmt: skip
         return after, steps
@@ -309,7 +309,7 @@ class Selection:
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
         """Drop effects that later ones have made unnecessary; sort the rest by their gain."""
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
-            if step.simulated:
+            if step.simulated is not None:
                 continue
             without = self._without(mode, step.signature.attached)
             gains = _gains(without, mode, self.criteria)

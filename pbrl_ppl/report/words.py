@@ -42,11 +42,14 @@ def verdict_in_words(loop: Loop) -> str:
         return f"Something is missing that no effect in the catalogue explains: {rest}."
     if loop.verdict == UNEXPLAINED:
         return (
-            "Something is missing that no effect in the catalogue explains. The nearest that it has"
-            f" is {found}; with that added, {rest}."
+            f"Something was missing: {found}. More is missing that no effect in the catalogue"
+            f" explains: {rest}."
         )
     if left is not None:
-        return f"Something was missing: {found}. A pattern remains that nothing explains: {rest}."
+        return (
+            f"Something was missing: {found}. What remains is small, and forecasts do not show it:"
+            f" {rest}."
+        )
     if len(loop.added) > 1:
         return f"{len(loop.added)} things were missing: {found}."
     return f"Something was missing: {found}."
@@ -83,9 +86,8 @@ def significant_acceleration(loop: Loop) -> float:
 
 
 def accepted(loop: Loop) -> tuple[Added, ...]:
-    """Return the added effects if the verdict accepts them, or none."""
-    stands = loop.verdict not in (UNEXPLAINED, NOT_CONVERGED)
-    return loop.added if stands else ()
+    """Return the added effects, or none without a verdict."""
+    return () if loop.verdict == NOT_CONVERGED else loop.added
 
 
 def depends_on_records(loop: Loop) -> bool:
@@ -98,10 +100,7 @@ def error_in_words(loop: Loop) -> str:
     """Explain a held-out error that seems to contradict the verdict; empty if none does."""
     model, after = "revised" if loop.added else "declared", loop.after.normalised_rmse
     if loop.unexplained is not None or significant_acceleration(loop):
-        return (
-            f"The unit is the noise fitted with the {model} model, which takes up what that leaves"
-            " unexplained: an error of 1.00 does not mean that nothing is missing."
-        )
+        return "The unit is what the measurement noise alone makes, one interval ahead."
     if after > _TOO_LARGE and loop.verdict != NOT_CONVERGED:
         return (
             "The verdict is of the fitted recordings alone: the held-out ones differ from the"

@@ -93,20 +93,31 @@ def test_a_held_out_error_that_the_verdict_does_not_lead_to_expect_is_explained(
             assert any(said in line for line in in_brief(far, "out")) == told
 
 
-def test_intervals_of_effects_that_the_verdict_rejects_are_left_out() -> None:
+def test_intervals_without_a_verdict_are_left_out() -> None:
     stuck = replace(made_up(), verdict="not-converged")
-    for findings in (nearest(), stuck):
-        text = text_of(findings)
-        for claim in ("How sure.", "How large.", "with 94 % probability", "Adding linear drag"):
-            assert claim not in text
-        assert "Posterior densities of the parameters of" not in render(findings)
-        assert not any("94 % interval" in line for line in in_brief(findings, "out"))
-    assert "nearest effects (linear drag), which do not explain the data" in text_of(nearest())
-    assert "How large." in text_of(made_up())
-    # evidence for a rejected effect too
-    real = revised()
-    assert "nats likelier" in text_of(real)
-    assert "nats likelier" not in text_of(replace(real, verdict="unexplained"))
+    text = text_of(stuck)
+    for claim in ("How sure.", "How large.", "with 94 % probability", "Adding linear drag"):
+        assert claim not in text
+    assert "Posterior densities of the parameters of" not in render(stuck)
+    assert not any("94 % interval" in line for line in in_brief(stuck, "out"))
+    assert "nats likelier" not in text_of(replace(revised(), verdict="not-converged"))
+
+
+def test_effects_beside_which_more_is_missing_are_told() -> None:
+    for findings in (nearest(), made_up()):
+        assert "How large." in text_of(findings)
+        assert any("94 % interval" in line for line in in_brief(findings, "out"))
+    assert "More is missing than the effects found (linear drag)" in text_of(nearest())
+    assert "nats likelier" in text_of(revised())
+
+
+def test_certainty_comes_from_simulations_where_they_named_an_effect() -> None:
+    findings = made_up()
+    doubtful = replace(findings.added[0], p_value=0.02)
+    sure = replace(doubtful, simulated_nats=120.0, simulated_share=0.5)
+    texts = [text_of(replace(findings, added=(one,))) for one in (doubtful, sure)]
+    assert "Not sure" in texts[0] and "As good as certain" in texts[1]
+    assert "simulated trajectories is 2.0 times as large, 120 nats" in texts[1]
 
 
 def test_dependence_is_shown_only_where_its_test_failed() -> None:

@@ -253,12 +253,12 @@ def test_added_effects_with_a_rest() -> None:
     )
     remains = made_up("unexplained").unexplained
     some = replace(findings, verdict="unexplained", unexplained=remains)
-    assert verdict_in_words(some).startswith("Something is missing that no effect in the")
-    assert f"The nearest that it has is {DRAG}" in verdict_in_words(some)
-    assert "with that added, its omega is off" in Page(render(some)).text
+    assert verdict_in_words(some).startswith(f"Something was missing: {DRAG} (linear drag)")
+    assert "More is missing that no effect in the catalogue" in verdict_in_words(some)
+    assert "explains: its omega is off" in Page(render(some)).text
     noted = replace(some, verdict="effects-added")
     assert verdict_in_words(noted).startswith(f"Something was missing: {DRAG}")
-    assert "A pattern remains that nothing explains: its omega is off" in verdict_in_words(noted)
+    assert "forecasts do not show it: its omega is off" in verdict_in_words(noted)
 
 
 def test_odd_findings_still_make_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
