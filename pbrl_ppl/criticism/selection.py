@@ -214,8 +214,9 @@ class Selection:
             begin = {each: sizes_of(mode, each) for each in effects}
             self.simulated = fit_pieces(*with_effects(self.simulated, effects, begin))
         sizes = np.array(list(signature.candidate.estimate.values()))
-        worth = worth_of(self.simulated, signature.attached, sizes)
-        if worth < self.criteria.simulation.least_nats:
+        enough = self.criteria.simulation.least_nats
+        worth = worth_of(self.simulated, signature.attached, sizes, enough)
+        if worth < enough:
             self._note(signature, f"takes too little off simulation errors ({worth:.1f} nats)")
             return False
         return True

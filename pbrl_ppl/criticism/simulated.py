@@ -256,17 +256,21 @@ def net_evidence(before: Mode, after: Mode, laws: int, candidates: int = 1) -> f
     return float(gained - price - max(_prior(after) - _prior(before), 0.0))
 
 
-def worth_of(mode: Mode, attached: Attached, sizes: Floats) -> float:
+def worth_of(mode: Mode, attached: Attached, sizes: Floats, enough: float) -> float:
     """Return the net evidence of one more law, its first sizes given, shape (q,): credit by drop.
 
-    ``mode`` is of simulated pieces.
+    ``mode`` is of simulated pieces. A first fit that is worth ``enough`` is not carried on.
     """
-    effects = (*mode.problem.physics.effects, attached)
-    begin = with_effects(mode, effects, {attached: sizes})
-    (within,) = climb_ladder([begin], [derivatives(mode)])
-    without = with_effects(within, mode.problem.physics.effects)
-    (dropped,) = climb_ladder([without], [derivatives(mode)])
-    return net_evidence(dropped if nats(mode, dropped)[0] > 0 else mode, within, 1)
+    effects, known = mode.problem.physics.effects, [derivatives(mode)]
+    within = climb_ladder([with_effects(mode, (*effects, attached), {attached: sizes})], known)
+    for _ in range(2):
+        (dropped,) = climb_ladder([with_effects(within[0], effects)], known)
+        before = dropped if nats(mode, dropped)[0] > 0 else mode
+        worth = net_evidence(before, within[0], 1)
+        if worth >= enough:
+            break
+        within = refined(within)
+    return worth
 
 
 def share_taken(before: Mode, after: Mode) -> float:

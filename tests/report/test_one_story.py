@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
 ]
 
-ONE = "does not mean that nothing is missing"
+ONE = "The unit is what the measurement noise alone makes, one interval ahead."
 
 
 @pytest.fixture
@@ -75,7 +75,7 @@ def test_negligible_acceleration_is_in_the_headline() -> None:
     assert ONE not in text_of(nothing) + "".join(in_brief(nothing, "out"))
 
 
-def test_the_unit_of_an_error_takes_up_what_is_unexplained() -> None:
+def test_the_unit_of_an_error_is_told_where_something_is_unexplained() -> None:
     for findings in (made_up("unexplained"), nearest()):
         assert ONE in text_of(findings)
         assert any(ONE in line for line in in_brief(findings, "out"))

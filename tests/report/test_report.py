@@ -111,7 +111,7 @@ def test_page_where_nothing_is_missing() -> None:
         "Nothing was found missing: the declared model passes all 2 tests of its residual." in text
     )
     assert "The table of all candidates has the detection limit of each" in text
-    assert "48 % coefficient 0.0200 kg/s" in text
+    assert "48 % – – coefficient 0.0200 kg/s" in text
     assert "linear drag on the cart came closest (p = 0.37)." in text
     assert "fell by" not in text and "After:" not in text
     assert "Where it remains" not in text
@@ -373,6 +373,8 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "not_separable_from",
         "elpd_difference",
         "elpd_difference_se",
+        "simulated_nats",
+        "simulated_share",
     ]
     assert got["added"][0]["parameters"]["coefficient"] == {
         "mean": 3.0,
@@ -392,6 +394,8 @@ def test_save_writes_the_contract(tmp_path: Path) -> None:
         "detectable",
         "caps",
         "why",
+        "simulated_nats",
+        "simulated_share",
     ]
     assert list(got["error"]) == ["before", "after", "noise_floor"]
     assert got["error"]["before"]["normalised_rmse"] == 2.4
