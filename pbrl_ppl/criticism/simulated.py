@@ -232,25 +232,34 @@ class _Trial:
 
     laws: tuple[Attached, ...]
     modes: list[Mode]
-    net: float
-    share: float
+    candidates: int
     same: tuple[Attached, ...] = ()
+    net: float = -np.inf
+    share: float = 0.0
 
 
-def nats(before: Mode, after: Mode) -> tuple[float, float]:
+def weights(mode: Mode) -> Floats:
+    """Return the effective number of measurements of each dimension, shape (state,)."""
+    likelihood = output_error(mode.problem)
+    return np.asarray(likelihood.starts.counts / np.array(likelihood.tau))
+
+
+def nats(before: Mode, after: Mode, weight: Floats | None = None) -> tuple[float, float]:
     """Return the log-evidence of a fall of the simulation error, and the effective sample size.
 
     ``sum over dimensions of n / tau * log(sigma_before / sigma_after)``, with the integrated
-    autocorrelation time tau of the residual under the model with the smaller error.
+    autocorrelation time tau of the residual under the model with the smaller error, or with other
+    ``weight``, shape (state,).
     """
-    likelihood = output_error(after.problem)
-    weight = likelihood.starts.counts / np.array(likelihood.tau)
+    weight = weights(after) if weight is None else weight
     return float((weight * np.log(before.sigma / after.sigma)).sum()), float(weight.sum())
 
 
-def net_evidence(before: Mode, after: Mode, laws: int, candidates: int = 1) -> float:
+def net_evidence(
+    before: Mode, after: Mode, laws: int, candidates: int = 1, weight: Floats | None = None
+) -> float:
     """Return the evidence less its price: parameters, their prior, and candidates tried."""
-    gained, effective = nats(before, after)
+    gained, effective = nats(before, after, weight)
     more = len(after.phi) - len(before.phi)
     price = 0.5 * more * np.log(max(effective, 2.0)) + laws * np.log(max(candidates, 1))
     return float(gained - price - max(_prior(after) - _prior(before), 0.0))
@@ -332,8 +341,7 @@ class SimulatedSearch:
                 again -= 1  # it was not at its optimum
                 now = [*now[:-1], without]
                 declared = declared if laws else without
-                n = len(self.missing(without))
-                trials = [self._judged(now, t.laws, t.modes, n, t.same) for t in trials]
+                trials = _compared(now, trials)
                 best = self._best(trials)
             if best is None:
                 break
@@ -409,12 +417,17 @@ class SimulatedSearch:
                 if leaders.keys().isdisjoint((signature.attached, *same(signature.attached))):
                     leaders[signature.attached] = self._first_size(signature)
                     found += 1
-        n = len(candidates)
+        distinct: list[Attached] = []
+        for each in candidates:
+            seen = any(own[each].basis.shape[1] for own in scores)
+            if seen and set(distinct).isdisjoint(same(each)):
+                distinct.append(each)
+        n = len(distinct)
         trials = []
         for law, size in leaders.items():
             trial = self._trial(now, parents, {law: size}, n)
             trials.append(replace(trial, same=tuple(o for o in same(law) if o != law)))
-        trials = self._refined(now, trials, n)
+        trials = self._refined(now, trials)
         if trials and not self._white(trials[0].modes) and (pairs or self._best(trials) is None):
             both = []
             for pair in combinations(trials[: limits.paired], 2):
@@ -423,8 +436,8 @@ class SimulatedSearch:
                     continue
                 begin = {each.laws[0]: sizes_of(each.modes[0], each.laws[0]) for each in pair}
                 both.append(self._trial(now, parents, begin, n))
-            trials += self._refined(now, both, n)
-        return trials
+            trials += self._refined(now, both)
+        return _compared(now, trials)
 
     def _first_size(self, signature: Signature) -> Floats:
         """Return where a candidate's refit begins, shape (q,).
@@ -440,17 +453,20 @@ class SimulatedSearch:
         null = np.array(effect.null)
         return np.asarray(null + np.clip(size - null, -most, most))
 
-    def _refined(self, now: list[Mode], trials: list[_Trial], candidates: int) -> list[_Trial]:
+    def _refined(self, now: list[Mode], trials: list[_Trial]) -> list[_Trial]:
         """Return trials, best first, the leading ones fitted until they gain no more."""
-        rough, done = sorted(trials, key=lambda trial: -trial.net), list[_Trial]()
+        limits, done = self.criteria.simulation, list[_Trial]()
+        rough = _compared(now, trials)
         while rough:
+            best = max((trial.net for trial in done), default=-np.inf)
+            near = rough[0].net > limits.worth_refining * max(best, 0.0)
+            # with little evidence in the data none may stand out before its optimum
+            if done and not (near or (best < limits.least_nats and len(done) < limits.leaders)):
+                break
             trial = rough.pop(0)
-            best = max((other.net for other in done), default=trial.net)
-            if trial.net <= self.criteria.simulation.worth_refining * max(best, 0.0):
-                return sorted([*done, trial, *rough], key=lambda trial: -trial.net)
-            modes = refined(trial.modes)
-            done.append(self._judged(now, trial.laws, modes, candidates, trial.same))
-        return sorted(done, key=lambda trial: -trial.net)
+            done.append(replace(trial, modes=refined(trial.modes)))
+            rough, done = _compared(now, rough), _compared(now, done)
+        return [*done, *rough]
 
     def _trial(
         self,
@@ -462,19 +478,7 @@ class SimulatedSearch:
         """Return the refit with some laws, at every length."""
         laws = tuple(begin)
         starts = [with_effects(m, (*m.problem.physics.effects, *laws), begin) for m in now]
-        return self._judged(now, laws, climb_ladder(starts, parents), candidates)
-
-    def _judged(
-        self,
-        now: list[Mode],
-        laws: tuple[Attached, ...],
-        modes: list[Mode],
-        candidates: int,
-        same: tuple[Attached, ...] = (),
-    ) -> _Trial:
-        """Return the trial of fitted modes."""
-        net = net_evidence(now[-1], modes[-1], len(laws), candidates)
-        return _Trial(laws, modes, net, share_taken(now[-1], modes[-1]), same)
+        return _Trial(laws, climb_ladder(starts, parents), candidates)
 
     def _pruned(self, mode: Mode, laws: list[Accepted]) -> tuple[Mode, list[Accepted]]:
         """Drop laws that later ones have made needless."""
@@ -510,6 +514,29 @@ def _law(mode: Mode, accepted: Accepted) -> Law:
         share=share_taken(without, mode),
         confounded=accepted.confounded_names,
     )
+
+
+def _compared(now: list[Mode], trials: list[_Trial]) -> list[_Trial]:
+    """Return trials with their evidence beside a model, best first.
+
+    All are judged by the correlation of the smallest residual: a model whose residual is white
+    would else outdo one with a smaller error.
+    """
+    if not trials:
+        return []
+    before = now[-1]
+    shares = [share_taken(before, trial.modes[-1]) for trial in trials]
+    weight = weights(trials[int(np.argmax(shares))].modes[-1])
+    judged = [
+        replace(
+            trial, share=share,
+            net=net_evidence(
+                before, trial.modes[-1], len(trial.laws), trial.candidates, weight
+            ),
+        )
+        for trial, share in zip(trials, shares, strict=True)
+    ]  # fmt: skip
+    return sorted(judged, key=lambda trial: -trial.net)
 
 
 def _without(mode: Mode, laws: Sequence[Attached]) -> Mode:
