@@ -27,6 +27,7 @@ from pbrl_ppl.modes import (
     Linear,
     Mode,
     climb_ladder,
+    corrected,
     derivatives,
     fit_pieces,
     ladder,
@@ -393,7 +394,8 @@ class SimulatedSearch:
         candidates = [
             each for each in self.missing(now[-1]) if not isinstance(each.effect.stage, Noise)
         ]
-        ranked = [rank_candidates(mode, candidates, self.criteria) for mode in now]
+        cheap = [corrected(mode) for mode in now]
+        ranked = [rank_candidates(mode, candidates, self.criteria) for mode in cheap]
         scores = [{signature.attached: signature for signature in own} for own in ranked]
 
         def same(one: Attached) -> tuple[Attached, ...]:
@@ -407,7 +409,7 @@ class SimulatedSearch:
                 )
             )  # fmt: skip
 
-        parents = [derivatives(mode) for mode in now]
+        parents = [derivatives(mode) for mode in cheap]
         leaders: dict[Attached, Floats] = {}
         for signatures in ranked:
             found = 0

@@ -11,6 +11,7 @@ from .evidence import trajectory_evidence as trajectory_evidence
 from .joint_search import weigh as weigh
 from .ladder import Linear as Linear
 from .ladder import climb_ladder as climb_ladder
+from .ladder import corrected as corrected
 from .ladder import derivatives as derivatives
 from .ladder import fit_pieces as fit_pieces
 from .ladder import ladder as ladder

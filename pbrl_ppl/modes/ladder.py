@@ -255,9 +255,11 @@ def fit_pieces(
     known : Linear, optional
         Derivatives that are not taken anew, of a smaller model nearby.
     """
-    priors, layout = problem.layout.priors, problem.layout
+    priors, layout, exact = problem.layout.priors, problem.layout, problem
     scale, sizes = layout.scale(phi), output_error(problem).starts.cells.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
+    if known is not None:
+        problem = _corrected(problem, phi)
     steps = _FIRST * np.where(layout.discrete, 0.0, scale), _FIRST * sizes
     damping, failed = 1e-3, 0
     for _ in range(rounds):
@@ -289,6 +291,7 @@ def fit_pieces(
         # friction makes kinks: over another width the derivative sees others
         steps = steps[0] * _WIDER[failed], steps[1] * _WIDER[failed]
         damping, failed = 1e-3, failed + 1
+    problem = replace(problem, physics=exact.physics, defect=None)
     linear = _linearise(problem, phi, start, steps, known)
     problem, sigma = _with_noise(problem, start, linear)
     step = _Step(problem, linear, sigma, phi, start)
@@ -297,6 +300,21 @@ def fit_pieces(
         problem, phi, sigma, step.jacobian, step.covariance,
         -_cost(problem, sigma, phi),
     )  # fmt: skip
+
+
+def corrected(mode: Mode) -> Mode:
+    """Return a mode of simulated pieces with few engine steps, whose error there is corrected."""
+    return replace(mode, problem=_corrected(mode.problem, mode.phi))
+
+
+def _corrected(problem: Problem, phi: Floats) -> Problem:
+    """Return a problem of pieces with few engine steps, corrected at phi (see `Problem`)."""
+    start = problem.segments.start[None]
+    rough, coarse = (
+        engine.simulator(phi[None], start, problem.inputs)[0]
+        for engine in (problem.rough, problem.coarse)
+    )
+    return replace(problem.coarse, defect=np.nan_to_num(rough - coarse))
 
 
 def refined(modes: Sequence[Mode]) -> list[Mode]:
@@ -318,7 +336,9 @@ def _tau(problem: Problem) -> Floats:
 
 def _residual(problem: Problem, points: Floats, starts: Floats) -> Floats:
     """Return residuals at points (n, p) and starts (n, piece, body, 6)."""
-    states = problem.rough.simulator(points, np.ascontiguousarray(starts), problem.inputs)
+    engine = problem.rough if problem.defect is None else problem
+    states = engine.simulator(points, np.ascontiguousarray(starts), problem.inputs)
+    states = states if problem.defect is None else states + problem.defect
     return finite(problem, problem.observations.residual(states))
 
 
