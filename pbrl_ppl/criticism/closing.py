@@ -306,7 +306,7 @@ def _grown(search: _Search, selection: Selection) -> _Search:
         steps.append(step)
         mode = step.after
         ranked = selection.rank(mode)
-    if len(steps) > 1 or search.steps:
+    if len(steps) > 1:
         say(Stage.PRUNE)
         mode, steps = selection.prune(mode, steps)
     return replace(search, mode=mode, steps=steps)

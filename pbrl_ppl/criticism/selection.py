@@ -310,8 +310,9 @@ class Selection:
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
         """Drop effects that later ones have made unnecessary; sort the rest by their gain."""
         for step in sorted(steps, key=lambda addition: addition.elpd_difference):
-            if step.simulated is not None:
-                continue
+            least = self.criteria.simulation.least_share
+            if step.simulated is not None and step.simulated.share >= least:
+                continue  # innovations have no veto on a large law
             without = self._without(mode, step.signature.attached)
             gains = _gains(without, mode, self.criteria)
             if why := self._uncertain(without, mode, *gains):

@@ -34,7 +34,7 @@ from pbrl_ppl.modes import (
     refined,
     with_robust_covariance,
 )
-from pbrl_ppl.parameters import prior_residual
+from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
 
@@ -235,6 +235,7 @@ class _Trial:
     modes: list[Mode]
     candidates: int
     same: tuple[Attached, ...] = ()
+    gained: float = 0.0
     net: float = -np.inf
     share: float = 0.0
 
@@ -261,9 +262,24 @@ def net_evidence(
 ) -> float:
     """Return the evidence less its price: parameters, their prior, and candidates tried."""
     gained, effective = nats(before, after, weight)
-    more = len(after.phi) - len(before.phi)
-    price = 0.5 * more * np.log(max(effective, 2.0)) + laws * np.log(max(candidates, 1))
+    price = 0.5 * _more_informed(before, after) * np.log(max(effective, 2.0)) + laws * np.log(
+        max(candidates, 1)
+    )
     return float(gained - price - max(_prior(after) - _prior(before), 0.0))
+
+
+def _more_informed(before: Mode, after: Mode) -> int:
+    """Return how many of a model's further parameters the data inform; all that are scanned."""
+    labels = after.problem.layout.labels
+    width = np.sqrt(np.maximum(np.diag(after.covariance), 0.0))
+    width = width * np.abs(prior_slopes(after.problem.layout.priors, after.phi))
+    return sum(
+        attached.effect.scan is not None
+        or bool(width[labels.index(label)] < DEFAULT.selection.informed)
+        for attached in after.problem.physics.effects
+        if attached not in before.problem.physics.effects
+        for label in attached.labels
+    )
 
 
 def worth_of(mode: Mode, attached: Attached, sizes: Floats, enough: float) -> float:
@@ -348,7 +364,7 @@ class SimulatedSearch:
                 break
             close = [
                 law for trial in trials for law in (*trial.laws, *trial.same)
-                if len(trial.laws) == 1 and trial.net > best.net - limits.least_nats
+                if len(trial.laws) == 1 and trial.gained > best.gained - limits.least_nats
             ]  # fmt: skip
             now = best.modes
             for law in best.laws:
@@ -531,7 +547,7 @@ def _compared(now: list[Mode], trials: list[_Trial]) -> list[_Trial]:
     weight = weights(trials[int(np.argmax(shares))].modes[-1])
     judged = [
         replace(
-            trial, share=share,
+            trial, share=share, gained=nats(before, trial.modes[-1], weight)[0],
             net=net_evidence(
                 before, trial.modes[-1], len(trial.laws), trial.candidates, weight
             ),
