@@ -233,7 +233,7 @@ class _Trial:
 
     laws: tuple[Attached, ...]
     modes: list[Mode]
-    candidates: int
+    choices: float
     same: tuple[Attached, ...] = ()
     gained: float = 0.0
     net: float = -np.inf
@@ -258,13 +258,14 @@ def nats(before: Mode, after: Mode, weight: Floats | None = None) -> tuple[float
 
 
 def net_evidence(
-    before: Mode, after: Mode, laws: int, candidates: int = 1, weight: Floats | None = None
+    before: Mode, after: Mode, choices: float = 0.0, weight: Floats | None = None
 ) -> float:
-    """Return the evidence less its price: parameters, their prior, and candidates tried."""
+    """Return the evidence less its price: parameters, their prior, and what was tried.
+
+    ``choices`` is the logarithm of the number of candidates and grid points.
+    """
     gained, effective = nats(before, after, weight)
-    price = 0.5 * _more_informed(before, after) * np.log(max(effective, 2.0)) + laws * np.log(
-        max(candidates, 1)
-    )
+    price = 0.5 * _more_informed(before, after) * np.log(max(effective, 2.0)) + choices
     return float(gained - price - max(_prior(after) - _prior(before), 0.0))
 
 
@@ -292,7 +293,7 @@ def worth_of(mode: Mode, attached: Attached, sizes: Floats, enough: float) -> fl
     for _ in range(2):
         (dropped,) = climb_ladder([with_effects(within[0], effects)], known)
         before = dropped if nats(mode, dropped)[0] > 0 else mode
-        worth = net_evidence(before, within[0], 1)
+        worth = net_evidence(before, within[0])
         if worth >= enough:
             break
         within = refined(within)
@@ -440,10 +441,13 @@ class SimulatedSearch:
             seen = any(own[each].basis.shape[1] for own in scores)
             if seen and set(distinct).isdisjoint(same(each)):
                 distinct.append(each)
-        n = len(distinct)
+        choices = {
+            law: float(np.log(len(distinct) * max(1, scores[-1][law].candidate.looks)))
+            for law in leaders
+        }
         trials = []
         for law, size in leaders.items():
-            trial = self._trial(now, parents, {law: size}, n)
+            trial = self._trial(now, parents, {law: size}, choices[law])
             trials.append(replace(trial, same=tuple(o for o in same(law) if o != law)))
         trials = self._refined(now, trials)
         if trials and not self._white(trials[0].modes) and (pairs or self._best(trials) is None):
@@ -453,7 +457,7 @@ class SimulatedSearch:
                 if twins(first, second, self.criteria):
                     continue
                 begin = {each.laws[0]: sizes_of(each.modes[0], each.laws[0]) for each in pair}
-                both.append(self._trial(now, parents, begin, n))
+                both.append(self._trial(now, parents, begin, sum(map(choices.__getitem__, begin))))
             trials += self._refined(now, both)
         return _compared(now, trials)
 
@@ -491,18 +495,18 @@ class SimulatedSearch:
         now: list[Mode],
         parents: list[Linear],
         begin: dict[Attached, Floats],
-        candidates: int,
+        choices: float,
     ) -> _Trial:
         """Return the refit with some laws, at every length."""
         laws = tuple(begin)
         starts = [with_effects(m, (*m.problem.physics.effects, *laws), begin) for m in now]
-        return _Trial(laws, climb_ladder(starts, parents), candidates)
+        return _Trial(laws, climb_ladder(starts, parents), choices)
 
     def _pruned(self, mode: Mode, laws: list[Accepted]) -> tuple[Mode, list[Accepted]]:
         """Drop laws that later ones have made needless."""
         while len(laws) > 1:
             without = [_without(mode, (law.attached,)) for law in laws]
-            worth = [net_evidence(each, mode, 1) for each in without]
+            worth = [net_evidence(each, mode) for each in without]
             taken = [share_taken(each, mode) for each in without]
             least = int(np.argmin(worth))
             enough = worth[least] > self.criteria.simulation.least_nats
@@ -528,7 +532,7 @@ def _law(mode: Mode, accepted: Accepted) -> Law:
         estimate=dict(zip(names, mode.phi[places].tolist(), strict=True)),
         sd=dict(zip(names, sd.tolist(), strict=True)),
         units={parameter.name: parameter.unit for parameter in effect.parameters},
-        nats=net_evidence(without, mode, 1),
+        nats=net_evidence(without, mode),
         share=share_taken(without, mode),
         confounded=accepted.confounded_names,
     )
@@ -549,7 +553,7 @@ def _compared(now: list[Mode], trials: list[_Trial]) -> list[_Trial]:
         replace(
             trial, share=share, gained=nats(before, trial.modes[-1], weight)[0],
             net=net_evidence(
-                before, trial.modes[-1], len(trial.laws), trial.candidates, weight
+                before, trial.modes[-1], trial.choices, weight
             ),
         )
         for trial, share in zip(trials, shares, strict=True)
