@@ -1,5 +1,7 @@
 """Model criticism: residual, score, effect, refit, verdict, held-out error."""
 
+from .attribution import Attribution as Attribution
+from .attribution import attribute as attribute
 from .closing import close_loop as close_loop
 from .criteria import DEFAULT as DEFAULT
 from .criteria import TRIED as TRIED
@@ -20,6 +22,7 @@ from .ranking import Ranking as Ranking
 from .ranking import criticise as criticise
 from .refinement import with_effects as with_effects
 from .remainder import learn_remainder as learn_remainder
+from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
 from .results import Added as Added
 from .results import Candidate as Candidate
 from .results import Errors as Errors
@@ -31,7 +34,5 @@ from .score import Signature as Signature
 from .score import inseparable as inseparable
 from .score import rank_candidates as rank_candidates
 from .score import twins as twins
-from .simulated import Attribution as Attribution
 from .simulated import Law as Law
-from .simulated import attribute as attribute
 from .stages import Stage as Stage

@@ -225,7 +225,7 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         say(Stage.REPEAT)
         declared = same_noise(search.declared, correlated)
         search = _grown(replace(search, declared=declared, mode=correlated), selection)
-    declared, found = search.declared, search.found
+    declared = search.declared
     revised, steps = search.mode, search.steps
     tested = replace(revised, problem=HeldOut.of(revised, test).problem)
     test, frames = without_measurements(test, outliers(tested, criteria))
@@ -239,16 +239,6 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         held = {label: values[label] for step in steps for label in step.signature.attached.labels}
         with_added = _prior_test(task, train, revised.problem.physics.effects, held)
     misfit = find_misfit(revised, after, horizon=horizon, seed=seed).with_test(with_added)
-    if steps and found is None and _too_much_remains(misfit, before, after):
-        without = find_misfit(declared, before, horizon=horizon, seed=seed)
-        share = after.square / before.square
-        followed = misfit.predictable < criteria.most_predictable * without.predictable
-        if share > criteria.large_if_small or not followed:
-            # any effect takes up a part of a misfit, so no name follows from that
-            say(Stage.WITHDRAW)
-            selection.withdraw(steps)
-            steps, revised, after = [], declared, before
-            misfit = without.with_test(prior)
     if steps:
         misfit = with_negligible_acceleration(misfit, revised, after)
     tested = replace(revised, problem=HeldOut.of(revised, test).problem)
@@ -332,18 +322,6 @@ def _prior_test(
     if more:
         sentence = f"{sentence}; {len(more)} more likewise"
     return ResidualTest(PRIOR, float("nan"), share, not checked.sentences, sentence)
-
-
-def _too_much_remains(
-    misfit: Misfit, before: UnexplainedAcceleration, after: UnexplainedAcceleration
-) -> bool:
-    """Return whether too much of the unexplained acceleration remains, and is not random."""
-    if misfit.unexplained is None or misfit.random or not before.square > 0:
-        return False
-    criteria = after.criteria
-    small = after.worst < criteria.negligible
-    limit = criteria.large_if_small if small else criteria.large_remainder
-    return after.square / before.square > limit
 
 
 def _posteriors(task: _Task, modes: list[Mode]) -> list[Any]:
@@ -463,6 +441,7 @@ def _put_together(
             "data_sha256": train.data_sha256,
             "test_sha256": test.data_sha256,
             "transitions": train.n_transitions,
+            "trajectories": train.n_trajectories,
             "test_transitions": test.n_transitions,
             "rollout_horizon": rollout,
             "rollout_seconds": rollout * scene.time_step,

@@ -82,7 +82,7 @@ class SelectionCriteria:
         Log-likelihoods that differ by less (nats) do not choose between effects: the order of the
         catalogue does.
     least_trajectories : int
-        With fewer trajectories, cross-validation leaves out runs of them, and evidence decides.
+        With fewer trajectories, cross-validation leaves out runs of them.
     """
 
     refits: int = 4
@@ -240,8 +240,7 @@ class Criteria:
         Standard errors that this gain needs, widened to Student's t for few folds. A signed-rank
         test of the folds at the same level is enough, too.
     min_evidence : float
-        Gain in log-evidence (nats) that an effect needs instead, where trajectories are too few for
-        cross-validation over them.
+        Gain in log-evidence (nats) that correlated measurement errors need.
     far_out : float
         Prior scales from the prior's centre beyond which an effect's size is not accepted.
     worse_forecast : float
@@ -252,14 +251,6 @@ class Criteria:
         Times that the noise model is corrected and the search for effects begins again, at most.
     min_remainder : float
         Log marginal likelihood (nats) that a learned force must gain over noise alone.
-    large_remainder : float
-        Where nothing can be simulated, added effects are withdrawn if a larger share of the
-        unexplained acceleration's square remains: any effect takes up a part of a misfit.
-    large_if_small : float
-        The same share where the remaining acceleration is negligible.
-    most_predictable : float
-        A remainder up to ``large_if_small`` may also stay if the predictable share of the
-        innovations falls below this multiple of what it was: the remainder is then random.
     worst_rhat : float
         Chains with a larger R-hat give no verdict.
     least_ess : float
@@ -286,9 +277,6 @@ class Criteria:
     most_added: int = 5
     noise_rounds: int = 4
     min_remainder: float = 6.0
-    large_remainder: float = 0.2
-    large_if_small: float = 0.5
-    most_predictable: float = 0.1
     worst_rhat: float = 1.05
     least_ess: float = 100.0
     engine: EngineCriteria = EngineCriteria()

@@ -9,7 +9,7 @@ from scipy.stats import chi2
 
 from pbrl_ppl.criticism.correlation import correlation_tests
 from pbrl_ppl.criticism.criteria import Criteria
-from pbrl_ppl.criticism.dependence import DEPENDENCE, find_dependence
+from pbrl_ppl.criticism.dependence import find_dependence
 from pbrl_ppl.criticism.forecast import forecast
 from pbrl_ppl.criticism.results import Correlations, Growth, ResidualTest, Unexplained
 from pbrl_ppl.criticism.unexplained import UnexplainedAcceleration, noise_alone
@@ -55,16 +55,6 @@ class Misfit:
         """
         needed = (FORECASTS, HELD_OUT, PRIOR)
         return all(test.passed for test in self.tests if test.name in needed)
-
-    @property
-    def random(self) -> bool:
-        """Return whether no quantity predicts the residual: it is a random force, and no law."""
-        return all(test.passed for test in self.tests if test.name != ACCELERATION)
-
-    @property
-    def predictable(self) -> float:
-        """Return the share of the residual's variance that recorded quantities predict."""
-        return next(test.size for test in self.tests if test.name == DEPENDENCE)
 
     def with_test(self, test: ResidualTest) -> Misfit:
         """Return the misfit with one more test, which is the unexplained one if no other fails."""

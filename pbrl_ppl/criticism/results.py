@@ -9,6 +9,11 @@ import numpy as np
 
 from pbrl_ppl.state import Floats
 
+#: What to know of effects that a recording of one trajectory shows.
+ONE_TRAJECTORY = (
+    "a single trajectory cannot tell a law from a lasting random force: record a second one"
+)
+
 
 @dataclass(frozen=True)
 class Candidate:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.stats import chi2
 
 from pbrl_ppl.criticism.criteria import Criteria
 from pbrl_ppl.criticism.cross_validation import (
@@ -17,7 +16,6 @@ from pbrl_ppl.criticism.cross_validation import (
     forecast_squares,
     leave_out,
     relative_fall,
-    trajectory_count,
 )
 from pbrl_ppl.criticism.forecast import forecast_change, longest_forecast
 from pbrl_ppl.criticism.refinement import with_effects, with_enough_substeps
@@ -26,7 +24,7 @@ from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, tw
 from pbrl_ppl.criticism.simulated import Law, Simulated, sizes_of, worth_of
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
-from pbrl_ppl.modes import Mode, fit_pieces, nearby_mode, trajectory_evidence, trajectory_mode
+from pbrl_ppl.modes import Mode, fit_pieces, nearby_mode, trajectory_mode
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -110,6 +108,7 @@ class Selection:
             return mode, []
         self.simulated = simulated.after
         scored = {signature.attached: signature for signature in ranked}
+        self.tried = {_key(scored[each]): worth for each, worth in simulated.tried.items()}
         for attached, (nats, share) in simulated.tried.items():
             told = (
                 f"takes {100 * share:.2g} % off the error of whole trajectories ({nats:.0f} nats)"
@@ -269,43 +268,16 @@ class Selection:
         )
 
     def _uncertain(self, before: Mode, after: Mode, density: Change, forecasts: Change) -> str:
-        """Return why gains in density and forecasts are not enough; empty if they are.
-
-        Runs of a few trajectories are too few and too similar for a standard error: there the
-        evidence decides.
-        """
+        """Return why gains in density and forecasts are not enough; empty if they are."""
         criteria = self.criteria
         if -forecasts.total > max(criteria.negligible, forecasts.needed(criteria.min_elpd_se)):
             return f"errors of cross-validated forecasts rise by {-100 * forecasts.total:.2g} %"
-        if trajectory_count(after) < criteria.selection.least_trajectories:
-            return self._without_evidence(before, after)
         needed = max(criteria.min_elpd, density.needed(criteria.min_elpd_se))
         either = any(each.certain(criteria.min_elpd_se) for each in (density, forecasts))
         if density.total >= criteria.min_elpd and either:
             return ""
         gained = f"{density.total:.1f} ± {density.error:.1f} nats"
         return f"cross-validation gains {gained}, {needed:.1f} are needed"
-
-    def _without_evidence(self, before: Mode, after: Mode) -> str:
-        """Return why evidence and likelihood do not support an effect; empty if both do.
-
-        The likelihood must rise, too: a declared prior that fits badly does not support an effect.
-        """
-        likelihood = _log_likelihood(after) - _log_likelihood(before)
-        more = len(after.phi) - len(before.phi)
-        chance = float(chi2.sf(2 * max(likelihood, 0.0), max(more, 1)))
-        if chance > self.criteria.try_p:
-            return f"the likelihood rises by {likelihood:.1f} nats (p = {chance:.2g})"
-        labels = before.problem.layout.labels
-        narrow = _width_over_prior(after) < self.criteria.selection.informed
-        informed = [
-            i for i, label in enumerate(after.problem.layout.labels)
-            if label not in labels and narrow[i]
-        ]  # fmt: skip
-        gained = trajectory_evidence(after, informed) - trajectory_evidence(before)
-        if gained >= self.criteria.min_evidence:
-            return ""
-        return f"the evidence rises by {gained:.1f} nats, {self.criteria.min_evidence:g} are needed"
 
     def prune(self, mode: Mode, steps: list[Step]) -> tuple[Mode, list[Step]]:
         """Drop effects that later ones have made unnecessary; sort the rest by their gain."""
@@ -320,12 +292,6 @@ class Selection:
                 mode = without
                 steps = [addition for addition in steps if addition is not step]
         return mode, sorted(steps, key=lambda addition: -addition.elpd_difference)
-
-    def withdraw(self, steps: list[Step]) -> None:
-        """Withdraw added effects, with which most of the residual remains."""
-        for step in steps:
-            self._note(step.signature, "withdrawn: most of what is missing remains with it")
-        self.small.clear()  # it was found beside the effects that are withdrawn
 
     def explained(self, ranked: list[Signature]) -> tuple[Candidate, ...]:
         """Return candidates with the decision on each, and what simulations say of it."""

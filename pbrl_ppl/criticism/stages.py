@@ -30,7 +30,6 @@ class Stage(StrEnum):
     PRUNE = "checking that each added effect is still needed", 0.29
     TEST = "testing the residual", 0.38
     SIMULATE = "simulating whole trajectories with what the model might lack"
-    WITHDRAW = "no effect of the catalogue explains what is missing"
     SAMPLE = "sampling the posteriors", 0.5
     COMPARE = "comparing errors on held-out data", 0.99
     LEARN = "learning a force for the residual"

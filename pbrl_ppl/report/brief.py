@@ -10,6 +10,7 @@ from pbrl_ppl.criticism import ADEQUATE, NOT_CONVERGED, UNEXPLAINED, Added, Loop
 from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import (
     accepted,
+    caution_in_words,
     depends_on_records,
     digits_of,
     error_in_words,
@@ -37,6 +38,7 @@ def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
     left, folder = loop.unexplained, Path(folder)
     lines = [f"Verdict: {loop.verdict}. {verdict_in_words(loop)}"]
     lines += [_effect(added) for added in accepted(loop)]
+    lines += [caution] if (caution := caution_in_words(loop)) else []
     lines += _errors(loop)
     if left is not None and left.body:
         lines.append(f"Where: {left.dimension} of the {plain(left.body)}.")

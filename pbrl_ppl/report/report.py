@@ -45,6 +45,7 @@ from pbrl_ppl.report.scene_plots import plot_recording
 from pbrl_ppl.report.style import UNITS
 from pbrl_ppl.report.words import (
     accepted,
+    caution_in_words,
     depends_on_records,
     error_in_words,
     gains_in_words,
@@ -134,6 +135,7 @@ def render(loop: Loop, source: Source | None = None) -> str:
         motion=animation(loop, held_out_motions(loop)),
         verdict=verdict_in_words(loop),
         accepted=accepted(loop),
+        caution=caution_in_words(loop),
         note=error_in_words(loop),
         rejected=rejected_in_words(loop),
         left_out=left_out_in_words(loop),

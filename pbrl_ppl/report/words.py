@@ -9,6 +9,7 @@ import numpy as np
 from pbrl_ppl.criticism import (
     ADEQUATE,
     NOT_CONVERGED,
+    ONE_TRAJECTORY,
     TRIED,
     UNEXPLAINED,
     Added,
@@ -107,6 +108,12 @@ def error_in_words(loop: Loop) -> str:
             f" {model} model by {number(after)} times the noise (another load, wear, calibration?)."
         )
     return ""
+
+
+def caution_in_words(loop: Loop) -> str:
+    """Return what to know of added effects of a recording of one trajectory; empty otherwise."""
+    single = bool(loop.added) and loop.provenance.get("trajectories") == 1
+    return f"{ONE_TRAJECTORY[0].upper()}{ONE_TRAJECTORY[1:]}." if single else ""
 
 
 def rejected_in_words(loop: Loop) -> str:

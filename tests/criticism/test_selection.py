@@ -49,9 +49,6 @@ def test_each_candidate_says_what_became_of_it(weak) -> None:
     assert why["torque_gain"] == "the same as inertia scale in these data"
     assert why["constant_torque"].startswith("not significant (p = ")
     assert why["heavy_tails"] == "the noise's shape is scored and never added: declare it"
-    chosen.withdraw(steps)
-    why = {one.effect: one.why for one in chosen.explained(first)}
-    assert why["linear_drag"] == "withdrawn: most of what is missing remains with it"
 
 
 def test_a_gain_that_is_not_sure_is_told(weak, monkeypatch) -> None:

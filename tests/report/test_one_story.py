@@ -257,3 +257,11 @@ def test_the_error_far_ahead_is_of_the_dimension_that_is_worst() -> None:
         "; of theta 2.00 s ahead 0.300 -> 0.0163 rad (noise floor 0.0160)."
         in (in_brief(findings, "out")[2])
     )
+
+
+def test_effects_of_one_trajectory_are_told_with_caution() -> None:
+    findings = made_up()
+    one = replace(findings, provenance={**findings.provenance, "trajectories": 1})
+    said = "A single trajectory cannot tell a law from a lasting random force"
+    assert said in text_of(one) and any(said in line for line in in_brief(one, "out"))
+    assert said not in text_of(findings)
