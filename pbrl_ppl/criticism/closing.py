@@ -407,7 +407,7 @@ def _put_together(
     verdict = EFFECTS_ADDED if steps else ADEQUATE
     unexplained = misfit.unexplained
     # added effects that leave an acceleration unexplained are at best near the right ones
-    if unexplained is not None and not (steps and misfit.predicts):
+    if unexplained is not None and not (steps and misfit.predicts(criteria)):
         verdict = UNEXPLAINED
     if steps and after.normalised_rmse > (1.0 + criteria.negligible) * before.normalised_rmse:
         verdict, unexplained = UNEXPLAINED, unexplained or _worse(before, after)

@@ -47,14 +47,18 @@ class Misfit:
     correlations: Correlations
     growth: Growth
 
-    @property
-    def predicts(self) -> bool:
+    def predicts(self, criteria: Criteria) -> bool:
         """Return whether forecasts are as good as noise lets them be, and the prior is possible.
 
-        What remains is then small: significant one step ahead, and not over a forecast.
+        What remains is then small: significant one step ahead, and not over a forecast. Beside an
+        unexplained acceleration forecasts must be near the noise; that none is known to be worse is
+        not enough.
         """
-        needed = (FORECASTS, HELD_OUT, PRIOR)
-        return all(test.passed for test in self.tests if test.name in needed)
+        tests = {test.name: test for test in self.tests}
+        forecasts = [tests[name] for name in (FORECASTS, HELD_OUT) if name in tests]
+        near = all(test.size < criteria.worse_forecast for test in forecasts)
+        passed = all(test.passed for test in (*forecasts, tests[PRIOR]))
+        return passed and (near or tests[ACCELERATION].passed)
 
     def with_test(self, test: ResidualTest) -> Misfit:
         """Return the misfit with one more test, which is the unexplained one if no other fails."""

@@ -134,7 +134,9 @@ def test_held_out_errors_are_of_one_world(model) -> None:
     assert shown.body == "a"  # which the other stops
     np.testing.assert_allclose(shown.before[1], expected[0, 0, A], atol=1e-9)
     off = model.problem.observations.residual(expected)[:, -1]
-    errors = held.errors(held, posterior_of(build_model(whole), phi), rollout=1, seed=1)
+    errors = held.errors(
+        held, posterior_of(build_model(whole), phi), rollout=1, seed=1, noise=held.mode.sigma
+    )
     for i, name in enumerate(STATE):
         found = errors.one_step_rmse[name]
         assert found == pytest.approx(np.sqrt((off[..., i] ** 2).mean()), rel=1e-6), name
