@@ -328,7 +328,8 @@ class SimulatedSearch:
         trials = self._refined(now, trials)
         if trials and not self._white(trials[0].modes) and (pairs or self._best(trials) is None):
             both = []
-            for pair in combinations(trials[: limits.paired], 2):
+            some = [trial for trial in trials if trial.share >= self.criteria.negligible]
+            for pair in combinations(some[: limits.paired], 2):
                 first, second = (scores[-1][each.laws[0]] for each in pair)
                 if twins(first, second, self.criteria):
                     continue
@@ -356,10 +357,11 @@ class SimulatedSearch:
         limits, done = self.criteria.simulation, list[_Trial]()
         rough = _compared(now, trials)
         while rough:
-            best = max((trial.net for trial in done), default=-np.inf)
+            best = max((trial.net for trial in done), default=0.0)
             near = rough[0].net > limits.worth_refining * max(best, 0.0)
             # with little evidence in the data none may stand out before its optimum
-            if done and not (near or (best < limits.least_nats and len(done) < limits.leaders)):
+            large = rough[0].share >= limits.least_share
+            if not (near or (best < limits.least_nats and large and len(done) < limits.leaders)):
                 break
             trial = rough.pop(0)
             done.append(replace(trial, modes=refined(trial.modes)))
