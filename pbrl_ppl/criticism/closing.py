@@ -38,7 +38,7 @@ from pbrl_ppl.criticism.results import (
     Unexplained,
 )
 from pbrl_ppl.criticism.rivals import keep_groups
-from pbrl_ppl.criticism.score import Signature
+from pbrl_ppl.criticism.score import Signature, named_beside
 from pbrl_ppl.criticism.selection import Selection, Step
 from pbrl_ppl.criticism.simulated import Simulated, SimulatedSearch
 from pbrl_ppl.criticism.stages import Stage
@@ -475,6 +475,9 @@ def _worse(before: Errors, after: Errors) -> Unexplained:
 def _added(step: Step, revised: _Model) -> Added:
     """Return an added effect with its posterior."""
     candidate, effect = step.signature.candidate, step.signature.attached.effect
+    named = {
+        named_beside(each, step.signature.attached) for each in revised.mode.problem.physics.effects
+    }  # an effect that was added as well is told from it
     drawn = posterior_draws(revised.posterior)
     bodies = [
         attached.body
@@ -494,7 +497,7 @@ def _added(step: Step, revised: _Model) -> Added:
         statistic=candidate.statistic,
         p_value=candidate.p_value,
         parameters=estimates,
-        not_separable_from=step.not_separable_from,
+        not_separable_from=tuple(n for n in step.not_separable_from if n not in named),
         elpd_difference=step.elpd_difference,
         elpd_difference_se=step.elpd_difference_se,
         simulated_nats=step.simulated.nats if step.simulated else None,

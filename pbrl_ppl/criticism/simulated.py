@@ -249,6 +249,11 @@ class SimulatedSearch:
                 laws.append(Accepted(law, others))
                 self.say(f"simulations name {law.effect.name} on {law.body}")
         last, laws = self._pruned(now[-1], laws)
+        named = {law.attached for law in laws}
+        laws = [
+            replace(law, confounded=tuple(each for each in law.confounded if each not in named))
+            for law in laws
+        ]
         return Simulated(declared, last, tuple(laws), tried)
 
     def _white(self, now: list[Mode]) -> bool:
