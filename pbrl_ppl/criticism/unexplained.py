@@ -103,12 +103,10 @@ def noise_alone(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
 
 
 def measurement_noise(mode: Mode, excess: UnexplainedAcceleration) -> Floats:
-    """Return the noise parameters with the measurement noise alone, shape (parameter,).
-
-    A significant acceleration is left out, and the measurement noise stays beside it.
-    """
-    sigma = noise_alone(mode, excess)
-    sigma[mode.problem.trajectory_noise.cells.accelerations] = NOTHING
+    """Return the noise parameters without accelerations that matter, shape (parameter,)."""
+    sigma = mode.sigma.copy()
+    places = np.array(mode.problem.trajectory_noise.cells.accelerations)
+    sigma[places[excess.matters]] = NOTHING
     return sigma
 
 
