@@ -227,8 +227,12 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
         search = _grown(replace(search, declared=declared, mode=correlated), selection)
     declared = search.declared
     revised, steps = search.mode, search.steps
-    tested = replace(revised, problem=HeldOut.of(revised, test).problem)
+    held_out = HeldOut.of(revised, test)
+    tested = replace(revised, problem=held_out.problem)
     test, frames = without_measurements(test, outliers(tested, criteria))
+    if frames:
+        held_out = HeldOut.of(revised, test)
+        tested = replace(revised, problem=held_out.problem)
     bad += tuple(f"held out: {frame}" for frame in frames)
     say(Stage.TEST)
     before, after = (unexplained_acceleration(mode, criteria) for mode in (declared, revised))
@@ -241,16 +245,15 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
     misfit = find_misfit(revised, after, horizon=horizon, seed=seed).with_test(with_added)
     if steps:
         misfit = with_negligible_acceleration(misfit, revised, after)
-    tested = replace(revised, problem=HeldOut.of(revised, test).problem)
     longest = longest_rollout(test, horizon)
     misfit = misfit.with_test(
         held_out_forecasts(tested, noise_alone(revised, after), longest, criteria)
     )
     say(Stage.SAMPLE)
     posteriors = _posteriors(task, [declared, revised] if steps else [declared])
-    first = last = _Model(declared, before, posteriors[0], HeldOut.of(declared, test))
+    first = last = _Model(revised, after, posteriors[-1], held_out)
     if revised is not declared:
-        last = _Model(revised, after, posteriors[-1], HeldOut.of(revised, test))
+        first = _Model(declared, before, posteriors[0], HeldOut.of(declared, test))
     say(Stage.COMPARE)
     return replace(
         _put_together(task, train, first, last, steps, misfit, longest),
@@ -399,11 +402,11 @@ def _put_together(
     """Return the result of the stages; errors are forecasts of ``rollout`` intervals."""
     scene, held_out, criteria = task.scene, revised.held_out, task.criteria
     test = held_out.problem.data.history
-    unit = held_out, measurement_noise(revised.mode, revised.excess)
-    before, after = (
-        model.held_out.errors(unit[0], model.posterior, rollout, task.seed, unit[1])
-        for model in (declared, revised)
-    )
+    unit = measurement_noise(revised.mode, revised.excess)
+    before = declared.held_out.errors(held_out, declared.posterior, rollout, task.seed, unit)
+    after = before
+    if revised is not declared:
+        after = held_out.errors(held_out, revised.posterior, rollout, task.seed, unit)
     verdict = EFFECTS_ADDED if steps else ADEQUATE
     unexplained = misfit.unexplained
     # added effects that leave an acceleration unexplained are at best near the right ones

@@ -85,9 +85,9 @@ class Selection:
         """Return the candidate effects for a model."""
         return candidates(self.scene, mode.problem.physics.effects, self.catalogue)
 
-    def rank(self, mode: Mode, at: Mode | None = None) -> list[Signature]:
-        """Return the scores of a model's candidates, at its mode or with other noise parameters."""
-        return rank_candidates(at or mode, self.missing(mode), self.criteria)
+    def rank(self, mode: Mode) -> list[Signature]:
+        """Return the scores of a model's candidates."""
+        return rank_candidates(mode, self.missing(mode), self.criteria)
 
     def adopted(
         self, mode: Mode, simulated: Simulated | None, ranked: list[Signature]

@@ -133,8 +133,11 @@ class Problem:
         rough = self.rough
         if rough.physics.substeps * _WORTH_CORRECTING > self.physics.substeps:
             return self
-        defect = self.predict(phi) - rough.predict(phi)
-        return replace(rough, defect=np.nan_to_num(defect))
+        return rough.corrected_to(self, phi)
+
+    def corrected_to(self, exact: Problem, phi: Floats) -> Problem:
+        """Return the problem with predictions corrected to those of more engine steps at phi."""
+        return replace(self, defect=np.nan_to_num(exact.predict(phi) - self.predict(phi)))
 
     def joined(self, phi: Floats, sigma: Floats) -> Problem:
         """Return the problem with bodies that meet at these draws in one part; itself if none do.

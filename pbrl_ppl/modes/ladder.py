@@ -259,7 +259,7 @@ def fit_pieces(
     scale, sizes = layout.scale(phi), output_error(problem).starts.cells.sizes(problem.scene)
     phi, start = inside(priors, phi), problem.segments.start
     if known is not None:
-        problem = _corrected(problem, phi)
+        problem = problem.coarse.corrected_to(problem.rough, phi)
     steps = _FIRST * np.where(layout.discrete, 0.0, scale), _FIRST * sizes
     damping, failed = 1e-3, 0
     for _ in range(rounds):
@@ -304,17 +304,8 @@ def fit_pieces(
 
 def corrected(mode: Mode) -> Mode:
     """Return a mode of simulated pieces with few engine steps, whose error there is corrected."""
-    return replace(mode, problem=_corrected(mode.problem, mode.phi))
-
-
-def _corrected(problem: Problem, phi: Floats) -> Problem:
-    """Return a problem of pieces with few engine steps, corrected at phi (see `Problem`)."""
-    start = problem.segments.start[None]
-    rough, coarse = (
-        engine.simulator(phi[None], start, problem.inputs)[0]
-        for engine in (problem.rough, problem.coarse)
-    )
-    return replace(problem.coarse, defect=np.nan_to_num(rough - coarse))
+    problem = mode.problem
+    return replace(mode, problem=problem.coarse.corrected_to(problem.rough, mode.phi))
 
 
 def refined(modes: Sequence[Mode]) -> list[Mode]:
@@ -416,12 +407,12 @@ class _Step:
     def _move(self, phi: Floats, start: Floats, residual: Floats) -> None:
         self.phi, self.start = phi, start
         self.rows = self._rows(start, residual)
-        left = self.rows - (self.u @ (np.swapaxes(self.u, 1, 2) @ self.rows[..., None]))[..., 0]
+        left = self._left(self.rows)
         priors = self.problem.layout.priors
         slopes = prior_slopes(priors, phi) if priors else np.zeros(0)
         self.gradient = self.jacobian.T @ left.ravel() - slopes * prior_residual(priors, phi)
         self.precision = self.normal + np.diag(slopes**2)
-        self.cost_before = self.cost(phi, start, residual)
+        self.cost_before = self._profiled(left, residual, phi)
 
     def at(self, phi: Floats, start: Floats, residual: Floats) -> _Step:
         """Return the steps from another point, with the same derivatives."""
@@ -436,8 +427,14 @@ class _Step:
 
     def cost(self, phi: Floats, start: Floats, residual: Floats) -> float:
         """Return the negative log-posterior at a point, the noise at its profile."""
-        rows = self._rows(start, residual)
-        left = rows - (self.u @ (np.swapaxes(self.u, 1, 2) @ rows[..., None]))[..., 0]
+        return self._profiled(self._left(self._rows(start, residual)), residual, phi)
+
+    def _left(self, rows: Floats) -> Floats:
+        """Return rows without what start states take up, shape (piece, row)."""
+        return np.asarray(rows - (self.u @ (np.swapaxes(self.u, 1, 2) @ rows[..., None]))[..., 0])
+
+    def _profiled(self, left: Floats, residual: Floats, phi: Floats) -> float:
+        """Return the cost of projected rows; ``residual`` has their shape before."""
         cut = residual[0].size
         square = (left[:, :cut].reshape(residual.shape) ** 2).sum((0, 1, 2))
         seen = self.starts.column >= 0
