@@ -10,8 +10,8 @@ import pytest
 from scipy.stats import binom
 
 from pbrl_ppl.criticism.criteria import DEFAULT
-from pbrl_ppl.criticism.dependence import _kernels
-from pbrl_ppl.criticism.misfit import ACCELERATION, DEPENDENCE, FORECASTS, find_misfit
+from pbrl_ppl.criticism.dependence import DEPENDENCE, _kernels
+from pbrl_ppl.criticism.misfit import ACCELERATION, FORECASTS, find_misfit
 from pbrl_ppl.criticism.unexplained import (
     UnexplainedAcceleration,
     noise_alone,
