@@ -57,7 +57,7 @@ class Misfit:
         tests = {test.name: test for test in self.tests}
         forecasts = [tests[name] for name in (FORECASTS, HELD_OUT) if name in tests]
         near = all(test.size < criteria.worse_forecast for test in forecasts)
-        passed = all(test.passed for test in (*forecasts, tests[PRIOR]))
+        passed = all(tests[name].passed for name in (FORECASTS, HELD_OUT, PRIOR) if name in tests)
         return passed and (near or tests[ACCELERATION].passed)
 
     def with_test(self, test: ResidualTest) -> Misfit:

@@ -56,7 +56,7 @@ def test_each_fails_on_clean_data_no_more_often_than_it_says(trajectories, inter
 def test_clean_data_of_another_engine_pass(make_history) -> None:
     found = misfit(fitted(BOX, box2d(make_history, 3)[0]))
     assert found.unexplained is None
-    assert found.predicts
+    assert found.predicts(DEFAULT)
     assert {test.name for test in found.tests if test.tested} == set(RATES)
 
 
@@ -138,7 +138,7 @@ def test_a_late_command_is_an_error_that_follows_commands(make_history) -> None:
     names = {test.name for test in found.tests if not test.passed}
     assert {ACCELERATION, COMMANDS, DEPENDENCE} <= names
     assert "command" in found.unexplained.depends_on
-    assert not found.predicts
+    assert not found.predicts(DEFAULT)
 
 
 def test_a_spring_that_is_not_in_the_scene_fails_all_that_look_at_states(make_history) -> None:
