@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.stats import chi2, norm
@@ -12,8 +13,8 @@ from pbrl_ppl.criticism.criteria import DEFAULT, Criteria
 from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import Look, caps, detectable_sizes, detection_limits_of_scan, looks
 from pbrl_ppl.effects import Attached, Noise
-from pbrl_ppl.likelihood import TrajectoryLikelihood
-from pbrl_ppl.modes import Mode, posterior_steps
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
+from pbrl_ppl.modes import Mode, in_parallel, posterior_slopes
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
 
@@ -104,7 +105,7 @@ def rank_candidates(
     def order(signature: Signature) -> tuple[bool, float]:
         return _of_noise(signature.attached), round(signature.log_p, _EQUAL)
 
-    return sorted(map(score, candidates), key=order)
+    return sorted(in_parallel(score, candidates), key=order)
 
 
 def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Floats, list[Floats]]:
@@ -122,7 +123,7 @@ def _signatures(mode: Mode, candidates: Sequence[Attached]) -> tuple[Floats, Flo
     p, priors = len(mode.phi), mode.problem.layout.priors
     residual = np.concatenate([mode.whitened_residual.ravel(), -prior_residual(priors, mode.phi)])
     jacobian = np.vstack([_slopes(mode), np.diag(prior_slopes(priors, mode.phi))])
-    signatures = [_slopes(mode, attached) for attached in candidates]
+    signatures = in_parallel(partial(_slopes, mode), candidates)
     return residual, jacobian, [np.pad(own, ((0, p), (0, 0))) for own in signatures]
 
 
@@ -146,12 +147,13 @@ def _slopes(mode: Mode, attached: Attached | None = None) -> Floats:
     lower, upper = (bound[new] for bound in layout.bounds)
     begin = 1e-3 * np.array([layout.priors[place].scale for place in new])
 
-    def predict(points: Floats) -> Floats:
+    def predict(points: Floats, problem: Problem = wide) -> Floats:
         phi = np.tile(null, (len(points), 1))
         phi[:, new] = points
-        return -np.nan_to_num(wide.whitened(phi, mode.sigma)).reshape(len(points), -1)
+        return -np.nan_to_num(problem.whitened(phi, mode.sigma)).reshape(len(points), -1)
 
-    return posterior_steps(predict, null[new], lower, upper, begin)[0]
+    rough = partial(predict, problem=wide.coarse)
+    return posterior_slopes(predict, null[new], lower, upper, begin, rough)
 
 
 @dataclass(frozen=True, eq=False)

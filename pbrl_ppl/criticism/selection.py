@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, tw
 from pbrl_ppl.criticism.simulated import Law, Simulated, sizes_of, worth_of
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
-from pbrl_ppl.modes import Mode, fit_pieces, nearby_mode, trajectory_mode
+from pbrl_ppl.modes import Mode, fit_pieces, in_parallel, nearby_mode, trajectory_mode
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
@@ -119,10 +119,15 @@ class Selection:
         problem = mode.problem.with_physics(effects=simulated.after.problem.physics.effects)
         phi = problem.layout.from_layout(simulated.after.problem.layout, simulated.after.phi)
         after = with_enough_substeps(trajectory_mode(problem, phi), self.say, self.criteria)
+        lacking = [mode]
+        if len(simulated.laws) > 1:
+            named = [law.attached for law in simulated.laws]
+            lacking = in_parallel(partial(self._without, after), named)
         steps = []
-        for law, described in zip(simulated.laws, simulated.described(), strict=True):
+        for law, described, without in zip(
+            simulated.laws, simulated.described(), lacking, strict=True
+        ):
             signature = scored[law.attached]
-            without = self._without(after, law.attached) if len(simulated.laws) > 1 else mode
             gained, _ = _gains(without, after, self.criteria)
             self._note(signature, "added")
             steps.append(
@@ -149,13 +154,13 @@ class Selection:
             penalty = 0.5 * _informed(fitted, signature.attached, limits.informed) * np.log(shown)
             return float(_log_likelihood(fitted) - penalty)
 
-        waiting = self._worth_a_refit(mode, ranked, order)
+        waiting = self._worth_a_refit(ranked, order)
         while waiting:
             # those far behind the first are tried only once it has failed
             enough = limits.worth_a_refit * waiting[0].candidate.statistic
             leading = [each for each in waiting if each.candidate.statistic >= enough]
             waiting = [each for each in waiting if each.candidate.statistic < enough]
-            fits = {signature: refitted(mode, signature) for signature in leading}
+            fits = dict(zip(leading, in_parallel(partial(refitted, mode), leading), strict=True))
             scores = {signature: score(signature, fitted) for signature, fitted in fits.items()}
             scores = {signature: value for signature, value in scores.items() if np.isfinite(value)}
             while scores:
@@ -173,9 +178,7 @@ class Selection:
                 return step
         return None
 
-    def _worth_a_refit(
-        self, mode: Mode, ranked: list[Signature], order: list[str]
-    ) -> list[Signature]:
+    def _worth_a_refit(self, ranked: list[Signature], order: list[str]) -> list[Signature]:
         """Return the candidates that could be added, best first; of twins, the earlier one.
 
         The noise's shape is scored and never added, for it would take up any misfit.
@@ -199,7 +202,7 @@ class Selection:
         most = self.criteria.selection.refits
         for signature in kept[most:]:
             self._note(signature, f"behind the {most} that are refitted in a round")
-        return [signature for signature in kept[:most] if self._is_supported(mode, signature)]
+        return kept[:most]
 
     def _is_supported(self, mode: Mode, signature: Signature) -> bool:
         """Return whether a candidate takes anything off the simulation error of trajectories.
@@ -224,6 +227,8 @@ class Selection:
         self, mode: Mode, signature: Signature, fitted: Mode, ranked: list[Signature]
     ) -> Step | None:
         """Return the step if its gain is significant in cross-validation and not negligible."""
+        if not self._is_supported(mode, signature):
+            return None
         fitted = with_enough_substeps(fitted, self.say, self.criteria)
         if why := self._implausible(fitted, signature):
             self._note(signature, why)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
@@ -26,6 +27,7 @@ from pbrl_ppl.modes import (
     corrected,
     derivatives,
     fit_pieces,
+    in_parallel,
     ladder,
     refined,
     with_robust_covariance,
@@ -74,6 +76,8 @@ class Simulated:
         The declared model and the one with the laws, at the greatest length.
     laws : tuple of Accepted
         In the order in which they were found.
+    without : tuple of Mode
+        The model without each law, refitted.
     tried : dict of Attached to (float, float)
         Net log-evidence (nats) of candidates that were refitted beside the declared model, and the
         share of the simulation error that they take away.
@@ -82,12 +86,13 @@ class Simulated:
     declared: Mode
     after: Mode
     laws: tuple[Accepted, ...]
+    without: tuple[Mode, ...]
     tried: Mapping[Attached, tuple[float, float]]
 
     def described(self) -> tuple[Law, ...]:
         """Return the laws with what each is worth in the last model."""
         after = with_robust_covariance(self.after)
-        return tuple(_law(after, law) for law in self.laws)
+        return tuple(map(partial(_law, after), self.laws, self.without))
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,12 +234,12 @@ class SimulatedSearch:
                 }  # fmt: skip
             best = self._best(trials)
             while best is not None and again:
-                without = _without(best.modes[-1], best.laws)
-                if nats(now[-1], without)[0] <= 1.0:
+                dropped = _without(best.modes[-1], best.laws)
+                if nats(now[-1], dropped)[0] <= 1.0:
                     break
                 again -= 1  # it was not at its optimum
-                now = [*now[:-1], without]
-                declared = declared if laws else without
+                now = [*now[:-1], dropped]
+                declared = declared if laws else dropped
                 trials = _compared(now, trials)
                 best = self._best(trials)
             if best is None:
@@ -248,13 +253,13 @@ class SimulatedSearch:
                 others = tuple(each for each in close if each not in best.laws)
                 laws.append(Accepted(law, others))
                 self.say(f"simulations name {law.effect.name} on {law.body}")
-        last, laws = self._pruned(now[-1], laws)
+        last, laws, without = self._pruned(now[-1], laws)
         named = {law.attached for law in laws}
         laws = [
             replace(law, confounded=tuple(each for each in law.confounded if each not in named))
             for law in laws
         ]
-        return Simulated(declared, last, tuple(laws), tried)
+        return Simulated(declared, last, tuple(laws), tuple(without), tried)
 
     def _white(self, now: list[Mode]) -> bool:
         """Return whether the residual is white at every length: a law would leave it correlated.
@@ -326,21 +331,25 @@ class SimulatedSearch:
             law: float(np.log(len(distinct) * max(1, scores[-1][law].candidate.looks)))
             for law in leaders
         }
-        trials = []
-        for law, size in leaders.items():
-            trial = self._trial(now, parents, {law: size}, choices[law])
-            trials.append(replace(trial, same=tuple(o for o in same(law) if o != law)))
-        trials = self._refined(now, trials)
+
+        def alone(law: Attached) -> _Trial:
+            trial = self._trial(now, parents, {law: leaders[law]}, choices[law])
+            return replace(trial, same=tuple(each for each in same(law) if each != law))
+
+        trials = self._refined(now, in_parallel(alone, leaders))
         if trials and not self._white(trials[0].modes) and (pairs or self._best(trials) is None):
-            both = []
+            both: list[dict[Attached, Floats]] = []
             some = [trial for trial in trials if trial.share >= self.criteria.negligible]
             for pair in combinations(some[: limits.paired], 2):
                 first, second = (scores[-1][each.laws[0]] for each in pair)
                 if twins(first, second, self.criteria):
                     continue
-                begin = {each.laws[0]: sizes_of(each.modes[0], each.laws[0]) for each in pair}
-                both.append(self._trial(now, parents, begin, sum(map(choices.__getitem__, begin))))
-            trials += self._refined(now, both)
+                both.append({each.laws[0]: sizes_of(each.modes[0], each.laws[0]) for each in pair})
+
+            def together(begin: dict[Attached, Floats]) -> _Trial:
+                return self._trial(now, parents, begin, sum(choices[law] for law in begin))
+
+            trials += self._refined(now, in_parallel(together, both))
         return _compared(now, trials)
 
     def _first_size(self, signature: Signature) -> Floats:
@@ -385,10 +394,12 @@ class SimulatedSearch:
         starts = [with_effects(m, (*m.problem.physics.effects, *laws), begin) for m in now]
         return _Trial(laws, climb_ladder(starts, parents), choices)
 
-    def _pruned(self, mode: Mode, laws: list[Accepted]) -> tuple[Mode, list[Accepted]]:
-        """Drop laws that later ones have made needless."""
-        while len(laws) > 1:
-            without = [_without(mode, (law.attached,)) for law in laws]
+    def _pruned(self, mode: Mode, laws: list[Accepted]) -> tuple[Mode, list[Accepted], list[Mode]]:
+        """Drop laws that later ones have made needless; return the models without each as well."""
+        while True:
+            without = in_parallel(partial(_without, mode), [(law.attached,) for law in laws])
+            if len(laws) < 2:
+                break
             worth = [net_evidence(each, mode) for each in without]
             taken = [share_taken(each, mode) for each in without]
             least = int(np.argmin(worth))
@@ -397,13 +408,13 @@ class SimulatedSearch:
                 break
             mode = without[least]
             laws = [law for law in laws if law is not laws[least]]
-        return mode, laws
+        return mode, laws, without
 
 
-def _law(mode: Mode, accepted: Accepted) -> Law:
+def _law(mode: Mode, accepted: Accepted, without: Mode) -> Law:
     """Return an accepted law with what it is worth in the last model."""
     attached = accepted.attached
-    effect, without = attached.effect, _without(mode, (attached,))
+    effect = attached.effect
     labels = mode.problem.layout.labels
     places = [labels.index(label) for label in attached.labels]
     sd = np.sqrt(np.diag(mode.covariance)[places])

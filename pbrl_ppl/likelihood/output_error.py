@@ -24,6 +24,8 @@ from pbrl_ppl.state import STATE, THETA, Bools, Floats, Ints, wrapped
 
 #: Directions of a start state with a smaller singular value move nothing that was measured.
 _SEEN = 1e-5
+#: Weight of a given start coordinate, over that of all measurements that depend on it.
+_FIRM = 1e6
 #: Rounds of sigma and projection, which depend on each other.
 _ROUNDS = 6
 #: Correlations below this end the sum of an integrated autocorrelation time.
@@ -46,6 +48,9 @@ class Starts:
         What was measured, shape (piece, H, body, state).
     begin : ndarray
         Measured minus latent start, shape (piece, cell); NaN where not measured.
+    given : ndarray of bool
+        Start coordinates that are given: recorded, of a dimension that is not observed. Shape
+        (piece, cell).
     column : ndarray of int
         Place among the observed dimensions of each cell, -1 if it is not one; shape (cell,).
     """
@@ -54,6 +59,7 @@ class Starts:
     slope: Floats
     seen: Bools
     begin: Floats
+    given: Bools
     column: Ints
     memory: Memory = field(init=False, default_factory=Memory)
 
@@ -105,8 +111,10 @@ class Starts:
     def _basis(self, weight: Floats) -> tuple[Floats, Floats]:
         pieces, cells = self.begin.shape
         moved = np.where(self.seen[..., None], self.slope, 0.0) * weight[:, None]
-        own = np.isfinite(self.begin)[:, :, None] * np.diag(self._weights(weight))
-        rows = np.concatenate([moved.reshape(pieces, -1, cells), own], axis=1)
+        moved = moved.reshape(pieces, -1, cells)
+        own = np.isfinite(self.begin) * self._weights(weight)
+        own += self.given * _FIRM * np.linalg.norm(moved, axis=1)
+        rows = np.concatenate([moved, own[:, :, None] * np.eye(cells)], axis=1)
         scale = np.linalg.norm(rows, axis=1)
         scale = np.where(scale > 0, scale, 1.0)
         rows = rows / scale[:, None]
@@ -277,7 +285,8 @@ def in_pieces(problem: Problem, length: int, states: Floats) -> Problem:
     seen = problem.observations.measured
     slope = np.zeros((*seen.shape, len(cells.places)))
     begin = _begin(problem, cells, column, problem.segments.start)
-    starts = Starts(cells, slope, seen, begin, column)
+    given = (column < 0) & np.isfinite(cells.of(_observed_starts(problem)))
+    starts = Starts(cells, slope, seen, begin, given, column)
     tau = (1.0,) * len(columns)
     return replace(
         problem, likelihood=OutputErrorLikelihood(starts=starts, tau=tau, nu=problem.likelihood.nu)
@@ -330,10 +339,15 @@ def output_error(problem: Problem) -> OutputErrorLikelihood:
 
 def _begin(problem: Problem, cells: Cells, column: Ints, start: Floats) -> Floats:
     """Return measured minus latent start states, shape (piece, cell); NaN where not measured."""
+    off = cells.of(_observed_starts(problem)) - cells.of(start)
+    return np.where(column >= 0, cells.wrapped(off), np.nan)
+
+
+def _observed_starts(problem: Problem) -> Floats:
+    """Return what was measured where pieces begin, shape (piece, body, 6), NaN where nothing."""
     segments = problem.segments
     observed = problem.data.history.dataset["observed"].to_numpy()
-    off = cells.of(observed[segments.trajectory, segments.step]) - cells.of(start)
-    return np.where(column >= 0, cells.wrapped(off), np.nan)
+    return np.asarray(observed[segments.trajectory, segments.step])
 
 
 def least_errors(problem: Problem) -> Floats:

@@ -18,13 +18,14 @@ from .ladder import ladder as ladder
 from .ladder import refined as refined
 from .ladder import with_robust_covariance as with_robust_covariance
 from .laplace import Mode as Mode
-from .laplace import posterior_steps as posterior_steps
+from .laplace import posterior_slopes as posterior_slopes
 from .library_choice import choose_from_library as choose_from_library
 from .noise import NOTHING as NOTHING
 from .noise import profile_sigma as profile_sigma
 from .search import find_mode as find_mode
 from .simulation import find_simulation_mode as find_simulation_mode
 from .simulation import simulation_mode as simulation_mode
+from .threads import in_parallel as in_parallel
 from .trajectories import find_trajectory_mode as find_trajectory_mode
 from .trajectories import following as following
 from .trajectories import nearby_mode as nearby_mode

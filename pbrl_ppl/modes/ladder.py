@@ -84,7 +84,7 @@ def ladder(mode: Mode) -> list[Mode]:
     found: list[Mode] = []
     states, phi = mode.problem.data.smoothed_states, mode.phi
     starts = output_error(in_pieces(mode.problem, longest, states)).starts
-    measured, unknown = int(starts.counts.sum()), starts.begin.size + len(phi)
+    measured, unknown = int(starts.counts.sum()), int((~starts.given).sum()) + len(phi)
     if measured <= unknown:
         raise HistoryError(
             f"history: it has {measured} measurements, and simulations of its trajectories have"

@@ -97,20 +97,23 @@ class Mode:
         return residual
 
 
-def posterior_steps(
-    function: Callable[[Floats], Floats], phi: Floats, lower: Floats, upper: Floats, begin: Floats
-) -> tuple[Floats, Floats]:
-    """Return the derivative with steps of one posterior standard deviation, and the steps.
+def posterior_slopes(
+    function: Callable[[Floats], Floats],
+    phi: Floats,
+    lower: Floats,
+    upper: Floats,
+    begin: Floats,
+    rough: Callable[[Floats], Floats] | None = None,
+) -> Floats:
+    """Return the derivative with steps of one posterior standard deviation.
 
     Friction makes kinks; a derivative over the posterior's own scale sees their average, one over a
-    tiny step sees whichever side it is on.
+    tiny step sees whichever side it is on. The posterior's scale comes from the derivative over the
+    steps ``begin``, shape (p,), of the function or a cheaper one, ``rough``.
     """
-    steps = begin
-    for _ in range(2):
-        jacobian = differentiate(function, phi, steps, lower, upper)
-        size = np.sqrt((jacobian**2).sum(axis=0))
-        steps = np.clip(1.0 / np.maximum(size, 1e-300), 1e-3 * begin, 1e2 * begin)
-    return jacobian, steps
+    size = np.sqrt((differentiate(rough or function, phi, begin, lower, upper) ** 2).sum(axis=0))
+    steps = np.clip(1.0 / np.maximum(size, 1e-300), 1e-3 * begin, 1e2 * begin)
+    return differentiate(function, phi, steps, lower, upper)
 
 
 def climb(
@@ -198,8 +201,7 @@ def finish(problem: Problem, peak: Peak) -> Mode:
 
     begin = 1e-3 * problem.layout.scale(phi)
     rough = partial(residual, engine=problem.coarse.simulator)
-    _, steps = posterior_steps(rough, phi, lower, upper, begin)
-    jacobian = differentiate(residual, phi, steps, lower, upper)
+    jacobian = posterior_slopes(residual, phi, lower, upper, begin, rough)
     precision = jacobian.T @ jacobian
     if tails:
         precision[tails, tails] = tail_precision(problem, phi, sigma)

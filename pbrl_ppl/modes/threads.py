@@ -1,8 +1,10 @@
-"""Limit of BLAS to one thread."""
+"""Threads: a map in parallel, and BLAS in one thread."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, wraps
 from typing import Any, ParamSpec, TypeVar
 
@@ -10,6 +12,7 @@ from threadpoolctl import ThreadpoolController
 
 P = ParamSpec("P")
 R = TypeVar("R")
+T = TypeVar("T")
 
 
 def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
@@ -25,6 +28,16 @@ def one_blas_thread(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return limited
+
+
+def in_parallel(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
+    """Return the function's values in the order of its arguments, a thread a processor.
+
+    Simulations and linear algebra release the interpreter's lock.
+    """
+    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+    with pool, _pools().limit(limits=1, user_api="blas"):
+        return list(pool.map(function, items))
 
 
 @cache

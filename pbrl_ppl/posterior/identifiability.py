@@ -11,7 +11,7 @@ import pandas as pd
 
 from pbrl_ppl.effects import LEARNED_REMAINDER, Effect, catalogue
 from pbrl_ppl.likelihood import Observations, TransitionLikelihood
-from pbrl_ppl.modes import Mode, posterior_steps
+from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import JOINT_INDICES, Layout, Prior, fold_draws, inside, wheels
 from pbrl_ppl.physics import Physics
 from pbrl_ppl.posterior.record import PosteriorRecord, layout_of
@@ -329,7 +329,7 @@ def _linearised(idata: Any, effects: tuple[Effect, ...]) -> tuple[Layout, Floats
         z = TransitionLikelihood().whiten(observations.residual(states), sigma)
         return np.nan_to_num(z.reshape(len(points), -1))
 
-    jacobian, _ = posterior_steps(residual, phi, *layout.bounds, 1e-3 * layout.scale(phi))
+    jacobian = posterior_slopes(residual, phi, *layout.bounds, 1e-3 * layout.scale(phi))
     return layout, phi, jacobian
 
 

@@ -45,6 +45,22 @@ def test_start_states_are_eliminated_exactly(history) -> None:
     assert (z**2).sum() == pytest.approx((left**2).sum() / 0.01**2 / tau, rel=1e-6)
 
 
+def test_a_velocity_recorded_at_the_start_alone_is_given(history) -> None:
+    """Released from rest, says the first row: what is left is that of a regression on 1 alone."""
+    frame = history.to_dataframe()
+    frame.loc[frame["step"] == 0, ["vx", "vy", "omega"]] = 0.0
+    problem = fit_pieces(pieces(History.from_dataframe(frame, BALL), 44), np.zeros(0)).problem
+    starts = output_error(problem).starts
+    assert starts.given[:, starts.cells.places == 4].all()
+    sigma = np.array([0.01])
+    z = output_error(problem).whiten(problem.residual(np.zeros(0)), sigma)
+    own = history.dataset["observed"].to_numpy()[:, :, 0, 1]
+    own = own + 0.5 * GRAVITY * (np.arange(45) / 30) ** 2
+    left = own - own.mean(axis=1, keepdims=True)
+    tau = output_error(problem).tau[0]
+    assert (z**2).sum() == pytest.approx((left**2).sum() / 0.01**2 / tau, rel=1e-6)
+
+
 def test_the_result_does_not_depend_on_the_start_states(history) -> None:
     """Start states elsewhere, of a linear motion: the same whitened residual."""
     problem = fit_pieces(pieces(history, 44), np.zeros(0)).problem
@@ -83,6 +99,7 @@ def test_the_correlation_time_is_that_of_the_errors(memory) -> None:
         seen=np.ones((40, n, 1, 1), dtype=bool),
         slope=np.zeros((40, n, 1, 1, likelihood.starts.slope.shape[-1])),
         begin=np.full((40, likelihood.starts.begin.shape[1]), np.nan),
+        given=np.zeros((40, likelihood.starts.begin.shape[1]), dtype=bool),
     )
     times = replace(likelihood, starts=starts).correlation_times(
         error[:, :, None, None], np.ones(1)
