@@ -61,6 +61,10 @@ class MeetingWarning(UserWarning):
     """A fit that was repeated because bodies that were simulated apart meet."""
 
 
+class RecordingWarning(UserWarning):
+    """A recording that is cut, or of which rows are left out."""
+
+
 class ResamplingWarning(UserWarning):
     """A history whose samples were not evenly spaced, and were interpolated."""
 

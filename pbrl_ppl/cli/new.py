@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import shutil
 import sys
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,15 +27,12 @@ from pbrl_ppl.cli.scene_text import (
     wall,
 )
 from pbrl_ppl.cli.terminal import check_file, interruptible, print_json
-from pbrl_ppl.errors import HistoryError, OutputError, SceneError
+from pbrl_ppl.errors import HistoryError, OutputError, RecordingWarning, SceneError
 from pbrl_ppl.files import write_text
-from pbrl_ppl.scene import Body, Scene, Shape, nearest
+from pbrl_ppl.scene import Body, Recording, Scene, Shape, nearest
 
 if TYPE_CHECKING:
     import pandas as pd
-
-#: Largest relative difference of time steps that count as even, as in a history.
-_EVEN = 0.01
 
 
 @dataclass(frozen=True)
@@ -49,32 +47,40 @@ class Recorded:
         Median time between a body's rows (s), to six digits.
     even : bool
         Whether all are that long.
-    velocities : bool
-        Whether it has columns of velocities.
+    layout : Recording, optional
+        How it is laid out; None where it is a history's.
+    said : list of str
+        What was seen in it.
     """
 
     names: tuple[str, ...]
     time_step: float
-    even: bool
-    velocities: bool
+    layout: Recording | None
+    said: list[str]
 
 
 def recorded(
     path: Path,
-    columns: Mapping[str, str | float],
-    units: Mapping[str, str],
+    layout: Recording,
     given: Sequence[str] = (),
+    *,
+    time_step: float | None = None,
+    walls: bool = False,
 ) -> Recorded:
-    """Read the names of bodies and the time step from a recording.
+    """Read bodies, time step and layout from a recording.
 
     Parameters
     ----------
     path : Path
         The recording.
-    columns, units : mapping of str
-        As of `History.load`.
+    layout : Recording
+        What is known of its layout.
     given : sequence of str
         Names of bodies from options, for a recording that names none.
+    time_step : float, optional
+        Time between rows (s), for a recording without times.
+    walls : bool
+        Whether walls are declared.
 
     Raises
     ------
@@ -83,9 +89,10 @@ def recorded(
     """
     import pandas as pd
 
-    from pbrl_ppl.history import as_history, read_table
+    from pbrl_ppl.history import as_history, is_history, propose, read_table
 
-    frame = read_table(path, columns)
+    frame, columns = read_table(path, layout=layout), dict(layout.columns)
+    plain = is_history(frame) and layout == Recording()
     names = _names(frame, columns) or list(given)
     if not names:
         raise HistoryError(
@@ -93,13 +100,22 @@ def recorded(
             " --columns body=COLUMN, or --columns NAME.x=COLUMN,... for bodies side by side"
         )
     # later commands read it with the scene; any outline will do here
-    stand_in = Scene(time_step=1.0, bodies=tuple(Body(n, Shape.circle(1.0)) for n in names))
-    table = as_history(frame, stand_in, f"history {path}", columns=columns, units=units)
-    for name in ("trajectory", "body", "time"):
+    stand_in = Scene(
+        time_step=time_step or 1.0, bodies=tuple(Body(n, Shape.circle(1.0)) for n in names)
+    )  # fmt: skip
+    if not plain and time_step is None and not {"time", "duration"} & {*columns, *frame.columns}:
+        raise HistoryError(
+            f"history {path}: it has no column time; say which it is (--columns time=COLUMN, or"
+            " duration=COLUMN for times since the row before), or give --time-step"
+        )
+    with warnings.catch_warnings():  # what is left out is said when the recording is used
+        warnings.simplefilter("ignore", RecordingWarning)
+        table = as_history(frame, stand_in, f"history {path}", None if plain else layout)
+    for name in ("trajectory", "body"):
         if name not in table:
             raise HistoryError(
-                f"history {path}: it has no column {name}; say which it is"
-                f" (--columns {name}=COLUMN), or give --body and --time-step instead"
+                f"history {path}: it has no column {name}; say which it is (--columns"
+                f" {name}=COLUMN)"
             )
     table["time"] = pd.to_numeric(table["time"], errors="coerce")
     steps = table.groupby(["trajectory", "body"])["time"].diff().dropna().to_numpy()
@@ -107,14 +123,11 @@ def recorded(
     if not step > 0:
         raise HistoryError(
             f"history {path}: its times do not rise from row to row of a body and trajectory;"
-            " correct them, or give --body and --time-step instead"
+            " correct them, or give --time-step; times since the row before are a column duration"
         )
-    return Recorded(
-        tuple(names),
-        float(f"{step:.6g}"),
-        even=bool((np.abs(steps - step) <= _EVEN * step).all()),
-        velocities=bool({"vx", "vy", "omega"} & set(table.columns)),
-    )
+    step = float(f"{step:.6g}")
+    found, said = propose(table, layout, step, walls=walls)
+    return Recorded(tuple(names), step, None if plain and not said else found, said)
 
 
 def _names(frame: pd.DataFrame, columns: Mapping[str, str | float]) -> list[str]:
@@ -174,6 +187,7 @@ def new(
         bool | None,
         typer.Option("--side/--top", help="Seen from the side (gravity acts in y), or from above."),
     ] = None,
+    gravity: Annotated[float, typer.Option(min=0.0, help="Size of gravity (m/s^2).")] = 9.81,
     time_step: Annotated[
         float | None, typer.Option(min=0.0, help="Time between rows of the history (s).")
     ] = None,
@@ -205,18 +219,21 @@ def new(
     with interruptible():
         check_file(scene, (".toml",), overwrite)
         names, measures = options.columns_of(columns), options.units_of(units)
+        layout = Recording(columns=tuple(names.items()), units=tuple(measures.items()))
         if model is not None and (side is not None or any(described)):
             raise SceneError("--from copies a model as it is: leave the other options, or --from")
         if history is None and (names or measures):
             raise SceneError("--columns and --units say how a recording is read: add --history")
-        reading: list[str] = []
+        found: Recorded | None = None
         try:
             if model is not None:
                 written = _copied(model, scene, overwrite)
             else:
                 shapes = outlines(bodies or [])
-                found = None if history is None else recorded(history, names, measures, [*shapes])
-                reading = _reading(found, columns, units)
+                if history is not None:
+                    found = recorded(
+                        history, layout, [*shapes], time_step=time_step, walls=bool(walls)
+                    )
                 answers = _asked(shapes, wheels, kinematic, side, time_step, history, found)
                 texts = body_texts(
                     answers.shapes, answers.names, wheels=answers.wheels,
@@ -226,6 +243,8 @@ def new(
                     texts, side=answers.side, time_step=answers.time_step,
                     hinges=[hinge(each, answers.names) for each in hinges or []],
                     walls=[wall(each) for each in walls or []],
+                    gravity=gravity, recording=found.layout if found else None,
+                    said=found.said if found else (),
                 )  # fmt: skip
                 written = [scene]
                 _write(scene, text)
@@ -236,23 +255,12 @@ def new(
     elif not quiet:
         for path in written:
             typer.echo(f"wrote {path}")
+        for sentence in found.said if found else ():
+            typer.echo(f"{history}: {sentence}")
         log = history or (written[-1] if len(written) > 1 else None)
-        command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv"), *reading]
+        command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv")]
         begin = "next" if log else "next, with your recording"
         typer.echo(f"{begin}: {shlex.join(command)}")
-
-
-def _reading(
-    found: Recorded | None, columns: list[str] | None, units: list[str] | None
-) -> list[str]:
-    """Return the options with which later commands read the recording."""
-    if found is None:
-        return []
-    options = [word for each in columns or [] for word in ("--columns", each)]
-    options += [word for each in units or [] for word in ("--units", each)]
-    if not found.even:
-        options += ["--time-step", f"{found.time_step:g}"]
-    return options if found.velocities else [*options, "--estimate-velocities"]
 
 
 def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:

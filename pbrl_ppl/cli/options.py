@@ -133,9 +133,10 @@ def columns_of(given: list[str] | None) -> dict[str, str | float]:
 
 def _number_or_name(text: str) -> str | float:
     try:
-        return float(text)
+        number = float(text)
     except ValueError:
         return text
+    return int(number) if number.is_integer() else number
 
 
 def units_of(given: list[str] | None) -> dict[str, str]:
@@ -236,6 +237,7 @@ class Reading:
         """Return the history without strange rows at trajectory ends, or warn of them."""
         if self.trim is None:
             return history
+        trim = self.trim or (scene.recording is not None and scene.recording.trim)
         from pbrl_ppl.history import strange_ends, trimmed
 
         ends = strange_ends(history, scene)
@@ -244,9 +246,9 @@ class Reading:
         named = "; ".join(str(end) for end in ends[:_MOST_ENDS])
         more = f"; and {len(ends) - _MOST_ENDS} more" if len(ends) > _MOST_ENDS else ""
         cure = "no command or contact explains it: --trim leaves the rows out"
-        cure = "left out" if self.trim else cure
+        cure = "left out" if trim else cure
         warnings.warn(f"history {path}: {named}{more}: {cure}", stacklevel=2)
-        return trimmed(history, ends) if self.trim else history
+        return trimmed(history, ends) if trim else history
 
 
 def load(

@@ -6,7 +6,8 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 
 from pbrl_ppl.errors import SceneError
-from pbrl_ppl.scene import WORLD, nearest
+from pbrl_ppl.scene import WORLD, Recording, nearest
+from pbrl_ppl.scene import toml as scene_toml
 
 _HEAD = """\
 # What is known before a measurement. SI units: m, kg, s, N, rad.
@@ -22,10 +23,10 @@ _HEAD = """\
 """
 _TOP = """\
 gravity = [0.0, 0.0]       # m/s^2 in the plane: seen from above
-normal_gravity = 9.81      # m/s^2, presses bodies on the floor
+normal_gravity = {gravity!r:<9} # m/s^2, presses bodies on the floor
 """
 _SIDE = """\
-gravity = [0.0, -9.81]     # m/s^2 in the plane: seen from the side
+gravity = [0.0, -{gravity!r}]     # m/s^2 in the plane: seen from the side
 """
 _CLOCK = """\
 time_step = {time_step:<14g} # s between rows of the history
@@ -35,6 +36,8 @@ substeps = 10              # engine steps in that time; close-loop takes more wh
 # x = 0.002                # one standard deviation, m
 # theta = 0.01             # rad
 """
+_RECORDING = """\
+[recording]                # how the files are laid out; forces that they lack are zero"""
 _SHAPE = """
 [[body]]
 name = {name:<20} # as in the history's column "body"
@@ -94,6 +97,9 @@ def scene_text(
     time_step: float,
     hinges: Sequence[str] = (),
     walls: Sequence[str] = (),
+    gravity: float = 9.81,
+    recording: Recording | None = None,
+    said: Sequence[str] = (),
 ) -> str:
     """Return a commented scene as TOML.
 
@@ -107,8 +113,21 @@ def scene_text(
         Between rows of the history (s).
     hinges, walls : sequence of str
         Text of each; without one, a comment says how to declare one.
+    gravity : float
+        Size of the acceleration (m/s^2).
+    recording : Recording, optional
+        How the recording is laid out.
+    said : sequence of str
+        What was seen in it, as comments.
     """
-    parts = [_HEAD, _SIDE if side else _TOP, _CLOCK.format(time_step=time_step), *bodies.values()]
+    layout = ""
+    if recording is not None:
+        lines = "".join(f"# {sentence}\n" for sentence in said)
+        layout = "\n".join(["", _RECORDING, scene_toml.write([("", recording.table())]).strip()])
+        layout += f"\n{lines}"
+    seen = (_SIDE if side else _TOP).format(gravity=gravity)
+    parts = [_HEAD, seen, _CLOCK.format(time_step=time_step), layout]
+    parts += bodies.values()
     no_joint = _NO_JOINT.format(name=_quoted(next(iter(bodies))))
     return "".join([*parts, *(walls or [_NO_WALL]), *(hinges or [no_joint])])
 

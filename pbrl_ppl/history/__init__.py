@@ -24,5 +24,7 @@ from .kinematics import estimate_rates as estimate_rates
 from .kinematics import fill_hinges as fill_hinges
 from .kinematics import hung_bodies as hung_bodies
 from .kinematics import lever as lever
+from .layout import is_history as is_history
+from .proposal import propose as propose
 from .units import mass_contradictions as mass_contradictions
 from .units import with_units as with_units

@@ -12,8 +12,9 @@ from scipy.interpolate import CubicHermiteSpline, CubicSpline
 from pbrl_ppl.errors import HistoryError, ResamplingWarning
 from pbrl_ppl.history.files import COLUMNS, as_table
 from pbrl_ppl.history.kinematics import unwrapped
+from pbrl_ppl.history.layout import completed, numbered, unseen_emptied
 from pbrl_ppl.history.rows import TIME_TOLERANCE, Rows, read_rows, with_clean_names
-from pbrl_ppl.scene import Scene, nearest
+from pbrl_ppl.scene import Recording, Scene, nearest
 from pbrl_ppl.state import STATE, THETA, WRENCH, Bools, Floats, Ints
 
 _LENGTH = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "km": 1e3, "in": 0.0254, "ft": 0.3048}
@@ -28,7 +29,7 @@ def _rates(units: Mapping[str, float]) -> dict[str, float]:
 
 #: What each column may be measured in, in SI units.
 _UNITS: Mapping[str, Mapping[str, float]] = {
-    "time": _TIME,
+    **dict.fromkeys(("time", "duration"), _TIME),
     **dict.fromkeys(("x", "y"), _LENGTH),
     "theta": _ANGLE,
     **dict.fromkeys(("vx", "vy"), _rates(_LENGTH)),
@@ -73,10 +74,11 @@ def renamed(
     by_body: dict[str, dict[str, str | float]] = {}
     for key, column in columns.items():
         body, dot, name = key.rpartition(".")
-        if name not in COLUMNS or (dot and name not in (*STATE, *WRENCH)):
+        if name not in (*COLUMNS, "duration") or (dot and name not in (*STATE, *WRENCH)):
             raise HistoryError(
                 f'columns: "{key}" is no column of a history{nearest(name, COLUMNS)}'
-                f" expected {', '.join(COLUMNS)}, or one of a body such as {names[0]}.x"
+                f" expected {', '.join(COLUMNS)}, duration in place of time, or one of a body such"
+                f" as {names[0]}.x"
             )
         if dot and body not in names:
             raise HistoryError(f'columns: "{key}": the scene has {", ".join(names)}')
@@ -175,14 +177,31 @@ class Reading(TypedDict, total=False):
 
 
 def as_history(
-    frame: pd.DataFrame, scene: Scene, source: str, **reading: Unpack[Reading]
+    frame: pd.DataFrame,
+    scene: Scene,
+    source: str,
+    layout: Recording | None = None,
+    **reading: Unpack[Reading],
 ) -> pd.DataFrame:
-    """Return a table with a history's column names, in SI units, resampled if asked."""
-    if columns := reading.get("columns"):
+    """Return a table with a history's column names, in SI units, resampled if asked.
+
+    ``layout`` says how it is laid out; what ``reading`` says goes before it.
+    """
+    columns, units = dict(reading.get("columns") or {}), dict(reading.get("units") or {})
+    if layout is not None:
+        columns, units = dict(layout.columns) | columns, dict(layout.units) | units
+    columns = dict(numbered(frame, columns, source))
+    if columns or layout is not None:
         frame = renamed(frame, scene, columns, source)
-    if units := reading.get("units"):
+    if layout is not None:
+        frame = unseen_emptied(frame, layout, source)
+    if units:
         frame = in_si(frame, units)
-    return resampled(frame, scene, source) if reading.get("resample") else frame
+    resample = reading.get("resample")
+    if layout is not None:
+        frame = completed(frame, scene, layout, source)
+        resample = resample or layout.resample
+    return resampled(frame, scene, source) if resample else frame
 
 
 #: Time steps that are interpolated across (not a lost sample), and that may be missing at most.

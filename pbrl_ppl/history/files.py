@@ -12,18 +12,25 @@ import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.files import write_atomically
+from pbrl_ppl.scene import SEPARATORS, Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
 COLUMNS = ("trajectory", "step", "time", "body", *STATE, *WRENCH)
 SUFFIXES = (".csv", ".parquet", ".nc")
+#: Suffixes of text tables that are read, and never written.
+_TEXTS = (".csv", ".txt", ".tsv", ".dat")
 
 # pandas reads numbers exactly from 3.1 on, and warns there of the option that older ones need.
 _PANDAS = tuple(int(part) for part in pd.__version__.split(".")[:2])
 _EXACT: dict[str, Any] = {} if _PANDAS >= (3, 1) else {"float_precision": "round_trip"}
+#: Separator of columns by blanks.
+_BLANKS = SEPARATORS["blank"].encode()
 _MISSING = ["", "nan", "NaN", "NAN", "NA", "N/A", "null", "NULL", "None"]
 
 
-def read_table(path: Path, names: Mapping[str, object] | None = None) -> pd.DataFrame:
+def read_table(
+    path: Path, names: Mapping[str, object] | None = None, layout: Recording | None = None
+) -> pd.DataFrame:
     """Return the rows of a history file, as they are.
 
     Parameters
@@ -32,6 +39,9 @@ def read_table(path: Path, names: Mapping[str, object] | None = None) -> pd.Data
         The suffix is its format.
     names : mapping of str to object, optional
         Its values are names of columns of numbers, as of `Reading`.
+    layout : Recording, optional
+        Separator and header of a text table; otherwise found from its first line. The columns of
+        one without header are called 0, 1, 2, ...
 
     Raises
     ------
@@ -39,15 +49,18 @@ def read_table(path: Path, names: Mapping[str, object] | None = None) -> pd.Data
         If the file is missing, of an unknown kind, or damaged.
     """
     suffix = path.suffix.lower()
-    if suffix not in SUFFIXES:
+    known = tuple(dict.fromkeys((*_TEXTS, *SUFFIXES)))
+    if suffix not in known:
         raise HistoryError(
             f"history {path}: the suffix is {path.suffix!r}, expected one of "
-            f"{', '.join(SUFFIXES)}; save it as one of these"
+            f"{', '.join(known)}; save it as one of these"
         )
+    layout = layout or Recording()
     try:
-        if suffix == ".csv":
-            return _read_csv(
-                path, [each for each in (names or {}).values() if isinstance(each, str)]
+        if suffix in _TEXTS:
+            columns = {**dict(layout.columns), **(names or {})}
+            return _read_text(
+                path, [each for each in columns.values() if isinstance(each, str)], layout
             )
         return _read_parquet(path) if suffix == ".parquet" else _read_netcdf(path)
     except FileNotFoundError:
@@ -56,29 +69,35 @@ def read_table(path: Path, names: Mapping[str, object] | None = None) -> pd.Data
         raise HistoryError(f"history {path}: cannot be read: {error}") from None
 
 
-def _read_csv(path: Path, others: list[str]) -> pd.DataFrame:
+def _read_text(path: Path, others: list[str], layout: Recording) -> pd.DataFrame:
     content = path.read_bytes()
     lines = content.removeprefix(b"\xef\xbb\xbf").splitlines()
     if not any(line.strip() for line in lines):
         raise HistoryError(f"history {path}: the file is empty; expected a header and rows")
+    given = SEPARATORS.get(layout.separator, layout.separator).encode()
     # a spreadsheet may write "1,5;2,0"
-    separator = next((mark for mark in (b",", b";", b"\t") if mark in lines[0]), b",")
-    decimal = "," if separator != b"," and b"," in content else "."
+    found = next((mark for mark in (b",", b";", b"\t") if mark in lines[0]), b"")
+    separator = given or found or (b"," if len(lines[0].split()) < 2 else _BLANKS)
+    decimal = "," if separator in (b";", b"\t") and b"," in content else "."
+    first = _cells(lines[0], separator)
+    header = layout.header if layout.header is not None else not all(map(_is_number, first))
     # pandas fills short rows with blanks without a word: a file that was cut off would pass.
     if b'"' not in content:
-        cells = lines[0].count(separator) + 1
         for number, line in enumerate(lines, start=1):
-            found = line.count(separator) + 1
-            if found != cells and line.strip():
+            cells = len(_cells(line, separator))
+            if cells != len(first) and line.strip():
                 raise HistoryError(
-                    f"history row {number}: {found} cells, expected {cells} as in the header; "
-                    f"repair or drop the row (file {path})"
+                    f"history row {number}: {cells} cells, expected {len(first)} as in the first"
+                    f" line; repair or drop the row (file {path})"
                 )
-    number_columns = {name: _MISSING for name in ("step", "time", *STATE, *WRENCH, *others)}
+    unnamed = [] if header else [str(i) for i in range(len(first))]
+    number_columns = dict.fromkeys(("step", "time", *STATE, *WRENCH, *others, *unnamed), _MISSING)
     try:
         frame: pd.DataFrame = pd.read_csv(
             io.BytesIO(content),
             sep=separator.decode(),
+            header=0 if header else None,
+            names=None if header else unnamed,
             decimal=decimal,
             dtype={"trajectory": "str", "body": "str"},
             keep_default_na=False,
@@ -93,7 +112,22 @@ def _read_csv(path: Path, others: list[str]) -> pd.DataFrame:
         raise HistoryError(f"history {path}: not a CSV table: {error}") from None
     if not isinstance(frame.index, pd.RangeIndex):
         raise HistoryError(f"history {path}: rows have more cells than the header; repair them")
+    frame.attrs["headerless"] = not header
     return frame
+
+
+def _cells(line: bytes, separator: bytes) -> list[bytes]:
+    """Return the cells of a line."""
+    return line.split() if separator == _BLANKS else line.split(separator)
+
+
+def _is_number(cell: bytes) -> bool:
+    """Return whether a cell is a number, with a point or a comma."""
+    try:
+        float(cell.replace(b",", b"."))
+    except ValueError:
+        return False
+    return True
 
 
 def _read_parquet(path: Path) -> pd.DataFrame:

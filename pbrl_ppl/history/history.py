@@ -16,8 +16,9 @@ from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history.conversion import Reading, as_history
 from pbrl_ppl.history.files import as_table, read_table, to_table, write_dataset
 from pbrl_ppl.history.kinematics import complete_start, kinematic_bodies, path_velocities
+from pbrl_ppl.history.layout import layout_of
 from pbrl_ppl.history.rows import arrays
-from pbrl_ppl.scene import Scene
+from pbrl_ppl.scene import Recording, Scene
 from pbrl_ppl.state import STATE, STATE_UNITS, WRENCH, WRENCH_UNITS, Bools, Floats, Ints
 
 
@@ -112,7 +113,8 @@ class History:
         path : str or pathlib.Path
             File with one row for each (trajectory, step, body), or one that `save` wrote.
         scene : Scene
-            The bodies, hinges and time step that are expected.
+            The bodies, hinges and time step that are expected; its ``recording`` says how a file of
+            another program is laid out.
         estimate_velocities : bool
             Whether single transitions (Eq. 11) may start from velocities that were never measured,
             as estimated from positions by a local polynomial. Whole trajectories need no estimate.
@@ -127,9 +129,10 @@ class History:
         """
         path = Path(path)
         return cls.from_dataframe(
-            read_table(path, reading.get("columns")),
+            read_table(path, reading.get("columns"), scene.recording),
             scene,
             estimate_velocities=estimate_velocities,
+            layout=scene.recording,
             source=f"history {path}",
             **reading,
         )
@@ -141,16 +144,22 @@ class History:
         scene: Scene,
         *,
         estimate_velocities: bool = False,
+        layout: Recording | None = None,
         source: str = "history",
         **reading: Unpack[Reading],
     ) -> History:
-        """Build a history from a table; arguments, errors and row numbers as `load` of a file."""
+        """Build a history from a table; arguments, errors and row numbers as `load` of a file.
+
+        A table is a history's unless ``layout`` says otherwise, such as the scene's ``recording``.
+        """
         if not isinstance(frame, pd.DataFrame):
             raise HistoryError(f"{source}: got {type(frame).__name__}, expected a pandas.DataFrame")
-        frame = as_history(frame, scene, source, **reading)
+        layout = layout_of(frame, layout)
+        frame = as_history(frame, scene, source, layout, **reading)
         table = arrays(frame, scene, source)
         start, assumed = complete_start(table.state, scene)
-        if estimate_velocities:  # of positions that were measured, or that hinges give
+        estimated = layout is not None and layout.velocities == "estimate"
+        if estimate_velocities or estimated:  # of positions that were measured, or that hinges give
             assumed[:, 3:] &= assumed[:, :3]
         n, k = len(table.n_rows), len(scene.moving)
         rows = ("trajectory", "time", "body")

@@ -7,6 +7,8 @@ from .checks import Point as Point
 from .checks import nearest as nearest
 from .joints import WORLD as WORLD
 from .joints import Joint as Joint
+from .recording import SEPARATORS as SEPARATORS
+from .recording import Recording as Recording
 from .scene import Scene as Scene
 from .shape import Shape as Shape
 from .units import MASS_PRIOR as MASS_PRIOR

@@ -29,6 +29,7 @@ from pbrl_ppl.scene.checks import (
     vector,
 )
 from pbrl_ppl.scene.joints import WORLD, Joint
+from pbrl_ppl.scene.recording import Recording
 from pbrl_ppl.scene.shape import Shape
 
 #: Engine steps a sample, at most: twice what `close_loop` goes to where data are that exact.
@@ -61,6 +62,8 @@ class Scene:
     test_is_later : bool
         Whether a test recording was made after the training recording, so that what lasts from some
         trajectory on, such as a payload, holds in it.
+    recording : Recording, optional
+        How files of recordings are laid out; by default as a history's.
 
     Raises
     ------
@@ -83,6 +86,7 @@ class Scene:
     joints: tuple[Joint, ...] = ()
     noise: Named = ()
     test_is_later: bool = True
+    recording: Recording | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "gravity", vector(self.gravity, 2, "[world]: gravity"))
@@ -106,6 +110,8 @@ class Scene:
                     raise SceneError(f"scene: {key} holds {part!r}, expected a {kind.__name__}")
             object.__setattr__(self, key, parts)
         object.__setattr__(self, "noise", stated_noise(self.noise))
+        if self.recording is not None and not isinstance(self.recording, Recording):
+            raise SceneError(f"scene: recording is {self.recording!r}, expected a Recording")
         self._check_bodies()
         self._check_joints()
 
@@ -199,6 +205,8 @@ class Scene:
         for where, table in arrays["joint"]:
             with located(where):
                 joints.append(Joint(**table))
+        if (layout := world["recording"]) is not None:
+            world["recording"] = Recording(**layout)
         any_joints = world.pop("joints", None) == "any"
         scene = cls(bodies=tuple(bodies), walls=tuple(walls), joints=tuple(joints), **world)
         return scene.with_any_joints() if any_joints else scene
@@ -211,6 +219,8 @@ class Scene:
         sections = [("[world]", table)]
         if self.noise:
             sections.append(("[noise]", dict(self.noise)))
+        if self.recording is not None:
+            sections.append(("[recording]", self.recording.table()))
         for body in self.bodies:
             table = dict(vars(body), shape=vars(body.shape), known=dict(body.known))
             table["prior"] = {name: dict(hyper) for name, hyper in body.prior}

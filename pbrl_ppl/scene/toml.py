@@ -14,9 +14,13 @@ Table = dict[str, Any]
 
 #: Required and optional keys of each table.
 KEYS: dict[str, tuple[str, str]] = {
-    "the file": ("world", "noise body wall joint"),
+    "the file": ("world", "noise recording body wall joint"),
     "[world]": ("time_step", "gravity normal_gravity substeps test_is_later joints"),
     "[noise]": ("", " ".join(STATE)),
+    "[recording]": (
+        "",
+        "columns units separator header not_seen velocities resample trim cut topics",
+    ),
     "body": (
         "name shape",
         "wheel static kinematic known prior effects pose class attributes typical",
@@ -28,7 +32,7 @@ KEYS: dict[str, tuple[str, str]] = {
 
 
 def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
-    """Return ``[world]`` with the noise, and the tables of each array with their places.
+    """Return ``[world]`` with noise and recording, and the tables of each array with their places.
 
     Raises
     ------
@@ -49,6 +53,9 @@ def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
         )
     noise = document.get("noise", {})
     _check_keys(noise, "[noise]")
+    recording = document.get("recording")
+    if recording is not None:
+        _check_keys(recording, "[recording]")
     arrays: dict[str, list[tuple[str, Table]]] = {}
     for key in ("body", "wall", "joint"):
         arrays[key] = list(_tables(document, key))
@@ -56,7 +63,7 @@ def read(text: str) -> tuple[Table, dict[str, list[tuple[str, Table]]]]:
             _check_keys(table, where, key)
             if key == "body":
                 _check_keys(table["shape"], f"shape of {where}", "shape")
-    return {**document["world"], "noise": noise}, arrays
+    return {**document["world"], "noise": noise, "recording": recording}, arrays
 
 
 def write(sections: Sequence[tuple[str, Mapping[str, Any]]]) -> str:

@@ -485,7 +485,7 @@ def test_the_first_broken_rule_is_reported_in_the_row_of_the_file(tmp_path: Path
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.txt", b"", "suffix is '.txt', expected one of .csv, .parquet, .nc"),
+        ("a.xlsx", b"", "suffix is '.xlsx', expected one of .csv, .txt, .tsv, .dat, .parquet, .nc"),
         ("a.csv", b"", "the file is empty"),
         ("a.csv", b"\n \n", "the file is empty"),
         ("a.csv", b"\xff\xfe,\n1,2\n", "not a CSV table"),

@@ -1,0 +1,135 @@
+"""How a recording is laid out: columns, units, separators, and where it is cut."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any
+
+from pbrl_ppl.errors import SceneError
+from pbrl_ppl.scene.checks import finite, flag, nearest, positive
+
+#: Separators by name; others are a single character.
+SEPARATORS = {"blank": r"\s+", "tab": "\t", "comma": ",", "semicolon": ";"}
+#: What the columns of velocities are.
+VELOCITIES = ("measured", "computed", "estimate")
+
+Pairs = tuple[tuple[str, Any], ...]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """Layout of a recording's files: the table ``[recording]`` of a scene file.
+
+    Of a file that has all columns of a history, ``columns``, ``units`` and ``not_seen`` are not
+    used. Wrench columns that a file lacks are zero: nothing pushed.
+
+    Attributes
+    ----------
+    columns : tuple of (str, str or float)
+        Column of the file for each of a history, ``{ x = "pos_x" }``, or a number that holds on all
+        rows; of a file without header the number of the column, from 0. ``duration`` in place of
+        ``time`` is the time since the row before. A dict will do here and below.
+    units : tuple of (str, str)
+        Unit of each column that is not in SI units, ``{ x = "mm" }``.
+    separator : str
+        ``"blank"``, ``"tab"``, ``"comma"``, ``"semicolon"`` or a character; found from the first
+        line by default.
+    header : bool, optional
+        Whether the first line names the columns; by default whether it holds anything but numbers.
+    not_seen : tuple of (str, float)
+        Values that stand for "not seen": a body's row with all of them is empty,
+        ``{ x = 0.0, y = 0.0 }``. In the file's units.
+    velocities : str
+        ``"measured"``, ``"computed"`` (differences of positions: left out) or ``"estimate"``
+        (single transitions may start from velocities that are estimated from positions).
+    resample : bool
+        Whether uneven samples are interpolated to the scene's time step.
+    trim : bool
+        Whether commands leave out rows at a trajectory's ends that belong to no model; in Python
+        :func:`pbrl_ppl.history.trimmed` does.
+    cut : tuple of (str, float)
+        Where trajectories are cut: ``every`` so many seconds, at ``gaps`` longer than so many
+        seconds, at ``rests`` of at least so many seconds, at ``jumps`` of a velocity by more than
+        so many m/s between rows.
+    topics : tuple of (str, str)
+        Topic of each body in a ROS bag or an MCAP file.
+
+    Raises
+    ------
+    SceneError
+        If a value is of another kind, or a name is unknown.
+
+    Examples
+    --------
+    >>> Recording(columns={"duration": 0, "x": 1, "y": 2}, header=False, cut={"jumps": 0.2}).cut
+    (('jumps', 0.2),)
+    """
+
+    columns: Pairs = ()
+    units: Pairs = ()
+    separator: str = ""
+    header: bool | None = None
+    not_seen: Pairs = ()
+    velocities: str = "measured"
+    resample: bool = False
+    trim: bool = False
+    cut: Pairs = ()
+    topics: Pairs = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            if field.type == "Pairs":
+                pairs = _pairs(getattr(self, field.name), f"[recording]: {field.name}")
+                object.__setattr__(self, field.name, pairs)
+        for name, column in self.columns:
+            if isinstance(column, bool) or not isinstance(column, str | int | float):
+                raise SceneError(
+                    f"[recording]: column {name} is {column!r}, expected a name or a number"
+                )
+        for key, kind in (("units", str), ("topics", str)):
+            for name, value in getattr(self, key):
+                if not isinstance(value, kind):
+                    raise SceneError(f"[recording]: {key} of {name} is {value!r}, expected text")
+        known = (*SEPARATORS, "")
+        if self.separator not in known and len(self.separator) != 1:
+            raise SceneError(
+                f"[recording]: separator is {self.separator!r}, expected one of"
+                f" {', '.join(SEPARATORS)} or one character"
+            )
+        if self.header is not None:
+            flag(self.header, "[recording]: header")
+        flag(self.resample, "[recording]: resample")
+        flag(self.trim, "[recording]: trim")
+        if self.velocities not in VELOCITIES:
+            raise SceneError(
+                f"[recording]: velocities is {self.velocities!r}, expected one of"
+                f" {', '.join(VELOCITIES)}{nearest(self.velocities, VELOCITIES)}"
+            )
+        for name, value in self.not_seen:
+            finite(value, f"[recording]: not_seen of {name}")
+        cuts = ("every", "gaps", "rests", "jumps")
+        for name, value in self.cut:
+            if name not in cuts:
+                raise SceneError(
+                    f'[recording]: cut has no "{name}", only {", ".join(cuts)}{nearest(name, cuts)}'
+                )
+            positive(value, f"[recording]: cut, {name}")
+
+    def table(self) -> dict[str, Any]:
+        """Return the entries of the TOML table: those that are not the defaults."""
+        table: dict[str, Any] = {}
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if value != field.default:
+                table[field.name] = dict(value) if field.type == "Pairs" else value
+        return table
+
+
+def _pairs(value: object, where: str) -> Pairs:
+    """Return names with their values."""
+    if isinstance(value, Mapping):
+        return tuple(value.items())
+    if isinstance(value, tuple) and all(isinstance(e, tuple) and len(e) == 2 for e in value):
+        return value
+    raise SceneError(f"{where} is {value!r}, expected a table such as {{ x = ... }}")
