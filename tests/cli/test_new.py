@@ -54,7 +54,7 @@ def refused(capsys: pytest.CaptureFixture[str], options: str) -> str:
 def test_three_commands_from_a_raw_table_to_a_verdict(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Its own names, milliseconds and degrees; each command says the next one's options."""
+    """Its own names, milliseconds and degrees are said once; the scene file keeps them."""
     seen: list[Any] = []
 
     def close_loop(scene: Any, train: Any, *rest: Any, **options: Any) -> Loop:
@@ -67,9 +67,9 @@ def test_three_commands_from_a_raw_table_to_a_verdict(
     assert run(f"new --history swing.csv {COLUMNS} {UNITS} {PENDULUM} {known}") == 0
     said = capsys.readouterr().out
     advised = said.partition("next: pbrl-ppl ")[2].strip()
-    assert advised == f"check scene.toml swing.csv {COLUMNS} {UNITS} --estimate-velocities"
+    assert advised == "check scene.toml swing.csv"
     declared = Scene.load(MODELS / "pendulum" / "scene.toml")
-    assert Scene.load("scene.toml") == declared.replace(substeps=10)
+    assert Scene.load("scene.toml").replace(recording=None) == declared.replace(substeps=10)
     assert run(f"{advised} --no-prior --json -q") == 0
     assert '"transitions"' in capsys.readouterr().out
     assert run(f"close-loop {advised.removeprefix('check ')} -o out -q") == 0
@@ -98,7 +98,8 @@ def test_a_double_pendulum_side_by_side_in_a_row(capsys: pytest.CaptureFixture[s
     assert scene.body("lower").known == (("mass", 0.2),) and scene.gravity == (0.0, -9.81)
     # its samples are uneven: later commands interpolate them
     said = capsys.readouterr().out
-    assert "--time-step 0.0101 --estimate-velocities" in said
+    assert "samples are uneven: interpolated every 0.0101 s" in said
+    assert scene.recording is not None and scene.recording.resample
 
 
 @pytest.mark.usefixtures("swing")
@@ -141,7 +142,7 @@ def test_a_pushed_block_beside_a_wall() -> None:
         ("--body b=polygon:0,0/1", "is not NAME=SHAPE"),
         ("--from pendulum", "--from copies a model as it is"),
         ("--columns x=px", "add --history"),
-        ("--history swing.csv", "it has no column trajectory; say which it is"),
+        ("--history swing.csv", "it has no column time; say which it is"),
         ("--history swing.csv --columns time=sec", 'no column "sec" for time'),
         (f"--history swing.csv {COLUMNS} --units time=h", '"h" is none of time'),
         ("--history swing.csv --columns time=volts", "its times do not rise"),
