@@ -18,8 +18,10 @@ from pbrl_ppl.cli import options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import (
     FAILED,
+    INTERRUPTED,
     UNDECIDED,
     check_can_make,
+    interrupted,
     interruptible,
     print_result,
     stages,
@@ -29,6 +31,10 @@ from pbrl_ppl.errors import OutputError
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
     from pbrl_ppl.report import Source
+
+
+#: How sentences on found effects begin.
+_FOUND = ("simulations name", "added")
 
 
 class Method(StrEnum):
@@ -145,9 +151,25 @@ def close_loop(
         from pbrl_ppl import criticism
 
         criticism.check_folder(output, overwrite)
-        loop = criticism.close_loop(
-            declared, *histories, seed=seed, draws=draws, method=method.value, progress=progress
-        )
+        found: list[str] = []
+
+        def noted(stage: str) -> None:
+            progress(stage)
+            if stage.startswith(_FOUND):
+                found.append(stage)
+
+        stopped = False
+        try:
+            loop = criticism.close_loop(
+                declared, *histories, seed=seed, draws=draws, method=method.value, progress=noted
+            )
+        except criticism.LoopInterrupted as interrupt:
+            progress("interrupted: Gaussians at the modes instead; once more ends without a report")
+            loop, stopped = interrupt.finish(), True
+        except KeyboardInterrupt:
+            so_far = f"so far: {'; '.join(found)}; " if found else ""
+            advice = "--method laplace, fewer rows or a coarser log take less time"
+            raise typer.Exit(interrupted(f"nothing was written; {so_far}{advice}")) from None
         progress("writing the report")
         source = report.Source(
             str(scene), str(train), str(test or ""), options.command_line(context)
@@ -160,6 +182,8 @@ def close_loop(
         loop.to_dict() | {"report": output / "report.html"} | remainder,
         report.in_brief(loop, output, words),
     )
+    if stopped:
+        raise typer.Exit(INTERRUPTED)
     if loop.verdict == criticism.NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
 

@@ -2,6 +2,7 @@
 
 from .attribution import Attribution as Attribution
 from .attribution import attribute as attribute
+from .closing import LoopInterrupted as LoopInterrupted
 from .closing import close_loop as close_loop
 from .criteria import DEFAULT as DEFAULT
 from .criteria import TRIED as TRIED

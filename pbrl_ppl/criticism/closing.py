@@ -118,6 +118,9 @@ def close_loop(
         If the histories do not fit each other or are too short.
     EffectError
         If the scene declares an unknown effect.
+    LoopInterrupted
+        If it is interrupted while it samples: the effects are found, and ``finish()`` returns the
+        loop with Gaussians at the modes.
 
     Warns
     -----
@@ -142,7 +145,21 @@ def close_loop(
         numbered = test.numbered(after) if scene.test_is_later else test
     # matrices are small: threads of linear algebra only get in each other's way
     with threadpool_limits(1, "blas"):
-        return replace(_closed(task, train, numbered), held_out=test, catalogue=task.catalogue)
+        return _closed(task, train, numbered, test)
+
+
+class LoopInterrupted(KeyboardInterrupt):
+    """Interrupt of :func:`close_loop` while it samples: the effects are found.
+
+    Parameters
+    ----------
+    finish : callable
+        Returns the loop with Gaussians at the modes in place of samples.
+    """
+
+    def __init__(self, finish: Callable[[], Loop]) -> None:
+        super().__init__("sampling was interrupted")
+        self.finish = finish
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,8 +200,8 @@ class _Search:
     steps: list[Step]
 
 
-def _closed(task: _Task, train: History, test: History) -> Loop:
-    """Go through the stages of :func:`close_loop`."""
+def _closed(task: _Task, train: History, test: History, recorded: History) -> Loop:
+    """Go through the stages of :func:`close_loop`; ``recorded`` is ``test`` as it was given."""
     seed, criteria, say = task.seed, task.criteria, task.say
     if task.substeps is not None:
         task.scene.replace(substeps=task.substeps)  # it is checked there
@@ -249,20 +266,29 @@ def _closed(task: _Task, train: History, test: History) -> Loop:
     misfit = misfit.with_test(
         held_out_forecasts(tested, noise_alone(revised, after), longest, criteria)
     )
-    say(Stage.SAMPLE)
-    posteriors = _posteriors(task, [declared, revised] if steps else [declared])
-    first = last = _Model(revised, after, posteriors[-1], held_out)
-    if revised is not declared:
-        first = _Model(declared, before, posteriors[0], HeldOut.of(declared, test))
-    say(Stage.COMPARE)
-    return replace(
-        _put_together(task, train, first, last, steps, misfit, longest),
-        candidates=selection.explained(search.first),
-        small=tuple(selection.small),
-        velocities_not_used=unused,
-        bad_frames=bad,
-        criteria=criteria,
-    )
+
+    def sampled(task: _Task) -> Loop:
+        say(Stage.SAMPLE)
+        posteriors = _posteriors(task, [declared, revised] if steps else [declared])
+        first = last = _Model(revised, after, posteriors[-1], held_out)
+        if revised is not declared:
+            first = _Model(declared, before, posteriors[0], HeldOut.of(declared, test))
+        say(Stage.COMPARE)
+        return replace(
+            _put_together(task, train, first, last, steps, misfit, longest),
+            candidates=selection.explained(search.first),
+            small=tuple(selection.small),
+            velocities_not_used=unused,
+            bad_frames=bad,
+            criteria=criteria,
+            held_out=recorded,
+            catalogue=task.catalogue,
+        )
+
+    try:
+        return sampled(task)
+    except KeyboardInterrupt:
+        raise LoopInterrupted(partial(sampled, replace(task, method="laplace"))) from None
 
 
 def _compile(scene: Scene, train: History, effects: tuple[Attached, ...]) -> None:
