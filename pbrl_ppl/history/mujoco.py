@@ -25,7 +25,10 @@ FLAT = 1e-3
 
 @dataclass(frozen=True)
 class _Joint:
-    """A joint's number, kind, axis in the plane's coordinates, and places in qpos and qvel."""
+    """A joint's number, kind, axis in the plane's coordinates, and places in qpos and qvel.
+
+    ``parent`` is the moving body that holds its body, if any.
+    """
 
     number: int
     kind: int
@@ -33,6 +36,7 @@ class _Joint:
     position: int
     velocity: int
     reference: float
+    parent: str | None
 
 
 def from_mujoco(
@@ -51,7 +55,8 @@ def from_mujoco(
 
     Bodies go by their names in the model. A body has slide joints along the plane's axes, a hinge
     about its normal, or a free joint; a coordinate without a joint is not measured, so a
-    pendulum's hinge gives its angle and rate. A scene's body has its origin where MuJoCo's body
+    pendulum's hinge gives its angle and rate. Angles in a chain of hinges are added up, and a motor
+    between two bodies acts on both. A scene's body has its origin where MuJoCo's body
     frame is: put that at the shape's centroid, unless a hinge alone holds it.
 
     Parameters
@@ -124,6 +129,7 @@ def from_mujoco(
             raise HistoryError(
                 f'body "{name}" leaves the plane; expected one that moves in it alone'
             )
+    _add_parents_angles(model, state, joints)
     if ctrl is not None and wrench is not None:
         raise HistoryError("ctrl and wrench are both given; expected one of them")
     action = np.zeros((n, rows, k, len(WRENCH)))
@@ -175,6 +181,8 @@ def _joints(model: Any, name: str, axes: Floats, reach: float) -> list[_Joint]:
         ) from None
     numbers = (body.jntadr, body.jntnum, body.parentid)
     first, count, parent = (int(np.ravel(number)[0]) for number in numbers)
+    holder = int(model.body_weldid[parent])
+    above = str(model.body(holder).name) if holder else None
     found = []
     for number in range(first, first + count):
         kind = int(model.jnt_type[number])
@@ -192,7 +200,7 @@ def _joints(model: Any, name: str, axes: Floats, reach: float) -> list[_Joint]:
             )
         place, rate = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
         reference = float(model.qpos0[place])
-        found.append(_Joint(number, kind, axis, place, rate, reference))
+        found.append(_Joint(number, kind, axis, place, rate, reference, above))
     slides = [joint for joint in found if joint.kind == SLIDE]
     turns = np.abs(np.asarray(body.quat)[1:]).max()
     if len(slides) == 1 or (found and found[0].kind != FREE and turns > FLAT):
@@ -241,6 +249,22 @@ def _fill(
     return True
 
 
+def _add_parents_angles(model: Any, state: Floats, joints: dict[str, list[_Joint]]) -> None:
+    """Add to angles and rates in a chain of hinges those of the bodies above, in place."""
+    order = list(joints)
+    for name in sorted(order, key=lambda each: int(model.body(each).id)):  # parents come first
+        for joint in joints[name]:
+            if joint.parent is None:
+                continue
+            if joint.parent not in joints:
+                raise HistoryError(
+                    f'body "{name}" hangs on body "{joint.parent}" of the MuJoCo model, which does'
+                    " not move in the scene; add that body to the scene"
+                )
+            body, above = state[:, :, order.index(name)], state[:, :, order.index(joint.parent)]
+            body[..., [2, 5]] += above[..., [2, 5]]
+
+
 def _motor_wrenches(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
     """Return the wrenches of motors at joints, shape (trajectory, row, body, 3)."""
     holder = {joint.number: (i, joint) for i, held in enumerate(joints.values()) for joint in held}
@@ -266,4 +290,6 @@ def _motor_wrenches(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -
             wrench[:, :, body, :2] += force[..., None] * joint.axis[:2]
         else:
             wrench[:, :, body, 2] += force * joint.axis[2]
+            if joint.parent is not None:
+                wrench[:, :, list(joints).index(joint.parent), 2] -= force * joint.axis[2]
     return wrench

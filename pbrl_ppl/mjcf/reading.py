@@ -234,7 +234,13 @@ class _View:
         return body, Joint("hinge", (other, name), at_parent, at_child)
 
     def angle(self, i: int) -> float:
-        """Return a body's angle: zero in the reference configuration if it is not free."""
+        """Return a body's angle in the reference configuration.
+
+        A free body's is that of its frame; of others it is the parent's, and zero on the world.
+        """
+        parent = int(self.model.body_weldid[self.model.body_parentid[i]])
+        if parent:
+            return self.angle(parent)
         if self.model.jnt_type[self.model.body_jntadr[i]] != FREE:
             return 0.0
         frame = self.axes @ self.data.xmat[i].reshape(3, 3) @ self.axes.T

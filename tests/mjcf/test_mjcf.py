@@ -146,6 +146,33 @@ def test_a_free_box_and_its_fall() -> None:
     np.testing.assert_allclose(states[..., 2], theta, atol=1e-6)
 
 
+def test_a_log_of_a_chain_on_a_free_body() -> None:
+    """The scene and the log of one model agree, with a parent that is turned in the model."""
+    xml = CRATE.replace(
+        'mass="2"/>',
+        """mass="2"/>
+      <body name="tail" pos="-.2 0 0"><joint type="hinge" axis="0 1 0"/>
+        <geom type="box" pos="-.1 0 0" size=".1 .02 .02" mass=".2"/></body>""",
+    )
+    scene = quiet(xml, plane="xz", known_mass=True, time_step=0.02)
+    assert [body.shape for body in scene.bodies] == [Shape.box(0.4, 0.2), Shape.box(0.2, 0.04)]
+    assert scene.joints == (Joint("hinge", ("crate", "tail"), (-0.2, 0.0), (0.1, 0.0)),)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qvel[4], data.qvel[6] = 1.0, 4.0
+    qpos, qvel, places = [], [], []
+    for _ in range(21):
+        mujoco.mj_forward(model, data)
+        qpos.append(data.qpos.copy())
+        qvel.append(data.qvel.copy())
+        places.append(data.xipos[2, [0, 2]].copy())
+        mujoco.mj_step(model, data)
+    history = pp.from_mujoco(model, scene, qpos, qvel, plane="xz")
+    start = history.dataset["start"].to_numpy()[0, :, 1]
+    np.testing.assert_allclose(start[:, :2], places[::10], atol=1e-9)
+    assert scene.body("tail").pose == pytest.approx(start[0, :3])
+
+
 def test_a_table_seen_from_above() -> None:
     with pytest.warns(ConversionWarning) as said:
         scene = pp.scene_from_mjcf(TABLE)
