@@ -28,7 +28,11 @@ from .effects import catalogue as catalogue
 from .errors import PbrlError as PbrlError
 from .history import History as History
 from .history import Segments as Segments
+from .history.bags import bag_topics as bag_topics
+from .history.bags import read_bag as read_bag
 from .history.mujoco import from_mujoco as from_mujoco
+from .mjcf import mjcf_ranges as mjcf_ranges
+from .mjcf import scene_from_mjcf as scene_from_mjcf
 from .model import SimulatorOp as SimulatorOp
 from .modes import joint_probabilities as joint_probabilities
 from .oomdp import LWR as LWR

@@ -69,6 +69,10 @@ class ResamplingWarning(UserWarning):
     """A history whose samples were not evenly spaced, and were interpolated."""
 
 
+class ConversionWarning(UserWarning):
+    """A scene of another simulator's model that leaves out what scenes do not have."""
+
+
 class FitError(PbrlError, ValueError):
     """A model that cannot be fitted as asked."""
 

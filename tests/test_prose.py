@@ -37,7 +37,10 @@ BLOCKS = [block for path in PROSE for block in blocks(path, "python")]
 
 
 def exported(folder: Path) -> None:
-    """Write the logs that the page Your own log reads, from the recorded cart."""
+    """Write the logs that the pages on logs read, from the recorded cart."""
+    pytest.importorskip("rosbags")
+    from tests.helpers.bags import Bag
+
     rows = pd.read_csv(CART / "recorded" / "train.csv")
     mocap = pd.DataFrame({"take": rows.trajectory, "t": 1e3 * rows.time, "px": 1e3 * rows.x})
     mocap = mocap.assign(
@@ -60,6 +63,14 @@ def exported(folder: Path) -> None:
     for name, column in (("force.x", "force_x"), ("force.y", "force_y"), ("torque.z", "torque")):
         pushed[f"field.wrench.{name}"] = rows[column]
     pushed.dropna().to_csv(folder / "wrench.csv", index=False)
+    bag = Bag("ros1")
+    for row in rows.itertuples():
+        time = 100.0 * row.trajectory + row.time
+        bag.add(time, "/odom", bag.odometry(time, row.x, row.y, row.theta))
+        if not np.isnan(row.torque):
+            wrench = bag.wrench_stamped(time, row.force_x, row.force_y, row.torque)
+            bag.add(time, "/wrench", wrench)
+    bag.write(folder)
 
 
 def loaded(tree: ast.Module) -> Iterator[str]:
@@ -154,6 +165,28 @@ def test_logs_of_others_are_the_same_recording(tmp_path, monkeypatch) -> None:
     )
     assert mocap["observed"].sel(state="vx").isnull().all()
     assert names["slid"].dataset.sizes["time"] == 21
+
+
+def test_bags_and_models_of_robots(tmp_path, monkeypatch) -> None:
+    """The bag holds the cart's recording; blocks with a posterior run with all others."""
+    pytest.importorskip("mujoco")
+    monkeypatch.chdir(tmp_path)
+    exported(tmp_path)
+    scene = pp.Scene.load(CART / "scene.toml")
+    whole = pp.History.load(CART / "recorded" / "train.csv", scene).dataset
+    names: dict[str, Any] = {"pp": pp, "scene": scene, "np": np}
+    for block in blocks(DOCS / "pages" / "guides" / "robots.md", "python"):
+        if "idata" not in block:
+            exec(compile(block, block, "exec"), names)
+    bag = names["from_bag"].dataset
+    place = ["x", "y"]
+    np.testing.assert_allclose(
+        bag["observed"].sel(state=place), whole["observed"].sel(state=place), atol=1e-5
+    )
+    turn = (bag["observed"] - whole["observed"]).sel(state="theta")
+    np.testing.assert_allclose(np.sin(turn), 0.0, atol=1e-5)
+    np.testing.assert_allclose(bag["action"], whole["action"], atol=1e-9)
+    assert names["arm_log"].dataset.sizes["time"] == 51
 
 
 @pytest.mark.long

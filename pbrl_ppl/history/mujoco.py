@@ -16,16 +16,19 @@ from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
 #: A plane's axes in MuJoCo's world, and its normal: a top view, and a side view.
-_PLANES = {"xy": np.eye(3), "xz": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
+PLANES = {"xy": np.eye(3), "xz": np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])}
 #: mjtJoint as numbers, as in mjmodel.h.
-_FREE, _SLIDE, _HINGE = 0, 2, 3
+FREE, SLIDE, HINGE = 0, 2, 3
 #: How far out of the plane is out of it, of a unit vector or in bounding radii.
-_FLAT = 1e-3
+FLAT = 1e-3
 
 
 @dataclass(frozen=True)
 class _Joint:
-    """A joint's number, kind, axis in the plane's coordinates, and places in qpos and qvel."""
+    """A joint's number, kind, axis in the plane's coordinates, and places in qpos and qvel.
+
+    ``parent`` is the moving body that holds its body, if any.
+    """
 
     number: int
     kind: int
@@ -33,6 +36,7 @@ class _Joint:
     position: int
     velocity: int
     reference: float
+    parent: str | None
 
 
 def from_mujoco(
@@ -51,7 +55,8 @@ def from_mujoco(
 
     Bodies go by their names in the model. A body has slide joints along the plane's axes, a hinge
     about its normal, or a free joint; a coordinate without a joint is not measured, so a
-    pendulum's hinge gives its angle and rate. A scene's body has its origin where MuJoCo's body
+    pendulum's hinge gives its angle and rate. Angles in a chain of hinges are added up, and a motor
+    between two bodies acts on both. A scene's body has its origin where MuJoCo's body
     frame is: put that at the shape's centroid, unless a hinge alone holds it.
 
     Parameters
@@ -93,7 +98,7 @@ def from_mujoco(
         qpos, qvel = state[..., 1 : 1 + model.nq], state[..., 1 + model.nq :]
         history = pp.from_mujoco(model, scene, qpos[:, :-1], qvel[:, :-1], ctrl=ctrl[:, 1:])
     """
-    if plane not in _PLANES:
+    if plane not in PLANES:
         raise HistoryError(f"plane is {plane!r}, expected xy (a top view) or xz (a side view)")
     positions = _batched(qpos, model.nq, "qpos", "nq")
     velocities = _batched(qvel, model.nv, "qvel", "nv")
@@ -110,7 +115,7 @@ def from_mujoco(
             f"rows are {step:g} s apart and the scene's time_step is {scene.time_step:g} s;"
             " expected a whole number of rows a step; change the scene's, or give time_step"
         )
-    axes = _PLANES[plane]
+    axes = PLANES[plane]
     reach = [body.shape.bounding_radius for body in scene.moving]
     joints = {
         body.name: _joints(model, body.name, axes, size)
@@ -124,6 +129,7 @@ def from_mujoco(
             raise HistoryError(
                 f'body "{name}" leaves the plane; expected one that moves in it alone'
             )
+    _add_parents_angles(model, state, joints)
     if ctrl is not None and wrench is not None:
         raise HistoryError("ctrl and wrench are both given; expected one of them")
     action = np.zeros((n, rows, k, len(WRENCH)))
@@ -175,27 +181,29 @@ def _joints(model: Any, name: str, axes: Floats, reach: float) -> list[_Joint]:
         ) from None
     numbers = (body.jntadr, body.jntnum, body.parentid)
     first, count, parent = (int(np.ravel(number)[0]) for number in numbers)
+    holder = int(model.body_weldid[parent])
+    above = str(model.body(holder).name) if holder else None
     found = []
     for number in range(first, first + count):
         kind = int(model.jnt_type[number])
         axis = axes @ np.asarray(model.jnt_axis[number])
-        along = np.abs(axis[2]) if kind == _HINGE else np.linalg.norm(axis[:2])
-        if kind not in (_FREE, _SLIDE, _HINGE) or (kind != _FREE and along < 1 - _FLAT):
+        along = np.abs(axis[2]) if kind == HINGE else np.linalg.norm(axis[:2])
+        if kind not in (FREE, SLIDE, HINGE) or (kind != FREE and along < 1 - FLAT):
             raise HistoryError(
                 f'body "{name}": its joint {number} leads out of the plane; expected slides in it,'
                 " a hinge about its normal, or a free joint"
             )
-        if count > 1 and kind == _HINGE and np.abs(model.jnt_pos[number]).max() > _FLAT * reach:
+        if count > 1 and kind == HINGE and np.abs(model.jnt_pos[number]).max() > FLAT * reach:
             raise HistoryError(
                 f'body "{name}": its hinge is not at its frame\'s origin, as a body that slides'
                 " needs; put the frame there"
             )
         place, rate = int(model.jnt_qposadr[number]), int(model.jnt_dofadr[number])
         reference = float(model.qpos0[place])
-        found.append(_Joint(number, kind, axis, place, rate, reference))
-    slides = [joint for joint in found if joint.kind == _SLIDE]
+        found.append(_Joint(number, kind, axis, place, rate, reference, above))
+    slides = [joint for joint in found if joint.kind == SLIDE]
     turns = np.abs(np.asarray(body.quat)[1:]).max()
-    if len(slides) == 1 or (found and found[0].kind != _FREE and turns > _FLAT):
+    if len(slides) == 1 or (found and found[0].kind != FREE and turns > FLAT):
         raise HistoryError(
             f'body "{name}": expected slides along both axes or none, and a body that is not'
             " turned in the model; a free joint has all"
@@ -217,28 +225,44 @@ def _fill(
     reach: float,
 ) -> bool:
     """Fill a body's states (trajectory, row, 6) in place; return whether it stays in the plane."""
-    if any(joint.kind == _SLIDE for joint in joints):
+    if any(joint.kind == SLIDE for joint in joints):
         state[..., :2], state[..., 3:5] = origin, 0.0
     for joint in joints:
         at, rate = joint.position, joint.velocity
         moved = qpos[..., at] - joint.reference
-        if joint.kind == _FREE:
+        if joint.kind == FREE:
             place = qpos[..., at : at + 3] @ axes.T
             turn = qpos[..., at + 4 : at + 7] @ axes.T
             drift = np.ptp(place[..., 2], axis=1).max() if place.size else 0.0
-            if np.abs(turn[..., :2]).max() > _FLAT or drift > _FLAT * reach:
+            if np.abs(turn[..., :2]).max() > FLAT or drift > FLAT * reach:
                 return False
             state[..., :2] = place[..., :2]
             state[..., 2] = 2 * np.arctan2(turn[..., 2], qpos[..., at + 3])
             state[..., 3:5] = (qvel[..., rate : rate + 3] @ axes.T)[..., :2]
             state[..., 5] = (qvel[..., rate + 3 : rate + 6] @ axes.T)[..., 2]
-        elif joint.kind == _SLIDE:
+        elif joint.kind == SLIDE:
             state[..., :2] += moved[..., None] * joint.axis[:2]
             state[..., 3:5] += qvel[..., rate, None] * joint.axis[:2]
         else:
             state[..., 2] = moved * joint.axis[2]
             state[..., 5] = qvel[..., rate] * joint.axis[2]
     return True
+
+
+def _add_parents_angles(model: Any, state: Floats, joints: dict[str, list[_Joint]]) -> None:
+    """Add to angles and rates in a chain of hinges those of the bodies above, in place."""
+    order = list(joints)
+    for name in sorted(order, key=lambda each: int(model.body(each).id)):  # parents come first
+        for joint in joints[name]:
+            if joint.parent is None:
+                continue
+            if joint.parent not in joints:
+                raise HistoryError(
+                    f'body "{name}" hangs on body "{joint.parent}" of the MuJoCo model, which does'
+                    " not move in the scene; add that body to the scene"
+                )
+            body, above = state[:, :, order.index(name)], state[:, :, order.index(joint.parent)]
+            body[..., [2, 5]] += above[..., [2, 5]]
 
 
 def _motor_wrenches(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -> Floats:
@@ -250,7 +274,7 @@ def _motor_wrenches(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -
     for number in range(ctrl.shape[-1]):
         is_motor = not any(kind[number] for kind in (*kinds, model.actuator_trntype))
         body, joint = holder.get(int(model.actuator_trnid[number, 0]), (-1, None))
-        if not is_motor or joint is None or joint.kind == _FREE:
+        if not is_motor or joint is None or joint.kind == FREE:
             raise HistoryError(
                 f"actuator {number} is no motor of a slide or hinge of the scene's bodies; give"
                 " wrench in place of ctrl"
@@ -262,8 +286,10 @@ def _motor_wrenches(model: Any, joints: dict[str, list[_Joint]], ctrl: Floats) -
         if model.actuator_forcelimited[number]:
             force = np.clip(force, *model.actuator_forcerange[number])
         force = force * model.actuator_gear[number, 0]
-        if joint.kind == _SLIDE:
+        if joint.kind == SLIDE:
             wrench[:, :, body, :2] += force[..., None] * joint.axis[:2]
         else:
             wrench[:, :, body, 2] += force * joint.axis[2]
+            if joint.parent is not None:
+                wrench[:, :, list(joints).index(joint.parent), 2] -= force * joint.axis[2]
     return wrench

@@ -103,6 +103,35 @@ def test_a_pendulum_in_a_side_view() -> None:
     np.testing.assert_allclose(start[:2], np.array([0.0, 1.0]) + below, atol=1e-9)
 
 
+def test_a_chain_of_hinges_and_its_motors() -> None:
+    """MuJoCo's angle of the lower link is relative to the upper one, a history's is not."""
+    xml = ARM.replace("</body>", """
+      <body name="tip" pos="0 0 -.4"><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02"/>
+        <joint name="elbow" type="hinge" axis="0 -1 0"/></body></body>""").replace(
+        "</mujoco>", '<actuator><motor joint="elbow" gear="2"/></actuator></mujoco>')  # fmt: skip
+    bodies = Body("tip", Shape.box(0.04, 0.2)), Body("arm", Shape.box(0.04, 0.4))
+    hinges = (
+        Joint("hinge", ("arm", "world"), anchor_a=(0.0, 0.2), anchor_b=(0.0, 1.0)),
+        Joint("hinge", ("arm", "tip"), anchor_a=(0.0, -0.2), anchor_b=(0.0, 0.1)),
+    )
+    scene = Scene(time_step=0.05, gravity=(0.0, -9.81), bodies=bodies, joints=hinges)
+    ctrl = np.full((101, 1), 0.01)
+    model, qpos, qvel, poses = rollout(xml, 101, ([0.7, 1.1], [1.0, 0.0]), ctrl)
+    history = from_mujoco(model, scene, qpos, qvel, ctrl=ctrl, plane="xz")
+    start = history.dataset["start"].to_numpy()[0]
+    for row, (xpos, xmat) in zip(start, poses[::5], strict=True):
+        for body, reach, place in zip(row, (0.1, 0.2), (1, 0), strict=True):
+            up = xmat[place].reshape(3, 3)[[0, 2], 2]
+            np.testing.assert_allclose(up, (-np.sin(body[2]), np.cos(body[2])), atol=1e-9)
+            np.testing.assert_allclose(body[:2], xpos[place][[0, 2]] - reach * up, atol=1e-9)
+    np.testing.assert_allclose(start[0, :, 5], -1.0)
+    torque = history.dataset["action"].to_numpy()[0, :-1, :, 2]
+    np.testing.assert_allclose(torque, np.tile((0.02, -0.02), (20, 1)))
+    alone = Scene(time_step=0.05, bodies=bodies[:1])
+    with pytest.raises(HistoryError, match=r'"tip" hangs on body "arm".*add that body'):
+        from_mujoco(model, alone, qpos, qvel, plane="xz")
+
+
 def test_what_is_no_plane_motion_is_refused() -> None:
     model, qpos, qvel, _ = rollout(SLED, 11)
     good = {"qpos": qpos, "qvel": qvel}

@@ -1,0 +1,285 @@
+"""Tables from ROS 1 bags, ROS 2 bags and MCAP files.
+
+The library ``rosbags`` reads them, so that no ROS is needed: ``pip install 'pbrl_ppl[ros]'``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import fields, is_dataclass
+from numbers import Real
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from pbrl_ppl.errors import HistoryError
+from pbrl_ppl.scene import nearest
+from pbrl_ppl.state import Bools, Floats
+
+#: Suffixes of single files; a ROS 2 bag may also be a folder.
+SUFFIXES = (".bag", ".db3", ".mcap")
+
+_NANO = 1e-9
+
+
+def bag_topics(path: str | Path) -> dict[str, str]:
+    """Return the topics of a bag with their message types.
+
+    Parameters
+    ----------
+    path : str or Path
+        As of :func:`read_bag`.
+
+    Raises
+    ------
+    HistoryError
+        If the bag is missing or cannot be read, or ``rosbags`` is not installed.
+
+    Examples
+    --------
+    ::
+
+        bag_topics("run.mcap")
+        {'/odom': 'nav_msgs/msg/Odometry', '/wrench': 'geometry_msgs/msg/WrenchStamped'}
+    """
+    with _opened(Path(path)) as reader:
+        return _types(reader)
+
+
+def read_bag(
+    path: str | Path,
+    topics: Mapping[str, str | Sequence[str]],
+    *,
+    longest_array: int = 8,
+    longest_gap: float = 3.0,
+) -> pd.DataFrame:
+    """Return the messages of a bag's topics as a table, with one row for each time and body.
+
+    The rows are at the stamps of the first body's messages. Other bodies are interpolated to these
+    stamps (angles unwrapped), within the time in which every body has messages. If a body has
+    several topics, the first has its stamps, and of the others the last message before a row
+    counts: a command is held.
+
+    Parameters
+    ----------
+    path : str or Path
+        A ROS 1 bag (.bag), a ROS 2 bag (a folder with metadata.yaml, or .db3) or a file of MCAP.
+    topics : mapping of str to str or sequence of str
+        The topic, or topics, of each body by the body's name. The name ``""`` is for a scene with
+        one body: the table then has no column ``body``.
+    longest_array : int
+        Arrays of more numbers are left out, as a covariance is.
+    longest_gap : float
+        Cells of a body that is interpolated are empty in gaps between its messages that are longer
+        than this many of its usual (median) intervals.
+
+    Returns
+    -------
+    DataFrame
+        ``time`` (s, from the first row on), from the headers' stamps if all messages of a topic
+        have one, else the times at which the bag received them; ``body``; each number of the
+        message under its path (``pose.pose.position.x``); and ``yaw`` (rad, unwrapped), the
+        rotation about z of the message's first quaternion. A number of a short array is
+        ``position[shoulder]`` where the message names its elements, as a JointState does, else
+        ``data[0]``. Text, flags, headers and lists of messages are left out. A column that an
+        earlier topic of the body has too is followed by its topic: ``data (/right/command)``. Of
+        messages with equal stamps the last is kept.
+
+    Raises
+    ------
+    HistoryError
+        If the bag is missing or cannot be read, a topic is not in it, has no messages or no
+        numbers, the bodies have no time in common, or ``rosbags`` is not installed.
+
+    Examples
+    --------
+    ::
+
+        log = pp.read_bag("run.bag", {"": ["/odom", "/wrench"]})
+        columns = {"x": "pose.pose.position.x", "y": "pose.pose.position.y", "theta": "yaw",
+                   "force_x": "wrench.force.x", "force_y": "wrench.force.y",
+                   "torque": "wrench.torque.z"}
+        history = pp.History.from_dataframe(log, scene, columns=columns, resample=True)
+    """
+    path = Path(path)
+    listed = {body: [names] if isinstance(names, str) else list(names)
+              for body, names in topics.items()}  # fmt: skip
+    if not listed or not all(listed.values()):
+        raise HistoryError(
+            f"bag {path}: topics is {dict(topics)!r}, expected a topic for each body, such as"
+            ' {"cart": "/odom"}'
+        )
+    if "" in listed and len(listed) > 1:
+        raise HistoryError(
+            f'bag {path}: topics names the body "" among {len(listed)}; name each body as the scene'
+            " does"
+        )
+    tables: dict[str, pd.DataFrame] = {}
+    with _opened(path) as reader:
+        there = _types(reader)
+        for topic in dict.fromkeys(name for names in listed.values() for name in names):
+            if topic not in there:
+                have = ", ".join(f"{name} ({kind})" for name, kind in there.items()) or "none"
+                raise HistoryError(
+                    f'bag {path}: there is no topic "{topic}"{nearest(topic, there)} Its topics:'
+                    f" {have}"
+                )
+            tables[topic] = _messages(reader, topic, there[topic], path, longest_array)
+    bodies = {body: _held([tables[name] for name in names], names, path)
+              for body, names in listed.items()}  # fmt: skip
+    first, *others = bodies.values()
+    begin = max(table.index[0] for table in bodies.values())
+    end = min(table.index[-1] for table in bodies.values())
+    stamps = first.index[(first.index >= begin) & (first.index <= end)]
+    if not len(stamps):
+        spans = ", ".join(
+            f"{_NANO * table.index[0]:.3f} to {_NANO * table.index[-1]:.3f} s ({body})"
+            for body, table in bodies.items()
+        )
+        raise HistoryError(
+            f"bag {path}: the bodies' messages have no time in common: {spans}; record them"
+            " together, with the stamps of one clock"
+        )
+    whole = [first.loc[stamps], *(_interpolated(each, stamps, longest_gap) for each in others)]
+    time = _NANO * (stamps - stamps[0]).to_numpy()
+    for body, table in zip(bodies, whole, strict=True):
+        table.insert(0, "time", time)
+        if body:
+            table.insert(1, "body", body)
+    joined: pd.DataFrame = pd.concat(whole, ignore_index=True)
+    order = np.arange(len(joined)).reshape(len(whole), -1).T.ravel()  # by time, then body
+    rows: pd.DataFrame = joined.iloc[order].reset_index(drop=True)
+    return rows
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a bag; raise what fails in reading as a `HistoryError`."""
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError:
+        raise HistoryError(
+            f"bag {path}: reading it needs rosbags: pip install 'pbrl_ppl[ros]'"
+        ) from None
+    if not path.exists():
+        raise HistoryError(f"bag {path}: there is no such file or folder; check the path")
+    if path.is_file() and path.suffix not in SUFFIXES:
+        raise HistoryError(
+            f"bag {path}: the suffix is {path.suffix!r}, expected {', '.join(SUFFIXES)} or a folder"
+            " with metadata.yaml"
+        )
+    try:
+        # bags of ROS 2 before Iron hold no definitions of their messages
+        with AnyReader([path], default_typestore=get_typestore(Stores.LATEST)) as reader:
+            yield reader
+    except HistoryError:
+        raise
+    except Exception as error:  # damaged files raise errors of many kinds
+        raise HistoryError(
+            f"bag {path}: cannot be read ({type(error).__name__}: {error}); record it to its end,"
+            " or repair it with `rosbag reindex`, `ros2 bag reindex` or `mcap recover`"
+        ) from None
+
+
+def _types(reader: Any) -> dict[str, str]:
+    """Return the message type of each topic; several of one topic with "or" between them."""
+    found: dict[str, dict[str, None]] = {}
+    for connection in sorted(reader.connections, key=lambda each: each.topic):
+        found.setdefault(connection.topic, {})[connection.msgtype] = None
+    return {topic: " or ".join(kinds) for topic, kinds in found.items()}
+
+
+def _messages(reader: Any, topic: str, kind: str, path: Path, longest: int) -> pd.DataFrame:
+    """Return the numbers of a topic's messages by their stamps (ns)."""
+    rows: list[dict[str, float]] = []
+    received, stamped = [], []
+    connections = [each for each in reader.connections if each.topic == topic]
+    for connection, time, content in reader.messages(connections=connections):
+        message = reader.deserialize(content, connection.msgtype)
+        stamp = getattr(getattr(message, "header", None), "stamp", None)
+        stamped.append(0 if stamp is None else stamp.sec * 1_000_000_000 + stamp.nanosec)
+        received.append(time)
+        row: dict[str, float] = {}
+        _flatten(message, "", row, longest)
+        rows.append(row)
+    if not rows:
+        raise HistoryError(f'bag {path}: topic "{topic}" ({kind}) has no messages; record it')
+    table = pd.DataFrame(rows, index=stamped if all(stamped) else received, dtype=float)
+    if table.columns.empty:
+        raise HistoryError(
+            f'bag {path}: messages of topic "{topic}" ({kind}) have no numbers outside lists of'
+            " messages; choose a topic of one body, such as its odometry or pose"
+        )
+    table = table.sort_index(kind="stable")
+    table = table[~table.index.duplicated(keep="last")]
+    if "yaw" in table:
+        seen = table["yaw"].notna()
+        table.loc[seen, "yaw"] = np.unwrap(table.loc[seen, "yaw"])
+    return table
+
+
+def _flatten(message: Any, path: str, row: dict[str, float], longest: int) -> None:
+    """Add the numbers of a message under their paths, and ``yaw``."""
+    values = {field.name: getattr(message, field.name) for field in fields(message)}
+    given = (values.get(name) for name in ("name", "names", "joint_names"))
+    labels = next((each for each in given if isinstance(each, list) and each), None)
+    for name, value in values.items():
+        if is_dataclass(value):
+            if name != "header":
+                _flatten(value, f"{path}{name}.", row, longest)
+        elif isinstance(value, Real) and not isinstance(value, bool):
+            row[path + name] = float(value)
+        elif isinstance(value, np.ndarray) and value.dtype.kind in "iuf":
+            each = range(len(value)) if labels is None else labels
+            if len(value) <= longest and len(value) == len(each):
+                row |= {
+                    f"{path}{name}[{label}]": float(number)
+                    for label, number in zip(each, value, strict=True)
+                }
+    if {*values} - {"__msgtype__"} == {*"xyzw"} and "yaw" not in row:
+        x, y, z, w = (values[name] for name in "xyzw")
+        # an orientation that was left out is all zeros
+        known = any((x, y, z, w))
+        yaw = math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
+        row["yaw"] = yaw if known else math.nan
+
+
+def _held(tables: list[pd.DataFrame], topics: list[str], path: Path) -> pd.DataFrame:
+    """Return the first table with the last row before of the others."""
+    whole, *others = tables
+    for table, topic in zip(others, topics[1:], strict=True):
+        whole = whole[whole.index >= table.index[0]]
+        if whole.empty:
+            raise HistoryError(
+                f'bag {path}: "{topic}" begins after the last message of "{topics[0]}"; record them'
+                " together, with the stamps of one clock"
+            )
+        held = table.reindex(whole.index, method="ffill")
+        there = {name: f"{name} ({topic})" for name in held if name in whole}
+        whole = whole.join(held.rename(columns=there))
+    return whole
+
+
+def _interpolated(table: pd.DataFrame, stamps: pd.Index, longest_gap: float) -> pd.DataFrame:
+    """Return a table's columns at other stamps (ns), within its own."""
+    zero = table.index[0]  # doubles hold nanoseconds since 1970 to 0.2 microseconds alone
+    have, want = ((index - zero).to_numpy().astype(float) for index in (table.index, stamps))
+    empty = _in_gaps(have, want, longest_gap)
+    columns = {name: np.where(empty, np.nan, np.interp(want, have, table[name])) for name in table}
+    return pd.DataFrame(columns, index=stamps)
+
+
+def _in_gaps(have: Floats, want: Floats, longest_gap: float) -> Bools:
+    """Return which times are between two others that are too far apart."""
+    if len(have) < 2:
+        return np.zeros(len(want), dtype=bool)
+    gaps = np.diff(have)
+    after = np.searchsorted(have, want).clip(1, len(have) - 1)
+    at_one = np.isin(want, have)
+    inside: Bools = (gaps[after - 1] > longest_gap * np.median(gaps)) & ~at_one
+    return inside
