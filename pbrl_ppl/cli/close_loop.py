@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli import options
+from pbrl_ppl.cli import effect_files, options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import (
     FAILED,
@@ -79,6 +79,7 @@ def close_loop(
             " verdict then stands."
         ),
     ] = Method.IMPORTANCE,
+    effect_file: effect_files.EffectFiles = None,
     noise: options.Noise = None,
     estimate_velocities: options.Velocities = False,
     columns: options.Columns = None,
@@ -117,9 +118,13 @@ def close_loop(
     if many is not None:
         if not (scene is train is test is None):
             raise typer.BadParameter("SCENE, TRAIN and --test are in the manifest, with --many")
-        for name, given in (("--trim", trim), ("--learn-remainder", learn_remainder)):
+        for name, given in (
+            ("--trim", trim),
+            ("--learn-remainder", learn_remainder),
+            ("--effect-file", effect_file),
+        ):
             if given:
-                raise typer.BadParameter(f"{name} is for one log; leave it, or --many")
+                raise typer.BadParameter(f"{name} is for one log; omit it, or omit --many")
         _close_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
@@ -140,14 +145,16 @@ def close_loop(
         declared, histories = options.load(
             scene, paths, reading, time_step=time_step, noise=noise, substeps=substeps
         )
+        catalogue = effect_files.with_catalogue(effect_file)
         progress("loading the sampler")
         import pbrl_ppl.report as report
         from pbrl_ppl import criticism
 
         criticism.check_folder(output, overwrite)
         loop = criticism.close_loop(
-            declared, *histories, seed=seed, draws=draws, method=method.value, progress=progress
-        )
+            declared, *histories, catalogue=catalogue, seed=seed, draws=draws,
+            method=method.value, progress=progress,
+        )  # fmt: skip
         progress("writing the report")
         source = report.Source(
             str(scene), str(train), str(test or ""), options.command_line(context)
