@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli import options
+from pbrl_ppl.cli import effect_files, options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import (
     FAILED,
@@ -30,7 +30,9 @@ from pbrl_ppl.errors import OutputError
 
 if TYPE_CHECKING:
     from pbrl_ppl.criticism import Loop
+    from pbrl_ppl.history import History
     from pbrl_ppl.report import Source
+    from pbrl_ppl.scene import Scene
 
 
 #: How sentences on found effects begin.
@@ -85,6 +87,7 @@ def close_loop(
             " verdict then stands."
         ),
     ] = Method.IMPORTANCE,
+    effect_file: effect_files.EffectFiles = None,
     noise: options.Noise = None,
     estimate_velocities: options.Velocities = False,
     columns: options.Columns = None,
@@ -123,9 +126,13 @@ def close_loop(
     if many is not None:
         if not (scene is train is test is None):
             raise typer.BadParameter("SCENE, TRAIN and --test are in the manifest, with --many")
-        for name, given in (("--trim", trim), ("--learn-remainder", learn_remainder)):
+        for name, given in (
+            ("--trim", trim),
+            ("--learn-remainder", learn_remainder),
+            ("--effect-file", effect_file),
+        ):
             if given:
-                raise typer.BadParameter(f"{name} is for one log; leave it, or --many")
+                raise typer.BadParameter(f"{name} is for one log; omit it, or omit --many")
         _close_many(
             many, output, jobs=jobs, scheduler=scheduler, as_json=as_json, quiet=quiet,
             again=overwrite, seed=seed, substeps=substeps, draws=draws,
@@ -146,30 +153,16 @@ def close_loop(
         declared, histories = options.load(
             scene, paths, reading, time_step=time_step, noise=noise, substeps=substeps
         )
+        catalogue = effect_files.with_catalogue(effect_file)
         progress("loading the sampler")
         import pbrl_ppl.report as report
         from pbrl_ppl import criticism
 
         criticism.check_folder(output, overwrite)
-        found: list[str] = []
-
-        def noted(stage: str) -> None:
-            progress(stage)
-            if stage.startswith(_FOUND):
-                found.append(stage)
-
-        stopped = False
-        try:
-            loop = criticism.close_loop(
-                declared, *histories, seed=seed, draws=draws, method=method.value, progress=noted
-            )
-        except criticism.LoopInterrupted as interrupt:
-            progress("interrupted: Gaussians at the modes instead; once more ends without a report")
-            loop, stopped = interrupt.finish(), True
-        except KeyboardInterrupt:
-            so_far = f"so far: {'; '.join(found)}; " if found else ""
-            advice = "--method laplace, fewer rows or a coarser log take less time"
-            raise typer.Exit(interrupted(f"nothing was written; {so_far}{advice}")) from None
+        loop, stopped = _finished(
+            declared, histories, progress, catalogue=catalogue, seed=seed, draws=draws,
+            method=method.value,
+        )  # fmt: skip
         progress("writing the report")
         source = report.Source(
             str(scene), str(train), str(test or ""), options.command_line(context)
@@ -186,6 +179,34 @@ def close_loop(
         raise typer.Exit(INTERRUPTED)
     if loop.verdict == criticism.NOT_CONVERGED:
         raise typer.Exit(UNDECIDED)
+
+
+def _finished(
+    scene: Scene, histories: Sequence[History], progress: Callable[[str], None], **settings: Any
+) -> tuple[Loop, bool]:
+    """Return the loop, with Gaussians at the modes if it is interrupted while it samples.
+
+    The second value is whether it was. An earlier interrupt ends the command, and says what was
+    found.
+    """
+    from pbrl_ppl import criticism
+
+    found: list[str] = []
+
+    def noted(stage: str) -> None:
+        progress(stage)
+        if stage.startswith(_FOUND):
+            found.append(stage)
+
+    try:
+        return criticism.close_loop(scene, *histories, progress=noted, **settings), False
+    except criticism.LoopInterrupted as interrupt:
+        progress("interrupted: Gaussians at the modes instead; once more ends without a report")
+        return interrupt.finish(), True
+    except KeyboardInterrupt:
+        so_far = f"so far: {'; '.join(found)}; " if found else ""
+        advice = "--method laplace, fewer rows or a coarser log take less time"
+        raise typer.Exit(interrupted(f"nothing was written; {so_far}{advice}")) from None
 
 
 def _remainder(

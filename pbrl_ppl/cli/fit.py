@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli import options
+from pbrl_ppl.cli import effect_files, options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import (
     INTERRUPTED,
@@ -60,6 +60,7 @@ def fit(
         float | None,
         typer.Option(min=0.1, help="Degrees of freedom of Student-t noise; else Gaussian."),
     ] = None,
+    effect_file: effect_files.EffectFiles = None,
     noise: options.Noise = None,
     substeps: options.Substeps = None,
     method: Annotated[
@@ -109,6 +110,7 @@ def fit(
         declared, (loaded,) = options.load(
             scene, [history], reading, time_step=time_step, noise=noise, substeps=substeps
         )
+        declared, own = effect_files.added_effects(declared, effect_files.own_effects(effect_file))
         progress("loading the sampler")
         from pbrl_ppl import sampling
         from pbrl_ppl.physics import check_history
@@ -119,7 +121,7 @@ def fit(
         progress("looking for the mode, then sampling")
         try:
             model = sampling.physics_model(
-                declared, loaded, likelihood=likelihood, horizon=horizon, nu=nu, seed=seed,
+                declared, loaded, own, likelihood=likelihood, horizon=horizon, nu=nu, seed=seed,
                 sigma="scalar" if scalar else "per_dimension",
                 around=None if likelihood == "transitions" else earlier,
             )  # fmt: skip
@@ -200,6 +202,7 @@ def update(
     output: Annotated[
         Path, typer.Option("-o", "--output", metavar="FILE", help="The new posterior file.")
     ],
+    effect_file: effect_files.EffectFiles = None,
     seed: options.Seed = 1,
     estimate_velocities: options.Velocities = False,
     columns: options.Columns = None,
@@ -217,6 +220,7 @@ def update(
     reading = options.Reading(columns, units, estimate_velocities, trim, resample)
     with interruptible(), stages(quiet) as progress:
         check_file(output, (".nc",), overwrite)
+        catalogue = effect_files.with_catalogue(effect_file)
         progress("reading the posterior and the history")
         from pbrl_ppl.posterior import load_posterior, save_posterior, scene_of
 
@@ -237,7 +241,7 @@ def update(
                 show(message, category, *place, **more)  # at once: a refit takes long
 
             warnings.showwarning = shown
-            idata = updating.update(idata, new, seed=seed, progress=False)
+            idata = updating.update(idata, new, effects=catalogue, seed=seed, progress=False)
         if "interrupted" in idata.attrs:  # half a posterior is no prior for the next update
             raise KeyboardInterrupt
         save_posterior(idata, output)

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pbrl_ppl.cli import options
+from pbrl_ppl.cli import effect_files, options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import FAILED, check_file, interruptible, print_result, stages
 from pbrl_ppl.errors import GoalError
@@ -61,6 +61,7 @@ def plan(
         float | None,
         typer.Option(help="Another limit (s); the plan then depends on the machine's load."),
     ] = None,
+    effect_file: effect_files.EffectFiles = None,
     seed: options.Seed = 1,
     animate: Annotated[
         Path | None,
@@ -77,6 +78,7 @@ def plan(
         for path, ending in ((output, ".csv"), (animate, ".gif")):
             if path is not None:
                 check_file(path, (ending,), overwrite)
+        catalogue = effect_files.with_catalogue(effect_file)
         progress("reading the posterior")
         from pbrl_ppl.planning import ActionSet, Goal
         from pbrl_ppl.planning import plan as make_plan
@@ -107,7 +109,7 @@ def plan(
         progress("planning")
         result = make_plan(
             idata, starts, wanted, allowed, method=method, draws=draws, tail=tail, noise=noise,
-            seconds=seconds, seed=seed, progress=progress, **limit,
+            seconds=seconds, effects=catalogue, seed=seed, progress=progress, **limit,
         )  # fmt: skip
         if output is not None:
             result.save(output)

@@ -13,14 +13,23 @@ from scipy.stats import binom
 
 from pbrl_ppl.criticism.criteria import DEFAULT, PriorCriteria
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.history import History, longest_gap, measurement_noise
+from pbrl_ppl.history import (
+    History,
+    longest_gap,
+    measured_alone,
+    measurement_noise,
+    unused_velocities,
+)
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import HDI_PROB
-from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, Floats, Ints, wrapped
+from pbrl_ppl.state import POSE, STATE, STATE_UNITS, THETA, Bools, Floats, Ints, wrapped
 
 #: Quantiles: the ends of the interval, its quartiles and the median.
 QUANTILES = (0.5 - HDI_PROB / 2, 0.25, 0.5, 0.75, 0.5 + HDI_PROB / 2)
 _CHUNK = 16
+#: A coordinate that never moves has mean square changes of at most this many times those of its
+#: noise over all times, up to so many intervals or more.
+_STILL, _STILL_INTERVALS = 2.0, 4
 #: Factors of wrong units: m and mm or N and mN; degrees; kg for the weight of a kg.
 _UNITS = {1000.0: "1000", 180 / np.pi: "57.3", 9.81: "9.81"}
 
@@ -105,9 +114,10 @@ def prior_predictive_check(
 ) -> PriorCheck:
     """Compare measured changes over a segment with predictions under the prior.
 
-    The noise added to the predictions is the median of sigma's prior, or the noise estimated from
-    the measurements alone, if that is larger. Draws from sigma's prior would not do: it is scaled
-    by the data, and so wide that noise could explain any change.
+    The noise added to the predictions is the median of sigma's prior, or the measurement noise, if
+    that is larger: the scene's where it states it, else an estimate from the measurements alone.
+    Draws from sigma's prior would not do: it is scaled by the data, and so wide that noise could
+    explain any change. Velocities that were computed from positions are not compared.
 
     Parameters
     ----------
@@ -150,6 +160,9 @@ def prior_predictive_check(
     rng = np.random.default_rng(seed)
     observations, segments = problem.observations, problem.segments
     columns = list(observations.columns)
+    unused = unused_velocities(problem.data.history)
+    history = measured_alone(problem.data.history, unused)
+    recorded = np.isfinite(history.dataset["observed"].to_numpy()).any(axis=(0, 1))
     noise = problem.noise_prior[0]
     first = segments.start[..., columns]
     # of bodies that are seen now and then, the last measured row counts
@@ -157,6 +170,9 @@ def prior_predictive_check(
     last = np.maximum((steps * observations.measured).max(axis=1), 1) - 1
     measured = _at(observations.values, last)
     measured = observations.wrapped(measured - first)
+    for velocity in unused:
+        if (d := STATE.index(velocity.state)) in columns:
+            measured[:, history.bodies.index(velocity.body), columns.index(d)] = np.nan
     names = [block.name for block in problem.layout.blocks]
     from pbrl_ppl.model import prior_predictive_draws  # PyMC takes seconds to load
 
@@ -178,16 +194,14 @@ def prior_predictive_check(
         )
     exact = observations.wrapped(ends[good] - first)
     # sensors may be worse than the prior's median; both ends of a change have an error
-    known = measurement_noise(problem.data.history)
+    known = _measurement_noise(history, dict(problem.scene.noise))
     noisy = np.sqrt(2.0) * known
     seconds = problem.data.horizon * problem.scene.time_step
     noisy[:, : len(POSE)] = np.hypot(noisy[:, : len(POSE)], seconds * known[:, len(POSE) :])
     predicted = ends[good] + np.maximum(noise, noisy[:, columns]) * rng.standard_normal(exact.shape)
     derived = np.ones(measured.shape[1:])
     for i, d in enumerate(columns):
-        rate = d if d >= len(POSE) else d + len(POSE)
-        seen = np.isfinite(problem.data.history.dataset["observed"].to_numpy()[..., rate])
-        derived[:, i] = ~seen.any(axis=(0, 1))
+        derived[:, i] = ~recorded[:, d if d >= len(POSE) else d + len(POSE)]
     dataset = _compare(observations.wrapped(predicted - first), measured, criteria.slack * derived)
     dataset = dataset.merge(_factors(exact, measured))
     coords = {
@@ -262,22 +276,59 @@ def telling_horizon(history: History, criteria: PriorCriteria = DEFAULT.prior) -
     angle = np.tile(np.arange(len(POSE)) == THETA, len(places) // len(POSE))
     longest = int(history.dataset["n_rows"].min()) - 1
 
-    def size(steps: int, order: int) -> Floats:
-        change = places
-        for _ in range(order):
-            change = change[:, steps:] - change[:, :-steps]
-            change = np.where(angle[:, None], wrapped(change), change)
-        if not change.size:
-            return np.zeros(len(places))
-        return np.asarray(np.nan_to_num(np.nanmean(change**2, axis=1)))
+    steps = [longest_gap(history)]
+    while steps[-1] < longest:
+        steps.append(min(2 * steps[-1], longest))
+    noise = _mean_square(places, angle, 1, 3) / 20.0
+    changes = np.array([_mean_square(places, angle, each, 1) for each in steps])
+    telling = changes >= criteria.signal**2 * noise
+    moves = (telling & (changes > 0.0)).any(
+        axis=0
+    )  # what never moves beyond its noise does not decide
+    enough = telling[:, moves].all(axis=1) & moves.any()
+    return steps[int(enough.argmax())] if enough.any() else steps[-1]
 
-    horizon = longest_gap(history)
+
+def _mean_square(values: Floats, angle: Bools, steps: int, order: int) -> Floats:
+    """Return mean squares of differences over some steps of series (series, time); 0 if none.
+
+    Differences of angles, which the mask (series,) names, are wrapped.
+    """
+    change = values
+    for _ in range(order):
+        change = change[:, steps:] - change[:, :-steps]
+        change = np.where(angle[:, None], wrapped(change), change)
+    if not change.size:
+        return np.zeros(len(values))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # means of no measurements
-        noise = size(1, 3) / 20.0
-        while horizon < longest and (size(horizon, 1) < criteria.signal**2 * noise).any():
-            horizon = min(2 * horizon, longest)
-    return horizon
+        return np.asarray(np.nan_to_num(np.nanmean(change**2, axis=1)))
+
+
+def _measurement_noise(history: History, stated: Mapping[str, float]) -> Floats:
+    """Return the measurement noise of each state, shape (body, state); 0 where it is unknown.
+
+    It is the stated one, or an estimate; of a coordinate that never moves beyond its noise the one
+    that third differences show.
+    """
+    found = measurement_noise(history)
+    observed = history.dataset["observed"].to_numpy()
+    half = observed.shape[1] // 2
+    steps = [2**k for k in range(max(half, 1).bit_length())]
+    for d, name in enumerate(STATE):
+        angle = np.full(len(observed), d == THETA)
+        for body in range(len(found)):
+            own = observed[:, :, body, d]
+            noise = float(_mean_square(own, angle, 1, 3).mean()) / 20.0
+            largest = max(float(_mean_square(own, angle, each, 1).mean()) for each in steps)
+            if half >= _STILL_INTERVALS and largest <= 2.0 * _STILL * noise:
+                found[body, d] = max(found[body, d], np.sqrt(noise))
+            if name in stated and np.isfinite(own).any():
+                if name in POSE and np.isnan(observed[:, :, body, d + len(POSE)]).all():
+                    # a velocity that a position gives is as uncertain as the position
+                    found[body, d + len(POSE)] *= stated[name] / (found[body, d] or stated[name])
+                found[body, d] = stated[name]
+    return found
 
 
 def _compare(predicted: Floats, measured: Floats, slack: Floats) -> xr.Dataset:

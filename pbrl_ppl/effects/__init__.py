@@ -3,6 +3,7 @@
 from .catalogue import attach as attach
 from .catalogue import candidates as candidates
 from .catalogue import catalogue as catalogue
+from .catalogue import check_names as check_names
 from .effect import Attached as Attached
 from .effect import Effect as Effect
 from .effect import EffectParameter as EffectParameter

@@ -70,8 +70,8 @@ def attach(
     Raises
     ------
     EffectError
-        If a name is unknown, a body is not in the scene, an effect does not apply to its body, or
-        an effect would be attached twice.
+        If a name is unknown, a body is not in the scene, an effect does not apply to its body, an
+        effect would be attached twice, or one has the name of another in the catalogue.
 
     Examples
     --------
@@ -80,10 +80,11 @@ def attach(
     >>> [a.effect.name for a in attach(Scene(time_step=0.1, bodies=(cart,)))]
     ['linear_drag']
     """
-    extra = tuple(extra)
+    extra, effects = tuple(extra), tuple(effects)
     bodies = {body.name: body for body in scene.dynamic}
     # a user's effect that is given may also be declared by name, as in a saved scene
-    given = (item.effect if isinstance(item, Attached) else item for item in extra)
+    given = [item.effect if isinstance(item, Attached) else item for item in extra]
+    check_names((*effects, *given))
     by_name = {effect.name: effect for effect in (*effects, *given)}
     result: list[Attached] = []
     for body in scene.dynamic:
@@ -93,7 +94,8 @@ def attach(
                 hint = f"; did you mean {near[0]!r}?" if near else ""
                 raise EffectError(
                     f"body {body.name!r} declares the effect {name!r}, which is not in the"
-                    f" catalogue{hint} (known: {', '.join(by_name)})"
+                    f" catalogue{hint}; give an effect of your own as an argument, or with"
+                    f" --effect-file (known: {', '.join(by_name)})"
                 )
             result.append(by_name[name].on(body.name))
     for item in extra:
@@ -118,6 +120,27 @@ def attach(
             raise EffectError(f"effect {name} is put on body {on_body!r} twice")
         seen.add((name, on_body))
     return tuple(attached.in_si(scene) for attached in result)
+
+
+def check_names(effects: Iterable[Effect]) -> None:
+    """Raise if an effect has the name of a catalogue effect, but another law.
+
+    Raises
+    ------
+    EffectError
+        Names the effect.
+
+    Examples
+    --------
+    >>> check_names(catalogue)
+    """
+    stages = {effect.name: effect.stage for effect in catalogue}
+    for effect in effects:
+        if effect.stage != stages.get(effect.name, effect.stage):
+            raise EffectError(
+                f"effect {effect.name}: the catalogue has another effect of this name; choose"
+                " another name for yours"
+            )
 
 
 def candidates(

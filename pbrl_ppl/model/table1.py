@@ -8,7 +8,6 @@ import numpy as np
 import pymc as pm
 from scipy.special import i0e
 
-from pbrl_ppl.errors import ParameterError
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.state import Floats
 
@@ -38,11 +37,6 @@ def random_variable(
         For each owner its prior if its index is 0, 1, ...; see `Block`.
     index : tensor, optional
         Index variable of each owner, whole numbers, shape (owner,).
-
-    Raises
-    ------
-    ParameterError
-        If the family is not one of Table 1 or a normal.
     """
     family = priors[0].family
 
@@ -67,13 +61,8 @@ def random_variable(
         if any(mu):
             return pm.TruncatedNormal(name, mu=mu, sigma=sigma, lower=0.0, dims=dims)
         return pm.HalfNormal(name, sigma=sigma, dims=dims)
-    if family == "categorical":
-        p = np.stack([prior.probabilities for prior in priors])
-        return pm.Categorical(name, p=p, dims=dims)
-    raise ParameterError(
-        f"prior of {name}: family {family!r} is unknown; use log_normal, truncated_normal, normal,"
-        " half_normal, von_mises or categorical"
-    )
+    p = np.stack([prior.probabilities for prior in priors])
+    return pm.Categorical(name, p=p, dims=dims)
 
 
 def _von_mises(name: str, mu: Floats, kappa: Floats, dims: str) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -15,6 +16,9 @@ from pbrl_ppl.state import Floats
 
 #: How far (in sigmas) mu may lie outside the support: farther out, densities lose their digits.
 _FARTHEST = 30.0
+FAMILIES = (
+    "log_normal", "truncated_normal", "normal", "half_normal", "von_mises", "categorical"
+)  # fmt: skip
 #: How far inside a bound the search stays, as a share of the prior's scale.
 _MARGIN = 1e-6
 
@@ -43,8 +47,9 @@ class Prior:
     Raises
     ------
     ParameterError
-        If the hyper-parameters make no distribution: a scale that is not above 0, a number that is
-        not finite, an empty support, or one so far from ``mu`` that the density underflows.
+        If the family is unknown, or the hyper-parameters make no distribution: a scale that is not
+        above 0, a number that is not finite, an empty support, or one so far from ``mu`` that the
+        density underflows.
 
     Examples
     --------
@@ -61,6 +66,12 @@ class Prior:
     weights: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
+        if self.family not in FAMILIES:
+            near = difflib.get_close_matches(str(self.family), FAMILIES, n=1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise ParameterError(
+                f"prior family {self.family!r} is unknown{hint} (known: {', '.join(FAMILIES)})"
+            )
         for key in ("mu", "sigma", "kappa"):
             value = getattr(self, key)
             if not np.isfinite(value):

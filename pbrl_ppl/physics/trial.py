@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterable
 from concurrent.futures import Future, wait
 from typing import Any
 
@@ -20,9 +21,10 @@ from pbrl_ppl.effects import (
 )
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.history import History
+from pbrl_ppl.physics.physics import Physics
 from pbrl_ppl.physics.properties import COLUMNS, SEEN
 from pbrl_ppl.scene import Body, Scene, Units, units_of
-from pbrl_ppl.state import Floats
+from pbrl_ppl.state import STATE, STATE_UNITS, Floats
 
 #: Time after which a trial counts as an endless loop (s).
 PATIENCE = 10.0
@@ -30,13 +32,19 @@ PATIENCE = 10.0
 _DRAWS = 4
 #: Wrench of a trial, in the body's natural units.
 _TRIAL = np.array([1.0, -0.5, 0.2])
+#: Intervals that are simulated with the effect at its null value and without it, and their engine
+#: steps.
+_INTERVALS, _STEPS = 6, 2
+#: Largest difference between the two that is rounding, as a share of the coordinate's size.
+_ROUNDING = 1e-9
 
 
 def try_effect(effect: Effect, scene: Scene, history: History, patience: float = PATIENCE) -> None:
     """Evaluate an effect's functions at a measured state and at parameters from its prior.
 
     In the compiled rollout, a law that raises would stop silently, and an endless one could not be
-    interrupted.
+    interrupted. A few measured intervals are also simulated with the effect at its null value and
+    without it, which must be the same.
 
     Parameters
     ----------
@@ -50,7 +58,8 @@ def try_effect(effect: Effect, scene: Scene, history: History, patience: float =
     Raises
     ------
     EffectError
-        If it raises, returns a number that is not finite, or does not return in time.
+        If it raises, returns a number that is not finite, does not return in time, or does not
+        vanish at its null value.
     """
     outcome: Future[None] = Future()
 
@@ -73,7 +82,7 @@ def try_effect(effect: Effect, scene: Scene, history: History, patience: float =
     if error is not None:
         raise EffectError(
             f"effect {effect.name} raised {type(error).__name__} when it was tried:"
-            f" {error}; mend it, or leave it out of the catalogue"
+            f" {error}; fix it, or remove it from the catalogue"
         ) from error
 
 
@@ -102,8 +111,66 @@ def _try(effect: Effect, scene: Scene, history: History) -> None:
                 )
                 raise EffectError(
                     f"effect {effect.name} gives what is not a finite number on {body.name} at"
-                    f" {shown}; mend its law or narrow its prior"
+                    f" {shown}; fix its law or narrow its prior"
                 )
+        _check_null(sized, scene, history, body)
+
+
+def _check_null(effect: Effect, scene: Scene, history: History, body: Body) -> None:
+    """Raise if simulations with the effect at its null value differ from those without it."""
+    at_null = ", ".join(
+        f"{parameter.name} = {parameter.null:.4g} {parameter.unit}".removesuffix(" 1")
+        for parameter in effect.parameters
+    )
+    cure = "change its law, or give EffectParameter the null= at which it vanishes"
+    if isinstance(effect.stage, Noise):
+        tail = float(effect.stage.tail(_named(effect, effect.null))[0, 0])
+        if tail != 0.0:
+            raise EffectError(
+                f"effect {effect.name} does not vanish on {body.name} at its null value"
+                f" ({at_null}): its tail is {tail:.3g} there, expected 0; {cure}"
+            )
+        return
+    states = np.nan_to_num(history.dataset["start"].to_numpy())
+    segments = history.pieces(states, 1)
+    chosen = np.unique(np.linspace(0, segments.n - 1, _INTERVALS).astype(int))
+    settings: dict[str, Any] = {"substeps": _STEPS, "extrapolate": False, "engine": "python"}
+    without = Physics(scene, **settings)
+    there = Physics(scene, (effect.on(body.name),), **settings)
+    values = {
+        label: prior.centre
+        for label, prior in zip(without.layout.labels, without.layout.priors, strict=True)
+    }
+    values |= dict(zip(effect.on(body.name).labels, effect.null, strict=True))
+    before, after = (
+        physics.predict(
+            np.array([values[label] for label in physics.layout.labels]),
+            segments.start[chosen],
+            physics.inputs(segments)[chosen],
+        )
+        for physics in (without, there)
+    )
+    change = np.nan_to_num(np.abs(after - before))
+    size = np.abs(np.nan_to_num(before)) + _sizes(scene)
+    relative = (change / size).max(axis=(0, 1))
+    if relative.max() > _ROUNDING:
+        moved, k = np.unravel_index(relative.argmax(), relative.shape)
+        most = change[..., moved, k].max()
+        raise EffectError(
+            f"effect {effect.name} does not vanish on {body.name} at its null value ({at_null}):"
+            f" it changes {STATE[k]} of {scene.moving[moved].name} by {most:.3g} {STATE_UNITS[k]}"
+            f" in one interval of {scene.time_step:g} s, expected no change; {cure}"
+        )
+
+
+def _sizes(scene: Scene) -> Floats:
+    """Return a small size of each coordinate of each moving body, shape (body, 6)."""
+    sizes = []
+    for body in scene.moving:
+        length = body.shape.bounding_radius
+        speed = length / scene.time_step
+        sizes.append([length, length, 1.0, speed, speed, 1.0 / scene.time_step])
+    return np.array(sizes)
 
 
 def _middle(history: History, body: Body) -> Floats:
@@ -113,13 +180,18 @@ def _middle(history: History, body: Body) -> Floats:
     return np.asarray(states[len(states) // 2] if len(states) else np.zeros(6))
 
 
-def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, units: Units) -> Floats:
-    """Return the results of an effect's functions at a state and parameters, as one array."""
-    stage: Any = effect.stage
-    named = {
+def _named(effect: Effect, parameters: Iterable[float]) -> dict[str, Floats]:
+    """Return parameters by name, shape (1, 1) each."""
+    return {
         parameter.name: np.array([[value]])
         for parameter, value in zip(effect.parameters, parameters, strict=True)
     }
+
+
+def _applied(effect: Effect, state: Floats, parameters: Floats, body: Body, units: Units) -> Floats:
+    """Return the results of an effect's functions at a state and parameters, as one array."""
+    stage: Any = effect.stage
+    named = _named(effect, parameters)
     if isinstance(stage, Force | Command):
         wrench = _TRIAL * (units.force, units.force, units.torque)
         command = wrench.copy()

@@ -7,7 +7,7 @@ from typing import Any
 
 import pymc as pm
 
-from pbrl_ppl.effects import Attached, Effect
+from pbrl_ppl.effects import LEARNED_REMAINDER, Attached, Effect, catalogue
 from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import (
     OutputErrorLikelihood,
@@ -25,7 +25,7 @@ from pbrl_ppl.modes import (
     trajectory_mode,
 )
 from pbrl_ppl.parameters import ParameterLibrary
-from pbrl_ppl.physics import Physics
+from pbrl_ppl.physics import Physics, try_effect
 from pbrl_ppl.posterior import linearised_as
 from pbrl_ppl.scene import Scene
 
@@ -55,7 +55,8 @@ def physics_model(
     history : History
         Measured transitions.
     effects : iterable of Effect or Attached
-        Effects beside those that the scene declares.
+        Effects beside those that the scene declares. Your own are tried once; see
+        :func:`pbrl_ppl.physics.try_effect`.
     likelihood : str
         ``transitions`` (Eq. 11): measured start states are exact.
 
@@ -104,7 +105,7 @@ def physics_model(
     Raises
     ------
     EffectError
-        If an effect is unknown or does not apply.
+        If an effect is unknown or does not apply, or your own does not vanish at its null value.
     HistoryError
         If the history has nothing to fit at this horizon, or nothing moves in whole trajectories,
         or start states of simulations can follow all that was measured.
@@ -138,8 +139,12 @@ def physics_model(
         raise ValueError(
             "around is given with likelihood 'transitions', expected 'trajectories' or 'simulation'"
         )
+    physics = Physics.declare(
+        with_units(scene, history), effects, substeps=substeps, threads=threads
+    )
+    _try_own(physics, history)
     problem = declared_problem(
-        Physics.declare(with_units(scene, history), effects, substeps=substeps, threads=threads),
+        physics,
         history,
         horizon=horizon,
         likelihood=TransitionLikelihood.declare(sigma, nu),
@@ -162,3 +167,11 @@ def physics_model(
         for name, value in problem.named(mode.phi, mode.sigma).items():
             model.set_initval(model[name], value)
     return model
+
+
+def _try_own(physics: Physics, history: History) -> None:
+    """Try the effects that are not of the catalogue; see :func:`pbrl_ppl.physics.try_effect`."""
+    known = {effect.name for effect in catalogue} | {LEARNED_REMAINDER}
+    own = {each.effect.name: each.effect for each in physics.effects}
+    for name in own.keys() - known:
+        try_effect(own[name], physics.scene, history)

@@ -261,3 +261,54 @@ def test_worse_sensors_than_the_noise_prior_has_are_no_wrong_prior(history, scen
     start = history.dataset["start"] + (noisy - observed).fillna(0.0)
     louder = History(history.dataset.assign(observed=noisy, start=start))
     assert prior_predictive_check(physics_model(scene, louder), draws=100).sentences == ()
+
+
+def pushed_straight(dt, velocities, seed=1) -> pd.DataFrame:
+    """A body of 2 kg that is pushed along x and never turns; all errors are 0.01."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for trajectory in range(6):
+        force, speed, turn = rng.normal(0.0, 4.0), rng.normal(), 0.3 * rng.normal()
+        time = dt * np.arange(30)
+        x = speed * time + 0.25 * force * time**2
+        states = np.zeros((30, 6))
+        states[:, 0], states[:, 2], states[:, 3] = x, turn, speed + 0.5 * force * time
+        frame = pd.DataFrame(states + 0.01 * rng.standard_normal((30, 6)), columns=list(STATE))
+        frame = frame.assign(trajectory=trajectory, time=time, body="cart", force_x=force)
+        frame = frame.assign(step=range(30), force_y=0.0, torque=0.0)
+        frame.loc[29, ["force_x", "force_y", "torque"]] = np.nan
+        rows.append(frame)
+    table = pd.concat(rows, ignore_index=True)
+    if velocities == "computed":
+        for rate, place in (("vx", "x"), ("vy", "y"), ("omega", "theta")):
+            table[rate] = table.groupby("trajectory")[place].transform(
+                lambda values: np.gradient(values, dt)
+            )
+    return table
+
+
+@pytest.mark.one_stack
+@pytest.mark.parametrize("velocities", ["measured", "computed"])
+@pytest.mark.parametrize("dt", [0.1, 0.02])
+@pytest.mark.parametrize("stated", [{}, {"x": 0.01, "theta": 0.01, "omega": 0.01}])
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_body_that_never_turns_is_no_wrong_prior(dt, velocities, stated, whole) -> None:
+    scene = Scene(time_step=dt, bodies=(Body("cart", Shape.box(0.4, 0.3)),), noise=stated)
+    history = History.from_dataframe(pushed_straight(dt, velocities), scene)
+    horizon = 29 if whole else telling_horizon(history)
+    assert whole or horizon <= 8  # what never turns does not make it longer
+    check = prior_predictive_check(physics_model(scene, history, horizon=horizon), draws=100)
+    assert check.sentences == ()
+    cells = check.dataset["cells"].sel(body="cart")
+    rates = cells.sel(state=["vx", "vy", "omega"]).to_numpy()
+    assert (rates == 0).all() if velocities == "computed" else (rates > 0).all()
+    assert (cells.sel(state=["x", "y", "theta"]) > 0).all()
+
+
+@pytest.mark.one_stack
+def test_stated_noise_is_that_of_the_predictions(scene, history) -> None:
+    """Errors as large as the angles explain an angle in degrees."""
+    degrees = scaled(history, scene, ["theta"], 180 / np.pi)
+    assert named(prior_predictive_check(physics_model(scene, degrees))) == {"theta"}
+    loud = scene.replace(noise={"theta": 3.0})
+    assert prior_predictive_check(physics_model(loud, degrees)).sentences == ()

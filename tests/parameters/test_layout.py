@@ -185,11 +185,6 @@ def test_model_has_the_same_prior(prior) -> None:
     assert model.named_vars_to_dims["phi"] == ("body",)
 
 
-def test_unknown_family_is_refused() -> None:
-    with pm.Model(coords={"body": ["one"]}), pytest.raises(ParameterError, match="cauchy"):
-        random_variable("phi", (Prior("cauchy"),), "body")
-
-
 def test_truncated_prior_far_from_its_support_can_be_sampled() -> None:
     """A belief that a scene file may state, 30 sigma outside, must not hang the sampler."""
     code = (

@@ -5,7 +5,19 @@ import time
 import numpy as np
 import pytest
 
-from pbrl_ppl.effects import Effect, EffectParameter, Force, Properties, Sensor, catalogue
+from pbrl_ppl.effects import (
+    Command,
+    Disc,
+    Effect,
+    EffectParameter,
+    Force,
+    Noise,
+    Properties,
+    Sensor,
+    Structure,
+    attach,
+    catalogue,
+)
 from pbrl_ppl.errors import EffectError
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.physics import try_effect
@@ -65,6 +77,62 @@ def test_the_whole_catalogue_passes(history) -> None:
     for scene in (PUCK, PUCK.replace(gravity=(0.0, -9.81))):
         for effect in catalogue:
             try_effect(effect, scene, history)
+
+
+def push(state, command, parameters, wrench):
+    wrench[0] += 1.0 + parameters[0]
+
+
+def halve(state, command, parameters, wrench):
+    wrench[:] *= 0.5 + parameters[0]
+
+
+def heavier(properties, parameters, clock):
+    properties["mass"] = 1.5 * properties["mass"] + parameters["size"]
+
+
+@pytest.mark.parametrize(
+    ("stage", "said"),
+    [
+        (Force(push), r"\(size = 0 N\): it changes vx of puck by 0\.\d+ m/s in one interval"),
+        (Command(halve), "changes (v[xy]|omega) of puck by"),
+        (Properties(heavier), "changes .* of puck by"),
+        (Sensor(lambda s, p: s + 1.0, lambda s, p: s - 0.9), "of puck by"),
+        (Structure(lambda p: (Disc(p["size"], 0.0 * p["size"], 9.0 + p["size"]),)), "of puck by"),
+        (Noise(lambda p: 0.1 + p["size"]), r"its tail is 0\.1 there, expected 0"),
+    ],
+)
+def test_an_effect_must_vanish_at_its_null_value(history, stage, said) -> None:
+    with pytest.raises(EffectError, match=said) as caught:
+        try_effect(own(stage), PUCK, history)
+    assert "effect own does not vanish on puck at its null value" in str(caught.value)
+    assert "change its law, or give EffectParameter the null=" in str(caught.value)
+
+
+def test_a_null_value_that_is_not_zero_is_enough(history) -> None:
+    size = EffectParameter("size", "1", Prior("normal"), null=0.5)
+    effect = Effect("own", (size,), "made up", "a test", Command(halve))
+    try_effect(effect, PUCK, history)
+
+
+def test_the_null_value_is_tried_without_measured_velocities() -> None:
+    history = simulated_history(PUCK, {"mass": 2.0}, seed=1)
+    history.dataset["start"].loc[{"state": ["vx", "vy", "omega"]}] = np.nan
+    try_effect(own(Force(lambda state, command, parameters, wrench: None)), PUCK, history)
+    with pytest.raises(EffectError, match="changes vx of puck"):
+        try_effect(own(Force(push)), PUCK, history)
+
+
+def test_the_name_of_a_catalogue_effect_is_refused() -> None:
+    size = EffectParameter("coefficient", "kg/s", Prior("half_normal"))
+    mine = Effect("linear_drag", (size,), "made up", "a test", Force(push))
+    refused = "effect linear_drag: the catalogue has another effect of this name; choose another"
+    for given in (((mine,), catalogue), ((), (*catalogue, mine))):
+        with pytest.raises(EffectError, match=refused):
+            attach(PUCK, *given)
+    (drag,) = (effect for effect in catalogue if effect.name == "linear_drag")
+    wide = Effect(drag.name, (size,), drag.sentence, drag.reference, drag.stage)
+    assert attach(PUCK, (wide,))[0].effect.parameters == (size,)  # its law with another prior
 
 
 def test_a_scan_of_another_shape_is_refused(history) -> None:
