@@ -1,6 +1,5 @@
 """MkDocs hook: pages from files of the repository, links between files as links between pages."""
 
-import ast
 import os
 import re
 from pathlib import Path
@@ -8,7 +7,6 @@ from typing import Any
 
 import jupytext
 import nbformat
-import typer
 from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
 
@@ -27,6 +25,11 @@ PAGES = {
     **{f"models/{path.parent.name}/README.md": f"models/{path.parent.name}.md"
        for path in ROOT.glob("models/*/README.md")},
 }  # fmt: skip
+#: Modules that the reference describes: links to them lead there.
+DESCRIBED = {
+    "pbrl_ppl/effects/catalogue.py": "reference/effects.md",
+    "pbrl_ppl/errors.py": "reference/errors.md",
+}
 _LINK = re.compile(r"(?<=\]\()(?![a-z]+:|[#/])([^)\s#]+)")
 
 
@@ -37,9 +40,6 @@ def on_files(files: Files, config: Any) -> Files:
     for script in sorted(NOTEBOOKS.glob("*.py")):
         for uri, content in notebook(script).items():
             files.append(File.generated(config, uri, content=content))
-    for room, content in rooms().items():
-        files.append(File.generated(config, f"reference/{room}.md", content=content))
-    files.append(File.generated(config, "reference/commands.md", content=commands()))
     return files
 
 
@@ -48,7 +48,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
     if not page.file.abs_src_path:
         return markdown
     folder = Path(page.file.abs_src_path).parent
-    pages = {ROOT / source: uri for source, uri in PAGES.items()}
+    pages = {ROOT / source: uri for source, uri in (PAGES | DESCRIBED).items()}
     pages |= {path: f"notebooks/{path.stem}.md" for path in NOTEBOOKS.glob("*.py")}
     pages |= {Path(file.abs_src_path): file.src_uri for file in files if file.abs_src_path}
 
@@ -85,41 +85,3 @@ def notebook(script: Path) -> dict[str, str | bytes]:
     outputs = {f"notebooks/{Path(name).name}": it for name, it in resources["outputs"].items()}
     page = f"{heading}\n\n[The script](../{kept}). {note}\n{rest}"
     return {f"notebooks/{script.stem}.md": page, kept: script.read_text(), **outputs}
-
-
-def rooms() -> dict[str, str]:
-    """Return the reference's pages: the public names of each room, and the errors."""
-    found: dict[str, list[str]] = {}
-    for statement in ast.parse((ROOT / "pbrl_ppl" / "__init__.pyi").read_text()).body:
-        if isinstance(statement, ast.ImportFrom):
-            names = found.setdefault(str(statement.module).partition(".")[0], [])
-            names += [alias.name for alias in statement.names]
-    tree = ast.parse((ROOT / "pbrl_ppl" / "errors.py").read_text())
-    found["errors"] = [node.name for node in tree.body if isinstance(node, ast.ClassDef)]
-    pages = {}
-    for room, names in found.items():
-        path = ROOT / "pbrl_ppl" / room
-        code = path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
-        said = ast.get_docstring(ast.parse(code.read_text())) or ""
-        where = "pbrl_ppl.errors" if room == "errors" else "pbrl_ppl"
-        blocks = "".join(f"::: {where}.{name}\n\n" for name in names)
-        pages[room] = f"# {room.capitalize()}\n\n{said}\n\n{blocks}"
-    return pages
-
-
-def commands() -> str:
-    """Return the page of all commands with their arguments and options."""
-    from pbrl_ppl.cli.app import app
-    from pbrl_ppl.cli.commands import commands
-
-    text = ["# Commands", "", app.info.epilog or ""]
-    made = typer.main.get_command(app).commands
-    for name, example in ((each.name, each.example) for each in commands()):
-        text += ["", f"## pbrl-ppl {name}", "", made[name].help or "", "", f"    {example}", ""]
-        text += ["| argument or option | |", "|---|---|"]
-        for each in made[name].params:
-            flags = each.opts + each.secondary_opts
-            shown = ", ".join(flags) if flags[0].startswith("-") else str(each.name).upper()
-            said = " ".join((getattr(each, "help", None) or "").split()).replace("|", "\\|")
-            text.append(f"| `{shown}` | {said} |")
-    return "\n".join(text)
