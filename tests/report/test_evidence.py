@@ -96,8 +96,8 @@ def test_motions_are_those_of_the_recording_worst_first() -> None:
     for motion in motions:
         measured = test.dataset["observed"].values[places[motion.name], :, :, :3]
         np.testing.assert_array_equal(motion.measured, measured)
-        np.testing.assert_array_equal(motion.before[0], measured[0])
-        np.testing.assert_array_equal(motion.after[0], measured[0])
+        np.testing.assert_allclose(motion.before[0], measured[0], rtol=1e-12)
+        np.testing.assert_allclose(motion.after[0], measured[0], rtol=1e-12)
     data = animation(findings, motions)
     assert data["models"] == ["before", "after"]
     assert data["bodies"] == [{"name": "puck", "outline": None, "radius": 0.2}]
