@@ -13,6 +13,7 @@ from pbrl_ppl.report.words import (
     caution_in_words,
     depends_on_records,
     digits_of,
+    diverges,
     error,
     error_in_words,
     joined,
@@ -97,6 +98,8 @@ def _next(loop: Loop, folder: Path, tried: bool) -> str:
     left = loop.unexplained
     if loop.verdict == NOT_CONVERGED:
         return "close the loop again with more --draws, or with tighter priors in the scene."
+    if diverges(loop):
+        return "open the report, which shows where forecasts diverge; do not plan with this model."
     if left is not None and depends_on_records(loop):
         learn = loop.verdict == UNEXPLAINED and not tried
         return (

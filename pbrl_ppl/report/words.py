@@ -62,9 +62,14 @@ def _named(added: Added) -> str:
     return f"{_listed([plain(added.effect), *others], 'or')} on the {plain(added.body)}"
 
 
+def has_size(added: Added) -> bool:
+    """Return whether an effect's size fits into a headline: one number of one effect."""
+    return len(added.parameters) == 1 and not added.not_separable_from
+
+
 def _size(added: Added) -> str:
     """Write the size of an effect with one parameter and its interval; empty for others."""
-    if len(added.parameters) != 1 or added.not_separable_from:
+    if not has_size(added):
         return ""
     (size,) = added.parameters.values()
     digits = digits_of(*size.hdi)
@@ -83,7 +88,7 @@ def _gained(loop: Loop) -> str:
 
 def _remains(loop: Loop) -> str:
     """Write what remains, and whether it matters."""
-    if any(np.isposinf(far) for far in loop.after.rollout_rmse.values()):
+    if diverges(loop):
         return f"forecasts of {number(loop.rollout_horizon * loop.scene.time_step)} s diverge"
     left, name = loop.unexplained, remaining_acceleration(loop)
     where = _where(loop, left.dimension, left.body) if left is not None and left.body else ""
@@ -124,6 +129,11 @@ def _unexplained(loop: Loop, where: str) -> str:
     if forecasts_at_noise(loop):
         text += ", but forecasts are as good as the noise allows"
     return text
+
+
+def diverges(loop: Loop) -> bool:
+    """Return whether held-out forecasts of the last model diverge."""
+    return any(np.isposinf(far) for far in loop.after.rollout_rmse.values())
 
 
 def forecasts_at_noise(loop: Loop) -> bool:
@@ -192,7 +202,7 @@ def error_in_words(loop: Loop) -> str:
     """Explain a held-out error that seems to contradict the verdict; empty if none does."""
     model, after = "revised" if loop.added else "declared", loop.after.normalised_rmse
     if loop.unexplained is not None or remaining_acceleration(loop):
-        return "The unit is what the measurement noise alone makes, one interval ahead."
+        return "The noise is that of the measurements alone, one interval ahead."
     if after > _TOO_LARGE and loop.verdict != NOT_CONVERGED:
         return (
             "The verdict is of the fitted recordings alone: the held-out ones differ from the"

@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
 ]
 
-ONE = "The unit is what the measurement noise alone makes, one interval ahead."
+ONE = "The noise is that of the measurements alone, one interval ahead."
 
 
 @pytest.fixture
