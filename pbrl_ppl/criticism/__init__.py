@@ -11,11 +11,16 @@ from .cross_validation import Change as Change
 from .cross_validation import gain as gain
 from .dependence import QUANTITIES as QUANTITIES
 from .dependence import recorded_quantities as recorded_quantities
+from .forecast import whole_rollouts as whole_rollouts
 from .loop import ADEQUATE as ADEQUATE
+from .loop import EFFECTS_ADDED as EFFECTS_ADDED
 from .loop import NOT_CONVERGED as NOT_CONVERGED
 from .loop import UNEXPLAINED as UNEXPLAINED
 from .loop import Loop as Loop
 from .loop import check_folder as check_folder
+from .misfit import LARGEST_SHARE as LARGEST_SHARE
+from .misfit import acceleration_in_words as acceleration_in_words
+from .misfit import share_in_words as share_in_words
 from .prior_check import PriorCheck as PriorCheck
 from .prior_check import prior_predictive_check as prior_predictive_check
 from .prior_check import telling_horizon as telling_horizon
@@ -27,6 +32,8 @@ from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
 from .results import Added as Added
 from .results import Candidate as Candidate
 from .results import Errors as Errors
+from .results import Unexplained as Unexplained
+from .results import diverged_after as diverged_after
 from .rivals import Rival as Rival
 from .rivals import fit_rivals as fit_rivals
 from .rivals import kept_groups as kept_groups

@@ -191,4 +191,7 @@ def _test(
         error = f"the error of {cells[worst.cell]}"
         sentence = f"{error} is correlated with {other} {when} ({worst.value:.2f})"
     name = _COMMANDS if names else _WHITENESS
-    return ResidualTest(name, p_value, abs(worst.value), passed, sentence)
+    dimension, _, body = ("" if passed else cells[worst.cell]).partition(" of ")
+    return ResidualTest(
+        name, p_value, abs(worst.value), passed, sentence, body=body, dimension=dimension
+    )

@@ -127,7 +127,11 @@ def find_dependence(
     if best is None:
         sentence = "the innovations depend on no recorded quantity"
         return ResidualTest(DEPENDENCE, 1.0, 0.0, True, sentence), None
-    return ResidualTest(DEPENDENCE, best.p_value, best.share, False, best.sentence), best
+    test = ResidualTest(
+        DEPENDENCE, best.p_value, best.share, False, best.sentence,
+        body=best.body, dimension=best.dimension,
+    )  # fmt: skip
+    return test, best
 
 
 def _in_both_frames(

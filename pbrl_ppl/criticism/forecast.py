@@ -103,6 +103,50 @@ def rollout(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Flo
     return states
 
 
+def whole_rollouts(problem: Problem, phi: Floats, sigma: Floats) -> dict[int, Floats]:
+    """Predict whole trajectories, each from its filtered first state.
+
+    That state is as measured, or fitted to the first rows where its velocities were not measured.
+
+    Returns
+    -------
+    dict of int to ndarray
+        By trajectory: predicted states from the first one on, shape (time, body, 6), SI units; NaN
+        from where the prediction diverges.
+    """
+    noise, segments = problem.trajectory_noise, problem.segments
+    begins = np.flatnonzero(noise.first)
+    lengths = np.diff(np.append(begins, segments.n))
+    trajectory = segments.trajectory[begins]
+    start = filtered_states(problem, phi, sigma)[trajectory, 0]
+    # shorter trajectories repeat their last command, and what follows is left out
+    steps = np.minimum(np.arange(lengths.max()), lengths[:, None] - 1)
+    inputs = problem.inputs[begins[:, None] + steps, 0]
+    states = rollout(problem, phi, start, inputs)
+    for i in np.flatnonzero(~np.isfinite(states).all(axis=(1, 2, 3))):
+        states[i] = _finite_part(problem, phi, start[i : i + 1], inputs[i : i + 1])
+    states = np.concatenate([start[:, None], states], axis=1)
+    whole = zip(trajectory.tolist(), states, lengths.tolist(), strict=True)
+    return {which: each[: length + 1] for which, each, length in whole}
+
+
+def _finite_part(problem: Problem, phi: Floats, start: Floats, inputs: Floats) -> Floats:
+    """Return a prediction that diverges up to there, shape (H, body, 6), then NaN.
+
+    The engine returns none of it: the longest prediction that it returns is found by bisection.
+    """
+    low, high = 0, inputs.shape[1]
+    result = np.full((high, *start.shape[1:]), np.nan)
+    while high - low > 1:
+        middle = (low + high) // 2
+        states = rollout(problem, phi, start, inputs[:, :middle])[0]
+        if np.isfinite(states).all():
+            low, result[:middle] = middle, states
+        else:
+            high = middle
+    return result
+
+
 def forecast(
     problem: Problem,
     phi: Floats,

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.special import logsumexp
 
-from pbrl_ppl.criticism.forecast import filtered_states, forecast, rollout
+from pbrl_ppl.criticism.forecast import forecast, whole_rollouts
 from pbrl_ppl.criticism.results import Errors, Rollout
 from pbrl_ppl.errors import HistoryError
 from pbrl_ppl.history import History, longest_gap
@@ -157,10 +157,8 @@ def example_rollout(declared: HeldOut, revised: HeldOut) -> Rollout:
     body = int(np.argmax(np.where(free, np.nansum(spread, axis=1), -1.0)))
     predicted = []
     for model in (declared, revised):
-        own, mode = model.problem, model.mode
-        start = filtered_states(own, mode.phi, mode.sigma)[:1, 0]
-        states = rollout(own, mode.phi, start, own.inputs[:length, 0][None])[0]
-        predicted.append(np.concatenate([start, states])[:, body][:, columns])
+        whole = whole_rollouts(model.problem, model.mode.phi, model.mode.sigma)[0]
+        predicted.append(whole[: length + 1, body][:, columns])
     return Rollout(
         body=scene.moving[body].name,
         time=np.arange(length + 1, dtype=float) * scene.time_step,

@@ -22,6 +22,8 @@ ACCELERATION, FORECASTS, PRIOR = "unexplained acceleration", "forecasts", "prior
 HELD_OUT = "held-out forecasts"
 #: What an unexplained residual depends on where no quantity predicts it.
 NOTHING_RECORDED = "nothing that was recorded"
+#: Shares of the bodies' acceleration from here on are of bodies that hardly accelerate.
+LARGEST_SHARE = 0.995
 #: Lengths of forecasts that a picture shows, at most.
 _LENGTHS = 6
 
@@ -64,7 +66,7 @@ class Misfit:
         """Return the misfit with one more test, which is the unexplained one if no other fails."""
         unexplained = self.unexplained
         if unexplained is None and not test.passed:
-            unexplained = Unexplained("", "", NOTHING_RECORDED, 0.0, 0.0, test.sentence)
+            unexplained = _unexplained(test)
         return replace(self, tests=(*self.tests, test), unexplained=unexplained)
 
 
@@ -77,7 +79,7 @@ def with_negligible_acceleration(
     """
     if misfit.unexplained is not None or not excess.remains.any():
         return misfit
-    return replace(misfit, unexplained=_located(_acceleration(excess), mode, excess))
+    return replace(misfit, unexplained=_unexplained(_acceleration(mode, excess)))
 
 
 def find_misfit(
@@ -99,44 +101,73 @@ def find_misfit(
     of_dependence, dependence = find_dependence(mode, excess.criteria, seed=seed)
     of_correlation, correlations = correlation_tests(mode, excess.criteria)
     of_forecasts, growth = _forecasts(mode, noise_alone(mode, excess), horizon, excess.criteria)
-    tests = (_acceleration(excess), *of_correlation, of_forecasts, of_dependence)
+    tests = (_acceleration(mode, excess), *of_correlation, of_forecasts, of_dependence)
     failed = [test for test in tests if not test.passed]
     unexplained = None
     if failed:
-        unexplained = dependence or _located(failed[0], mode, excess)
+        unexplained = dependence or _unexplained(failed[0])
     return Misfit(tests, unexplained, correlations, growth)
 
 
-def _located(test: ResidualTest, mode: Mode, excess: UnexplainedAcceleration) -> Unexplained:
-    """Return a failed test with the body and dimension whose acceleration is unexplained most."""
-    places = mode.problem.trajectory_noise.cells.places
-    name = excess.names[int(np.argmax(excess.relative))]
-    d = STATE.index(name)
-    columns = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
-    size = (mode.whitened_residual[:, columns] ** 2).mean(axis=0)
-    body = mode.problem.scene.moving[int(places[columns[int(np.argmax(size))]] // len(STATE))].name
-    return Unexplained(body, name, NOTHING_RECORDED, test.size, test.p_value, test.sentence)
+def _unexplained(test: ResidualTest) -> Unexplained:
+    """Return what a failed test found, which depends on no recorded quantity."""
+    return Unexplained(
+        test.body, test.dimension, NOTHING_RECORDED, test.size, test.p_value, test.sentence
+    )
 
 
-def _acceleration(excess: UnexplainedAcceleration) -> ResidualTest:
+def _acceleration(mode: Mode, excess: UnexplainedAcceleration) -> ResidualTest:
     """Return the test of unexplained accelerations against none."""
-    passed = not excess.matters.any()
-    chosen = excess.certain if passed else excess.matters
-    worst = int(np.argmax(np.where(chosen, excess.relative, -1.0)))
-    unit = "rad/s²" if excess.names[worst] == "omega" else "m/s²"
-    sentence = "no unexplained acceleration is significant"
+    passed, largest = not excess.matters.any(), excess.largest
+    name, relative = excess.names[largest], float(excess.relative[largest])
+    sentence, body = "no unexplained acceleration is significant", ""
     if excess.certain.any():
+        body = _most_unexplained(mode, name)
         sentence = (
-            f"an acceleration of {excess.size[worst]:.2g} {unit} in {excess.names[worst]} is"
-            f" unexplained in each interval, {100 * excess.relative[worst]:.2g} % of the bodies'"
-            " acceleration"
+            f"an acceleration of {acceleration_in_words(name, excess.size[largest])} of {body} is"
+            f" unexplained in each interval, {share_in_words(relative)}"
         )
-        if not excess.beyond_engine[worst]:
+        if not excess.beyond_engine[largest]:
             sentence += ": engines differ by as much in their steps"
         elif passed:
             sentence += ", which is negligible"
-    p_value = float(min(1.0, excess.p_value[worst] * len(excess.names)))
-    return ResidualTest(ACCELERATION, p_value, float(excess.relative[worst]), passed, sentence)
+    p_value = float(min(1.0, excess.p_value[largest] * len(excess.names)))
+    return ResidualTest(
+        ACCELERATION, p_value, relative, passed, sentence, body=body, dimension=name if body else ""
+    )
+
+
+def _most_unexplained(mode: Mode, name: str) -> str:
+    """Return the body with the largest innovations of a velocity, or of its position."""
+    d, places = STATE.index(name), mode.problem.trajectory_noise.cells.places
+    columns = np.flatnonzero(np.isin(places % len(STATE), (d, d - 3)))
+    size = (mode.whitened_residual[:, columns] ** 2).mean(axis=0)
+    body = int(places[columns[int(np.argmax(size))]] // len(STATE))
+    return mode.problem.scene.moving[body].name
+
+
+def acceleration_in_words(name: str, size: float) -> str:
+    """Write an acceleration of a velocity.
+
+    Examples
+    --------
+    >>> acceleration_in_words("omega", 0.1234)
+    '0.12 rad/s² in omega'
+    """
+    return f"{size:.2g} {'rad/s²' if name == 'omega' else 'm/s²'} in {name}"
+
+
+def share_in_words(relative: float) -> str:
+    """Write a share of the bodies' acceleration; none where they hardly accelerate.
+
+    Examples
+    --------
+    >>> share_in_words(0.1234), share_in_words(300.6)
+    ("12 % of the bodies' acceleration", "more than the bodies' acceleration itself")
+    """
+    if relative < LARGEST_SHARE:
+        return f"{100 * relative:.2g} % of the bodies' acceleration"
+    return "more than the bodies' acceleration itself"
 
 
 def held_out_forecasts(mode: Mode, sigma: Floats, horizon: int, criteria: Criteria) -> ResidualTest:
@@ -160,11 +191,13 @@ def _forecasts(
     every = [forecast(mode.problem, mode.phi, sigma, int(n)) for n in steps]
     allowed = criteria.negligible * bodies_acceleration(mode.problem)
     last = forecast(mode.problem, mode.phi, sigma, longest, allowed=allowed)
-    worst, p_value, name = 0.0, 1.0, ""
+    worst, p_value, name, body = 0.0, 1.0, "", ""
     dimensions = np.unique(last.dimension)
     for d in dimensions:
-        error = last.error[:, last.dimension == d]
-        z = (error**2 / last.variance[:, last.dimension == d])[~np.isnan(error)]
+        columns = np.flatnonzero(last.dimension == d)
+        error = last.error[:, columns]
+        square = error**2 / last.variance[:, columns]
+        z = square[~np.isnan(error)]
         if not z.size:
             continue
         # forecasts overlap by half, so half of them count
@@ -172,16 +205,23 @@ def _forecasts(
         chance = len(dimensions) * float(chi2.sf(total, max(z.size / 2, 1)))
         if np.sqrt(z.mean()) > worst:
             worst, p_value, name = float(np.sqrt(z.mean())), min(1.0, chance), STATE[d]
+            own = int(noise.cells.places[columns[int(np.argmax(np.nansum(square, axis=0)))]])
+            body = mode.problem.scene.moving[own // len(STATE)].name
     passed = p_value > criteria.false_alarm or worst < criteria.worse_forecast
     dt = mode.problem.scene.time_step
     seconds = longest * dt
     sentence = f"errors of forecasts of {seconds:g} s are those of noise"
     if not passed:
+        sentence = f"within {seconds:g} s forecasts of {name} of {body} diverge"
+    if not passed and np.isfinite(worst):
         sentence = (
-            f"after {seconds:g} s the error of {name} is {worst:.1f} times what noise and"
+            f"after {seconds:g} s the error of {name} of {body} is {worst:.1f} times what noise and"
             f" {100 * criteria.negligible:g} % of the bodies' acceleration make"
         )
     growth = Growth(
         steps * dt, tuple(each.rmse() for each in every), tuple(each.floor() for each in every)
     )
-    return ResidualTest(FORECASTS, p_value, worst, passed, sentence), growth
+    if passed:
+        body = name = ""
+    test = ResidualTest(FORECASTS, p_value, worst, passed, sentence, body=body, dimension=name)
+    return test, growth

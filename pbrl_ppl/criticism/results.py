@@ -88,6 +88,8 @@ class ResidualTest:
         The result in words.
     tested : bool
         Whether the data could fail the test; one that they could not was not passed either.
+    body, dimension : str
+        Where the misfit is largest; empty where the test names no place.
     """
 
     name: str
@@ -96,6 +98,8 @@ class ResidualTest:
     passed: bool
     sentence: str
     tested: bool = True
+    body: str = ""
+    dimension: str = ""
 
     @classmethod
     def untested(cls, name: str, why: str) -> ResidualTest:
@@ -259,7 +263,7 @@ class Rollout:
     names, units : tuple of str
         State dimensions shown, and their units.
     measured, before, after : ndarray
-        Shape (time, state); measured is NaN where missing.
+        Shape (time, state); measured is NaN where missing, predictions from where they diverge.
     """
 
     body: str
@@ -269,6 +273,29 @@ class Rollout:
     measured: Floats
     before: Floats
     after: Floats
+
+
+def diverged_after(time: Floats, predicted: Floats) -> float | None:
+    """Return how long (s) a prediction is finite; None if it does not diverge.
+
+    Parameters
+    ----------
+    time : ndarray
+        Seconds since the start, shape (time,).
+    predicted : ndarray
+        Predicted states, shape (time, ...): not finite from where they diverge.
+
+    Examples
+    --------
+    >>> time = np.array([0.0, 0.1, 0.2])
+    >>> diverged_after(time, np.array([1.0, 2.0, np.nan]))
+    0.1
+    >>> diverged_after(time, np.array([1.0, 2.0, 3.0]))
+    """
+    finite = np.isfinite(predicted).reshape(len(time), -1).all(axis=1)
+    if finite.all():
+        return None
+    return float(time[max(int(np.argmin(finite)) - 1, 0)])
 
 
 @dataclass(frozen=True)

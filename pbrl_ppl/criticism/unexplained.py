@@ -69,6 +69,15 @@ class UnexplainedAcceleration:
         return np.asarray(self.certain & self.beyond_engine)
 
     @property
+    def largest(self) -> int:
+        """Return the place of the largest relative one: of those that matter, or are significant.
+
+        Of all where none is significant.
+        """
+        chosen = next((one for one in (self.matters, self.certain) if one.any()), self.size >= 0)
+        return int(np.argmax(np.where(chosen, self.relative, -1.0)))
+
+    @property
     def worst(self) -> float:
         """Return the largest relative one among those that are significant; 0 without any."""
         return float(np.where(self.certain, self.relative, 0.0).max(initial=0.0))

@@ -13,12 +13,15 @@ from pbrl_ppl.report.words import (
     caution_in_words,
     depends_on_records,
     digits_of,
+    diverges,
+    error,
     error_in_words,
     joined,
     left_out_in_words,
     number,
     plain,
     quantity,
+    remains_in_words,
     verdict_in_words,
 )
 
@@ -35,13 +38,12 @@ def in_brief(loop: Loop, folder: str | Path, remainder: str = "") -> list[str]:
     remainder : str
         What a learned remainder does, or why there is none; empty if none was requested.
     """
-    left, folder = loop.unexplained, Path(folder)
+    folder = Path(folder)
     lines = [f"Verdict: {loop.verdict}. {verdict_in_words(loop)}"]
     lines += [_effect(added) for added in accepted(loop)]
     lines += [caution] if (caution := caution_in_words(loop)) else []
     lines += _errors(loop)
-    if left is not None and left.body:
-        lines.append(f"Where: {left.dimension} of the {plain(left.body)}.")
+    lines += [f"  {remains}"] if (remains := remains_in_words(loop)) else []
     lines += [f"Left out: {words}"] if (words := left_out_in_words(loop)) else []
     lines += [f"Remainder: {remainder}"] if remainder else []
     lines.append(f"Next: {_next(loop, folder, bool(remainder))}")
@@ -58,7 +60,8 @@ def _effect(added: Added) -> str:
         sizes.append(
             f"{plain(name)} {quantity(e.mean, e.unit, digits)} (94 % interval {low} to {high})"
         )
-    text = f"  {plain(added.effect)} on the {plain(added.body)}: {', '.join(sizes)}"
+    name = f"{plain(added.effect)} on the {plain(added.body)}"
+    text = f"  {name} ({added.sentence.rstrip('.')}): {', '.join(sizes)}"
     if added.not_separable_from:
         others = joined((plain(name) for name in added.not_separable_from), "or")
         text += f"; these data cannot tell it from {others}"
@@ -66,27 +69,28 @@ def _effect(added: Added) -> str:
 
 
 def _errors(loop: Loop) -> list[str]:
-    """Write the held-out errors, before and after if something was added."""
-    before, after, floor = loop.before, loop.after, loop.noise_floor
+    """Write the held-out error far ahead that is worst, before and after if something was added."""
+    before, after, floor = (
+        each.rollout_rmse for each in (loop.before, loop.after, loop.noise_floor)
+    )
 
-    def both(one: float, two: float) -> str:
-        return f"{number(one)} -> {number(two)}" if loop.added else number(one)
+    def times_floor(name: str) -> float:
+        if np.isposinf(after.get(name, 0.0)):
+            return float("inf")
+        return before[name] / (floor.get(name, 0.0) or np.inf)
 
-    text = f"Held-out error: {both(before.normalised_rmse, after.normalised_rmse)} times the noise"
-    far = {
-        name: error / (floor.rollout_rmse.get(name, 0.0) or np.inf)
-        for name, error in before.rollout_rmse.items()
-    }
-    if far:
-        name = max(far, key=far.__getitem__)
+    lines = []
+    if before:
+        name = max(before, key=times_floor)
         seconds = loop.rollout_horizon * loop.scene.time_step
-        text += (
-            f"; of {name} {number(seconds)} s ahead"
-            f" {both(before.rollout_rmse[name], after.rollout_rmse.get(name, np.nan))}"
-            f" {UNITS[name]} (noise floor {number(floor.rollout_rmse.get(name))})"
+        errors = (before[name], after.get(name, np.nan)) if loop.added else (before[name],)
+        unit = f" {UNITS[name]}" * bool(np.isfinite(errors[-1]))
+        lines.append(
+            f"Held-out error of {name} {number(seconds)} s ahead:"
+            f" {' -> '.join(map(error, errors))}{unit} (noise floor {number(floor.get(name))}"
+            f" {UNITS[name]})."
         )
-    note = error_in_words(loop)
-    return [f"{text}.", *([f"  {note}"] if note else [])]
+    return [*lines, *([f"  {note}"] if (note := error_in_words(loop)) else [])]
 
 
 def _next(loop: Loop, folder: Path, tried: bool) -> str:
@@ -94,6 +98,8 @@ def _next(loop: Loop, folder: Path, tried: bool) -> str:
     left = loop.unexplained
     if loop.verdict == NOT_CONVERGED:
         return "close the loop again with more --draws, or with tighter priors in the scene."
+    if diverges(loop):
+        return "open the report, which shows where forecasts diverge; do not plan with this model."
     if left is not None and depends_on_records(loop):
         learn = loop.verdict == UNEXPLAINED and not tried
         return (

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from scipy.stats import norm
 
-from pbrl_ppl.criticism import Loop
+from pbrl_ppl.criticism import Loop, diverged_after
 from pbrl_ppl.posterior import HDI_PROB
 from pbrl_ppl.report.style import (
     AFTER,
@@ -50,6 +50,8 @@ def plot_residuals(loop: Loop, width: float = WIDE) -> Figure:
         for place, name in enumerate(names):
             values = np.asarray(residuals[name], dtype=float)
             values = values[np.isfinite(values)]
+            if values.size < len(residuals[name]):
+                label(axes, "diverged", (place + shift, 0.0), color=colour)
             if not values.size:
                 continue
             largest = max(largest, float(np.abs(values).max()))
@@ -87,16 +89,18 @@ def plot_errors(loop: Loop, width: float = WIDE) -> Figure:
             getattr(e, kind) for e in (loop.before, loop.after, loop.noise_floor)
         )
         has_floor = all(np.isfinite(floor.get(d, np.nan)) and floor[d] > 0 for d in before)
-        scale = floor if has_floor else before
+        scale = floor if has_floor else {d: e if np.isfinite(e) else 1.0 for d, e in before.items()}
         models = _models(loop, before, after)
         for i, (_, values, colour) in enumerate(models):
             for place, dim in enumerate(before):
                 value = values.get(dim, np.nan)
-                if not np.isfinite(value) or not scale[dim] > 0:
+                if np.isnan(value) or not scale[dim] > 0:
                     continue
                 at = (value / scale[dim], place + 0.38 * (i - (len(models) - 1) / 2))
-                axes.barh(at[1], at[0], height=0.36, color=colour)
                 text = f"{value:.3g} {UNITS.get(dim, '')}"
+                if np.isinf(value):
+                    at, text = (0.0, at[1]), "diverged"
+                axes.barh(at[1], at[0], height=0.36, color=colour)
                 label(axes, text, at, xytext=(3, 0), va="center", fontsize=7.5)
         axes.axvline(1.0, color="black", linewidth=1.0, linestyle=":")
         axes.set_yticks(range(len(before)), list(before))
@@ -125,11 +129,21 @@ def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
         if unit == "rad":
             measured = unwrap(measured)
         axes.plot(rollout.time, measured, "o", color="black", markersize=2.5)
-        for (_, values, colour), style in zip(models, styles, strict=True):
+        notes = [("black", _measured_until(rollout.time, measured))]
+        shown = [measured]
+        for (which, values, colour), style in zip(models, styles, strict=True):
             line = values[:, place]
             if unit == "rad":
                 line = _beside(unwrap(line), measured)
             axes.plot(rollout.time, line, linestyle=style, color=colour, linewidth=1.6)
+            end = diverged_after(rollout.time, values)
+            if end is None:
+                shown.append(line)
+            else:
+                notes.append((colour, f"{which}: diverged after {end:.3g} s"))
+        if len(shown) <= len(models):
+            _fit_to(axes, np.concatenate(shown))
+        _write(axes, notes)
         axes.set_ylabel(f"{name} ({unit})")
         if place >= count - columns:
             axes.set_xlabel("time (s)")
@@ -141,6 +155,32 @@ def plot_rollout(loop: Loop, width: float = WIDE) -> Figure:
     ]
     legend(figure, handles)
     return figure
+
+
+def _measured_until(time: Floats, measured: Floats) -> str:
+    """Say where measurements end before the curve does; empty if they do not."""
+    seen = np.flatnonzero(np.isfinite(measured))
+    if not seen.size:
+        return "not measured"
+    last = seen[-1]
+    return "" if last + 1 == len(time) else f"not measured after {time[last]:.3g} s"
+
+
+def _fit_to(axes: Axes, values: Floats) -> None:
+    """Show some values: others, of a prediction that diverges, leave the panel."""
+    seen = values[np.isfinite(values)]
+    if seen.size:
+        spare = 0.5 * float(np.ptp(seen)) or 1.0
+        axes.set_ylim(float(seen.min()) - spare, float(seen.max()) + spare)
+
+
+def _write(axes: Axes, notes: list[tuple[str, str]]) -> None:
+    """Write notes in their colours at the top of a panel."""
+    for i, (colour, text) in enumerate((each, said) for each, said in notes if said):
+        axes.text(
+            0.98, 0.97 - 0.11 * i, text, color=colour, transform=axes.transAxes, ha="right",
+            va="top", fontsize=8, bbox={"color": "white", "alpha": 0.7, "pad": 1.0},
+        )  # fmt: skip
 
 
 def unwrap(angle: Floats) -> Floats:
@@ -221,7 +261,13 @@ def plot_growth(loop: Loop, width: float = WIDE) -> Figure:
             for error, floor in zip(growth.error, growth.floor, strict=True)
         ]
         colour = AFTER if i % 2 else BEFORE
-        axes.plot(growth.seconds, ratio, ["o-", "s--", "^:"][i // 2 % 3], color=colour, label=name)
+        ended = np.flatnonzero(~np.isfinite(ratio))
+        why = ""
+        if ended.size:
+            said = "diverged" if np.isinf(ratio[ended[0]]) else "not measured"
+            why = f" ({said} at {growth.seconds[ended[0]]:.3g} s)"
+        style = ["o-", "s--", "^:"][i // 2 % 3]
+        axes.plot(growth.seconds, ratio, style, color=colour, label=f"{name}{why}")
     axes.set_xlabel("length of the forecast (s)")
     axes.set_ylabel("error / noise alone")
     top = axes.get_ylim()[1]

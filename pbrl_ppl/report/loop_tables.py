@@ -15,7 +15,7 @@ from pbrl_ppl.posterior import Comparison
 from pbrl_ppl.report.evidence import Evidence
 from pbrl_ppl.report.page import Table
 from pbrl_ppl.report.style import UNITS, acceleration_unit
-from pbrl_ppl.report.words import chance, number, percent, plain, quantity
+from pbrl_ppl.report.words import chance, error, number, percent, plain, quantity, share
 from pbrl_ppl.scene import units_of
 from pbrl_ppl.state import STATE, Floats
 
@@ -113,7 +113,7 @@ def _row(
 ) -> tuple[str, ...]:
     """Return the row of an error before, after and of the noise; without after if none is added."""
     shown = errors if loop.added else (errors[0], errors[2])
-    return (name, *(number(value, digits) for value in shown), *unit)
+    return (name, *(error(value, digits) for value in shown), *unit)
 
 
 def models_of(loop: Loop) -> tuple[str, ...]:
@@ -164,7 +164,7 @@ def acceleration_table(loop: Loop) -> Table:
             (
                 name,
                 *(number(value) for value in values),
-                *(percent(share) for share in shares),
+                *(share(each) for each in shares),
                 acceleration_unit(name),
                 "yes" if left.certain_after.get(name) else "no",
             )

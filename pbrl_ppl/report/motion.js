@@ -33,7 +33,7 @@
     if (seen) group.setAttribute("transform",
       `translate(${pose[0]} ${pose[1]}) rotate(${pose[2] * 180 / Math.PI})`);
   };
-  const stages = data.models.map((model) => {
+  const stages = data.models.map((model, number) => {
     const svg = byId("stage-" + model);
     const world = make("g", { transform: "scale(1 -1)" }, svg);
     for (const wall of data.walls)
@@ -41,6 +41,7 @@
     for (const body of data.static) place(shape(body, { class: "static" }, world), body.pose);
     return {
       model,
+      number,
       svg,
       trails: data.bodies.map(() => [
         make("polyline", { class: "trail measured" }, world),
@@ -77,17 +78,20 @@
     const measured = at(motion.measured, now);
     for (const stage of stages) {
       const predicted = at(motion[stage.model], now);
-      let far = 0, turned = 0;
+      const diverged = predicted.some((pose) => pose.includes(null));
+      let far = 0, turned = 0, compared = 0;
       data.bodies.forEach((body, b) => {
         place(stage.measured[b], measured[b]);
         place(stage.predicted[b], predicted[b]);
         stage.trails[b][0].setAttribute("points", trail(motion.measured, b, now));
         stage.trails[b][1].setAttribute("points", trail(motion[stage.model], b, now));
         if (measured[b].includes(null) || predicted[b].includes(null)) return;
+        compared += 1;
         far = Math.max(far, Math.hypot(predicted[b][0] - measured[b][0], predicted[b][1] - measured[b][1]));
         turned = Math.max(turned, Math.abs(turn(predicted[b][2] - measured[b][2])) * 180 / Math.PI);
       });
-      stage.off.textContent = `off by ${far.toPrecision(3)} m and ${turned.toFixed(1)}°`;
+      stage.off.textContent = diverged ? `diverged after ${seconds(motion.diverged[stage.number])} s`
+        : compared ? `off by ${far.toPrecision(3)} m and ${turned.toFixed(1)}°` : "nothing measured here";
     }
     scrub.value = now;
     scrub.setAttribute("aria-valuetext", seconds(now) + " seconds");

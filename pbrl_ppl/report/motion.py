@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from pbrl_ppl.criticism import Loop
+from pbrl_ppl.criticism import Loop, diverged_after, whole_rollouts
 from pbrl_ppl.effects import Effect
 from pbrl_ppl.history import History
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import Problem, along_trajectories
 from pbrl_ppl.posterior import best_draw, parameter_draws, problem_of
+from pbrl_ppl.report.words import number
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats, wrapped
 
@@ -31,8 +32,9 @@ class Motion:
     time : ndarray
         Seconds since the first pose, shape (time,).
     measured, before, after : ndarray
-        x, y, theta (m, m, rad), shape (time, body, 3); NaN where not measured. Predictions begin at
-        the first measured state and see none after it.
+        x, y, theta (m, m, rad), shape (time, body, 3); NaN where not measured, or from where a
+        prediction diverges. Predictions begin at the first state, which is as measured, or fitted
+        to the first rows where velocities were not measured.
     """
 
     name: str
@@ -52,6 +54,8 @@ def best_vectors(problem: Problem, posterior: Any) -> tuple[Floats, Floats]:
 def held_out_motions(loop: Loop) -> list[Motion]:
     """Return predictions of held-out trajectories, those worst predicted by the old model first.
 
+    Those of which the new model's prediction diverges come before them.
+
     Each posterior predicts with its draw of highest likelihood.
     """
     if loop.held_out is None:
@@ -60,23 +64,25 @@ def held_out_motions(loop: Loop) -> list[Motion]:
     if loop.posterior_after is not loop.posterior_before:
         after = _predicted(loop.posterior_after, loop.held_out, loop.catalogue)
     dataset = loop.held_out.dataset
-    known, rows = dataset["start"].to_numpy()[..., :3], dataset["n_rows"].to_numpy()
+    known = dataset["start"].to_numpy()[..., :3]
     labels = [str(label) for label in dataset["trajectory"].to_numpy()]
-    motions = []
-    for (trajectory, step), first in before.items():
-        end = int(min(rows[trajectory], step + len(first)))
-        length = end - step
-        motions.append(
-            Motion(
-                labels[trajectory],
-                np.arange(length, dtype=float) * loop.scene.time_step,
-                known[trajectory, step:end],
-                first[:length],
-                after[trajectory, step][:length],
-            )
+    motions = [
+        Motion(
+            labels[trajectory],
+            np.arange(len(first), dtype=float) * loop.scene.time_step,
+            known[trajectory, : len(first)],
+            first,
+            after[trajectory],
         )
+        for trajectory, first in before.items()
+    ]
     shown: list[Motion] = []
-    for motion in sorted(motions, key=lambda each: -distance(loop.scene, each, each.before)):
+
+    def worst(motion: Motion) -> tuple[bool, float]:
+        first, last = (distance(loop.scene, motion, p) for p in (motion.before, motion.after))
+        return not np.isposinf(last), -float(np.nan_to_num(first))
+
+    for motion in sorted(motions, key=worst):
         if shown and sum(len(each.time) for each in [*shown, motion]) > _MOST_ROWS:
             break
         shown.append(motion)
@@ -84,26 +90,43 @@ def held_out_motions(loop: Loop) -> list[Motion]:
 
 
 def distance(scene: Scene, motion: Motion, predicted: Floats) -> float:
-    """Return the root mean square distance (m) of outlines from the measured ones."""
+    """Return the root mean square distance (m) of outlines from the measured ones.
+
+    Infinite if the prediction diverges, NaN if nothing was measured.
+    """
+    if diverged_after(motion.time, predicted) is not None:
+        return float("inf")
     reach = np.array([body.shape.bounding_radius for body in scene.moving])
     off = predicted - motion.measured
     square = off[..., 0] ** 2 + off[..., 1] ** 2 + (reach * wrapped(off[..., 2])) ** 2
-    return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else 0.0
+    return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else float("nan")
 
 
-def _predicted(
-    posterior: Any, history: History, effects: Sequence[Effect]
-) -> dict[tuple[int, int], Floats]:
-    """Return the poses that a posterior predicts, by trajectory and starting step."""
+def divergence_in_words(motions: Sequence[Motion]) -> str:
+    """Return which model's predictions of how many motions diverge, and after how long."""
+    parts = []
+    for which, name in (("before", "declared"), ("after", "revised")):
+        ends = [diverged_after(each.time, getattr(each, which)) for each in motions]
+        seconds = [end for end in ends if end is not None]
+        if seconds:
+            first = "" if len(seconds) == 1 else "at the earliest "
+            parts.append(
+                f"the {name} model's prediction of {len(seconds)} of the {len(motions)} held-out"
+                f" recordings below diverges, {first}after {number(min(seconds))} s"
+            )
+    text = "; ".join(parts)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+def _predicted(posterior: Any, history: History, effects: Sequence[Effect]) -> dict[int, Floats]:
+    """Return the poses that a posterior predicts of whole trajectories, by trajectory."""
     problem = problem_of(posterior, effects)
-    phi, _ = best_vectors(problem, posterior)
-    longest = int(history.dataset["n_rows"].max()) - 1
-    problem = problem.with_data(history=history, states=None, horizon=longest)
-    segments = problem.segments
-    states = problem.predict(phi, problem.one_world)[..., :3]
-    states = np.concatenate([segments.start[:, None, :, :3], states], axis=1)
-    keys = zip(segments.trajectory.tolist(), segments.step.tolist(), strict=True)
-    return dict(zip(keys, states, strict=True))
+    phi, sigma = best_vectors(problem, posterior)
+    cells = problem.trajectory_noise.cells
+    problem = problem.with_data(history=history, states=None)
+    problem = along_trajectories(problem, phi, sigma, cells)
+    whole = whole_rollouts(problem, phi, sigma)
+    return {trajectory: states[..., :3] for trajectory, states in whole.items()}
 
 
 def animation(loop: Loop, motions: Sequence[Motion]) -> dict[str, Any] | None:
@@ -135,6 +158,7 @@ def _drawn(scene: Scene, motion: Motion, margin: float) -> dict[str, Any]:
     """Return a motion, and the corners of its view, as JSON values."""
     box = _box(motion, margin)
     places = _decimals(1e-5 * float((box[1] - box[0]).max()))
+    both = (motion.before, motion.after)
 
     def poses(given: Floats) -> Any:
         return _listed(np.concatenate([given[..., :2].round(places), given[..., 2:].round(5)], -1))
@@ -147,9 +171,10 @@ def _drawn(scene: Scene, motion: Motion, margin: float) -> dict[str, Any]:
         "before": poses(motion.before),
         "after": poses(motion.after),
         "distance": [
-            round(distance(scene, motion, predicted), places)
-            for predicted in (motion.before, motion.after)
+            round(far, places) if np.isfinite(far) else None
+            for far in (distance(scene, motion, predicted) for predicted in both)
         ],
+        "diverged": [diverged_after(motion.time, predicted) for predicted in both],
     }
 
 
@@ -160,8 +185,8 @@ def _box(motion: Motion, margin: float) -> Floats:
     spare = 0.7 * float((high - low).max()) + margin
     every = np.concatenate([motion.before, motion.after])[..., :2].reshape(-1, 2)
     every = np.clip(every, low - spare, high + spare)
-    low = np.minimum(low, np.nanmin(every, axis=0)) - margin
-    high = np.maximum(high, np.nanmax(every, axis=0)) + margin
+    low = np.minimum(low, np.nanmin(every, axis=0, initial=np.inf)) - margin
+    high = np.maximum(high, np.nanmax(every, axis=0, initial=-np.inf)) + margin
     return np.array([low, high])
 
 

@@ -36,7 +36,7 @@ from pbrl_ppl.report.loop_tables import (
     models_of,
     residual_test_table,
 )
-from pbrl_ppl.report.motion import animation, held_out_motions
+from pbrl_ppl.report.motion import animation, divergence_in_words, held_out_motions
 from pbrl_ppl.report.page import Source, render_page
 from pbrl_ppl.report.posterior_plots import plot_rank, plot_trace
 from pbrl_ppl.report.posterior_report import recorded_poses, render_posterior
@@ -49,8 +49,11 @@ from pbrl_ppl.report.words import (
     depends_on_records,
     error_in_words,
     gains_in_words,
+    has_size,
+    held_out_in_words,
     left_out_in_words,
     rejected_in_words,
+    remains_in_words,
     verdict_in_words,
 )
 
@@ -106,6 +109,7 @@ def render(loop: Loop, source: Source | None = None) -> str:
     evidence = find_evidence(loop) if accepted(loop) else None
     laws = find_laws(loop)
     poses = recorded_poses(loop.posterior_before)
+    motions = held_out_motions(loop)
     pictures: dict[str, Callable[[float], Figure]] = {
         "rollout": partial(plot_rollout, loop),
         "errors": partial(plot_errors, loop),
@@ -132,9 +136,13 @@ def render(loop: Loop, source: Source | None = None) -> str:
         pictures,
         result=loop,
         source=source or Source(),
-        motion=animation(loop, held_out_motions(loop)),
+        motion=animation(loop, motions),
+        diverging=divergence_in_words(motions),
         verdict=verdict_in_words(loop),
+        remains=remains_in_words(loop),
+        held_out=held_out_in_words(loop),
         accepted=accepted(loop),
+        has_size=has_size,
         caution=caution_in_words(loop),
         note=error_in_words(loop),
         rejected=rejected_in_words(loop),

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from pbrl_ppl.criticism import (
     ADEQUATE,
+    LARGEST_SHARE,
     NOT_CONVERGED,
     ONE_TRAJECTORY,
     TRIED,
     UNEXPLAINED,
     Added,
     Loop,
+    acceleration_in_words,
+    share_in_words,
 )
 
 _RAISED = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -25,65 +28,163 @@ _TOO_LARGE = 1.5
 
 
 def verdict_in_words(loop: Loop) -> str:
-    """Return the verdict in a sentence or two, for a reader without statistics."""
-    found = joined(
-        f"{added.sentence.rstrip('.')} ({plain(added.effect)}) on the {plain(added.body)}"
-        for added in loop.added
-    )
-    left = loop.unexplained
-    rest = "a pattern remains in the errors" if left is None else left.sentence.rstrip(".")
+    """Return the verdict in a sentence: what was found, how much it helps, what remains.
+
+    It is the first line of the report and of the summary in a terminal.
+    """
     if loop.verdict == NOT_CONVERGED:
         return (
-            "No verdict: the chains have not converged. Take more draws (--draws), or give the"
+            "No verdict: the chains have not converged; take more draws (--draws), or give the"
             " parameters tighter priors."
         )
-    if loop.verdict == ADEQUATE:
-        return _adequate(loop)
-    if loop.verdict == UNEXPLAINED and not found:
-        return f"Something is missing that no effect in the catalogue explains: {rest}."
+    return f"{_found(loop)}: {_gained(loop)}; {_remains(loop)}."
+
+
+def _found(loop: Loop) -> str:
+    """Name what was found, with its size if it is one effect that the data can tell."""
+    if not loop.added:
+        if loop.verdict == UNEXPLAINED:
+            return "No effect in the catalogue explains the residual"
+        matters = " that matters" if loop.small or remaining_acceleration(loop) else ""
+        return f"Nothing{matters} was found missing"
+    if len(loop.added) == 1:
+        found = f"{_named(loop.added[0])}{_size(loop.added[0])}"
+    else:
+        found = _listed([_named(one) for one in loop.added], "and")
+    return f"{found[0].upper()}{found[1:]}"
+
+
+def _named(added: Added) -> str:
+    """Write an effect and its body, or the effects that fit as well."""
+    others = [plain(name) for name in added.not_separable_from]
+    if len(others) > 2:
+        others = [f"one of {len(others)} others that fit as well"]
+    return f"{_listed([plain(added.effect), *others], 'or')} on the {plain(added.body)}"
+
+
+def has_size(added: Added) -> bool:
+    """Return whether an effect's size fits into a headline: one number of one effect."""
+    return len(added.parameters) == 1 and not added.not_separable_from
+
+
+def _size(added: Added) -> str:
+    """Write the size of an effect with one parameter and its interval; empty for others."""
+    if not has_size(added):
+        return ""
+    (size,) = added.parameters.values()
+    digits = digits_of(*size.hdi)
+    low, high = (number(end, digits) for end in size.hdi)
+    return f", {quantity(size.mean, size.unit, digits)} (94 % {low} to {high})"
+
+
+def _gained(loop: Loop) -> str:
+    """Write the held-out error, before and after if something was added."""
+    before, after = loop.before.normalised_rmse, loop.after.normalised_rmse
+    if np.isposinf(after):
+        return "held-out predictions diverge"
+    both = f"{error(before)} -> {number(after)}" if loop.added else number(after)
+    return f"held-out error {both} times the noise"
+
+
+def _remains(loop: Loop) -> str:
+    """Write what remains, and whether it matters."""
+    if diverges(loop):
+        return f"forecasts of {number(loop.rollout_horizon * loop.scene.time_step)} s diverge"
+    left, name = loop.unexplained, remaining_acceleration(loop)
+    where = _where(loop, left.dimension, left.body) if left is not None and left.body else ""
     if loop.verdict == UNEXPLAINED:
-        return (
-            f"Something was missing: {found}. More is missing that no effect in the catalogue"
-            f" explains: {rest}."
-        )
-    if left is not None:
-        return (
-            f"Something was missing: {found}. What remains is small, and forecasts do not show it:"
-            f" {rest}."
-        )
-    if len(loop.added) > 1:
-        return f"{len(loop.added)} things were missing: {found}."
-    return f"Something was missing: {found}."
+        return _unexplained(loop, where)
+    if name and not where:
+        where = _where(loop, name)
+        if loop.acceleration.relative_after[name] >= loop.criteria.negligible:
+            return f"what remains, {where}, is no more than the engine's error"
+    if where or left is not None:
+        return f"what remains{where and f', {where},'} is negligible"
+    if loop.after.normalised_rmse > _TOO_LARGE:
+        return "the recordings that were fitted leave only noise"
+    return "only noise remains"
 
 
-def _adequate(loop: Loop) -> str:
-    """Describe an adequate model: the tests that passed, and negligible but significant misfit."""
+def _where(loop: Loop, dimension: str, body: str = "") -> str:
+    """Write where something remains, with its acceleration if that is significant."""
+    where = f"in {dimension}"
+    if loop.acceleration.certain_after.get(dimension):
+        where = acceleration_in_words(dimension, loop.acceleration.after[dimension])
+    return f"{where} of the {plain(body)}" if body else where
+
+
+def _unexplained(loop: Loop, where: str) -> str:
+    """Write where something is unexplained, and whether forecasts show it."""
+    left, still = loop.unexplained, " still" * bool(loop.added)
+    failed = [test.name for test in loop.tests if not test.passed]
+    if left is not None and where:
+        depends = f", which depends on {left.depends_on}," * depends_on_records(loop)
+        text = f"what remains {where}{depends} is{still} unexplained"
+        if not where.startswith("in "):
+            text = text.removeprefix("what remains ")
+    elif failed:
+        text = f"the model{still} fails the test of {failed[0]}"
+    else:
+        text = "held-out forecasts became worse"
+    if forecasts_at_noise(loop):
+        text += ", but forecasts are as good as the noise allows"
+    return text
+
+
+def diverges(loop: Loop) -> bool:
+    """Return whether held-out forecasts of the last model diverge."""
+    return any(np.isposinf(far) for far in loop.after.rollout_rmse.values())
+
+
+def forecasts_at_noise(loop: Loop) -> bool:
+    """Return whether all held-out errors are near those that noise alone makes."""
+    most, floor = loop.criteria.worse_forecast, loop.noise_floor.rollout_rmse
+    errors = loop.after.rollout_rmse.items()
+    near = all(error < most * floor.get(name, 0.0) for name, error in errors)
+    return near and loop.after.normalised_rmse < most
+
+
+def remains_in_words(loop: Loop) -> str:
+    """Return what the tests of the residual found, in a sentence or two; empty without a verdict.
+
+    Negligible effects are named where nothing was added: the table of candidates has the others.
+    """
+    if loop.verdict == NOT_CONVERGED:
+        return ""
+    if loop.unexplained is not None:
+        left = loop.unexplained
+        chance_of = f" ({p_equals(left.p_value)})" if left.body else ""
+        return f"{left.sentence[:1].upper()}{left.sentence[1:]}{chance_of}."
     tested = sum(test.tested for test in loop.tests)
-    passed = f"the declared model passes all {tested} tests of its residual"
+    model = "revised" if loop.added else "declared"
+    passed = f"The {model} model passes all {tested} tests of its residual"
     if untested := [test.name for test in loop.tests if not test.tested]:
         passed += f" that these data can fail (not {joined(untested, 'nor')})"
-    # beside what was added the table of candidates has them
+    if name := remaining_acceleration(loop):
+        size, relative = loop.acceleration.after[name], loop.acceleration.relative_after[name]
+        passed += (
+            f". An acceleration of {acceleration_in_words(name, size)} is left"
+            f" unexplained in each interval, {share_in_words(relative)}:"
+            " significant, but too small to matter, or within the error of the engine"
+        )
+    if loop.added or loop.verdict != ADEQUATE:
+        return f"{passed}."
     small = "".join(
         f" There is {plain(one.effect)} on the {plain(one.body)}, which changes predictions by"
         f" less than {100 * loop.criteria.negligible:g} %."
         for one in loop.small
     )
-    remains = significant_acceleration(loop)
-    if remains > 0:
-        return (
-            f"Adequate to {percent(remains)} of the bodies' acceleration: {passed}. An acceleration"
-            " of that size is left unexplained in each interval: significant, but too small to"
-            f" matter, or within the error of the engine.{small}"
-        )
-    missing = "Nothing that matters was" if small else "Nothing was"
-    return f"{missing} found missing: {passed}.{small}"
+    return f"{passed}.{small}"
 
 
-def significant_acceleration(loop: Loop) -> float:
-    """Return the largest significant unexplained acceleration over that of the bodies, or 0."""
+def remaining_acceleration(loop: Loop) -> str:
+    """Return the velocity with the largest significant unexplained acceleration; empty if none.
+
+    The largest over the bodies' acceleration.
+    """
     left = loop.acceleration
-    sizes = (left.relative_after[name] for name, sure in left.certain_after.items() if sure)
-    return max(sizes, default=0.0)
+    sure = {name: left.relative_after[name] for name, each in left.certain_after.items() if each}
+    return max(sure, key=sure.__getitem__, default="")
 
 
 def accepted(loop: Loop) -> tuple[Added, ...]:
@@ -100,14 +201,33 @@ def depends_on_records(loop: Loop) -> bool:
 def error_in_words(loop: Loop) -> str:
     """Explain a held-out error that seems to contradict the verdict; empty if none does."""
     model, after = "revised" if loop.added else "declared", loop.after.normalised_rmse
-    if loop.unexplained is not None or significant_acceleration(loop):
-        return "The unit is what the measurement noise alone makes, one interval ahead."
+    if loop.unexplained is not None or remaining_acceleration(loop):
+        return "The noise is that of the measurements alone, one interval ahead."
     if after > _TOO_LARGE and loop.verdict != NOT_CONVERGED:
         return (
             "The verdict is of the fitted recordings alone: the held-out ones differ from the"
             f" {model} model by {number(after)} times the noise (another load, wear, calibration?)."
         )
     return ""
+
+
+def held_out_in_words(loop: Loop) -> str:
+    """Return the held-out errors of one model, or of both and their change."""
+    before, after = loop.before.normalised_rmse, loop.after.normalised_rmse
+    floor = f"; noise alone gives {number(loop.noise_floor.normalised_rmse)}."
+    if not loop.added:
+        said = f"the error of the declared model is {error(before)} times the noise"
+    elif np.isposinf(after):
+        said = (
+            f"the revised model diverges; the error of the declared one is {error(before)} times"
+            " the noise"
+        )
+    else:
+        said = (
+            f"the prediction error {change(before, after)}, from {error(before)} to"
+            f" {number(after)} times the noise"
+        )
+    return f"On held-out recordings {said}{floor}"
 
 
 def caution_in_words(loop: Loop) -> str:
@@ -201,6 +321,28 @@ def p_equals(p_value: float) -> str:
     return f"p {text}" if text.startswith("<") else f"p = {text}"
 
 
+def error(value: float | None, digits: int = 3) -> str:
+    """Write an error, which is infinite where predictions diverge.
+
+    Examples
+    --------
+    >>> error(0.1234), error(float("inf")), error(float("nan"))
+    ('0.123', 'diverged', '–')
+    """
+    return "diverged" if value is not None and np.isposinf(value) else number(value, digits)
+
+
+def share(relative: float) -> str:
+    """Write a share of the bodies' acceleration; of bodies that hardly accelerate a bound.
+
+    Examples
+    --------
+    >>> share(0.0123), share(300.6)
+    ('1.2 %', '> 100 %')
+    """
+    return percent(relative) if relative < LARGEST_SHARE else "> 100 %"
+
+
 def change(before: float, after: float) -> str:
     """Return by how much an error fell or rose."""
     share = 1 - after / before if before > 0 else float("nan")
@@ -219,9 +361,14 @@ def gains_in_words(
     >>> gains_in_words({"x": 0.2, "omega": 1.0}, {"x": 0.1, "omega": 0.1}, {"x": "m"})
     'fell in 2 of 2 state dimensions, most in omega (by 90 %, from 1.00 to 0.100)'
     """
-    shares = {d: after[d] / before[d] for d in before if d in after and before[d] > 0}
+    ends = {d: (before[d], after[d]) for d in before if d in after and before[d] > 0}
+    lost = [d for d, (_, last) in ends.items() if np.isposinf(last)]
+    won = [d for d, (first, last) in ends.items() if np.isposinf(first) and d not in lost]
+    said = {"diverges": lost, "no longer diverges": won}
+    diverging = [f"{what} in {_listed(names, 'and')}" for what, names in said.items() if names]
+    shares = {d: last / first for d, (first, last) in ends.items() if d not in (*lost, *won)}
     if not shares:
-        return ""
+        return "; it ".join(diverging)
     best, worst = min(shares, key=shares.__getitem__), max(shares, key=shares.__getitem__)
 
     def change_of(name: str) -> str:
@@ -234,7 +381,12 @@ def gains_in_words(
     )
     if shares[worst] > 1.005:
         parts.append(f"rose{' most' if fell < len(shares) - 1 else ''} in {change_of(worst)}")
-    return "; it ".join(parts) or "did not change"
+    return "; it ".join([*diverging, *parts]) or "did not change"
+
+
+def _listed(parts: Sequence[str], word: str) -> str:
+    """Write a list as a headline has it: ``a, b and c``."""
+    return f" {word} ".join([", ".join(parts[:-1]), parts[-1]]) if len(parts) > 1 else parts[0]
 
 
 def joined(parts: Iterable[str], word: str = "and") -> str:

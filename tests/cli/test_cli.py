@@ -79,12 +79,13 @@ def test_close_loop(files: Path, calls: list[Any], capsys: pytest.CaptureFixture
     captured = capsys.readouterr()
     assert code == 0
     assert captured.out.splitlines() == [
-        "Verdict: effects-added. Something was missing: a force against the motion that grows with"
-        " the speed (linear drag) on the cart.",
-        "  linear drag on the cart: coefficient 3.00 kg/s (94 % interval 2.81 to 3.19); these data"
-        " cannot tell it from quadratic drag",
-        "Held-out error: 2.40 -> 1.02 times the noise; of x 2.00 s ahead 0.0192 -> 0.00816 m"
-        " (noise floor 0.00800).",
+        "Verdict: effects-added. Linear drag or quadratic drag on the cart: held-out error 2.40 ->"
+        " 1.02 times the noise; only noise remains.",
+        "  linear drag on the cart (a force against the motion that grows with the speed):"
+        " coefficient 3.00 kg/s (94 % interval 2.81 to 3.19); these data cannot tell it from"
+        " quadratic drag",
+        "Held-out error of x 2.00 s ahead: 0.0192 -> 0.00816 m (noise floor 0.00800 m).",
+        "  The revised model passes all 2 tests of its residual.",
         "Next: pbrl-ppl suggest a/out/after.nc -o next.csv: a recording that tells these effects"
         " apart.",
         "Report: a/out/report.html; posteriors before.nc and after.nc beside it.",

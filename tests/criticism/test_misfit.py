@@ -93,6 +93,37 @@ def test_a_disturbance_without_memory_is_an_acceleration() -> None:
     assert left.worst > 2 * DEFAULT.negligible
 
 
+def disturbed(relative, p_value):
+    """A misfit with a disturbance without memory, and these shares and p-values."""
+    disc = Disc(8, 15, FINE)
+    rng = np.random.default_rng(7)
+    mode = disc.mode(rng, 0.3 * rng.normal(size=disc.pushes.shape))
+    left = unexplained_acceleration(mode)
+    left = replace(left, relative=np.array(relative), p_value=np.array(p_value))
+    return find_misfit(mode, left, horizon=10), left
+
+
+def test_body_dimension_and_size_of_what_remains_have_one_source() -> None:
+    """The largest of those that are significant; a larger one that may be noise is not named."""
+    found, left = disturbed([0.1, 0.2, 0.9], [1e-9, 1e-9, 0.5])
+    test, remains = found.tests[0], found.unexplained
+    assert (test.name, test.body, test.dimension) == (ACCELERATION, "puck", "vy")
+    assert (remains.body, remains.dimension, remains.share) == ("puck", "vy", 0.2)
+    assert remains.sentence == test.sentence
+    assert test.sentence == (
+        f"an acceleration of {left.size[1]:.2g} m/s² in vy of puck is unexplained in each"
+        " interval, 20 % of the bodies' acceleration"
+    )
+
+
+def test_bodies_that_hardly_accelerate_have_no_share_of_it() -> None:
+    found, left = disturbed([300.6, 0.2, 0.1], [1e-9, 1e-9, 0.5])
+    assert found.unexplained.sentence == (
+        f"an acceleration of {left.size[0]:.2g} m/s² in vx of puck is unexplained in each interval,"
+        " more than the bodies' acceleration itself"
+    )
+
+
 def test_what_engines_differ_by_is_no_misfit() -> None:
     """Half of the engine's error is certain in enough data, and left alone; ten times is not."""
     sizes = np.array([0.02, 0.02, 0.02])

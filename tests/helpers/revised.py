@@ -4,11 +4,13 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+import xarray as xr
 
 from pbrl_ppl.criticism.loop import Loop
 from pbrl_ppl.criticism.results import Added, Estimate, Unexplained
 from pbrl_ppl.effects import catalogue
 from pbrl_ppl.history import History
+from pbrl_ppl.posterior.store import from_groups, groups
 from pbrl_ppl.sampling import fit, physics_model
 from tests.helpers.free_puck import DISC, Disc
 from tests.helpers.made_up import made_up
@@ -60,3 +62,57 @@ def unexplained() -> Loop:
         posterior_after=before,
         held_out=revised().held_out,
     )
+
+
+@cache
+def diverging() -> Loop:
+    """The same as revised, with a drag that pushes, so that the revised model diverges."""
+    found = revised()
+    datasets = groups(found.posterior_after)
+    draws = datasets["posterior"]
+    name = "linear_drag_coefficient"
+    pushed = draws.assign({name: xr.full_like(draws[name], -60.0)})
+    rollout, far = found.rollout, {name: float("inf") for name in found.after.rollout_rmse}
+    lost = rollout.after.copy()
+    lost[12:] = np.nan
+    growth = replace(
+        found.growth, error=(*found.growth.error[:2], dict.fromkeys(("x", "omega"), np.inf))
+    )
+    return replace(
+        found,
+        posterior_after=from_groups(
+            datasets | {"posterior": pushed}, dict(found.posterior_after.attrs)
+        ),
+        after=replace(found.after, rollout_rmse=far),
+        rollout=replace(rollout, after=lost),
+        growth=growth,
+    )
+
+
+def every_verdict() -> dict[str, Loop]:
+    """Return findings of each verdict, of effects beside which more is missing, and diverging."""
+    added, left, nothing = revised(), unexplained(), made_up("adequate")
+    worse = replace(added.after, normalised_rmse=1.8)
+    return {
+        "adequate": replace(
+            left,
+            verdict="adequate",
+            unexplained=None,
+            tests=nothing.tests,
+            acceleration=nothing.acceleration,
+            before=nothing.before,
+            after=nothing.after,
+        ),
+        "effects-added": added,
+        "unexplained": left,
+        "unexplained-beside": replace(
+            added,
+            verdict="unexplained",
+            unexplained=left.unexplained,
+            tests=left.tests,
+            acceleration=left.acceleration,
+            after=worse,
+        ),
+        "not-converged": replace(added, verdict="not-converged"),
+        "diverging": diverging(),
+    }

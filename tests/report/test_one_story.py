@@ -12,7 +12,7 @@ from pbrl_ppl.report import page as page_module
 from pbrl_ppl.report.brief import in_brief
 from pbrl_ppl.report.loop_tables import limits_in_words
 from pbrl_ppl.report.report import render
-from pbrl_ppl.report.words import gains_in_words, verdict_in_words
+from pbrl_ppl.report.words import gains_in_words, remains_in_words, verdict_in_words
 from tests.helpers.html import Page
 from tests.helpers.made_up import made_up
 from tests.helpers.revised import revised, unexplained
@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.ConvergenceWarning"),
 ]
 
-ONE = "The unit is what the measurement noise alone makes, one interval ahead."
+ONE = "The noise is that of the measurements alone, one interval ahead."
 
 
 @pytest.fixture
@@ -61,9 +61,13 @@ def test_negligible_acceleration_is_in_the_headline() -> None:
     )
     said = verdict_in_words(findings)
     assert said == (
-        "Adequate to 0.51 % of the bodies' acceleration: the declared model passes all 2 tests of"
-        " its residual. An acceleration of that size is left unexplained in each interval:"
-        " significant, but too small to matter, or within the error of the engine."
+        "Nothing that matters was found missing: held-out error 1.01 times the noise; what remains,"
+        " 0.0051 m/s² in vx, is negligible."
+    )
+    assert remains_in_words(findings) == (
+        "The declared model passes all 2 tests of its residual. An acceleration of 0.0051 m/s² in"
+        " vx is left unexplained in each interval, 0.51 % of the bodies' acceleration: significant,"
+        " but too small to matter, or within the error of the engine."
     )
     text = text_of(findings)
     assert said in text and ONE in text
@@ -71,7 +75,7 @@ def test_negligible_acceleration_is_in_the_headline() -> None:
     lines = in_brief(findings, "out")
     assert lines[0] == f"Verdict: adequate. {said}"
     nothing = with_acceleration(findings, vx=(0.0051, False))
-    assert verdict_in_words(nothing).startswith("Nothing was found missing: ")
+    assert verdict_in_words(nothing).endswith("; only noise remains.")
     assert ONE not in text_of(nothing) + "".join(in_brief(nothing, "out"))
 
 
@@ -132,11 +136,10 @@ def test_dependence_is_shown_only_where_its_test_failed() -> None:
     assert "R² =" not in passed and "velocity x" not in passed
     assert "After 1 s vx of Puck is off." in passed  # with its capitals
     assert "310 %" not in passed  # a factor is no share
-    assert "In vx of the puck (p < 1e-16)." in passed
+    assert "What remains. After 1 s vx of Puck is off (p < 1e-16)." in passed
     # a test that names no body has no p-value
-    assert "Where it remains" not in text_of(
-        replace(unexplained(), unexplained=replace(left, body=""))
-    )
+    nowhere = text_of(replace(unexplained(), unexplained=replace(left, body="")))
+    assert "What remains. After 1 s vx of Puck is off." in nowhere
 
 
 def test_a_candidate_with_a_large_score_says_why_it_was_not_added() -> None:
@@ -223,15 +226,13 @@ def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:
     assert max(map(len, every.values())) <= 6 and len(in_brief(five, "out")) <= 10
     for verdict, lines in every.items():
         assert lines[0].startswith(f"Verdict: {verdict}. ")
-        assert sum(line.startswith("Held-out error: ") for line in lines) == 1
+        assert sum(line.startswith("Held-out error of x 2.00 s ahead: ") for line in lines) == 1
         assert lines[-1].startswith("Report: out/report.html")
         assert lines[-2].startswith("Next: ")
         assert not any("would not show" in line or "plausible" in line for line in lines)
-    assert (
-        "Held-out error: 1.01 times the noise; of x 2.00 s ahead 0.00808 m" in every["adequate"][1]
-    )
+    assert "Held-out error of x 2.00 s ahead: 0.00808 m" in every["adequate"][1]
     assert "detection limit" in every["adequate"][-2]
-    assert "Where: omega of the cart." in every["unexplained"]
+    assert "  Its omega is off in a way that depends on omega (p = 0.0020)." in every["unexplained"]
     assert "plots the residual against omega" in every["unexplained"][-2]
     assert "--learn-remainder" in every["unexplained"][-2]
     learned = in_brief(made_up("unexplained"), "out", "a force without a law")
@@ -244,7 +245,7 @@ def test_the_terminal_has_ten_lines_and_says_where_and_what_next() -> None:
     )
     left = replace(made_up("unexplained").unexplained, depends_on="nothing that was recorded")
     nowhere = in_brief(replace(made_up("unexplained"), unexplained=replace(left, body="")), "out")
-    assert not any(line.startswith("Where: ") for line in nowhere)
+    assert "  Its omega is off in a way that depends on omega." in nowhere
     assert nowhere[-2] == "Next: open the report; record more quantities, or longer."
 
 
@@ -253,10 +254,8 @@ def test_the_error_far_ahead_is_of_the_dimension_that_is_worst() -> None:
     findings = made_up()
     far = findings.before.rollout_rmse | {"theta": 0.3}
     findings = replace(findings, before=replace(findings.before, rollout_rmse=far))
-    assert (
-        "; of theta 2.00 s ahead 0.300 -> 0.0163 rad (noise floor 0.0160)."
-        in (in_brief(findings, "out")[2])
-    )
+    said = "Held-out error of theta 2.00 s ahead: 0.300 -> 0.0163 rad (noise floor 0.0160 rad)."
+    assert said in in_brief(findings, "out")
 
 
 def test_effects_of_one_trajectory_are_told_with_caution() -> None:

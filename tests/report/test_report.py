@@ -25,7 +25,7 @@ from pbrl_ppl.report.page import Source
 from pbrl_ppl.report.posterior_plots import MOST_PARAMETERS, most_interesting, summary
 from pbrl_ppl.report.posterior_tables import PARAMETERS
 from pbrl_ppl.report.report import render
-from pbrl_ppl.report.words import number, rejected_in_words, verdict_in_words
+from pbrl_ppl.report.words import number, rejected_in_words, remains_in_words, verdict_in_words
 from tests.helpers.html import Page, stands_alone
 from tests.helpers.made_up import DRAG, idata, made_up, made_up_posterior
 from tests.helpers.revised import revised, unexplained
@@ -65,7 +65,8 @@ def test_page_plays_the_held_out_motions() -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_page_of_an_added_effect() -> None:
     text = page("effects-added").text
-    assert f"Something was missing: {DRAG} (linear drag) on the cart." in text
+    assert "Linear drag or quadratic drag on the cart: held-out error 2.40 → 1.02 times" in text
+    assert f"What it is. {DRAG.capitalize()} (linear drag)." in text
     assert "As good as certain (p < 1e-16, corrected for all 4 candidates)" in text
     assert (
         "Its coefficient is 3.00 kg/s; with 94 % probability it lies between 2.81 and 3.19 kg/s"
@@ -107,14 +108,14 @@ def test_page_explains_its_words() -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_page_where_nothing_is_missing() -> None:
     text = page("adequate").text
-    assert (
-        "Nothing was found missing: the declared model passes all 2 tests of its residual." in text
-    )
+    said = "Nothing was found missing: held-out error 1.01 times the noise; only noise remains."
+    assert said in text
+    assert "What was tested. The declared model passes all 2 tests of its residual." in text
     assert "The table of all candidates has the detection limit of each" in text
     assert "48 % – – coefficient 0.0200 kg/s" in text
     assert "linear drag on the cart came closest (p = 0.37)." in text
     assert "fell by" not in text and "After:" not in text
-    assert "Where it remains" not in text
+    assert "What remains." not in text
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -136,19 +137,22 @@ def test_what_is_small_is_said_to_be_there() -> None:
         one = findings.candidates[len(findings.added)]
         findings = replace(findings, small=(replace(one, body="Cart_2"),))
         said = f" There is {one.effect.replace('_', ' ')} on the Cart 2, which changes"
-        # a headline is of what was added; the table of candidates has the rest
-        assert (said in verdict_in_words(findings)) == (verdict == "adequate")
+        # beside what was added the table of candidates has them
+        assert (said in remains_in_words(findings)) == (verdict == "adequate")
         assert "Nothing was found missing" not in verdict_in_words(findings)
     # what remains may be what looks like it
     findings = replace(made_up("unexplained"), small=made_up().candidates[:1])
-    assert "linear drag" not in verdict_in_words(findings)
+    assert "linear drag" not in verdict_in_words(findings) + remains_in_words(findings)
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_page_where_something_is_unexplained() -> None:
     text = page("unexplained").text
-    assert "Something is missing that no effect in the catalogue explains: its omega is off" in text
-    assert "In omega of the cart, which depends on omega (p = 0.0020)." in text
+    assert (
+        "No effect in the catalogue explains the residual: held-out error 2.40 times the noise;"
+        " 0.15 rad/s² in omega of the cart, which depends on omega, is unexplained."
+    ) in text
+    assert "What remains. Its omega is off in a way that depends on omega (p = 0.0020)." in text
     assert "an acceleration of 0.2 rad/s² in omega is left" in text
     assert "detection limit of each" not in text
 
@@ -156,7 +160,7 @@ def test_page_where_something_is_unexplained() -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_a_verdict_without_converged_chains_is_none() -> None:
     findings = made_up("not-converged")
-    assert verdict_in_words(findings).startswith("No verdict: the chains have not converged.")
+    assert verdict_in_words(findings).startswith("No verdict: the chains have not converged; ")
     assert "No verdict" in page("not-converged").text
 
 
@@ -239,26 +243,32 @@ def test_names_from_files_are_escaped() -> None:
     html = render(replace(findings, unexplained=remains))
     assert Page(html).tags.count("script") == 1  # it opens details in print
     assert "<" not in page_module._data({"name": "</script><script>alert(1)"})
-    assert "a<b>&" in Page(html).text
+    assert "A<b>&" in Page(html).text
 
 
 @pytest.mark.usefixtures("undrawn")
 def test_added_effects_with_a_rest() -> None:
     findings = made_up()
-    second = replace(findings.added[0], effect="push_offset", sentence="it turns", body="big_cart")
-    both = replace(findings, added=(findings.added[0], second))
+    first = replace(findings.added[0], not_separable_from=())
+    second = replace(first, effect="push_offset", sentence="it turns", body="big_cart")
+    both = replace(findings, added=(first, second))
     assert verdict_in_words(both) == (
-        f"2 things were missing: {DRAG} (linear drag) on the cart, and it turns (push offset) on"
-        " the big cart."
+        "Linear drag on the cart and push offset on the big cart: held-out error 2.40 -> 1.02 times"
+        " the noise; only noise remains."
     )
-    remains = made_up("unexplained").unexplained
-    some = replace(findings, verdict="unexplained", unexplained=remains)
-    assert verdict_in_words(some).startswith(f"Something was missing: {DRAG} (linear drag)")
-    assert "More is missing that no effect in the catalogue" in verdict_in_words(some)
-    assert "explains: its omega is off" in Page(render(some)).text
-    noted = replace(some, verdict="effects-added")
-    assert verdict_in_words(noted).startswith(f"Something was missing: {DRAG}")
-    assert "forecasts do not show it: its omega is off" in verdict_in_words(noted)
+    left = made_up("unexplained")
+    some = replace(both, verdict="unexplained", unexplained=left.unexplained, tests=left.tests)
+    some = replace(some, acceleration=left.acceleration, after=left.before)
+    assert verdict_in_words(some) == (
+        "Linear drag on the cart and push offset on the big cart: held-out error 2.40 -> 2.40 times"
+        " the noise; 0.15 rad/s² in omega of the cart, which depends on omega, is still"
+        " unexplained."
+    )
+    assert "What remains. Its omega is off in a way" in Page(render(some)).text
+    noted = replace(some, verdict="effects-added", after=findings.after)
+    assert "what remains, 0.15 rad/s² in omega of the cart, is negligible." in (
+        verdict_in_words(noted)
+    )
 
 
 def test_odd_findings_still_make_a_page(monkeypatch: pytest.MonkeyPatch) -> None:
