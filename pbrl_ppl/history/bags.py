@@ -106,18 +106,7 @@ def read_bag(
         history = pp.History.from_dataframe(log, scene, columns=columns, resample=True)
     """
     path = Path(path)
-    listed = {body: [names] if isinstance(names, str) else list(names)
-              for body, names in topics.items()}  # fmt: skip
-    if not listed or not all(listed.values()):
-        raise HistoryError(
-            f"bag {path}: topics is {dict(topics)!r}, expected a topic for each body, such as"
-            ' {"cart": "/odom"}'
-        )
-    if "" in listed and len(listed) > 1:
-        raise HistoryError(
-            f'bag {path}: topics names the body "" among {len(listed)}; name each body as the scene'
-            " does"
-        )
+    listed = _listed(topics, path)
     tables: dict[str, pd.DataFrame] = {}
     with _opened(path) as reader:
         there = _types(reader)
@@ -154,6 +143,28 @@ def read_bag(
     order = np.arange(len(joined)).reshape(len(whole), -1).T.ravel()  # by time, then body
     rows: pd.DataFrame = joined.iloc[order].reset_index(drop=True)
     return rows
+
+
+def _listed(topics: Any, path: Path) -> dict[str, list[str]]:
+    """Return each body's topics, of which there is at least one."""
+    given = topics if isinstance(topics, Mapping) else {}
+    listed = {
+        body: [names] if isinstance(names, str) else list(names)
+        for body, names in given.items()
+        if isinstance(names, str | Sequence)
+    }
+    right = all(names and all(isinstance(n, str) for n in names) for names in listed.values())
+    if not listed or len(listed) < len(given) or not right:
+        raise HistoryError(
+            f"bag {path}: topics is {topics!r}, expected a topic for each body, such as"
+            ' {"cart": "/odom"}'
+        )
+    if "" in listed and len(listed) > 1:
+        raise HistoryError(
+            f'bag {path}: topics names the body "" among {len(listed)}; name each body as the scene'
+            " does"
+        )
+    return listed
 
 
 @contextmanager

@@ -1,5 +1,6 @@
 """Bags of ROS 1 and ROS 2 and MCAP files, as rosbags' own writers make them."""
 
+import sqlite3
 import sys
 
 import numpy as np
@@ -149,6 +150,16 @@ def test_bodies_with_other_stamps_are_interpolated(tmp_path) -> None:
     np.testing.assert_allclose(np.diff(b.yaw[:10]), 0.5, atol=1e-5)
 
 
+def test_a_bag_without_definitions_of_its_messages(tmp_path) -> None:
+    """As ROS 2 wrote them before Iron."""
+    path = drive("db3").write(tmp_path)
+    with sqlite3.connect(next(path.glob("*.db3"))) as database:
+        database.execute("DELETE FROM message_definitions")
+    database.close()
+    table = read_bag(path, {"cart": "/odom"})
+    np.testing.assert_allclose(table["pose.pose.position.x"], 0.5 * np.arange(40))
+
+
 def test_what_cannot_be_read_is_said(tmp_path, monkeypatch) -> None:
     bag = drive("ros1")
     bag.add(6.0, "/early", bag.pose_stamped(-50.0, 0.0, 0.0, 0.0))
@@ -168,6 +179,9 @@ def test_what_cannot_be_read_is_said(tmp_path, monkeypatch) -> None:
         (path, {"": "/log"}, r"/log.*String.* have no numbers"),
         (path, {}, "expected a topic for each body"),
         (path, {"": []}, "expected a topic for each body"),
+        (path, {"": 3}, "topics is {'': 3}, expected a topic for each body"),
+        (path, {"": [3]}, "expected a topic for each body"),
+        (path, "/odom", "topics is '/odom', expected a topic for each body"),
         (path, {"": "/odom", "b": "/odom"}, "name each body as the scene does"),
         (path, {"a": "/odom", "b": "/early"}, r"no time in common: .* \(a\), .* \(b\)"),
         (path, {"a": ["/odom", "/far"]}, '"/far" begins after the last message of "/odom"'),
