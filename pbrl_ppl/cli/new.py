@@ -199,6 +199,12 @@ def new(
     ] = None,
     columns: options.Columns = None,
     units: options.Units = None,
+    topics: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--topic", metavar="NAME=TOPIC,...", help="Topics of a body in a ROS bag: cart=/odom."
+        ),
+    ] = None,
     model: Annotated[
         str | None,
         typer.Option("--from", metavar="MODEL", help="Copy a model that comes with the package."),
@@ -219,7 +225,11 @@ def new(
     with interruptible():
         check_file(scene, (".toml",), overwrite)
         names, measures = options.columns_of(columns), options.units_of(units)
-        layout = Recording(columns=tuple(names.items()), units=tuple(measures.items()))
+        layout = Recording(
+            columns=tuple(names.items()),
+            units=tuple(measures.items()),
+            topics=tuple(_topics(topics).items()),
+        )
         if model is not None and (side is not None or any(described)):
             raise SceneError("--from copies a model as it is: leave the other options, or --from")
         if history is None and (names or measures):
@@ -261,6 +271,17 @@ def new(
         command = ["pbrl-ppl", "check", str(scene), str(log or "history.csv")]
         begin = "next" if log else "next, with your recording"
         typer.echo(f"{begin}: {shlex.join(command)}")
+
+
+def _topics(given: list[str] | None) -> dict[str, tuple[str, ...]]:
+    """Return the topics of each body from ``--topic NAME=TOPIC,...``."""
+    found = {}
+    for text in given or ():
+        name, _, listed = text.partition("=")
+        if not (name and listed):
+            raise SceneError(f"--topic: {text!r} is not NAME=TOPIC, such as cart=/odom")
+        found[name] = tuple(listed.split(","))
+    return found
 
 
 def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:

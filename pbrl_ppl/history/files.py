@@ -12,6 +12,7 @@ import xarray as xr
 
 from pbrl_ppl.errors import HistoryError, OutputError
 from pbrl_ppl.files import write_atomically
+from pbrl_ppl.history import bags
 from pbrl_ppl.scene import SEPARATORS, Recording
 from pbrl_ppl.state import STATE, WRENCH, Floats
 
@@ -36,7 +37,7 @@ def read_table(
     Parameters
     ----------
     path : Path
-        The suffix is its format.
+        The suffix is its format; a folder is a ROS 2 bag.
     names : mapping of str to object, optional
         Its values are names of columns of numbers, as of `Reading`.
     layout : Recording, optional
@@ -48,14 +49,15 @@ def read_table(
     HistoryError
         If the file is missing, of an unknown kind, or damaged.
     """
-    suffix = path.suffix.lower()
+    suffix, layout = path.suffix.lower(), layout or Recording()
+    if suffix in bags.SUFFIXES or path.is_dir():
+        return _read_bag(path, dict(layout.topics))
     known = tuple(dict.fromkeys((*_TEXTS, *SUFFIXES)))
     if suffix not in known:
         raise HistoryError(
             f"history {path}: the suffix is {path.suffix!r}, expected one of "
             f"{', '.join(known)}; save it as one of these"
         )
-    layout = layout or Recording()
     try:
         if suffix in _TEXTS:
             columns = {**dict(layout.columns), **(names or {})}
@@ -67,6 +69,16 @@ def read_table(
         raise HistoryError(f"history {path}: there is no such file; check the path") from None
     except OSError as error:
         raise HistoryError(f"history {path}: cannot be read: {error}") from None
+
+
+def _read_bag(path: Path, topics: dict[str, Any]) -> pd.DataFrame:
+    if not topics:
+        there = ", ".join(f"{topic} ({kind})" for topic, kind in bags.bag_topics(path).items())
+        raise HistoryError(
+            f"history {path}: say which topics are whose (--topic BODY=/odom, or topics in"
+            f" [recording]); it has {there}"
+        )
+    return bags.read_bag(path, topics)
 
 
 def _read_text(path: Path, others: list[str], layout: Recording) -> pd.DataFrame:

@@ -52,8 +52,8 @@ class Recording:
         Where trajectories are cut: ``every`` so many seconds, at ``gaps`` longer than so many
         seconds, at ``rests`` of at least so many seconds, at ``jumps`` of a velocity by more than
         so many m/s between rows.
-    topics : tuple of (str, str)
-        Topic of each body in a ROS bag or an MCAP file.
+    topics : tuple of (str, str or tuple of str)
+        Topic, or topics, of each body in a ROS bag or an MCAP file.
 
     Raises
     ------
@@ -87,9 +87,12 @@ class Recording:
                 raise SceneError(
                     f"[recording]: column {name} is {column!r}, expected a name or a number"
                 )
-        for key, kind in (("units", str), ("topics", str)):
+        topics = tuple((n, tuple(t) if isinstance(t, list) else t) for n, t in self.topics)
+        object.__setattr__(self, "topics", topics)
+        for key in ("units", "topics"):
             for name, value in getattr(self, key):
-                if not isinstance(value, kind):
+                each = value if key == "topics" and isinstance(value, tuple) else (value,)
+                if not all(isinstance(text, str) for text in each):
                     raise SceneError(f"[recording]: {key} of {name} is {value!r}, expected text")
         known = (*SEPARATORS, "")
         if self.separator not in known and len(self.separator) != 1:

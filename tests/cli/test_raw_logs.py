@@ -13,6 +13,7 @@ from pbrl_ppl.errors import HistoryError, RecordingWarning, SceneError
 from pbrl_ppl.history import History
 from pbrl_ppl.scene import Body, Recording, Scene, Shape
 from tests.helpers import raw_logs
+from tests.helpers.bags import Bag
 
 pytestmark = pytest.mark.one_stack
 
@@ -81,6 +82,37 @@ def test_a_camera_that_loses_a_puck_between_walls(capsys: pytest.CaptureFixture[
     said = capsys.readouterr().out
     assert "read as not seen" in said and "the velocity jumps, as at a wall" in said
     assert run("close-loop scene.toml puck.csv --method laplace -q -o out") == 0
+    verdict, effects = named("out")
+    assert verdict == "effects-added" and "linear_drag" in effects
+
+
+def pushed(folder: Path, runs: int = 8, rows: int = 60) -> None:
+    """Write ``run``, a ROS 2 bag of a puck that is pushed now and then and slides with a drag."""
+    rng = np.random.default_rng(5)
+    bag = Bag("db3")
+    for run in range(runs):
+        heading, place = rng.uniform(0, 2 * np.pi), rng.uniform(-1, 1, 2)
+        for row in range(rows):
+            slid = 1.5 / raw_logs.DRAG * (1 - np.exp(-raw_logs.DRAG * row / 30))
+            x, y = place + slid * np.array([np.cos(heading), np.sin(heading)])
+            x, y = np.array([x, y]) + raw_logs.NOISE * rng.standard_normal(2)
+            time = 5.0 * run + row / 30
+            bag.add(time, "/puck", bag.odometry(time, x, y, 0.0))
+    bag.write(folder)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_a_bag(capsys: pytest.CaptureFixture[str]) -> None:
+    pushed(Path())
+    columns = "x=pose.pose.position.x,y=pose.pose.position.y"
+    shape = "--body puck=circle:0.03"
+    assert run(f"new --history run {shape} --columns {columns}") == 2
+    assert "--topic BODY=/odom" in capsys.readouterr().err
+    assert run(f"new --history run {shape} --columns {columns} --topic puck=/puck") == 0
+    assert "cut at gaps" in capsys.readouterr().out
+    assert run("check scene.toml run -q --no-prior") == 0
+    assert run("close-loop scene.toml run --method laplace -q -o out") == 0
     verdict, effects = named("out")
     assert verdict == "effects-added" and "linear_drag" in effects
 
