@@ -1,6 +1,7 @@
 """Reports with all pictures, as files, and in a real browser: all fits, and the motion plays."""
 
 import base64
+import json
 import shutil
 from collections.abc import Iterator
 from io import BytesIO
@@ -12,9 +13,10 @@ from PIL import Image
 
 from pbrl_ppl.report import render_posterior
 from pbrl_ppl.report.report import render
+from pbrl_ppl.report.words import number
 from tests.helpers.fleet import many_page
 from tests.helpers.html import Page, stands_alone
-from tests.helpers.revised import revised
+from tests.helpers.revised import every_verdict, revised
 
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 pytestmark = [
@@ -193,4 +195,55 @@ def test_motion_is_a_row_of_stills_where_less_is_wanted(
     assert page.evaluate(clock).startswith("0.00 s")
     until(page, f"!{clock}.startsWith('0.00 s')")
     assert page.inner_text("#play") == "Pause"
+    page.context.close()
+
+
+#: Numbers of points of each curve of a model's picture, measured and predicted.
+POINTS = """(model) => ["measured", model].map((kind) =>
+  document.querySelector(`#stage-${model} polyline.trail.${kind}`).getAttribute("points")
+    .split(" ").filter(Boolean).length)"""
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        "adequate",
+        "effects-added",
+        "unexplained",
+        "unexplained-beside",
+        "not-converged",
+        "diverging",
+    ],
+)
+def test_page_of_each_verdict_shows_both_curves_and_the_numbers_of_its_json(
+    browser: Any, tmp_path: Path, case: str
+) -> None:
+    loop = every_verdict()[case]
+    file = tmp_path / "report.html"
+    file.write_text(render(loop), encoding="utf-8")
+    told = json.loads(json.dumps(loop.to_dict()))
+    page, wrong = opened(browser, file, 1100)
+    headline = page.inner_text("h1")
+    models = ["before", "after"] if told["added"] else ["before"]
+    if told["verdict"] != "not-converged":
+        errors = [number(told["error"][model]["normalised_rmse"]) for model in models]
+        assert f"held-out error {' → '.join(errors)} times the noise" in headline
+    source = "JSON.parse(document.getElementById('motion-data').textContent).motions[0]"
+    drawn = page.evaluate(source)
+    for i, model in enumerate(models):
+        measured, predicted = page.evaluate(POINTS, model)
+        end, off = drawn["diverged"][i], page.inner_text(f"#off-{model}")
+        assert measured == len(drawn["time"])
+        if case == "diverging" and model == "after":
+            assert 2 <= predicted < measured
+            assert off == f"diverged after {end:.2f} s"
+        else:
+            assert predicted == measured and end is None
+            assert off.startswith("off by ") and not off.startswith("off by 0.00 ")
+    if case == "diverging":
+        assert "diverged after" in page.inner_text("#pick option:first-child")
+        page.focus("#scrub")
+        page.keyboard.press("Home")
+        assert page.inner_text("#off-after").startswith("off by ")
+    assert wrong == []
     page.context.close()
