@@ -17,6 +17,8 @@ import typer
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli.app import app, main
+from pbrl_ppl.posterior import MIN_ESS
+from pbrl_ppl.sampling import updating
 from tests.helpers.places import MODELS, ROOT
 
 DOCS = ROOT / "analysis" / "docs"
@@ -101,6 +103,15 @@ def test_each_name_is_made_before_it_is_used() -> None:
         assert set(loaded(tree)) <= known, block
         for name in re.findall(r"\bpp\.(\w+)", block):
             assert hasattr(pp, name)
+
+
+def test_the_guide_says_when_an_update_refits() -> None:
+    page = (DOCS / "pages" / "guides" / "fit.md").read_text()
+    assert updating._MOVE == 0.5 and "worth at least half of the draws" in page
+    assert f"and {MIN_ESS:.0f} effective draws left" in page
+    assert f"worth at least {updating._REFIT:.0%}".replace("%", " %") in page
+    assert f"Pareto k at most {updating._HEAVY:g}" in page
+    assert f"at most {updating._WALKERS} draws are moved" in page
 
 
 def test_links_lead_to_files() -> None:
