@@ -105,6 +105,15 @@ def test_each_name_is_made_before_it_is_used() -> None:
             assert hasattr(pp, name)
 
 
+def test_the_tutorial_defines_what_it_uses() -> None:
+    """A reader of the tutorial has seen no other page."""
+    known = set(dir(builtins))
+    for block in blocks(DOCS / "pages" / "tutorial.md", "python"):
+        tree = ast.parse(block)
+        known |= set(bound(tree))
+        assert set(loaded(tree)) <= known, block
+
+
 def test_the_guide_says_when_an_update_refits() -> None:
     page = (DOCS / "pages" / "guides" / "fit.md").read_text()
     assert updating._MOVE == 0.5 and "worth at least half of the draws" in page
@@ -204,6 +213,8 @@ def test_bags_and_models_of_robots(tmp_path, monkeypatch) -> None:
 def test_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At small size: Gaussian approximations, short searches and a short episode."""
     shutil.copytree(MODELS, tmp_path / "models")
+    shutil.copy(CART / "scene.toml", tmp_path / "cart.toml")  # as `pbrl-ppl new --from` does
+    shutil.copy(CART / "recorded" / "train.csv", tmp_path)
     exported(tmp_path)
     monkeypatch.chdir(tmp_path)
     whole, loop, plan, episode = pp.fit, pp.close_loop, pp.plan, pp.run_episode
