@@ -17,6 +17,8 @@ import typer
 
 import pbrl_ppl as pp
 from pbrl_ppl.cli.app import app, main
+from pbrl_ppl.posterior import MIN_ESS
+from pbrl_ppl.sampling import updating
 from tests.helpers.places import MODELS, ROOT
 
 DOCS = ROOT / "analysis" / "docs"
@@ -101,6 +103,24 @@ def test_each_name_is_made_before_it_is_used() -> None:
         assert set(loaded(tree)) <= known, block
         for name in re.findall(r"\bpp\.(\w+)", block):
             assert hasattr(pp, name)
+
+
+def test_the_tutorial_defines_what_it_uses() -> None:
+    """A reader of the tutorial has seen no other page."""
+    known = set(dir(builtins))
+    for block in blocks(DOCS / "pages" / "tutorial.md", "python"):
+        tree = ast.parse(block)
+        known |= set(bound(tree))
+        assert set(loaded(tree)) <= known, block
+
+
+def test_the_guide_says_when_an_update_refits() -> None:
+    page = (DOCS / "pages" / "guides" / "fit.md").read_text()
+    assert updating._MOVE == 0.5 and "worth at least half of the draws" in page
+    assert f"and {MIN_ESS:.0f} effective draws left" in page
+    assert f"worth at least {updating._REFIT:.0%}".replace("%", " %") in page
+    assert f"Pareto k at most {updating._HEAVY:g}" in page
+    assert f"at most {updating._WALKERS} draws are moved" in page
 
 
 def test_links_lead_to_files() -> None:
@@ -193,6 +213,8 @@ def test_bags_and_models_of_robots(tmp_path, monkeypatch) -> None:
 def test_blocks_run_in_order(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """At small size: Gaussian approximations, short searches and a short episode."""
     shutil.copytree(MODELS, tmp_path / "models")
+    shutil.copy(CART / "scene.toml", tmp_path / "cart.toml")  # as `pbrl-ppl new --from` does
+    shutil.copy(CART / "recorded" / "train.csv", tmp_path)
     exported(tmp_path)
     monkeypatch.chdir(tmp_path)
     whole, loop, plan, episode = pp.fit, pp.close_loop, pp.plan, pp.run_episode

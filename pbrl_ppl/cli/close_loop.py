@@ -159,6 +159,8 @@ def close_loop(
         from pbrl_ppl import criticism
 
         criticism.check_folder(output, overwrite)
+        if learn_remainder:
+            criticism.check_scikit_learn()
         loop, stopped = _finished(
             declared, histories, progress, catalogue=catalogue, seed=seed, draws=draws,
             method=method.value,

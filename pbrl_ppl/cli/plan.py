@@ -11,7 +11,7 @@ import typer
 from pbrl_ppl.cli import effect_files, options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import FAILED, check_file, interruptible, print_result, stages
-from pbrl_ppl.errors import GoalError
+from pbrl_ppl.errors import EffectError, GoalError
 
 
 @command("plan", 9, "pbrl-ppl plan cart.nc --start -2,0,0 --goal 2,1,1.57 -o plan.csv")
@@ -185,10 +185,21 @@ def suggest(
             raise GoalError("suggest: --bounds and --actions both say what is allowed; drop one")
         check_file(output, (".csv",), overwrite)
         progress("reading the posterior")
+        from pbrl_ppl.criticism import kept_groups
         from pbrl_ppl.planning import ActionSet, suggest_actions
         from pbrl_ppl.posterior import load_posterior, scene_of
 
         idata = load_posterior(posterior)
+        if len(effect or ()) < 2 and (effect or not kept_groups(idata)):
+            why = (
+                f"got --effect '{effect[0]}' alone"
+                if effect
+                else (f"{posterior} names no effects that its data cannot separate")
+            )
+            raise EffectError(
+                f"suggest: {why}; name two or more, such as --effect linear_drag --effect"
+                " quadratic_drag"
+            )
         bodies = [body.name for body in scene_of(idata).dynamic]
         starts = options.starts_of(start, bodies)
         allowed = _bounds(bounds, bodies) if bounds else None

@@ -27,6 +27,7 @@ from .prior_check import telling_horizon as telling_horizon
 from .ranking import Ranking as Ranking
 from .ranking import criticise as criticise
 from .refinement import with_effects as with_effects
+from .remainder import check_scikit_learn as check_scikit_learn
 from .remainder import learn_remainder as learn_remainder
 from .results import ONE_TRAJECTORY as ONE_TRAJECTORY
 from .results import Added as Added

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable, Iterable
+from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
@@ -37,6 +38,21 @@ _BEYOND = 0.3
 _BUMPS, _SHARE, _FORMS = 48, 0.9995, 24
 #: Draws of each chain; they are independent.
 DRAWS = 250
+
+
+def check_scikit_learn() -> None:
+    """Raise if scikit-learn, which a learned remainder needs, is not installed.
+
+    Raises
+    ------
+    FitError
+        Names the extra that installs it.
+    """
+    if find_spec("sklearn") is None:
+        raise FitError(
+            "a learned remainder needs scikit-learn, which is not installed: pip install"
+            " 'pbrl_ppl[remainder]'"
+        )
 
 
 def learn_remainder(
@@ -92,6 +108,7 @@ def learn_remainder(
     PosteriorError
         If the posterior is of single transitions.
     """
+    check_scikit_learn()
     say = progress or (lambda stage: None)
     with threadpool_limits(1, "blas"):
         mode = posterior_mode(posterior, tuple(catalogue))
@@ -168,14 +185,10 @@ def _learned(mode: Mode, body: str, seed: int, criteria: Criteria) -> LearnedRem
 
 def _process(x: Floats, y: Floats, seed: int, needed: float) -> tuple[float, Floats] | None:
     """Return the standard deviation of a force and its length scales; None if it is noise."""
-    try:
-        from sklearn.exceptions import ConvergenceWarning
-        from sklearn.gaussian_process import GaussianProcessRegressor
-        from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-    except ImportError:
-        raise FitError(
-            "a learned remainder needs scikit-learn: pip install 'pbrl_ppl[remainder]'"
-        ) from None
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.gaussian_process import GaussianProcessRegressor
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
     scale = float(np.sqrt(np.mean(y**2)))
     if not scale > 0:
         return None

@@ -24,14 +24,16 @@ from pbrl_ppl.planning.goals import Goal
 from pbrl_ppl.planning.receding import mppi
 from pbrl_ppl.planning.search import NODES, Found, Task, tail_mean
 from pbrl_ppl.scene import Scene, nearest
-from pbrl_ppl.state import STATE, Floats
+from pbrl_ppl.state import POSE, STATE, WRENCH, Floats
 
 METHODS = ("astar", "mppi")
+#: Rows that a printed plan shows, at most.
+_SHOWN = 8
 #: Draws of Eq. 13's noise that a predicted distribution holds, at least.
 _NOISY = 64
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Plan:
     """Wrenches that lead to a goal, and where the model says they lead.
 
@@ -96,6 +98,26 @@ class Plan:
         """
         table = self.to_dataframe()
         write_atomically(Path(path), lambda to: table.to_csv(to, index=False))
+
+    def __repr__(self) -> str:
+        reached = "reached" if self.reached else "not reached"
+        return f"Plan({len(self.wrenches)} intervals, {self.duration:.3g} s, goal {reached})"
+
+    def __str__(self) -> str:
+        """Return the plan's sentence, and a table of at most eight rows, with mean predictions."""
+        bodies = [body.name for body in self.scene.moving]
+        times = self.scene.time_step * np.arange(len(self.wrenches))
+        mean = self.predicted["predicted"].mean("draw").transpose("time", "body", "state")
+        states = mean.to_numpy()[: len(times), :, : len(POSE)]
+        table = pd.DataFrame(
+            np.concatenate([self.wrenches, states], axis=2).reshape(-1, len(WRENCH + POSE)),
+            columns=[*WRENCH, *POSE],
+        )
+        table.insert(0, "time", np.repeat(times, len(bodies)))
+        table.insert(1, "body", bodies * len(times))
+        rows = np.unique(np.linspace(0, len(table) - 1, _SHOWN).round().astype(int))
+        shown = table.iloc[rows if len(table) else []]
+        return f"{self.in_words()}\n{shown.to_string(index=False, float_format='%.3g')}"
 
     def in_words(self) -> str:
         """Return a sentence: whether the plan reaches the goal, how, and how far off it ends."""

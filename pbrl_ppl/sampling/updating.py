@@ -75,10 +75,12 @@ def update(
     their order, so that what is repeated shows as autocorrelation in ArviZ's figures (IBIS:
     Chopin, 2002). Only the new transitions are simulated. Weights add up over updates; when they
     are worth less than half of the draws, or fewer than 400 effective draws are left, at most 1000
-    draws are kept and moved by Metropolis steps under all data. When the weights are worth next to
-    nothing, or too uneven to be relied on, all data are fitted anew, with the defaults of fit. So
-    are they always, by the posterior's own method, where the likelihood is of simulations, whose
-    start states are fitted with the parameters.
+    draws are kept and moved by Metropolis steps under all data. When the weights are worth less
+    than 5 % of the draws, or their Pareto k is above 0.7, all data are fitted anew, with the
+    defaults of fit: that takes as long as a fit, or several times as long where chains run because
+    importance sampling does not suit. All data are fitted anew always, by the posterior's own
+    method, where the likelihood is of simulations, whose start states are fitted with the
+    parameters.
 
     Parameters
     ----------

@@ -1,6 +1,7 @@
 """A learned remainder: of a force that no effect explains, with its uncertainty; none if none."""
 
 import json
+import re
 import sys
 from dataclasses import replace
 
@@ -176,10 +177,24 @@ def test_a_verdict_with_names_is_left_alone() -> None:
         made_up("adequate").learn_remainder()
 
 
-def test_without_the_library_it_says_what_to_install(loop, monkeypatch) -> None:
-    monkeypatch.setitem(sys.modules, "sklearn.gaussian_process", None)
-    with pytest.raises(FitError, match=r"pip install 'pbrl_ppl\[remainder\]'"):
-        loop.learn_remainder()
+@pytest.mark.one_stack
+def test_without_the_library_it_says_what_to_install(tmp_path, monkeypatch, capsys) -> None:
+    """At once, not after the search."""
+    monkeypatch.setitem(sys.modules, "sklearn", None)
+    install = "pip install 'pbrl_ppl[remainder]'"
+    with pytest.raises(FitError, match=re.escape(install)):
+        learn_remainder(None, "puck")
+    monkeypatch.setattr(criticism, "close_loop", lambda *given, **options: pytest.fail("searched"))
+    (tmp_path / "scene.toml").write_text(BOX.to_toml())
+    train = tmp_path / "train.csv"
+    train.write_text(
+        "trajectory,step,time,body,x,y,theta,vx,vy,omega,force_x,force_y,torque\n"
+        "0,0,0.0,puck,0,0,0,0,0,0,1,0,0\n0,1,0.1,puck,0,0,0,0,0,0,,,\n"
+    )
+    files = [str(tmp_path / "scene.toml"), str(train), "-o", str(tmp_path / "out"), "-q"]
+    assert main(["close-loop", *files, "--learn-remainder"]) == 2
+    assert install in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_many_logs_at_once_learn_none(tmp_path, capsys) -> None:

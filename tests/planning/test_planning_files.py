@@ -174,3 +174,36 @@ def test_a_file_that_is_no_posterior_is_named(tmp_path, capsys) -> None:
 if __name__ == "__main__":
     for generation, path in PLANS.items():
         planned(load_posterior(file(generation))).save(path)
+
+
+@pytest.mark.one_stack
+def test_a_plan_prints_as_a_sentence_and_a_short_table() -> None:
+    found = planned(load_posterior(file("5")))
+    sentence, head, *rows = str(found).splitlines()
+    assert sentence == found.in_words()
+    assert head.split() == ["time", "body", "force_x", "force_y", "torque", "x", "y", "theta"]
+    assert 1 < len(rows) <= 8
+    first, last = rows[0].split(), rows[-1].split()
+    assert first[:2] == ["0", "puck"] and first[5:] == ["0", "0", "0"]
+    assert float(last[0]) == pytest.approx(found.duration - found.scene.time_step, rel=0.01)
+    np.testing.assert_allclose([float(x) for x in last[2:5]], found.wrenches[-1, 0], rtol=0.01)
+    assert repr(found) == (
+        f"Plan({len(found.wrenches)} intervals, {found.duration:.3g} s, goal reached)"
+    )
+
+
+@pytest.mark.one_stack
+@pytest.mark.parametrize(
+    ("given", "why"),
+    [
+        ([], "puck.nc names no effects that its data cannot separate"),
+        (["--effect", "spring"], "got --effect 'spring' alone"),
+    ],
+)
+def test_suggest_asks_for_effects_in_the_command_s_terms(tmp_path, capsys, given, why) -> None:
+    save_posterior(load_posterior(file("5")), tmp_path / "puck.nc")
+    command = ["suggest", str(tmp_path / "puck.nc"), "--start", "0,0,0", "-q"]
+    assert main([*command, "-o", str(tmp_path / "next.csv"), *given]) == 2
+    said = capsys.readouterr().err
+    cure = "name two or more, such as --effect linear_drag --effect quadratic_drag"
+    assert why in said and cure in said and "effects=" not in said
