@@ -123,3 +123,16 @@ def test_other_subjects_of_the_fit_have_their_anchors() -> None:
     page = (DOCS / "pages" / "guides" / "fit.md").read_text()
     for anchor in ("as-data-come-in", "with-arviz", "is-the-sampler-right", "three-likelihoods"):
         assert f'<a id="{anchor}">' in page
+
+
+def test_the_readme_shows_a_row_of_the_page_on_hardware() -> None:
+    """If the measured recordings were run again, copy the row's new numbers."""
+    readme = (ROOT / "README.md").read_text().partition("\n## ")[0]
+    page = (DOCS / "pages" / "results" / "hardware.md").read_text()
+    (name,) = re.findall(r"`([\w-]+)` of\s+\[On hardware\]", readme)
+    (row,) = re.findall(rf"^\| {name} \|.*", page, re.M)
+    (shown,) = re.findall(r"^\| a .*", readme, re.M)
+    assert shown.split(" | ")[0].removeprefix("| ") in row
+    numbers = re.findall(r"[\d.]+ \([\d.]+ to [\d.]+\)|[\d.]+ → [\d.]+", shown)
+    assert len(numbers) == 3 and all(each in row for each in numbers)
+    assert re.findall(r"`([a-z-]+)`", shown)[-1] in row

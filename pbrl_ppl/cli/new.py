@@ -284,11 +284,23 @@ def _topics(given: list[str] | None) -> dict[str, tuple[str, ...]]:
     return found
 
 
-def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
-    """Copy a model's scene, and its recordings beside it."""
+def models_folder() -> Path:
+    """Return the folder of the models that come with the package.
+
+    Raises
+    ------
+    OutputError
+        If it is not there.
+    """
     folder = next((path for path in _MODELS if path.is_dir()), None)
     if folder is None:
-        raise OutputError("--from: the models are not installed with this package; clone it")
+        raise OutputError("the models are not installed with this package; clone it")
+    return folder
+
+
+def _copied(model: str, scene: Path, overwrite: bool) -> list[Path]:
+    """Copy a model's scene, and its recordings beside it."""
+    folder = models_folder()
     known = sorted(path.parent.name for path in folder.glob("*/scene.toml"))
     if model not in known:
         raise SceneError(
