@@ -160,6 +160,7 @@ class Selection:
             enough = limits.worth_a_refit * waiting[0].candidate.statistic
             leading = [each for each in waiting if each.candidate.statistic >= enough]
             waiting = [each for each in waiting if each.candidate.statistic < enough]
+            self.say(f"refitting with each of {len(leading)} candidates")
             fits = dict(zip(leading, in_parallel(partial(refitted, mode), leading), strict=True))
             scores = {signature: score(signature, fitted) for signature, fitted in fits.items()}
             scores = {signature: value for signature, value in scores.items() if np.isfinite(value)}

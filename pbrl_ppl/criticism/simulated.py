@@ -336,6 +336,8 @@ class SimulatedSearch:
             trial = self._trial(now, parents, {law: leaders[law]}, choices[law])
             return replace(trial, same=tuple(each for each in same(law) if each != law))
 
+        if leaders:
+            self.say(f"simulating with each of {len(leaders)} candidates")
         trials = self._refined(now, in_parallel(alone, leaders))
         if trials and not self._white(trials[0].modes) and (pairs or self._best(trials) is None):
             both: list[dict[Attached, Floats]] = []
@@ -349,6 +351,8 @@ class SimulatedSearch:
             def together(begin: dict[Attached, Floats]) -> _Trial:
                 return self._trial(now, parents, begin, sum(choices[law] for law in begin))
 
+            if both:
+                self.say(f"simulating with {len(both)} pairs of them")
             trials += self._refined(now, in_parallel(together, both))
         return _compared(now, trials)
 
