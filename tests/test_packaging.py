@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -48,6 +49,24 @@ def files() -> list[str]:
 def test_the_citation_has_the_version_of_the_package() -> None:
     citation = (ROOT / "CITATION.cff").read_text()
     assert re.findall(r"^version: (.*)$", citation, re.M) == [pbrl_ppl.__version__]
+
+
+def test_the_citation_is_valid() -> None:
+    """It has the fields that the Citation File Format 1.2.0 requires."""
+    yaml = pytest.importorskip("yaml")
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text())
+    assert {"cff-version", "message", "title", "authors"} <= set(citation)
+    assert citation["cff-version"] == "1.2.0" and citation["type"] in ("software", "dataset")
+    assert str(citation["version"]) == pbrl_ppl.__version__
+    for each in (citation, *citation["references"]):
+        assert each["title"] and all({"name", "family-names"} & set(who) for who in each["authors"])
+
+
+def test_readme_lists_the_extras() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (said,) = re.findall(r"^Extras, as in.*?\n\n", (ROOT / "README.md").read_text(), re.M | re.S)
+    named = set(re.findall(r"`(\w+)`", said))
+    assert named == set(project["optional-dependencies"])
 
 
 @pytest.mark.slow
