@@ -153,7 +153,7 @@ def close_loop(
         declared, histories = options.load(
             scene, paths, reading, time_step=time_step, noise=noise, substeps=substeps
         )
-        catalogue = effect_files.with_catalogue(effect_file)
+        catalogue = {"catalogue": effect_files.with_catalogue(effect_file)} if effect_file else {}
         progress("loading the sampler")
         import pbrl_ppl.report as report
         from pbrl_ppl import criticism
@@ -162,8 +162,7 @@ def close_loop(
         if learn_remainder:
             criticism.check_scikit_learn()
         loop, stopped = _finished(
-            declared, histories, progress, catalogue=catalogue, seed=seed, draws=draws,
-            method=method.value,
+            declared, histories, progress, seed=seed, draws=draws, method=method.value, **catalogue,
         )  # fmt: skip
         progress("writing the report")
         source = report.Source(

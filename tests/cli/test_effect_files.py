@@ -98,8 +98,9 @@ def test_close_loop_adds_own_effects_to_the_catalogue(files, monkeypatch) -> Non
     assert main([*run, "--effect-file", "laws.py"]) == 2
     *known, tether = given["catalogue"]
     assert tuple(known) == pp.catalogue and tether.name == "tether"
+    given.clear()
     assert main(run) == 2
-    assert given["catalogue"] == pp.catalogue
+    assert "catalogue" not in given
 
 
 def test_an_own_effect_that_the_scene_declares_acts_there_alone(files) -> None:
