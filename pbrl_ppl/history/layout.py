@@ -107,8 +107,9 @@ def completed(frame: pd.DataFrame, scene: Scene, layout: Recording, source: str)
     RecordingWarning
         How many rows are left out, and why.
     """
-    frame = frame.copy()
-    by_body = ["trajectory", "body"]
+    frame, by_body = frame.copy(), ["trajectory", "body"]
+    if not {*by_body} <= {*frame} or frame[by_body].isna().any(axis=None):
+        return frame  # which is an error, and said where rows are read
     if "duration" in frame:
         duration = pd.to_numeric(frame.pop("duration"), errors="coerce").fillna(0.0)
         frame["time"] = duration.groupby([frame[name] for name in by_body]).cumsum()
@@ -176,7 +177,7 @@ def _pieces(rows: pd.DataFrame, cuts: Mapping[str, float]) -> Ints:
     piece = np.where(kept, np.cumsum(begins) - 1, -1)
     if "every" in cuts:
         piece = _every(times, piece, cuts["every"])
-    sizes = np.bincount(piece[piece >= 0], minlength=piece.max(initial=-1) + 1)
+    sizes = np.bincount(piece[piece >= 0], minlength=max(piece.max(initial=-1) + 1, 1))
     number = np.cumsum(sizes >= _LEAST_ROWS) - 1
     long = (piece >= 0) & (sizes[piece] >= _LEAST_ROWS)
     return np.asarray(np.where(long, number[piece], -1)[at])

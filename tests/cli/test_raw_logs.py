@@ -192,6 +192,17 @@ def test_cuts() -> None:
     assert History.from_dataframe(again, PUCK).dataset["n_rows"].to_numpy().tolist() == [30]
 
 
+def test_a_recording_without_bodies_or_with_nothing_between_cuts(tmp_path: Path) -> None:
+    two = PUCK.replace(
+        bodies=(*PUCK.bodies, Body("other", Shape.circle(0.1))), recording=Recording()
+    )
+    (tmp_path / "a.csv").write_text("time,x\n0,1\n0.1,2\n")
+    with pytest.raises(HistoryError, match="missing column.s. body"):
+        History.load(tmp_path / "a.csv", two)
+    with pytest.raises(HistoryError, match="nothing is left between its cuts"):
+        load("time,x\n0,1\n0.1,1\n0.2,1\n0.3,1\n", tmp_path / "b.csv", cut={"rests": 0.1})
+
+
 @pytest.mark.parametrize(
     ("layout", "message"),
     [
