@@ -197,7 +197,7 @@ def test_a_recording_without_bodies_or_with_nothing_between_cuts(tmp_path: Path)
         bodies=(*PUCK.bodies, Body("other", Shape.circle(0.1))), recording=Recording()
     )
     (tmp_path / "a.csv").write_text("time,x\n0,1\n0.1,2\n")
-    with pytest.raises(HistoryError, match="missing column.s. body"):
+    with pytest.raises(HistoryError, match=r"missing column.s. body"):
         History.load(tmp_path / "a.csv", two)
     with pytest.raises(HistoryError, match="nothing is left between its cuts"):
         load("time,x\n0,1\n0.1,1\n0.2,1\n0.3,1\n", tmp_path / "b.csv", cut={"rests": 0.1})
@@ -232,9 +232,8 @@ def test_velocities_that_were_computed_or_are_estimated(tmp_path: Path) -> None:
     rows = "time,x,vx\n0,1,7\n0.1,2,8\n0.2,3,9\n"
     computed = load(rows, tmp_path / "a.csv", velocities="computed")
     assert computed.dataset["observed"].isnull().to_numpy()[..., 3].all()
-    estimated = load(
-        "time,x,y,theta\n0,1,0,0\n0.1,2,0,0\n", tmp_path / "b.csv", velocities="estimate"
-    )
+    poses = "time,x,y,theta\n0,1,0,0\n0.1,2,0,0\n"
+    estimated = load(poses, tmp_path / "b.csv", velocities="estimate")
     assert not estimated.dataset["assumed"].to_numpy().any()
-    measured = load(rows, tmp_path / "c.csv")
+    measured = load(poses, tmp_path / "c.csv")
     assert measured.dataset["assumed"].to_numpy()[:, 3:].all()
