@@ -33,9 +33,11 @@ def verdict_in_words(loop: Loop) -> str:
     It is the first line of the report and of the summary in a terminal.
     """
     if loop.verdict == NOT_CONVERGED:
+        named = [_named(one) for one in loop.added]
+        found = f" (found so far: {_listed(named, 'and')})" if named else ""
         return (
-            "No verdict: the chains have not converged; take more draws (--draws), or give the"
-            " parameters tighter priors."
+            f"No verdict: the chains have not converged{found}; take more draws (--draws),"
+            " Gaussians at the modes (--method laplace), or give the parameters tighter priors."
         )
     return f"{_found(loop)}: {_gained(loop)}; {_remains(loop)}."
 

@@ -164,6 +164,7 @@ def test_the_page_on_own_logs_writes_scenes_that_load(
 ) -> None:
     """Its examples of ``new``, on short tables of the columns that they name."""
     monkeypatch.chdir(tmp_path)
+    Path("pole.txt").write_text("0.00 1.0\n0.05 1.1\n")
     Path("swing.csv").write_text("swing,ms,angle\n0,0,1\n0,20,2\n")
     angles = "run,t,q1,dq1,tau1,q2,dq2,tau2"
     Path("arm.csv").write_text(f"{angles}\n0,0,0,0,0,0,0,0\n0,0.01,0,0,0,0,0,0\n")
@@ -177,4 +178,4 @@ def test_the_page_on_own_logs_writes_scenes_that_load(
         assert run(f"{command.removeprefix('pbrl-ppl ')} --overwrite -q") == 0
         scene = Scene.load("scene.toml")
         kinds.append((len(scene.dynamic), len(scene.moving), len(scene.joints), len(scene.walls)))
-    assert kinds == [(1, 1, 1, 0), (2, 2, 2, 0), (1, 2, 0, 1)]
+    assert kinds == [(1, 1, 1, 0), (1, 1, 1, 0), (2, 2, 2, 0), (1, 2, 0, 1)]

@@ -29,8 +29,9 @@ HEADLINES = {
     "unexplained-beside": "Linear drag on the puck, 0.8000 kg/s (94 % 0.7800 to 0.8200): held-out"
     " error 2.40 -> 1.80 times the noise; 0.1 m/s² in vx of the puck, which depends on velocity x,"
     " is still unexplained.",
-    "not-converged": "No verdict: the chains have not converged; take more draws (--draws), or give"
-    " the parameters tighter priors.",
+    "not-converged": "No verdict: the chains have not converged (found so far: linear drag on the"
+    " puck); take more draws (--draws), Gaussians at the modes (--method laplace), or give the"
+    " parameters tighter priors.",
     "diverging": "Linear drag on the puck, 0.8000 kg/s (94 % 0.7800 to 0.8200): held-out error 2.40"
     " -> 1.02 times the noise; forecasts of 2.00 s diverge.",
 }

@@ -160,7 +160,7 @@ def test_page_where_something_is_unexplained() -> None:
 @pytest.mark.usefixtures("undrawn")
 def test_a_verdict_without_converged_chains_is_none() -> None:
     findings = made_up("not-converged")
-    assert verdict_in_words(findings).startswith("No verdict: the chains have not converged; ")
+    assert verdict_in_words(findings).startswith("No verdict: the chains have not converged")
     assert "No verdict" in page("not-converged").text
 
 
