@@ -115,7 +115,7 @@ def test_the_tutorial_defines_what_it_uses() -> None:
 
 
 def test_the_guide_says_when_an_update_refits() -> None:
-    page = (DOCS / "pages" / "guides" / "fit.md").read_text()
+    page = (DOCS / "pages" / "guides" / "update.md").read_text()
     assert updating._MOVE == 0.5 and "worth at least half of the draws" in page
     assert f"and {MIN_ESS:.0f} effective draws left" in page
     assert f"worth at least {updating._REFIT:.0%}".replace("%", " %") in page
