@@ -45,7 +45,7 @@ def propose(
     states = frame[places].apply(pd.to_numeric, errors="coerce").to_numpy(float, copy=True)
     unseen = _unseen(states, groups)
     if unseen.any() and not layout.not_seen:
-        layout = replace(layout, not_seen=dict.fromkeys(places, 0.0))  # type: ignore[arg-type]
+        layout = replace(layout, not_seen=tuple((name, 0.0) for name in places))
         said.append(f"{' = '.join(places)} = 0 in {unseen.sum()} rows: read as not seen")
         states[unseen] = np.nan
     spacing = np.concatenate([np.diff(times[rows]) for rows in groups])
@@ -76,7 +76,7 @@ def propose(
         said.append(
             f"{len(whole)} long trajectory: cut every {cut['every']:g} s, so that there are several"
         )
-    return replace(layout, cut=cut or ()), said  # type: ignore[arg-type]
+    return replace(layout, cut=tuple(cut.items())), said
 
 
 def _unseen(states: Floats, groups: list[Ints]) -> Bools:

@@ -30,18 +30,9 @@ from pbrl_ppl.posterior import completion, group, load_posterior
 from pbrl_ppl.sampling import physics_model
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.places import MODELS, ROOT
+from tests.helpers.puck import SCENE
 
 HEADER = "trajectory,step,time,body,x,y,theta,vx,vy,omega,force_x,force_y,torque\n"
-SCENE = """
-[world]
-time_step = 0.1
-substeps = 4
-
-[[body]]
-name = "puck"
-shape = { kind = "circle", radius = 0.1 }
-known = { r = 0.5, mu_c = 0.3 }
-"""
 
 
 @pytest.fixture

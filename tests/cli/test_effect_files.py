@@ -13,6 +13,7 @@ from pbrl_ppl.cli.effect_files import added_effects, own_effects
 from pbrl_ppl.posterior import load_posterior, scene_of
 from tests.helpers.histories import simulated_history
 from tests.helpers.places import ROOT
+from tests.helpers.puck import SCENE
 
 pytestmark = pytest.mark.one_stack
 
@@ -29,16 +30,6 @@ def law(state, command, parameters, wrench):
 
 
 tether = pp.Effect("tether", (size,), "a pull", "Hooke's law", pp.Force(law))
-"""
-SCENE = """
-[world]
-time_step = 0.1
-substeps = 4
-
-[[body]]
-name = "puck"
-shape = { kind = "circle", radius = 0.1 }
-known = { r = 0.5, mu_c = 0.3 }
 """
 
 
