@@ -378,32 +378,24 @@ def _posterior(task: _Task, mode: Mode) -> tuple[Any, list[Warning], list[str]]:
     Returns the posterior, its warnings, and what to tell the user.
     """
     from pbrl_ppl.model import build_model  # PyMC takes seconds to load
-    from pbrl_ppl.sampling import DEFAULT, FALLBACK, fit, unsuited
+    from pbrl_ppl.sampling import fit
 
     # one thread a chain: more would wait for each other
     mode = replace(mode, problem=mode.problem.with_physics(threads=1))
     model, method, said = build_model(mode.problem), task.method, []
-    why = unsuited(mode) if method == DEFAULT else ""
-    if why:
-        method = FALLBACK
     for n in DRAWS.get(method, CHAIN_DRAWS) if task.draws is None else (task.draws,):
         tune = max(LEAST_TUNE, 5 * n // 8)
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             fitted = fit(
-                model, method=method, seed=task.seed, draws=n, tune=tune, start=mode,
+                model, method=method, seed=task.seed, draws=n, tune=tune, start=mode, cores=1,
                 progress=False,
             )  # fmt: skip
         if "interrupted" in fitted.attrs:  # half a posterior gives no verdict
             raise KeyboardInterrupt
-        if "fallback" in fitted.attrs:  # more draws are of chains at once
-            method, why = FALLBACK, fitted.attrs["fallback"]
         if _converged(fitted, task.criteria):
             break
         said.append(f"{n} draws of each chain are too few")
-    if why:
-        fitted.attrs["fallback"] = why
-        said.insert(0, f"sampling by chains: {why}")
     # of the last fit; draws from a Gaussian are no chains that converge
     unheeded: tuple[type[Warning], ...] = (ConvergenceWarning,) if method == "laplace" else ()
     kept = [each.message for each in caught if not issubclass(each.category, unheeded)]

@@ -25,7 +25,11 @@ from .noise import profile_sigma as profile_sigma
 from .search import find_mode as find_mode
 from .simulation import find_simulation_mode as find_simulation_mode
 from .simulation import simulation_mode as simulation_mode
+from .space import Space as Space
+from .space import constrain as constrain
+from .space import unconstrain as unconstrain
 from .threads import in_parallel as in_parallel
+from .threads import one_blas_thread as one_blas_thread
 from .trajectories import find_trajectory_mode as find_trajectory_mode
 from .trajectories import following as following
 from .trajectories import nearby_mode as nearby_mode

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import solve_triangular
-from scipy.special import gammaln, ndtr, ndtri
-from scipy.stats import truncnorm
+from scipy.special import gammaln
 
-from pbrl_ppl.likelihood import log_posterior, noise_law
+from pbrl_ppl.likelihood import log_posterior
 from pbrl_ppl.modes.laplace import Mode
-from pbrl_ppl.parameters import Prior, evened
+from pbrl_ppl.modes.space import Space
 from pbrl_ppl.state import Floats
 
 #: Draws a round, rounds at most, and effective draws that are enough: the log-evidence is then
@@ -20,9 +19,6 @@ from pbrl_ppl.state import Floats
 _DRAWS, _ROUNDS, _ENOUGH = 1000, 12, 200
 #: Degrees of freedom of the proposal: tails heavier than a posterior's, at little cost.
 _NU = 8.0
-#: Points of the table of a von Mises distribution.
-_POINTS = 100_001
-_CHUNK = 128
 
 
 @dataclass(frozen=True)
@@ -44,111 +40,6 @@ class Evidence:
     ess: float | None = None
 
 
-class Coordinates:
-    """Parameters and noise in coordinates in which their prior is a standard normal.
-
-    The evidence is then the mean of the likelihood over a standard normal distribution.
-
-    Parameters
-    ----------
-    mode : Mode
-        An angle's circle is cut opposite to it.
-    """
-
-    def __init__(self, mode: Mode) -> None:
-        self.problem = mode.problem
-        priors = self.problem.layout.priors
-        self._laws = [_Law(prior, x) for prior, x in zip(priors, mode.phi, strict=True)]
-        self._centre, self._spread = noise_law(self.problem)
-        likelihood = self.problem.likelihood
-        sigma = likelihood.free(np.log(mode.sigma))
-        self._counts = likelihood.pooled(self.problem.observations.measured.sum((0, 1, 2)))
-        z = [float(law.standard(x)) for law, x in zip(self._laws, mode.phi, strict=True)]
-        #: The mode, shape (d,).
-        self.origin = np.concatenate([z, (sigma - self._centre) / self._spread])
-
-    def values(self, z: Floats) -> tuple[Floats, Floats]:
-        """Return phi (n, p) and sigma (n, parameter) at z (n, d)."""
-        p = len(self._laws)
-        columns = [law.value(z[:, i]) for i, law in enumerate(self._laws)]
-        phi = np.stack(columns, axis=1) if columns else np.zeros((len(z), 0))
-        sigma = np.exp(self._centre + self._spread * z[:, p:])
-        states = len(self.problem.observations.columns)
-        return phi, np.broadcast_to(sigma, (len(z), states))
-
-    def log_density(self, z: Floats) -> Floats:
-        """Return the log-posterior density of z, normalised by the prior, shape (n,)."""
-        phi, sigma = self.values(z)
-        problem = self.problem
-        parts = [
-            problem.log_density(problem.residual(phi[i:j]), sigma[i:j], phi[i:j])
-            for i, j in ((i, i + _CHUNK) for i in range(0, len(z), _CHUNK))
-        ]
-        even = evened(problem.layout, phi).sum(axis=-1)  # it sees one description of a wheel
-        return np.asarray(np.concatenate(parts).sum(axis=-1) + _log_normal(z) + even)
-
-    def gauss_newton(self, mode: Mode) -> tuple[Floats, Floats]:
-        """Return the mode (d,) and the Laplace covariance (d, d) in these coordinates."""
-        p, step = len(self._laws), 1e-4
-        slope = np.array(
-            [
-                float(np.diff(law.value(z + np.array([-step, step])))[0]) / (2 * step)
-                for law, z in zip(self._laws, self.origin, strict=False)
-            ]
-        )
-        jacobian = mode.jacobian * slope
-        precision = np.eye(len(self.origin))
-        precision[:p, :p] += jacobian.T @ jacobian
-        own = np.arange(p, len(precision))
-        precision[own, own] += 2.0 * self._counts * self._spread**2
-        covariance = np.linalg.inv(precision)
-        # a density's mode moves with its coordinates: where the data are silent, to the origin
-        residual = np.nan_to_num(self.problem.robust(mode.phi, mode.sigma)).ravel()
-        pull = np.concatenate([-jacobian.T @ residual, np.zeros(len(own))])
-        whole = covariance @ (pull - self.origin)
-        tried = self.origin + np.array([0.0, 0.25, 0.5, 1.0])[:, None] * whole
-        best = int(np.argmax(self.log_density(tried)))
-        return tried[best], np.asarray((covariance + covariance.T) / 2)
-
-
-class _Law:
-    """Map between a prior's values and a standard normal coordinate."""
-
-    def __init__(self, prior: Prior, near: float) -> None:
-        self._prior = prior
-        if prior.family == "von_mises":
-            grid = near + np.linspace(-np.pi, np.pi, _POINTS)
-            density = np.exp(prior.kappa * (np.cos(grid - prior.mu) - 1.0))
-            below = np.concatenate([[0.0], np.cumsum(density[1:] + density[:-1])])
-            self._grid, self._below = grid, below / below[-1]
-        elif prior.family not in ("log_normal", "normal"):
-            ends = (np.array(prior.support) - prior.mu) / prior.sigma
-            self._law = truncnorm(*ends, prior.mu, prior.sigma)
-
-    def standard(self, x: float) -> Floats:
-        """Return the coordinate of a value."""
-        prior = self._prior
-        if prior.family in ("log_normal", "normal"):
-            natural = np.log(x) if prior.family == "log_normal" else x
-            return np.asarray((natural - prior.mu) / prior.sigma)
-        if prior.family == "von_mises":
-            return np.asarray(ndtri(np.interp(x, self._grid, self._below)))
-        below, above = self._law.cdf(x), self._law.sf(x)
-        return np.asarray(np.where(below < above, ndtri(below), -ndtri(above)))
-
-    def value(self, z: Floats) -> Floats:
-        """Return the values at coordinates, same shape."""
-        prior = self._prior
-        if prior.family == "log_normal":
-            return np.asarray(np.exp(prior.mu + prior.sigma * z))
-        if prior.family == "normal":
-            return np.asarray(prior.mu + prior.sigma * z)
-        if prior.family == "von_mises":
-            return np.asarray(np.interp(ndtr(z), self._below, self._grid))
-        ends = self._law.ppf(ndtr(np.minimum(z, 0.0))), self._law.isf(ndtr(-np.maximum(z, 0.0)))
-        return np.asarray(np.where(z < 0, *ends))
-
-
 def laplace(mode: Mode) -> Evidence:
     """Return the Laplace approximation of the evidence, with a Gauss-Newton curvature.
 
@@ -157,10 +48,11 @@ def laplace(mode: Mode) -> Evidence:
     mode : Mode
         Of a problem of continuous parameters.
     """
-    coordinates = Coordinates(mode)
-    centre, covariance = coordinates.gauss_newton(mode)
-    log_det = np.linalg.slogdet(2 * np.pi * covariance)[1]
-    return Evidence(float(coordinates.log_density(centre[None])[0] + 0.5 * log_det))
+    space = Space.of(mode)
+    centre, covariance = space.laplace(mode)
+    loud = space.loud
+    log_det = np.linalg.slogdet(2 * np.pi * covariance[np.ix_(loud, loud)])[1]
+    return Evidence(float(space.log_density(centre[None])[0] + 0.5 * log_det))
 
 
 def trajectory_evidence(mode: Mode, unit: Sequence[int] = ()) -> float:
@@ -204,15 +96,18 @@ def importance(mode: Mode, rng: np.random.Generator) -> Evidence:
     rng : Generator
         Source of randomness.
     """
-    coordinates = Coordinates(mode)
-    centre, covariance = coordinates.gauss_newton(mode)
-    d = len(centre)
+    space = Space.of(mode)
+    centre, covariance = space.laplace(mode)
+    loud = space.loud
+    centre, covariance, d = centre[loud], covariance[np.ix_(loud, loud)], len(loud)
     for _ in range(_ROUNDS):
         factor = np.asarray(np.linalg.cholesky(covariance), dtype=float)
         radius = np.sqrt(_NU / rng.chisquare(_NU, (_DRAWS, 1)))
         moved: Floats = radius * rng.standard_normal((_DRAWS, d)) @ factor.T
         z = centre + moved
-        log_weight = coordinates.log_density(z) - _log_student(moved, factor)
+        q = space.prior_draws(np.zeros((_DRAWS, space.size)), rng)
+        q[:, loud] = z
+        log_weight = space.log_density(q) - _log_student(moved, factor)
         top = log_weight.max()
         weight = np.exp(log_weight - top)
         ess = float(weight.sum() ** 2 / (weight**2).sum())
@@ -230,11 +125,6 @@ def importance(mode: Mode, rng: np.random.Generator) -> Evidence:
         centre = centre + share * (mean - centre)
         covariance = covariance + share * (spread - covariance)
     return found
-
-
-def _log_normal(z: Floats) -> Floats:
-    """Return the log-density of a standard normal, shape (n,), at (n, d)."""
-    return np.asarray(-0.5 * (z**2).sum(axis=1) - 0.5 * z.shape[1] * np.log(2 * np.pi))
 
 
 def _log_student(x: Floats, factor: Floats) -> Floats:

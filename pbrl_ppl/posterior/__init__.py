@@ -1,6 +1,7 @@
 """Posterior files: save, load, draws, what the data inform, the next prior."""
 
 from .completion import LIKELIHOOD as LIKELIHOOD
+from .completion import MAX_PARETO_K as MAX_PARETO_K
 from .completion import MIN_ESS as MIN_ESS
 from .completion import PARETO_K as PARETO_K
 from .completion import checked as checked

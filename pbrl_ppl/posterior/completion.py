@@ -39,6 +39,10 @@ from pbrl_ppl.state import Floats, Ints
 #: Attributes of a trace of weighted proposals: their Pareto k, and log-likelihoods of transitions,
 #: shape (draw, transition), chains joined, which need not be evaluated anew.
 PARETO_K, LIKELIHOOD = "pareto_k", "log_likelihood"
+#: Further attributes of a trace that the posterior keeps.
+_SAMPLED = ("proposals", "rungs", "acceptance", "log_evidence")
+#: Pareto k of weights above which they miss a part of the posterior (Vehtari et al., 2024).
+MAX_PARETO_K = 0.7
 #: Largest R-hat and least effective sample size of reliable summaries (Vehtari et al., 2021).
 MAX_RHAT, MIN_ESS = 1.01, 400
 #: Draws are simulated in groups of this many, or of more with at most this many transitions.
@@ -123,7 +127,7 @@ def complete(
     if isinstance(problem.likelihood, TrajectoryLikelihood) and len(phi) > 1:
         record = replace(record, linearisation=linearisation(problem, phi, sigma))
     idata = placed(from_groups(result, record.attributes()), places(problem.segments))
-    for name in (ATTRIBUTE, PARETO_K, SIZE):
+    for name in (ATTRIBUTE, PARETO_K, SIZE, *_SAMPLED):
         if name in trace.attrs:
             idata.attrs[name] = trace.attrs[name]
     return checked(problem, idata, asked)
@@ -352,6 +356,13 @@ def _warnings(
             ConvergenceWarning,
             f"sampling was interrupted after {sizes['draw']} of {asked[0]} draws in"
             f" {sizes['chain']} of {asked[1]} chains, which are kept; for more, {on}",
+        )
+    if not idata.attrs.get(PARETO_K, 0.0) <= MAX_PARETO_K:
+        yield (
+            ConvergenceWarning,
+            f"Pareto k of the proposals' weights is {idata.attrs[PARETO_K]:.2g} (want <="
+            f" {MAX_PARETO_K}): they may miss a part of the posterior; raise draws=, or compare"
+            " with method='metropolis'",
         )
     rough = doubts(idata)
     if rough is not None:

@@ -103,8 +103,14 @@ class PosteriorRecord:
     pareto_k, importance_ess : float, optional
         Of draws by importance sampling: Pareto k of the proposals' weights, and the number of
         independent draws that the resampled draws are worth, which limits every parameter's ESS.
-    fallback : str, optional
-        Why chains were run in place of importance sampling.
+    proposals : str, optional
+        The density that was weighted: of an emulator, of few engine steps, or Gaussians.
+    rungs : int, optional
+        Rungs at which the engine moved particles, where weights alone did not suffice.
+    acceptance : float, optional
+        Share of those moves that were accepted; 1 without any.
+    log_evidence : float, optional
+        Of the model, about the modes that were found.
     """
 
     scene: Scene
@@ -134,7 +140,10 @@ class PosteriorRecord:
     interrupted: bool | None = None
     pareto_k: float | None = None
     importance_ess: float | None = None
-    fallback: str | None = None
+    proposals: str | None = None
+    rungs: int | None = None
+    acceptance: float | None = None
+    log_evidence: float | None = None
 
     @classmethod
     def of(cls, idata: Any) -> PosteriorRecord:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Callable, Mapping
-from functools import partial
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from pbrl_ppl.modes import (
     find_simulation_mode,
     find_trajectory_mode,
     following,
+    one_blas_thread,
     weigh,
 )
 from pbrl_ppl.posterior import (
@@ -37,9 +38,8 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     stored_mode,
 )
-from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job, Unsuited
-from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, prior_starts, summed
-from pbrl_ppl.sampling.starts import dispersed, from_posterior
+from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job, Method
+from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import Floats
 
 #: Searches for the mode, by the likelihood's name.
@@ -50,8 +50,6 @@ _SEARCHES: Mapping[str, Callable[..., Mode]] = {
 }
 #: The default sampler.
 DEFAULT = "importance"
-#: The sampler where the default one does not suit the posterior.
-FALLBACK = "metropolis"
 #: Draws of a trace at which contacts between parts are looked for, at most.
 _CHECKED_DRAWS = 50
 
@@ -72,8 +70,8 @@ def fit(
 ) -> Any:
     """Sample the posterior of a model of :func:`pbrl_ppl.physics_model`.
 
-    Draws come from importance sampling, or from chains where that does not suit. Both start about
-    the mode, which multi-start least squares finds if the model holds none. Where the scene does
+    Draws come from importance sampling by default. They start about the modes, which multi-start
+    least squares finds if the model holds none. Where the scene does
     not say which bodies a joint joins, every choice is fitted by itself, and their draws are mixed
     by their evidences (:func:`pbrl_ppl.joint_probabilities`). A model with a ``library`` needs no
     chain: all choices are summed over, unless ``method="paper"`` walks among them.
@@ -88,12 +86,11 @@ def fit(
     model : pymc.Model
         As made by ``physics_model``.
     method : str
-        ``importance``: proposals that many walkers draw together from the posterior of an
-        emulator, weighted by the engine in one batch and resampled; where bodies touch along whole
-        trajectories, where there are several independent parts or modes, or where no emulator is
-        close enough, ``metropolis``, and ``attrs["fallback"]`` says why; ``metropolis``: adaptive
-        blocks that follow the scene's independent parts and look ahead with polynomials where
-        engine runs are dear; ``paper``: one random walk a variable, by default on the schedule of
+        ``importance``: particles that begin at Gaussians about the modes, move to the posterior of
+        an emulator or of few engine steps, and are weighted by the engine in one batch and
+        resampled; where the weights do not suffice, the engine moves them on in rungs;
+        ``metropolis``: chains of the same moves under the engine's posterior, each of which
+        is many walkers, one after another; ``paper``: one random walk a variable, by default on the schedule of
         the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them burn-in,
         each tenth kept); with a library, on that for the apartment (``draws=400, tune=1000,
         thin=10, chains=1``), each body's set proposed uniformly;
@@ -108,9 +105,10 @@ def fit(
     chains : int, optional
         Chains; 4 by default, 30 for ``paper``, 1 for ``paper`` with a library.
     thin : int, optional
-        Steps a draw; rounds over the blocks for ``metropolis``.
+        Steps a draw; sweeps for ``metropolis``.
     cores : int, optional
-        Processes; as many as there are processors by default, at most one a chain.
+        Processes, at most one a chain, or the engine's threads; as many as there are processors by
+        default.
     start : Mode, optional
         A mode found before, in place of the search for one.
     resume : InferenceData or DataTree, optional
@@ -127,9 +125,10 @@ def fit(
         their own labels), prior, log_prior, observed_data and constant_data, with units, and in
         ``attrs`` the scene, effects, method, versions, seed, the hash of the data and the
         convergence. Of importance sampling there are ``pareto_k``, the shape of the weights' tail
-        (at most 0.7), and ``importance_ess``, the number of independent draws that the draws are
-        worth by their weights, which limits each parameter's effective sample size. Interrupted
-        chains keep the draws so far.
+        (at most 0.7), ``importance_ess``, the number of independent draws that the draws are worth
+        by their weights, which limits each parameter's effective sample size, ``proposals`` (what
+        was weighted), ``rungs`` and ``acceptance`` of the engine's moves, and ``log_evidence``.
+        Interrupted chains keep the draws so far.
 
     Raises
     ------
@@ -143,8 +142,8 @@ def fit(
     Warns
     -----
     ConvergenceWarning
-        If an R-hat of chains is over 1.01 or an effective sample size under 400, if sampling was
-        interrupted, or if an evidence is too rough for the probability of a joint.
+        If an R-hat of chains is over 1.01, a Pareto k over 0.7 or an effective sample size under
+        400, if sampling was interrupted, or if an evidence is too rough for the probability of a joint.
     LinearisationWarning
         If states smoothed anew at draws give another likelihood (``attrs["linearisation"]``, nats).
     MeetingWarning
@@ -155,97 +154,94 @@ def fit(
         If the data say nothing about a parameter.
     """
     problem = _checked_problem(model, method, start, resume)
-    again = partial(
-        fit, method=method, seed=seed, draws=draws, tune=tune, chains=chains, thin=thin,
-        cores=cores, progress=progress,
-    )  # fmt: skip
-    library, why = problem.library, ""
-    if method == DEFAULT and (library is not None or problem.layout.discrete.any()):
-        method = FALLBACK
-    elif method == DEFAULT and resume is not None:
-        earlier = PosteriorRecord.of(resume)
-        if earlier.method != DEFAULT:  # chains go on as chains
-            method, why = FALLBACK, earlier.fallback or ""
-    chosen = METHODS[method] if library is None else OVER_LIBRARY.get(method, METHODS[method])
-    # with one set there is no choice to sample
+    library = problem.library
+    # with one set there is no choice to walk over
     walks = library is not None and method in OVER_LIBRARY and len(library.names) > 1
-    chains = chosen.chains if chains is None else chains
-    if method == "map":
-        draws = chains = 1
-
-    def wanted() -> int:
-        return chosen.draws if draws is None else draws
-
-    def sampled(model: pm.Model, mode: Any, starts: list[dict[str, Any]] | None = None) -> Any:
-        nonlocal chosen, method, why
-        if starts is None:
-            starts = dispersed(mode, np.random.default_rng(seed), chains)
-        job = Job(
-            model=model,
-            mode=mode,
-            seed=seed,
-            draws=wanted(),
-            tune=chosen.tune if tune is None else tune,
-            chains=len(starts),
-            thin=chosen.thin if thin is None else thin,
-            cores=min(len(starts), os.cpu_count() or 1) if cores is None else cores,
-            progress=progress,
-            starts=starts,
-        )
-        with model, warnings.catch_warnings():
-            # of PyMC's processes
-            warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
-            # draws from the prior, of which SMC needs some, are not compiled on the newer stack
-            warnings.filterwarnings("ignore", message="Numba will use object mode")
-            try:
-                return chosen.run(job)
-            except Unsuited as unsuited:
-                chosen, method, why = METHODS[FALLBACK], FALLBACK, str(unsuited)
-        return sampled(model, mode, starts)
-
-    model = _as_in(model, resume)
-    problem = model.problem
-    if walks:
-        starts = prior_starts(problem, np.random.default_rng(seed), chains)
-        trace = sampled(model, None, starts)
-        point = most_frequent(problem, trace)
-    elif library is not None:
-        trace, point = summed(model, wanted(), chains, seed)
-        method = "exact sum over the library"
-    elif problem.layout.discrete.any():
-        found = weigh(problem, seed=seed, progress=progress)
-        point = most_probable(problem, found)
-        trace = mix(model, problem, found, sampled, draws=wanted(), chains=chains, seed=seed)
-    elif resume is not None:
-        trace = sampled(model, *from_posterior(problem, resume))
-        point = stored_mode(problem, resume)
-    else:
-        held: Mode | None = model.mode
-        mode = start or held or _SEARCHES[problem.likelihood.name](problem, seed=seed)
-        if not isinstance(mode.problem.likelihood, TransitionLikelihood) and mode is not held:
-            if start is not None and isinstance(start.problem.likelihood, TrajectoryLikelihood):
-                mode = following(start)
-            problem = mode.problem  # linearised at the mode
-            model = build_model(problem)
-        if joined := _joined_model(problem, mode.phi[None], mode.sigma[None]):
-            return again(joined)
-        trace = sampled(model, mode)
-        point = Point(mode.phi, mode.sigma)
-    # PyMC ends an interrupted run quietly, with fewer draws or with the chains that had most
-    sizes = group(trace, "posterior").sizes
-    all_chains = chains if resume is None else group(resume, "posterior").sizes["chain"]
-    cut = sizes["draw"] < wanted() or sizes["chain"] < all_chains
-    if not cut and (joined := _joined_of_draws(problem, trace)):
-        return again(joined)
+    chosen = OVER_LIBRARY[method] if walks else METHODS[method]
+    job = Job(
+        model=_as_in(model, resume),
+        mode=None,
+        resume=resume,
+        seed=seed,
+        draws=1 if method == "map" else chosen.draws if draws is None else draws,
+        tune=chosen.tune if tune is None else tune,
+        chains=1 if method == "map" else chosen.chains if chains is None else chains,
+        thin=chosen.thin if thin is None else thin,
+        cores=os.cpu_count() or 1 if cores is None else cores,
+        progress=progress,
+    )
+    while True:
+        job, trace, point = _drawn(job, chosen, start, walks)
+        # PyMC ends an interrupted run quietly, with fewer draws or with the chains that had most
+        sizes = group(trace, "posterior").sizes
+        all_chains = job.chains if resume is None else group(resume, "posterior").sizes["chain"]
+        cut = sizes["draw"] < job.draws or sizes["chain"] < all_chains
+        joined = None if cut else _joined_of_draws(job.problem, trace)
+        if joined is None:
+            break
+        job, start, resume = replace(job, model=joined, resume=None), None, None
     if resume is not None:
         if sizes["chain"] < all_chains:
             raise KeyboardInterrupt  # some chains have nothing new, and resume= has all of them
         trace = _appended(resume, trace)
-    asked = (wanted(), all_chains) if cut else None
-    result = complete(problem, trace, seed=seed, method=method, asked=asked, mode=point)
-    if why:
-        result.attrs["fallback"] = why
-    return result
+    return complete(
+        job.problem,
+        trace,
+        seed=seed,
+        method=method if library is None or walks else "exact sum over the library",
+        asked=(job.draws, all_chains) if cut else None,
+        mode=point,
+    )
+
+
+def _drawn(job: Job, chosen: Method, start: Mode | None, walks: bool) -> tuple[Job, Any, Point]:
+    """Return the job on the model that was sampled, its draws, and its mode."""
+    problem = job.problem
+    if walks:
+        trace = _run(chosen, job)
+        return job, trace, most_frequent(problem, trace)
+    if problem.library is not None:
+        return job, *summed(job.model, job.draws, job.chains, job.seed)
+    if problem.layout.discrete.any():
+        found = weigh(problem, seed=job.seed, progress=job.progress)
+
+        def sample(model: pm.Model, mode: Mode) -> Any:
+            return _run(chosen, replace(job, model=model, mode=mode))
+
+        trace = mix(
+            job.model, problem, found, sample, draws=job.draws, chains=job.chains, seed=job.seed
+        )
+        return job, trace, most_probable(problem, found)
+    if job.resume is not None:
+        return job, _run(chosen, job), stored_mode(problem, job.resume)
+    job = _at_mode(job, start)
+    return job, _run(chosen, job), Point(job.at_mode.phi, job.at_mode.sigma)
+
+
+def _at_mode(job: Job, start: Mode | None) -> Job:
+    """Return the job with a mode, in whose model bodies that meet at it are in one part."""
+    while True:
+        model, held = job.model, job.model.mode
+        mode = start or held or _SEARCHES[job.problem.likelihood.name](job.problem, seed=job.seed)
+        if mode is not held and not isinstance(mode.problem.likelihood, TransitionLikelihood):
+            if start is not None and isinstance(start.problem.likelihood, TrajectoryLikelihood):
+                mode = following(start)
+            model = build_model(mode.problem)  # linearised at the mode
+        problem = model.problem
+        joined = _joined_model(problem, mode.phi[None], mode.sigma[None])
+        if joined is None:
+            return replace(job, model=model, mode=replace(mode, problem=problem))
+        job, start = replace(job, model=joined), None
+
+
+@one_blas_thread
+def _run(chosen: Method, job: Job) -> Any:
+    """Return draws by a method, without what its processes warn of."""
+    with job.model, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*fork.*", category=DeprecationWarning)
+        # draws from the prior, of which SMC needs some, are not compiled on the newer stack
+        warnings.filterwarnings("ignore", message="Numba will use object mode")
+        return chosen.run(job)
 
 
 def _checked_problem(model: pm.Model, method: str, start: Any, resume: Any) -> Problem:

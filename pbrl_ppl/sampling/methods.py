@@ -3,26 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from copy import deepcopy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import pymc as pm
 import xarray as xr
+from rich.console import Console
+from rich.progress import track
 
-from pbrl_ppl.posterior import CELLS, LIKELIHOOD, PARETO_K, SIZE, from_groups, groups
-from pbrl_ppl.sampling.emulator import FewSteps, Surrogate, Unpack, emulate
-from pbrl_ppl.sampling.importance import MAX_PARETO_K, draw_pool, resample, stream, unsuited
-from pbrl_ppl.sampling.metropolis import AdaptiveMetropolis, Jumps, Schedule
-from pbrl_ppl.sampling.starts import blank_point, evened_logp, gaussian_blocks
+from pbrl_ppl.errors import FitError
+from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.modes import Mode, Space
+from pbrl_ppl.posterior import (
+    CELLS,
+    LIKELIHOOD,
+    PARETO_K,
+    SIZE,
+    from_groups,
+    group,
+    groups,
+    parameter_draws,
+)
+from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference
+from pbrl_ppl.sampling.importance import cheaper, draw_pool, resample, stream
+from pbrl_ppl.sampling.starts import dispersed, last_draws, prior_starts
 from pbrl_ppl.state import Floats
 
-#: Weighted proposals a draw, and the least share of the draws that they must be worth.
-_PROPOSALS, _WORTH = 1.4, 0.3
-#: Ratio of engine steps from which the engine with few of them is a surrogate.
-_FEWER = 4
-#: Engine steps below which a surrogate does not pay.
+#: Weighted proposals a draw.
+_PROPOSALS = 1.4
+#: Walkers of a chain of the ensemble.
+_WALKERS = 20
+#: Engine steps below which a cheaper posterior does not pay.
 _LITTLE = 2000
 
 
@@ -49,10 +61,23 @@ class Method:
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """Arguments of a sampler's run; ``mode`` is a Mode, or None over the sets of a library."""
+    """What a sampler runs on.
+
+    Parameters
+    ----------
+    model : pymc.Model
+        As made by ``physics_model``.
+    mode : Mode, optional
+        Where draws begin, unless they go on from a posterior or walk over a library.
+    resume : InferenceData or DataTree, optional
+        Posterior to go on from.
+    seed, draws, tune, chains, thin, cores, progress
+        As of :func:`pbrl_ppl.fit`, with defaults filled in.
+    """
 
     model: pm.Model
-    mode: Any
+    mode: Mode | None
+    resume: Any
     seed: int
     draws: int
     tune: int
@@ -60,18 +85,57 @@ class Job:
     thin: int
     cores: int
     progress: bool
-    starts: list[dict[str, Any]]
+
+    @property
+    def problem(self) -> Problem:
+        """The model's problem."""
+        return self.model.problem  # type: ignore[no-any-return]
+
+    def starts(self) -> list[dict[str, Any]]:
+        """Return starts of PyMC's chains, and of the stream of random numbers."""
+        rng = np.random.default_rng(self.seed)
+        if self.resume is not None:
+            draws = zip(*last_draws(self.problem, self.resume), strict=True)
+            return [self.problem.named(*draw) for draw in draws]
+        if self.mode is None:
+            return prior_starts(self.problem, rng, self.chains)
+        return dispersed(self.mode, rng, self.chains)
+
+    def reference(self) -> Reference:
+        """Return Gaussians about the modes, or of the draws of the posterior to go on from."""
+        if self.resume is None:
+            space = Space.of(self.at_mode)
+            rough = space.on(space.problem.with_physics(threads=self.cores).rough)
+            space = space.on(space.problem.with_physics(threads=self.cores))
+            return Reference.about(space, self.at_mode, rough)
+        phi, sigma = parameter_draws(self.problem, self.resume)
+        problem = self.problem.with_physics(threads=self.cores)
+        return Reference.of_draws(*Space.of_draws(problem, phi, sigma))
+
+    @property
+    def at_mode(self) -> Mode:
+        """The mode.
+
+        Raises
+        ------
+        FitError
+            If there is none.
+        """
+        if self.mode is None:
+            raise FitError("fit: this method begins at a mode, and there is none")
+        return self.mode
 
     def sample(self, step: Any, steps_a_draw: int = 1) -> Any:
         """Run ``pm.sample`` from the starts, without its checks of convergence."""
+        starts = self.starts()
         try:
             trace = pm.sample(
                 draws=self.draws * steps_a_draw,
                 tune=self.tune,
-                chains=self.chains,
-                cores=self.cores,
+                chains=len(starts),
+                cores=min(self.cores, len(starts)),
                 step=step,
-                initvals=self.starts,
+                initvals=starts,
                 random_seed=self.seed,
                 progressbar=self.progress,
                 quiet=not self.progress,
@@ -90,69 +154,70 @@ class Job:
         return from_groups(data, {})
 
 
-def _metropolis(job: Job) -> Any:
-    """Run block-wise adaptive Metropolis with a surrogate; see `AdaptiveMetropolis`."""
-    problem, model = job.mode.problem, job.model
-    blocks = gaussian_blocks(model, job.mode)
-    if job.mode.others and len(blocks) == 1:
-        others = [gaussian_blocks(model, mode)[0] for mode in job.mode.others]
-        jumps = Jumps((deepcopy(blocks[0]), *others))  # the block itself adapts
-    else:
-        jumps = None
-    # engine steps of one exact step of a block
-    engine = problem.simulator
-    cost = engine.steps * problem.segments.n * problem.data.horizon / len(engine.parts)
-    rough, schedule = None, Schedule(thin=job.thin)
-    if cost > _LITTLE:
-        unpack = Unpack(model, problem)
-        if emulator := emulate(job.mode, unpack, blocks, job.seed):
-            rough = Surrogate(problem, unpack, emulator)
-            schedule = Schedule(inner=45, plain=0.3, thin=job.thin)
-        elif engine.steps >= _FEWER * problem.rough.simulator.steps:
-            rough = Surrogate(problem, unpack, FewSteps(job.mode))
-            schedule = Schedule(inner=20, plain=0.1, thin=job.thin)
-    return job.sample(
-        AdaptiveMetropolis(
-            model.free_RVs,
-            blocks=blocks,
-            rough=rough,
-            schedule=schedule,
-            jumps=jumps,
-            extra=evened_logp(model, problem),
-            initial_point=blank_point(model, problem),
-        )
-    )
-
-
-class Unsuited(Exception):
-    """A sampler does not suit a posterior, and why."""
-
-
 def _importance(job: Job) -> Any:
-    """Weight proposals from an emulator's posterior; see `importance`.
-
-    Raises
-    ------
-    Unsuited
-        If no emulator is close enough to the posterior.
-    """
-    if why := unsuited(job.mode):
-        raise Unsuited(why)
-    shape, seed = (job.chains, job.draws), stream(job.seed, job.starts)
-    n = job.chains * job.draws
-    pool, why = draw_pool(job.mode, int(_PROPOSALS * n), seed, job.cores)
-    if pool is None:
-        raise Unsuited(why)
+    """Weight proposals from a cheaper posterior; see `importance`."""
+    chains = job.chains if job.resume is None else group(job.resume, "posterior").sizes["chain"]
+    shape, seed = (chains, job.draws), stream(job.seed, job.starts())
+    n = chains * job.draws
+    pool = draw_pool(job.reference(), int(_PROPOSALS * n), seed)
     chosen, k, size = resample(pool.log_weight, n, np.random.default_rng([*seed, 1]))
-    if not k <= MAX_PARETO_K:
-        raise Unsuited(f"Pareto k of the proposals is {k:.2f}, above {MAX_PARETO_K}")
-    if size < _WORTH * n:
-        raise Unsuited(f"weights leave {size:.0f} of {n} draws")
     phi, sigma = pool.phi[chosen], pool.sigma[chosen]
-    values = job.mode.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
+    values = job.problem.named(phi.reshape(*shape, -1), sigma.reshape(*shape, -1))
     trace = as_trace(job.model, values, {"log_weight": pool.log_weight[chosen].reshape(shape)})
-    trace.attrs |= {PARETO_K: k, SIZE: size, LIKELIHOOD: pool.log_likelihood[chosen]}
+    trace.attrs |= {
+        PARETO_K: k, SIZE: pool.kept * size, LIKELIHOOD: pool.log_likelihood[chosen],
+        "proposals": pool.cheaper, "rungs": pool.rungs, "acceptance": pool.accepted,
+        "log_evidence": pool.log_evidence,
+    }  # fmt: skip
     return trace
+
+
+def _metropolis(job: Job) -> Any:
+    """Run the ensemble as chains; see `ensemble`. A chain is its walkers, one after another."""
+    reference, rng = job.reference(), np.random.default_rng(stream(job.seed, job.starts()))
+    problem = reference.space.problem
+    walkers = min(_WALKERS, job.draws)
+    per_walker = -(-job.draws // walkers)
+    chains = job.chains
+    if job.resume is None:
+        q = reference.draw(chains * walkers, rng)
+    else:
+        phi, sigma = last_draws(job.problem, job.resume, walkers)
+        chains = len(phi) // walkers
+        q = Space.of_draws(problem, phi, sigma)[1]
+    ensemble, exact = Ensemble(reference, q, rng), Posterior(reference.space)
+    cost = problem.simulator.steps * problem.segments.n * problem.data.horizon
+    cheap = None
+    if cost / len(problem.simulator.parts) > _LITTLE:
+        cheap = cheaper(reference, rng).posterior
+    tune = -(-job.tune // walkers) * job.thin
+    kept, rates = [], []
+    steps = track(
+        range(tune + per_walker), "sampling", console=Console(stderr=True),
+        disable=not job.progress,
+    )  # fmt: skip
+    try:
+        for i in steps:
+            sweeps = 1 if i < tune else job.thin
+            rate = ensemble.move(exact, sweeps, cheap, adapt=i < tune)
+            ensemble.q = reference.space.prior_draws(ensemble.q, rng)
+            if i < tune:
+                ensemble.learn()
+                continue
+            kept.append(ensemble.q.copy())
+            rates.append(rate)
+    except KeyboardInterrupt:
+        if len(kept) < 2:
+            raise
+    phi, sigma = reference.space.split(np.array(kept))  # (draw, walker of all chains, ...)
+
+    def chained(values: Floats) -> Floats:
+        values = np.moveaxis(values, 0, 1).reshape(chains, walkers * len(kept), -1)
+        return values[:, -job.draws :]
+
+    values = job.problem.named(chained(phi), chained(sigma))
+    accept = np.repeat(np.array(rates)[:, None], chains * walkers, axis=1)
+    return as_trace(job.model, values, {"accept": chained(accept[..., None])[..., 0]})
 
 
 def _paper(job: Job) -> Any:
@@ -194,14 +259,15 @@ def _smc(job: Job) -> Any:
 
 def _map(job: Job) -> Any:
     """Return the mode alone, as a posterior of one draw."""
-    values = job.mode.problem.named(job.mode.phi, job.mode.sigma)
+    mode = job.at_mode
+    values = mode.problem.named(mode.phi, mode.sigma)
     draws = {name: np.asarray(value)[None, None] for name, value in values.items()}
-    return as_trace(job.model, draws, {"lp": np.array([[job.mode.log_posterior]])})
+    return as_trace(job.model, draws, {"lp": np.array([[mode.log_posterior]])})
 
 
 def _laplace(job: Job) -> Any:
     """Draw independently from the Gaussian at the mode; that of the noise is of its logarithm."""
-    rng, mode = np.random.default_rng(job.seed), job.mode
+    rng, mode = np.random.default_rng(job.seed), job.at_mode
     shape = job.chains, job.draws
     phi = mode.draws(rng, job.chains * job.draws)
     centre, covariance = mode.noise_gaussian()

@@ -237,17 +237,6 @@ def summed(model: pm.Model, draws: int, chains: int, seed: int) -> tuple[Any, Po
     return as_trace(model, values, {"accept": accepted}), _point(problem, best)
 
 
-def prior_starts(problem: Problem, rng: np.random.Generator, chains: int) -> list[dict[str, Any]]:
-    """Draw starts of chains: each owner's set from the prior, sigma at its prior's median."""
-    median = problem.noise_prior[0]
-    sigma = np.exp(np.log(median).mean()) if problem.scalar_sigma else median
-    laws = [_library(problem).prior(owner) for owner in problem.scene.owners]
-    return [
-        {"library_index": np.array([rng.choice(len(p), p=p) for p in laws]), "sigma": sigma}
-        for _ in range(chains)
-    ]
-
-
 def most_frequent(problem: Problem, trace: Any) -> Point:
     """Return the most frequent choice among the draws, jointly for bodies that meet.
 

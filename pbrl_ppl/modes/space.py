@@ -1,0 +1,353 @@
+"""Space of a problem: unconstrained parameters and noise, in which a posterior is near normal."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from scipy.special import expit
+
+from pbrl_ppl.likelihood import Problem, TransitionLikelihood, exponential, log_noise_prior
+from pbrl_ppl.modes.laplace import Mode
+from pbrl_ppl.parameters import Prior, evened, gathered, inside, wheels
+from pbrl_ppl.state import Bools, Floats, Ints
+
+#: Noise that may vanish is a power of its coordinate.
+_ROOT = 3.0
+#: A parameter whose derivative is below this in units of noise over its prior is not informed.
+_SILENT = 1e-3
+#: Step of differences of a prior's density in the unconstrained space, and its least curvature: a
+#: truncated prior's tails there are those of a logistic distribution.
+_STEP, _FLAT = 1e-3, 0.05
+#: Distances at which a posterior is evaluated (standard deviations), and the fall (nats) from which
+#: a point is outside; a Gaussian falls by 2 at the first.
+_FAR, _LOW = (2.0, 4.0, 8.0, 16.0), 2.5
+#: Numbers held at once.
+_NUMBERS = 4_000_000
+
+
+def unconstrain(prior: Prior, x: Any) -> tuple[Any, Any]:
+    """Return the unconstraining transform of a prior's variable at x, and its derivative.
+
+    Numbers or arrays of any shape.
+    """
+    if prior.family in ("log_normal", "half_normal"):
+        return np.log(x), 1.0 / x
+    if prior.family == "truncated_normal":
+        left, right = x - prior.lower, prior.upper - x
+        return np.log(left / right), 1.0 / left + 1.0 / right
+    return x, np.ones_like(x)
+
+
+def constrain(prior: Prior, u: Any) -> Any:
+    """Return the inverse of :func:`unconstrain`."""
+    if prior.family in ("log_normal", "half_normal"):
+        return np.exp(u)
+    if prior.family == "truncated_normal":
+        return prior.lower + (prior.upper - prior.lower) * expit(u)
+    return u
+
+
+@dataclass(frozen=True, eq=False)
+class Independent:
+    """Parameters and bodies that given the noise are independent of all others.
+
+    Parameters
+    ----------
+    places, bodies : ndarray of int
+        Places of the informed parameters in phi, and of the bodies, shapes (entry,) and (body,).
+    """
+
+    places: Ints
+    bodies: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Space:
+    """Space of a problem: its transformed parameters, then the noise; a point has shape (d,).
+
+    Parameters are as PyMC transforms them. Measurement noise is by its logarithm; unexplained
+    accelerations and correlated errors, which may vanish, are by their cube root (E. B. Wilson and
+    M. M. Hilferty, The distribution of chi-square, 1931). The equal descriptions of a wheel share
+    its prior evenly; see `parameters.evened`. A circle is cut opposite to the centre.
+
+    Parameters
+    ----------
+    problem : Problem
+        Of continuous parameters.
+    centre : ndarray
+        Parameters about which circles are cut, shape (p,).
+    silent : ndarray of bool, optional
+        Parameters that the data do not inform, shape (p,): their posterior is their prior, and no
+        density here includes it.
+    """
+
+    problem: Problem
+    centre: Floats
+    silent: Bools = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def __post_init__(self) -> None:
+        """Take no parameter to be silent by default."""
+        if not len(self.silent):
+            object.__setattr__(self, "silent", np.zeros(len(self.centre), dtype=bool))
+
+    @classmethod
+    def of(cls, mode: Mode) -> Space:
+        """Return the space about a mode, with the parameters that its derivative finds silent."""
+        return cls(mode.problem, mode.phi, silent(mode))
+
+    @classmethod
+    def of_draws(cls, problem: Problem, phi: Floats, sigma: Floats) -> tuple[Space, Floats]:
+        """Return the space about a posterior's draws (n, p), and they in it, shape (n, d).
+
+        All wheels are at one mode.
+        """
+        phi = gathered(problem.layout, phi)
+        space = cls(problem, phi.mean(axis=0))
+        return space, space.at(phi, sigma)
+
+    def on(self, problem: Problem) -> Space:
+        """Return the same space of a problem with the same parameters and noise."""
+        return replace(self, problem=problem)
+
+    @property
+    def phi_size(self) -> int:
+        """Number of parameters, p."""
+        return len(self.centre)
+
+    @cached_property
+    def roots(self) -> Bools:
+        """Which noise parameters are by their cube root, shape (free,)."""
+        free = self.problem.likelihood.free(exponential(self.problem).astype(float))
+        return np.asarray(free, dtype=bool)
+
+    @property
+    def size(self) -> int:
+        """Number of coordinates, d."""
+        return self.phi_size + len(self.roots)
+
+    @cached_property
+    def parts(self) -> tuple[Independent, ...]:
+        """Independent parts; one where the likelihood mixes the bodies' residuals."""
+        parts = self.problem.simulator.parts
+        if not isinstance(self.problem.likelihood, TransitionLikelihood):
+            bodies = np.arange(len(self.problem.scene.moving))
+            return (Independent(np.flatnonzero(~self.silent), bodies),)
+        return tuple(
+            Independent(part.places[~self.silent[part.places]], part.bodies) for part in parts
+        )
+
+    @property
+    def loud(self) -> Ints:
+        """The coordinates that the data inform, shape (loud,)."""
+        return np.concatenate(
+            [np.flatnonzero(~self.silent), np.arange(self.phi_size, self.size)]
+        )
+
+    @cached_property
+    def noise_blocks(self) -> tuple[Ints, ...]:
+        """Coordinates of the noise that are moved together; errors of measuring come first."""
+        entries = self.phi_size + np.arange(len(self.roots))
+        blocks = (entries[~self.roots], entries[self.roots])
+        return tuple(block for block in blocks if len(block))
+
+    def at(self, phi: Floats, sigma: Floats) -> Floats:
+        """Return the points of parameters (..., p) and noise (..., parameter), shape (..., d)."""
+        priors = self.problem.layout.priors
+        phi = inside(priors, phi)
+        columns = [unconstrain(prior, phi[..., i])[0] for i, prior in enumerate(priors)]
+        u = np.stack(columns, axis=-1) if columns else phi
+        for i in self._circles:
+            u[..., i] = self.centre[i] + np.mod(u[..., i] - self.centre[i] + np.pi, 2 * np.pi) - np.pi
+        log_sigma = np.log(self.problem.likelihood.free(sigma))
+        return np.concatenate([u, self.noise(log_sigma)], axis=-1)
+
+    def noise(self, log_sigma: Floats) -> Floats:
+        """Return the coordinates of free noise parameters, given their logarithm, (..., free)."""
+        return np.where(self.roots, np.exp(log_sigma / _ROOT), log_sigma)
+
+    def split(self, q: Floats) -> tuple[Floats, Floats]:
+        """Return phi, shape (..., p), and sigma, shape (..., parameter), at points (..., d)."""
+        problem, p = self.problem, self.phi_size
+        with np.errstate(over="ignore"):
+            columns = [constrain(prior, q[..., i]) for i, prior in enumerate(problem.layout.priors)]
+            noise = q[..., p:]
+            sigma = np.where(self.roots, np.abs(noise) ** _ROOT, np.exp(noise))
+        phi = np.stack(columns, axis=-1) if columns else q[..., :0]
+        return phi, np.broadcast_to(sigma, (*sigma.shape[:-1], len(problem.noise_prior[0])))
+
+    @cached_property
+    def _circles(self) -> list[int]:
+        priors = self.problem.layout.priors
+        return [i for i, prior in enumerate(priors) if prior.family == "von_mises"]
+
+    def log_priors(self, q: Floats) -> Floats:
+        """Return the log-prior of each part, then of the noise, shape (..., part + 1).
+
+        Minus infinity outside; without the silent parameters.
+        """
+        each, noise = self._of_parameters(q), self._of_noise(q)
+        sums = [each[..., part.places].sum(axis=-1) for part in self.parts]
+        total = np.stack([*sums, noise], axis=-1)
+        return np.where(np.isfinite(total), total, -np.inf)
+
+    def _of_parameters(self, q: Floats) -> Floats:
+        """Return the log-prior of each transformed parameter, shape (..., p)."""
+        problem, phi = self.problem, self.split(q)[0]
+        priors = problem.layout.priors
+        with np.errstate(all="ignore"):
+            slopes = [unconstrain(prior, phi[..., i])[1] for i, prior in enumerate(priors)]
+            density = problem.layout.log_prior(phi) + evened(problem.layout, phi)
+            density -= np.moveaxis(np.log(np.abs(slopes)), 0, -1) if slopes else 0.0
+        for i in self._circles:
+            beyond = np.abs(q[..., i] - self.centre[i]) > np.pi
+            density[..., i] = np.where(beyond, -np.inf, density[..., i])
+        return np.asarray(density)
+
+    def _of_noise(self, q: Floats) -> Floats:
+        """Return the log-prior of the noise's coordinates, shape (...)."""
+        noise = q[..., self.phi_size :]
+        with np.errstate(all="ignore"):
+            log_sigma = np.where(self.roots, _ROOT * np.log(noise), noise)
+            # the density of a root, from that of the logarithm
+            slope = np.where(self.roots, np.log(_ROOT / noise), 0.0).sum(axis=-1)
+            return np.asarray(log_noise_prior(self.problem, log_sigma) + slope)
+
+    def log_likelihoods(self, q: Floats, residual: Floats) -> Floats:
+        """Return the log-likelihood of each part at residuals, shape (n, part)."""
+        problem = self.problem
+        phi, sigma = self.split(q)
+        with np.errstate(all="ignore"):
+            if len(self.parts) == 1:
+                value = problem.log_density(residual, sigma, phi).sum(axis=-1)[:, None]
+            else:
+                measured, nu = problem.observations.measured, problem.nu(phi)
+                value = np.empty((len(q), len(self.parts)))
+                for j, part in enumerate(self.parts):
+                    nu_of = nu[..., part.bodies, :] if isinstance(nu, np.ndarray) else nu
+                    some, seen = residual[..., part.bodies, :], measured[..., part.bodies, :]
+                    each = problem.likelihood.log_density(some, sigma, seen, nu_of)
+                    value[:, j] = each.sum(axis=-1)
+        return np.where(np.isnan(value), -np.inf, value)
+
+    def residual(self, q: Floats) -> Floats:
+        """Return the engine's residuals, shape (n, transition, H, body, state)."""
+        return self.problem.residual(self.possible(q))
+
+    def possible(self, q: Floats) -> Floats:
+        """Return phi (n, p), with the centre where a point is outside what numbers can hold."""
+        phi = self.split(q)[0]
+        there = np.isfinite(phi).all(axis=-1, keepdims=True)
+        return inside(self.problem.layout.priors, np.where(there, phi, self.centre))
+
+    def log_density(self, q: Floats) -> Floats:
+        """Return the log-posterior up to the evidence at points (n, d), shape (n,)."""
+        width = max(1, _NUMBERS // max(self.problem.measured.size, 1))
+        density = self.log_priors(q).sum(axis=-1)
+        for first in range(0, len(q), width):
+            some = q[first : first + width]
+            density[first : first + width] += self.log_likelihoods(some, self.residual(some)).sum(1)
+        return np.where(np.isnan(density), -np.inf, density)
+
+    def prior_draws(self, q: Floats, rng: np.random.Generator) -> Floats:
+        """Return points (n, d) with the silent parameters drawn from their prior."""
+        q = q.copy()
+        for place in np.flatnonzero(self.silent):
+            prior = self.problem.layout.priors[place]
+            drawn = inside([prior], prior.sample(rng, len(q))[:, None])[:, 0]
+            q[:, place] = unconstrain(prior, drawn)[0]
+        return q
+
+    def laplace(self, mode: Mode) -> tuple[Floats, Floats]:
+        """Return the Laplace approximation about a mode, shapes (d,) and (d, d).
+
+        Its curvature is Gauss and Newton's. A density's mode moves with its coordinates: where the
+        data say little, it is that of the prior here.
+        """
+        p, mean = self.phi_size, self.at(mode.phi, mode.sigma)
+        centre, of_noise = _noise_gaussian(mode)
+        mean[p:] = self.noise(centre)
+        stretch = np.where(self.roots, mean[p:] / _ROOT, 1.0)
+        covariance = np.zeros((len(mean), len(mean)))
+        covariance[p:, p:] = stretch[:, None] * of_noise * stretch
+        if p:
+            priors = self.problem.layout.priors
+            slope = np.array([1.0 / unconstrain(*pair)[1] for pair in zip(priors, mode.phi, strict=True)])
+            jacobian = mode.jacobian * slope
+            ends = mean + _STEP * np.eye(len(mean))[:p], mean - _STEP * np.eye(len(mean))[:p]
+            here = self._of_parameters(mean)
+            above, below = (np.diagonal(self._of_parameters(end)) for end in ends)
+            curvature = np.maximum((2 * here - above - below) / _STEP**2, _FLAT)
+            precision = jacobian.T @ jacobian + np.diag(curvature)
+            for place in self.problem.tails:
+                precision[place, place] = slope[place] ** 2 / mode.covariance[place, place]
+            scale = 1.0 / np.sqrt(np.diag(precision))
+            inverse = np.linalg.inv(precision * np.outer(scale, scale) + 1e-12 * np.eye(p))
+            covariance[:p, :p] = scale[:, None] * inverse * scale
+            residual = np.nan_to_num(self.problem.robust(mode.phi, mode.sigma)).ravel()
+            pull = (above - below) / (2 * _STEP) - jacobian.T @ residual
+            pull[list(self.problem.tails)] = 0.0
+            step = np.zeros_like(mean)
+            step[:p] = covariance[:p, :p] @ pull
+            tried = mean + np.array([0.0, 0.25, 0.5, 1.0])[:, None] * step
+            mean = tried[int(np.argmax(self.log_density(tried)))]
+        return mean, (covariance + covariance.T) / 2
+
+    def widened(self, mean: Floats, covariance: Floats) -> Floats:
+        """Return a covariance, widened where the posterior falls off slowly, shape (d, d).
+
+        At a kink, or with few contacts, the curvature overstates how well a parameter is known.
+        """
+        p = self.phi_size
+        loud = np.flatnonzero(~self.silent)
+        steps = np.sqrt(np.diag(covariance))[loud]
+        ends = np.array([*_FAR, *(-far for far in _FAR)])
+        moves = np.zeros((len(loud), len(ends), len(mean)))
+        moves[np.arange(len(loud)), :, loud] = steps[:, None] * ends
+        top, *heights = self.log_density(np.vstack([mean, mean + moves.reshape(-1, len(mean))]))
+        fall = (top - np.array(heights)).reshape(len(loud), 2, -1)
+        # on either side, up to the first point that has fallen
+        within = np.nan_to_num(fall, nan=np.inf) < _LOW
+        count = np.logical_and.accumulate(within, axis=2).sum(axis=2)
+        stretch = np.array([_FAR[0], *_FAR])[count].mean(axis=1) / _FAR[0]
+        extra = np.zeros(len(mean))
+        extra[:p][loud] = steps**2 * (stretch**2 - 1.0)
+        return np.asarray(covariance + np.diag(extra))
+
+
+def silent(mode: Mode) -> Bools:
+    """Return the mask of parameters of which the data say nothing: their posterior is the prior.
+
+    A wheel's parameters are never among them, for its prior is not one of independent numbers.
+    """
+    problem = mode.problem
+    # the sigma of a log-normal prior is that of the logarithm
+    scale = np.array(
+        [
+            prior.sigma * (x if prior.family == "log_normal" else 1.0)
+            for prior, x in zip(problem.layout.priors, mode.phi, strict=True)
+        ]
+    )
+    size = np.sqrt((mode.jacobian**2).sum(axis=0)) * np.nan_to_num(scale, nan=1.0)
+    mask = (size < _SILENT) & bool(mode.jacobian.any())
+    for wheel in wheels(problem.layout):
+        mask[list(wheel.places)] = False
+    mask[list(problem.tails)] = False
+    return np.asarray(mask)
+
+
+def _noise_gaussian(mode: Mode) -> tuple[Floats, Floats]:
+    """Return the Laplace approximation of the logarithm of the free noise parameters.
+
+    Shapes (free,) and (free, free).
+    """
+    problem = mode.problem
+    if not isinstance(problem.likelihood, TransitionLikelihood):
+        return mode.noise_gaussian()
+    # the variance of log sigma is half the inverse of the number of measurements
+    counts = problem.likelihood.pooled(problem.likelihood.counts(problem.observations))
+    spread = problem.noise_prior[1]
+    covariance = np.diag(1.0 / (2.0 * counts + spread**-2.0))
+    return problem.likelihood.free(np.log(mode.sigma)), covariance

@@ -1,0 +1,598 @@
+"""Ensemble of particles: Metropolis moves of many at once, and annealing between two densities.
+
+All particles move together: one engine batch a sweep, accepted for each independent part by itself.
+Where there is a cheaper density, several moves under it make one proposal: the surrogate transition
+method (Liu, 2001, section 9.4.3). Annealing is a sequential Monte Carlo sampler (Del Moral, Doucet
+and Jasra, 2006): particles are weighted, resampled and moved along a geometric path whose rungs
+their effective sample size sets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+from scipy.special import logsumexp
+
+from pbrl_ppl.likelihood import TrajectoryLikelihood, TransitionLikelihood
+from pbrl_ppl.modes import Mode, Space
+from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
+from pbrl_ppl.state import Bools, Floats, Ints
+
+#: Best acceptance rate of a random walk in many dimensions (Roberts, Gelman and Gilks, 1997).
+TARGET_ACCEPTANCE = 0.234
+#: Variance of a Gaussian that draws are proposed from over that of what it stands for.
+_WIDER = 1.3
+#: Share of moves that jump between modes, where there are several.
+_JUMPS = 0.25
+#: Moves under a cheaper density that make one proposal, and moves of the noise for each of the
+#: parameters; along trajectories each runs the filter.
+_INNER, _NOISE, _NOISE_ALONG = 15, 5, 1
+#: Numbers held at once: particles move in groups whose predictions are fewer.
+_NUMBERS = 8_000_000
+#: Effective share of the particles that a rung leaves, and that a last weighting must leave.
+_RUNG, _WORTH = 0.5, 0.3
+#: Sweeps between two looks at whether particles have forgotten where they were, looks at most, and
+#: the largest correlation with it then.
+_SWEEPS, _LOOKS, _FORGOTTEN = 3, 8, 0.5
+#: Rungs at most.
+_RUNGS = 60
+
+
+class Target(Protocol):
+    """A log-density of particles, in columns: one a part of the scene, the last of the noise."""
+
+    def look(self, q: Floats) -> Any:
+        """Return what is dear at particles (n, d), and does not depend on the noise."""
+
+    def columns(self, q: Floats, look: Any) -> Floats:
+        """Return the log-density of each part and of the noise, shape (n, part + 1)."""
+
+
+class Posterior:
+    """Log-posterior of a problem, up to the evidence, by the engine or by what stands for it.
+
+    Parameters
+    ----------
+    space : Space
+        Of the particles.
+    predict : callable, optional
+        From phi, shape (n, p), to residuals; by default the engine.
+    power : float
+        Exponent of the likelihood.
+    """
+
+    def __init__(self, space: Space, predict: Any = None, power: float = 1.0) -> None:
+        self.space, self.power = space, power
+        self.predict = predict or space.problem.residual
+
+    def look(self, q: Floats) -> Floats:
+        """Return residuals, shape (n, transition, H, body, state)."""
+        return np.asarray(self.predict(self.space.possible(q)))
+
+    def columns(self, q: Floats, look: Floats) -> Floats:
+        """Return log-priors and log-likelihoods, shape (n, part + 1)."""
+        total = self.space.log_priors(q)
+        likelihood = self.power * self.space.log_likelihoods(q, look)
+        there = np.isfinite(total).all(axis=1)
+        total[:, :-1] = np.where(there[:, None], total[:, :-1] + likelihood, -np.inf)
+        return total
+
+
+class Path:
+    """Geometric path from one density to another, at a share ``beta`` of the way."""
+
+    def __init__(self, start: Target, end: Target, beta: float) -> None:
+        self.start, self.end, self.beta = start, end, beta
+
+    def look(self, q: Floats) -> tuple[Any, Any]:
+        """Return what both are, at particles (n, d)."""
+        return (self.start.look(q) if self.beta < 1 else None), self.end.look(q)
+
+    def columns(self, q: Floats, look: tuple[Any, Any]) -> Floats:
+        """Return the weighted mean of both, shape (n, part + 1)."""
+        end = self.end.columns(q, look[1])
+        if self.beta == 1:
+            return end
+        start = self.start.columns(q, look[0])
+        with np.errstate(invalid="ignore"):
+            both = (1.0 - self.beta) * start + self.beta * end
+        return np.where(np.isneginf(start) | np.isneginf(end), -np.inf, both)
+
+
+class _Gaussian(NamedTuple):
+    """A Gaussian by its mean (d,), Cholesky factor (d, d) and the inverse of that."""
+
+    mean: Floats
+    factor: Floats
+    inverse: Floats
+
+    def standardised(self, x: Floats) -> Floats:
+        """Return points (n, d) in units of this Gaussian, same shape."""
+        return np.asarray((x - self.mean) @ self.inverse.T)
+
+    def log_density(self, x: Floats) -> Floats:
+        """Return the log-density at points (n, d), shape (n,)."""
+        z = self.standardised(x)
+        constant = np.log(np.diag(self.factor)).sum() + 0.5 * z.shape[1] * np.log(2 * np.pi)
+        return np.asarray(-0.5 * (z**2).sum(axis=1) - constant)
+
+
+@dataclass(eq=False)
+class Block:
+    """Coordinates that move together: a mixture of Gaussians about the modes, and its moves.
+
+    Three proposals take turns: a random walk, which finds its way anywhere; a Crank-Nicolson step
+    that is reversible for the Gaussian (Rudolf and Sprungk, 2018), which makes large moves where
+    the posterior is close to one; and between modes a jump that keeps the point's place in units of
+    the mode's Gaussian (Tjelmeland and Hegstad, 2001, without their local search).
+
+    Parameters
+    ----------
+    places : ndarray of int
+        The coordinates, shape (d,).
+    modes : sequence of _Gaussian
+        At least one.
+    """
+
+    places: Ints
+    modes: Sequence[_Gaussian]
+    step: Floats = field(init=False)
+    log_scale: float = field(init=False)
+    log_beta: float = float(np.log(0.6))
+
+    def __post_init__(self) -> None:
+        """Start from the best scale for a Gaussian."""
+        self.step = self.modes[0].factor
+        self.log_scale = float(np.log(2.38 / np.sqrt(max(len(self.places), 1))))
+
+    def draw(self, n: int, rng: np.random.Generator) -> Floats:
+        """Draw n points from the mixture, shape (n, d)."""
+        which = rng.integers(len(self.modes), size=n)
+        noise = rng.standard_normal((n, len(self.places)))
+        drawn = np.empty_like(noise)
+        for i, mode in enumerate(self.modes):
+            drawn[which == i] = mode.mean + noise[which == i] @ mode.factor.T
+        return drawn
+
+    def log_density(self, x: Floats) -> Floats:
+        """Return the log-density of the mixture at points (n, d), shape (n,)."""
+        each = [mode.log_density(x) for mode in self.modes]
+        return np.asarray(logsumexp(each, axis=0) - np.log(len(each)))
+
+    def kind(self, rng: np.random.Generator) -> str:
+        """Return which move is made next."""
+        if len(self.modes) > 1:
+            return "jump" if rng.uniform() < _JUMPS else "walk"
+        return "walk" if rng.uniform() < 0.5 else "draw"
+
+    def propose(self, x: Floats, kind: str, rng: np.random.Generator) -> tuple[Floats, Floats]:
+        """Return a proposal from each point (n, d), and the logarithm of the Hastings ratio."""
+        if kind == "jump":
+            first, second = (self.modes[i] for i in rng.choice(len(self.modes), 2, replace=False))
+            stretch = np.log(np.diag(second.factor) / np.diag(first.factor)).sum()
+            moved = second.mean + first.standardised(x) @ second.factor.T
+            return moved, np.full(len(x), stretch)
+        noise = rng.standard_normal(x.shape)
+        if kind == "walk":
+            return x + np.exp(self.log_scale) * noise @ self.step.T, np.zeros(len(x))
+        mode, beta = self.modes[0], np.exp(self.log_beta)
+        kept = np.sqrt(1 - beta**2) * (x - mode.mean)
+        moved = mode.mean + kept + beta * noise @ mode.factor.T
+        return moved, mode.log_density(x) - mode.log_density(moved)
+
+    def adapt(self, kind: str, rate: float) -> None:
+        """Change the step size of a kind of move towards the best acceptance rate."""
+        if kind == "walk":
+            self.log_scale += rate - TARGET_ACCEPTANCE
+        elif kind == "draw":  # up to draws that forget where they were
+            self.log_beta = min(self.log_beta + rate - TARGET_ACCEPTANCE, 0.0)
+
+    def learn(self, x: Floats, wider: float = 1.0) -> None:
+        """Take the particles' mean and covariance; the covariance about modes if several."""
+        if not len(self.places) or len(x) < 3:
+            return
+        if len(self.modes) == 1:
+            self.modes = (_gaussian(x.mean(axis=0), wider * np.cov(x, rowvar=False)),)
+            self.step = self.modes[0].factor
+            return
+        nearest = np.argmax([mode.log_density(x) for mode in self.modes], axis=0)
+        about = x - np.array([mode.mean for mode in self.modes])[nearest]
+        self.step = _gaussian(about.mean(axis=0), about.T @ about / len(x)).factor
+
+
+def _gaussian(mean: Floats, covariance: Floats) -> _Gaussian:
+    """Return a Gaussian that is never singular."""
+    covariance = np.asarray(covariance).reshape(2 * (len(mean),))
+    deviation = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
+    correlation = covariance / np.outer(deviation, deviation)
+    factor = np.linalg.cholesky(correlation + 1e-9 * np.eye(len(mean)))
+    inverse = solve_triangular(factor, np.eye(len(mean)), lower=True)
+    return _Gaussian(mean, deviation[:, None] * factor, inverse / deviation)
+
+
+class Reference:
+    """A product over independent parts, and the noise, of mixtures of Gaussians about the modes.
+
+    Parameters
+    ----------
+    space : Space
+        Of the particles.
+    origin : ndarray
+        The first mode, shape (d,).
+    parts, noise : list of Block
+        In the order of the space's parts; blocks of the noise.
+    """
+
+    def __init__(
+        self, space: Space, origin: Floats, parts: list[Block], noise: list[Block]
+    ) -> None:
+        self.space, self.origin, self.parts, self.noise = space, origin, parts, noise
+
+    @classmethod
+    def about(cls, space: Space, mode: Mode, cheap: Space | None = None) -> Reference:
+        """Return the Laplace approximations about a mode and its others, somewhat wider.
+
+        ``cheap`` is the space of fewer engine steps, which tells how far off densities fall.
+        """
+        each = []
+        for one in (mode, *mode.others):
+            mean, covariance = space.laplace(one)
+            each.append((mean, _WIDER * (cheap or space).widened(mean, covariance)))
+
+        def block(places: Ints) -> Block:
+            modes: list[_Gaussian] = []
+            for mean, covariance in each:
+                own = _gaussian(mean[places], covariance[np.ix_(places, places)])
+                apart = [np.abs(old.standardised(own.mean[None])).max(initial=0.0) for old in modes]
+                if all(distance > 1.0 for distance in apart):
+                    modes.append(own)
+            return Block(places, tuple(modes))
+
+        parts = [block(part.places) for part in space.parts]
+        return cls(space, each[0][0], parts, [block(places) for places in space.noise_blocks])
+
+    @classmethod
+    def of_draws(cls, space: Space, q: Floats) -> Reference:
+        """Return the product of Gaussians of a posterior's draws (n, d), somewhat wider."""
+        middle = q.mean(axis=0)
+
+        def block(places: Ints) -> Block:
+            own = _gaussian(middle[places], _WIDER * np.cov(q[:, places], rowvar=False))
+            return Block(places, (own,))
+
+        parts = [block(part.places) for part in space.parts]
+        return cls(space, middle, parts, [block(places) for places in space.noise_blocks])
+
+    def draw(self, n: int, rng: np.random.Generator) -> Floats:
+        """Draw n particles, silent parameters from their prior, shape (n, d)."""
+        q = np.tile(self.origin, (n, 1))
+        for block in (*self.parts, *self.noise):
+            q[:, block.places] = block.draw(n, rng)
+        return self.space.prior_draws(q, rng)
+
+    def look(self, q: Floats) -> None:
+        """Return nothing: no engine is needed."""
+
+    def columns(self, q: Floats, look: None) -> Floats:
+        """Return the log-density of each part and of the noise, shape (n, part + 1)."""
+        parts = [block.log_density(q[:, block.places]) for block in self.parts]
+        noise = sum(block.log_density(q[:, block.places]) for block in self.noise)
+        return np.stack([*parts, noise + np.zeros(len(q))], axis=1)
+
+    def learned(self, q: Floats) -> Reference:
+        """Return the product of Gaussians of particles; of several modes, this one."""
+        copies = [[Block(b.places, b.modes) for b in blocks] for blocks in (self.parts, self.noise)]
+        for block in (*copies[0], *copies[1]):
+            block.learn(q[:, block.places], _WIDER)
+        return Reference(self.space, self.origin, *copies)
+
+
+class Ensemble:
+    """Particles with their proposals.
+
+    Parameters
+    ----------
+    reference : Reference
+        First guess of the proposals, which are learned.
+    q : ndarray
+        The particles, shape (n, d).
+    rng : Generator
+        Source of randomness.
+    """
+
+    def __init__(self, reference: Reference, q: Floats, rng: np.random.Generator) -> None:
+        self.space, self.q, self.rng = reference.space, q.copy(), rng
+        own = reference.learned(q[:0])
+        self.parts, self.noise = own.parts, own.noise
+
+    @property
+    def blocks(self) -> list[Block]:
+        """All blocks."""
+        return [*self.parts, *self.noise]
+
+    def learn(self) -> None:
+        """Take the proposals' Gaussians from the particles."""
+        for block in self.blocks:
+            block.learn(self.q[:, block.places])
+
+    def groups(self) -> Iterator[slice]:
+        """Yield groups of particles whose predictions fit into memory."""
+        problem = self.space.problem
+        size, keeping = problem.measured.size, nullcontext()
+        if isinstance(problem.likelihood, TrajectoryLikelihood):
+            size *= len(problem.trajectory_noise.cells.places)
+        width = max(8, _NUMBERS // max(size, 1))
+        if isinstance(problem.likelihood, TrajectoryLikelihood):
+            keeping = problem.trajectory_noise.memory.keeping(2 * width)
+        with keeping:  # each particle's noise has gains of the filter of its own
+            for first in range(0, len(self.q), width):
+                yield slice(first, first + width)
+
+    def move(
+        self, target: Target, sweeps: int, cheap: Target | None = None, adapt: bool = True
+    ) -> float:
+        """Move all particles by Metropolis sweeps; return the share of accepted moves.
+
+        Parameters
+        ----------
+        target : Target
+            Density that is kept.
+        sweeps : int
+            Engine batches of each group.
+        cheap : Target, optional
+            Density under which several moves make one proposal; every other sweep does without,
+            which frees particles from where it is far too low.
+        adapt : bool
+            Whether step sizes follow acceptance rates.
+        """
+        rates = []
+        for chosen in self.groups():
+            self.q[chosen], rate = self._moved(self.q[chosen], target, sweeps, cheap, adapt)
+            rates.append(rate)
+        return float(np.mean(rates))
+
+    def _moved(
+        self, q: Floats, target: Target, sweeps: int, cheap: Target | None, adapt: bool
+    ) -> tuple[Floats, float]:
+        look = target.look(q)
+        here, rates = target.columns(q, look), []
+        along = not isinstance(self.space.problem.likelihood, TransitionLikelihood)
+        for i in range(sweeps):
+            ahead = cheap if cheap is not None and i % 2 == 0 else None
+            y, gain, kinds = self._proposed(q) if ahead is None else self._ahead(q, ahead, adapt)
+            seen = target.look(y)
+            there = target.columns(y, seen)
+            accepted, rate = self._accepted(there[:, :-1] - here[:, :-1] + gain)
+            if adapt:
+                self._adapt(kinds, rate)
+            q, look = self._chosen(accepted, y, q), self._merged(accepted, seen, look)
+            here[:, :-1] = np.where(accepted, there[:, :-1], here[:, :-1])
+            rates.append(rate.mean() if len(rate) else 1.0)
+            for _ in range(_NOISE_ALONG if along else _NOISE):
+                for block in self.noise:
+                    q, here = self._of_noise(block, q, here, target, look, adapt)
+        return q, float(np.mean(rates))
+
+    def _proposed(self, q: Floats) -> tuple[Floats, Floats, list[str]]:
+        """Return a proposal, the log Hastings ratio of each part, and the kinds of move."""
+        y, gain, kinds = q.copy(), np.zeros((len(q), len(self.parts))), []
+        for j, block in enumerate(self.parts):
+            kinds.append(block.kind(self.rng))
+            if len(block.places):
+                y[:, block.places], gain[:, j] = block.propose(
+                    q[:, block.places], kinds[-1], self.rng
+                )
+        return y, gain, kinds
+
+    def _ahead(self, q: Floats, cheap: Target, adapt: bool) -> tuple[Floats, Floats, list[str]]:
+        """Return a proposal of several moves under a cheaper density.
+
+        They must be as likely in the reverse order: step sizes adapt only at the end.
+        """
+        begin = here = cheap.columns(q, cheap.look(q))[:, :-1]
+        learned: list[tuple[list[str], Floats]] = []
+        for _ in range(_INNER):
+            y, gain, kinds = self._proposed(q)
+            there = cheap.columns(y, cheap.look(y))[:, :-1]
+            accepted, rate = self._accepted(there - here + gain)
+            learned.append((kinds, rate))
+            q, here = self._chosen(accepted, y, q), np.where(accepted, there, here)
+        if adapt:
+            for kinds, rate in learned:
+                self._adapt(kinds, rate / _INNER + TARGET_ACCEPTANCE * (1 - 1 / _INNER))
+        with np.errstate(invalid="ignore"):
+            return q, np.nan_to_num(begin - here, nan=-np.inf), []
+
+    def _adapt(self, kinds: list[str], rates: Floats) -> None:
+        for block, kind, rate in zip(self.parts, kinds, rates, strict=False):
+            block.adapt(kind, float(rate))
+
+    def _accepted(self, log_ratio: Floats) -> tuple[Bools, Floats]:
+        """Return which proposals are accepted, same shape, and the mean rates over particles."""
+        with np.errstate(invalid="ignore"):
+            rate = np.exp(np.minimum(np.nan_to_num(log_ratio, nan=-np.inf), 0.0))
+        return self.rng.uniform(size=rate.shape) < rate, rate.mean(axis=0)
+
+    def _chosen(self, accepted: Bools, y: Floats, q: Floats) -> Floats:
+        """Return the particles with the proposal for the parts (n, part) that accept it."""
+        result = q.copy()
+        for j, block in enumerate(self.parts):
+            chosen = np.ix_(accepted[:, j], block.places)
+            result[chosen] = y[chosen]
+        return result
+
+    def _merged(self, accepted: Bools, new: Any, old: Any) -> Any:
+        """Return what is known of particles, from the proposals for the parts that accept them."""
+        if isinstance(old, tuple):
+            return tuple(self._merged(accepted, *pair) for pair in zip(new, old, strict=True))
+        if old is None:
+            return None
+        for j, part in enumerate(self.space.parts):
+            which = accepted[:, j]
+            if len(self.parts) == 1:
+                old[which] = new[which]
+            else:
+                chosen = np.flatnonzero(which)[:, None]
+                old[chosen, ..., part.bodies, :] = new[chosen, ..., part.bodies, :]
+        return old
+
+    def _of_noise(
+        self, block: Block, q: Floats, here: Floats, target: Target, look: Any, adapt: bool
+    ) -> tuple[Floats, Floats]:
+        """Return particles and columns after a move of the noise, for which no engine is needed."""
+        y, kind = q.copy(), block.kind(self.rng)
+        y[:, block.places], gain = block.propose(q[:, block.places], kind, self.rng)
+        there = target.columns(y, look)
+        with np.errstate(invalid="ignore"):
+            accepted, rate = self._accepted(there.sum(axis=1) - here.sum(axis=1) + gain)
+        if adapt:
+            block.adapt(kind, float(rate))
+        return np.where(accepted[:, None], y, q), np.where(accepted[:, None], there, here)
+
+    def settle(self, target: Target, cheap: Target | None = None) -> tuple[float, float]:
+        """Move until particles have forgotten where they were.
+
+        Returns
+        -------
+        accepted : float
+            Share of accepted moves.
+        correlation : float
+            With where they were, the largest of a coordinate.
+        """
+        begin, rates = self.q.copy(), []
+        places = np.concatenate([block.places for block in self.blocks])
+        sweeps = 1 if cheap is not None else _SWEEPS
+        for _ in range(_LOOKS):
+            rates.append(self.move(target, sweeps, cheap))
+            correlation = _correlation(begin[:, places], self.q[:, places])
+            if correlation < _FORGOTTEN:
+                break
+            self.learn()
+        return float(np.mean(rates)), correlation
+
+    def heights(self, target: Target) -> Floats:
+        """Return the log-density of all particles, shape (n,)."""
+        height = np.empty(len(self.q))
+        for chosen in self.groups():
+            q = self.q[chosen]
+            height[chosen] = target.columns(q, target.look(q)).sum(axis=1)
+        return height
+
+
+class Annealed(NamedTuple):
+    """Particles at the end of a path, with their weights.
+
+    Attributes
+    ----------
+    log_weight : ndarray
+        What is left of the path, up to a constant, shape (n,).
+    log_z : float
+        Logarithm of the ratio of the densities' integrals.
+    rungs : int
+        Rungs at which particles were moved.
+    accepted : float
+        Share of accepted moves; 1 without any.
+    kept : float
+        Independent particles that the moves left, over all.
+    """
+
+    log_weight: Floats
+    log_z: float
+    rungs: int
+    accepted: float
+    kept: float
+
+
+def anneal(
+    ensemble: Ensemble,
+    start: Target,
+    end: Target,
+    *,
+    cheap: Target | None = None,
+    weigh: bool = False,
+) -> Annealed:
+    """Take particles of one density to another, in place.
+
+    Parameters
+    ----------
+    ensemble : Ensemble
+        Independent particles of ``start``.
+    start, end : Target
+        Log-densities; the first is normalised if the evidence matters.
+    cheap : Target, optional
+        As of :meth:`Ensemble.move`.
+    weigh : bool
+        Whether the last rung weights particles, without a move, if their weights suffice.
+    """
+    beta, log_z, rungs, kept = 0.0, 0.0, 0, 1.0
+    rates: list[float] = []
+    while beta < 1.0:
+        with np.errstate(invalid="ignore"):
+            gap = ensemble.heights(end) - ensemble.heights(start)
+        gap = np.where(np.isnan(gap), -np.inf, gap)
+        rest = (1.0 - beta) * gap
+        if rungs == _RUNGS or (weigh and _suffices(rest)):
+            log_z += float(logsumexp(rest) - np.log(len(rest)))
+            return Annealed(rest, log_z, rungs, _mean(rates), kept)
+        step = _step(gap, 1.0 - beta)
+        total = logsumexp(step * gap)
+        log_z += float(total - np.log(len(gap)))
+        beta = 1.0 if step == 1.0 - beta else beta + step
+        chosen = systematic(np.exp(step * gap - total), len(gap), ensemble.rng)
+        ensemble.q = ensemble.q[chosen]
+        ensemble.learn()
+        rate, correlation = ensemble.settle(Path(start, end, beta), cheap)
+        rates.append(rate)
+        rungs += 1
+        # copies of a particle are as alike as each is to where they began, squared
+        copies = np.bincount(chosen).astype(float)
+        kept = len(gap) / float((copies + copies * (copies - 1) * correlation**2).sum())
+    return Annealed(np.zeros(len(ensemble.q)), log_z, rungs, _mean(rates), kept)
+
+
+def _mean(rates: list[float]) -> float:
+    return float(np.mean(rates)) if rates else 1.0
+
+
+def _suffices(log_weight: Floats) -> bool:
+    """Return whether weights are good enough to end with."""
+    if not np.isfinite(log_weight).sum() > 2:
+        return False
+    weight, k = smoothed(log_weight[np.isfinite(log_weight)])
+    return bool(k <= MAX_PARETO_K and 1.0 / (weight**2).sum() >= _WORTH * len(log_weight))
+
+
+def _step(gap: Floats, most: float) -> float:
+    """Return the largest step of a path that leaves enough effective particles."""
+
+    def share(step: float) -> float:
+        weight = np.exp(step * gap - logsumexp(step * gap))
+        return float(1.0 / (weight**2).sum() / len(gap))
+
+    if share(most) >= _RUNG:
+        return most
+    low, high = 0.0, most
+    for _ in range(40):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if share(middle) >= _RUNG else (low, middle)
+    return max(low, 1e-6 * most)
+
+
+def _correlation(before: Floats, after: Floats) -> float:
+    """Return the largest correlation over the columns between the particles before and after."""
+    a, b = before - before.mean(axis=0), after - after.mean(axis=0)
+    size = np.sqrt((a**2).sum(axis=0) * (b**2).sum(axis=0))
+    return float(((a * b).sum(axis=0) / np.maximum(size, 1e-300)).max(initial=0.0))
+
+
+def systematic(weights: Floats, n: int, rng: np.random.Generator) -> NDArray[np.intp]:
+    """Return ``n`` indices in increasing order by systematic resampling."""
+    ends = np.cumsum(weights)
+    indices = np.searchsorted(ends / ends[-1], (rng.uniform() + np.arange(n)) / n)
+    return np.minimum(indices, len(weights) - 1)
