@@ -68,9 +68,7 @@ class Truth(NamedTuple):
     values: Floats
 
 
-def draw_truths(
-    design: Problem, n: int, seed: int, colour: float = 0.0
-) -> tuple[list[Truth], int]:
+def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tuple[list[Truth], int]:
     """Draw parameters from the model's prior with PyMC, and what is measured with them.
 
     Next states are drawn by Eq. 13, and whole trajectories with process noise; simulations from the
@@ -122,9 +120,7 @@ def draw_truths(
     )
 
 
-def _trajectories(
-    design: Problem, phi: Floats, sigma: Floats, seed: int, colour: float
-) -> Floats:
+def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour: float) -> Floats:
     """Return measured states of whole trajectories, one set a draw; 0 where nothing is measured."""
     rngs = [np.random.default_rng([seed, i]) for i in range(len(phi))]
     if isinstance(design.likelihood, OutputErrorLikelihood):
