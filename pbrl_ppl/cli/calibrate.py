@@ -12,6 +12,7 @@ import typer
 from pbrl_ppl.cli import options
 from pbrl_ppl.cli.commands import command
 from pbrl_ppl.cli.terminal import FAILED, check_can_make, interruptible, print_result
+from pbrl_ppl.errors import FitError, PbrlError
 
 if TYPE_CHECKING:
     from concurrent.futures import Executor
@@ -29,14 +30,24 @@ def calibrate(
         Path,
         typer.Option("-o", "--output", metavar="DIR", help="Folder for results; goes on there."),
     ],
-    trajectories: Annotated[
-        bool,
+    likelihood: Annotated[
+        str,
         typer.Option(
-            "--trajectories/--transitions",
-            help="Likelihood of whole trajectories, as of fit and close-loop (it takes several"
-            " times as long), or of single transitions from exact states (the paper's Eq. 11).",
+            metavar="NAME",
+            help="transitions (single ones from exact states, the paper's Eq. 11), trajectories"
+            " (whole ones with process noise, as of close-loop; it takes several times as long) or"
+            " simulation (trajectories without process noise, as of criticise --simulate).",
         ),
-    ] = False,
+    ] = "transitions",
+    trajectories: Annotated[
+        bool | None, typer.Option("--trajectories/--transitions", hidden=True)
+    ] = None,
+    colour: Annotated[
+        float,
+        typer.Option(
+            min=0.0, help="Correlation of neighbouring rows' errors, with --likelihood simulation."
+        ),
+    ] = 0.0,
     noise: options.Noise = None,
     replications: Annotated[int, typer.Option(min=2, help="Simulated histories.")] = 200,
     seed: options.Seed = 1,
@@ -52,6 +63,8 @@ def calibrate(
     """Simulate from the prior, fit, and test whether the true values' ranks are uniform."""
     reading = options.Reading(columns, units, estimate_velocities, resample=time_step is not None)
     with interruptible(f"finished replications are in {output}; the same command goes on"):
+        if trajectories is not None:  # older spellings
+            likelihood = "trajectories" if trajectories else "transitions"
         check_can_make(output)
         declared, (design,) = options.load(
             scene, [history], reading, time_step=time_step, noise=noise
@@ -61,10 +74,15 @@ def calibrate(
         from pbrl_ppl.sampling import calibration
 
         with _pool(jobs) as executor:
-            result = calibration.calibrate(
-                declared, design, trajectories=trajectories, replications=replications, seed=seed,
-                draws=draws, folder=output, executor=executor, progress=not quiet,
-            )  # fmt: skip
+            try:
+                result = calibration.calibrate(
+                    declared, design, likelihood=likelihood, colour=colour, seed=seed, draws=draws,
+                    replications=replications, folder=output, executor=executor, progress=not quiet,
+                )  # fmt: skip
+            except PbrlError:
+                raise
+            except ValueError as error:  # an option that calibrate refuses
+                raise FitError(f"calibrate: {error}") from None
         result.save(output / "ranks.nc")
         write_atomically(output / "table.csv", result.table().to_csv)
         picture = report.png(report.plot_calibration(result))
@@ -101,9 +119,12 @@ def _calibrated(calibration: Calibration) -> str:
     head = rows.iloc[0]
     columns = ["p_holm", "coverage_50", "coverage_90", "ess", "r_hat", "passed"]
     short = int((data["size"] < data["size"].max()).any("parameter").sum())
+    apart = ", ".join(rows.index[~rows["judged"]])
     ranges = (f"{head[f'low_{level}']:.3g} to {head[f'high_{level}']:.3g}" for level in (50, 90))
     return (
         rows[columns].to_string(float_format="{:.4g}".format, index_names=False)
         + f"\n{data.sizes['replication']} replications, {short} with too few effective draws;"
-        " expected of a right sampler: p_holm at least 0.01, coverages in " + ", ".join(ranges)
+        " expected of a right sampler: p_holm at least 0.01, coverages in "
+        + ", ".join(ranges)
+        + (f"\nnot judged, for errors are coloured: {apart}" if apart else "")
     )

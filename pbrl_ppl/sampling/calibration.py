@@ -1,8 +1,9 @@
 """Simulation-based calibration of the whole pipeline (Talts et al., 2018; Modrák et al., 2023).
 
-Parameters are drawn from the model's prior, next states are simulated with them from the
-history's start states (Eq. 13), and the whole fit is run on these. If prior, engine, likelihood and
-sampler belong together, the true values' ranks among the posterior draws are uniform.
+Parameters are drawn from the model's prior, measurements are simulated with them from the history's
+start states (Eq. 13 of single transitions), and the whole fit is run on these. If prior, engine,
+likelihood and sampler belong together, the true values' ranks among the posterior draws are
+uniform.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ from rich.progress import track
 from pbrl_ppl.effects import Attached, Effect
 from pbrl_ppl.errors import FitError, OutputError
 from pbrl_ppl.files import write_text
-from pbrl_ppl.history import History
+from pbrl_ppl.history import History, with_units
 from pbrl_ppl.likelihood import (
+    OutputErrorLikelihood,
     Problem,
     TrajectoryLikelihood,
     TransitionLikelihood,
@@ -49,6 +51,8 @@ def calibrate(
     seed: int = 1,
     folder: str | Path | None = None,
     executor: Executor | None = None,
+    likelihood: str = TransitionLikelihood.name,
+    colour: float = 0.0,
     horizon: int = 1,
     sigma: str = "per_dimension",
     nu: float | None = None,
@@ -64,9 +68,13 @@ def calibrate(
 
     Start states, actions and which cells are measured are the history's; what was measured counts
     only for the prior of sigma, which stays that of the history. A start state is exact, as
-    in Eq. 11, or measured with an error, with ``trajectories``. A wheel's equal descriptions are
+    in Eq. 11, or measured with an error, of the other likelihoods. A wheel's equal descriptions are
     folded into one, of truth and draws alike. The log-likelihood is ranked too: the parameters'
     ranks alone cannot see a fit that ignores its data.
+
+    With coloured errors, :attr:`Calibration.passed` judges the parameters alone: the log-likelihood
+    of ``simulation`` is divided by the errors' autocorrelation time, so that the ranks of sigma and
+    of the log-likelihood need not be uniform.
 
     Parameters
     ----------
@@ -85,8 +93,16 @@ def calibrate(
         there, with more replications if more are asked for. Made if missing.
     executor : concurrent.futures.Executor, optional
         Where replications are run; by default here, one after another.
-    horizon, sigma, nu, substeps, trajectories : optional
+    likelihood : str
+        ``transitions``, ``trajectories`` or ``simulation``, as of :func:`pbrl_ppl.physics_model`.
+        Simulations have errors of measurement, and no process noise.
+    colour : float
+        Correlation of neighbouring rows' errors, with ``likelihood="simulation"``; at least 0 and
+        below 1. Errors are autoregressive, AR(1), with the standard deviation sigma.
+    horizon, sigma, nu, substeps : optional
         As of :func:`pbrl_ppl.physics_model`.
+    trajectories : bool
+        True is the same as ``likelihood="trajectories"``.
     draws, tune, chains : int
         As of :func:`pbrl_ppl.fit`. A fit with fewer than 99 effective draws is done again with four
         times the draws, at most twice.
@@ -109,7 +125,8 @@ def calibrate(
     OutputError
         If the folder holds another calibration, or cannot be written.
     ValueError
-        If ``replications`` is below 2.
+        If ``replications`` is below 2, ``colour`` is not at least 0 and below 1 or not for the
+        likelihood, or :func:`pbrl_ppl.physics_model` refuses an option.
 
     Warns
     -----
@@ -126,12 +143,21 @@ def calibrate(
     """
     if replications < 2:
         raise ValueError(f"replications is {replications}, expected at least 2, better 200")
+    if trajectories:
+        likelihood = TrajectoryLikelihood.name
+    if not 0.0 <= colour < 1.0:
+        raise ValueError(f"colour is {colour}, expected a correlation of at least 0 and below 1")
+    if colour and likelihood != OutputErrorLikelihood.name:
+        raise ValueError(
+            f"colour is {colour} with likelihood {likelihood!r}, expected 0: coloured errors are"
+            f" for {OutputErrorLikelihood.name!r}"
+        )
     design = declared_problem(
-        Physics.declare(scene, effects, substeps=substeps),
+        Physics.declare(with_units(scene, history), effects, substeps=substeps),
         history,
         horizon=horizon,
         likelihood=TransitionLikelihood.declare(sigma, nu),
-        kind="trajectories" if trajectories else "transitions",
+        kind=likelihood,
     )
     if design.layout.discrete.any():
         raise FitError(
@@ -142,9 +168,10 @@ def calibrate(
     median, spread = design.noise_prior
     design = design.with_likelihood(prior=(tuple(median.tolist()), spread))
     settings = {"draws": draws, "tune": tune, "chains": chains, **options}
-    about = _about(design, seed, settings)
+    # of the declared scene: its natural units follow from the history
+    about = _about(design, seed, settings) | {"scene": scene.to_toml(), "colour": colour}
     store = None if folder is None else _opened(Path(folder), about)
-    truths, redrawn = draw_truths(design, replications, seed)
+    truths, redrawn = draw_truths(design, replications, seed, colour)
     done: dict[int, Record] = {}
     failures: dict[int, str] = {}
     tasks = {}
@@ -184,6 +211,7 @@ def calibrate(
         columns.pop("rank"),
         columns.pop("size"),
         list(labels(design)),
+        judged=design.layout.labels if colour else None,
         replication=np.array(numbers),
         failures=failed,
         attrs={key: json.dumps(value) for key, value in about.items()} | {"redrawn": redrawn},
@@ -208,7 +236,6 @@ def _results(tasks: Mapping[int, Any], executor: Executor | None) -> Generator[t
 def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str, Any]:
     """Return the provenance of a calibration: all that its numbers depend on, as JSON values."""
     about = {
-        "scene": design.scene.to_toml(),
         "history": design.data.history.data_sha256,
         "effects": [[attached.effect.name, attached.body, repr(attached.effect.parameters)]
                     for attached in design.physics.effects],
@@ -216,7 +243,7 @@ def _about(design: Problem, seed: int, settings: Mapping[str, Any]) -> dict[str,
         "substeps": design.physics.substeps,
         "scalar_sigma": design.scalar_sigma,
         "nu": design.likelihood.nu,
-        "trajectories": isinstance(design.likelihood, TrajectoryLikelihood),
+        "likelihood": design.likelihood.name,
         "sigma_prior": design.likelihood.prior,
         "seed": seed,
         "settings": dict(settings),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -99,8 +100,8 @@ class Calibration:
         Over ``replication`` and ``parameter``: ``rank``, ``size`` (draws ranked among),
         ``position`` (the rank as a place in (0, 1), ties broken at random), ``truth``, ``ess``,
         ``r_hat``; and ``covered``, also over ``level``: whether a central interval holds the truth.
-        A parameter's unit is that of the model; ``log_likelihood`` is the data's. ``attrs`` say
-        what was calibrated.
+        Over ``parameter``: ``judged``, whether it counts for `passed`. A parameter's unit is that
+        of the model; ``log_likelihood`` is the data's. ``attrs`` say what was calibrated.
     failures : tuple of str
         Replications that ended in an error, and which.
 
@@ -121,6 +122,7 @@ class Calibration:
         size: Floats,
         parameters: list[str],
         *,
+        judged: Collection[str] | None = None,
         replication: Floats | None = None,
         failures: tuple[str, ...] = (),
         attrs: dict[str, object] | None = None,
@@ -133,7 +135,9 @@ class Calibration:
         rank, size : ndarray
             As from :func:`rank`.
         parameters : list of str
-            Ints.
+            Their names.
+        judged : collection of str, optional
+            Those that count for `passed`; all by default.
         replication : ndarray, optional
             Their numbers.
         failures : tuple of str
@@ -153,7 +157,8 @@ class Calibration:
         variables = {"rank": rank, "size": size, "position": position, **others}
         dataset = xr.Dataset(
             {name: (dims, value) for name, value in variables.items()}
-            | {"covered": ((*dims, "level"), off < np.array(LEVELS) / 2)},
+            | {"covered": ((*dims, "level"), off < np.array(LEVELS) / 2)}
+            | {"judged": ("parameter", [judged is None or name in judged for name in parameters])},
             {"replication": numbers, "parameter": parameters, "level": list(LEVELS)},
             attrs or {},
         )
@@ -168,7 +173,8 @@ class Calibration:
             ``p_value`` and, corrected for the number of parameters, ``p_holm``; ``coverage_50``,
             ``coverage_90`` and their binomial limits ``low_``, ``high_``, which hold all coverages
             of the table together in 99 % of calibrations of a right sampler; the smallest ``ess``
-            and largest ``r_hat`` of a replication, where known; ``passed``.
+            and largest ``r_hat`` of a replication, where known; ``passed``, and ``judged``, whether
+            it counts for :attr:`passed`.
         """
         data = self.dataset
         names = [str(name) for name in data["parameter"].values]
@@ -189,16 +195,18 @@ class Calibration:
             table["ess"] = data["ess"].values.min(axis=0)
             table["r_hat"] = data["r_hat"].values.max(axis=0)
         table["passed"] = passed
+        table["judged"] = data["judged"].values
         return table
 
     @property
     def passed(self) -> bool:
-        """Whether every parameter passed and no replication failed.
+        """Whether every judged parameter passed and no replication failed.
 
         A right sampler passes in at least 98 % of calibrations: 1 % of false alarms for uniform
         ranks and 1 % for coverage, whatever the number of parameters.
         """
-        return not self.failures and bool(self.table()["passed"].all())
+        table = self.table()
+        return not self.failures and bool(table.loc[table["judged"], "passed"].all())
 
     def save(self, path: str | Path) -> None:
         """Write the dataset to a NetCDF file, whole or not at all.

@@ -17,10 +17,13 @@ from pbrl_ppl.errors import (
     MeetingWarning,
     UninformedWarning,
 )
-from pbrl_ppl.history import from_segments
+from pbrl_ppl.history import History, from_segments
 from pbrl_ppl.likelihood import (
+    OutputErrorLikelihood,
     Problem,
-    TrajectoryLikelihood,
+    TransitionLikelihood,
+    along_trajectories,
+    in_pieces,
     simulated_trajectories,
     with_measurements,
 )
@@ -47,7 +50,7 @@ _KNOWN = (
 
 
 class Truth(NamedTuple):
-    """True parameters of a replication, and the next states simulated with them.
+    """True parameters of a replication, and what was simulated with them.
 
     Attributes
     ----------
@@ -56,7 +59,8 @@ class Truth(NamedTuple):
     sigma : ndarray
         Shape (state,).
     values : ndarray
-        Shape (transition, H, body, state).
+        Next states, shape (transition, H, body, state); measured states of trajectories, shape
+        (trajectory, time, body, 6).
     """
 
     phi: Floats
@@ -64,8 +68,11 @@ class Truth(NamedTuple):
     values: Floats
 
 
-def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
-    """Draw parameters from the model's prior and next states by Eq. 13, with PyMC.
+def draw_truths(design: Problem, n: int, seed: int, colour: float = 0.0) -> tuple[list[Truth], int]:
+    """Draw parameters from the model's prior with PyMC, and what is measured with them.
+
+    Next states are drawn by Eq. 13, and whole trajectories with process noise; simulations from the
+    design's start states have errors of measurement alone.
 
     Parameters
     ----------
@@ -75,6 +82,8 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
         How many; the first of more are the same.
     seed : int
         Of the draws.
+    colour : float
+        Correlation of neighbouring rows' errors, of simulations.
 
     Returns
     -------
@@ -89,7 +98,7 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
         If too few draws can be simulated.
     """
     model = build_model(design)
-    whole = isinstance(design.likelihood, TrajectoryLikelihood)
+    whole = not isinstance(design.likelihood, TransitionLikelihood)
     names = [*(block.name for block in design.layout.blocks), *design.noise_variables]
     names += [] if whole else ["next_state"]
     total = n
@@ -98,7 +107,7 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
         phi = design.layout.to_vectors(drawn, total)
         sigma = np.hstack([drawn[name].reshape(total, -1) for name in design.noise_variables])
         sigma = np.broadcast_to(sigma, (total, len(design.noise_prior[0])))
-        values = _trajectories(design, phi, sigma, seed) if whole else drawn["next_state"]
+        values = _trajectories(design, phi, sigma, seed, colour) if whole else drawn["next_state"]
         possible = np.asarray(np.isfinite(values).reshape(total, -1).all(axis=1))
         chosen = np.flatnonzero(possible)[:n]
         if len(chosen) == n:
@@ -111,20 +120,57 @@ def draw_truths(design: Problem, n: int, seed: int) -> tuple[list[Truth], int]:
     )
 
 
-def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int) -> Floats:
+def _trajectories(design: Problem, phi: Floats, sigma: Floats, seed: int, colour: float) -> Floats:
     """Return measured states of whole trajectories, one set a draw; 0 where nothing is measured."""
-    every = [
-        simulated_trajectories(design, phi[i], sigma[i], np.random.default_rng([seed, i]))
-        for i in range(len(phi))
-    ]
+    rngs = [np.random.default_rng([seed, i]) for i in range(len(phi))]
+    if isinstance(design.likelihood, OutputErrorLikelihood):
+        every = _simulations(design, phi)
+        columns = list(design.observations.columns)
+        for states, own, rng in zip(every, sigma, rngs, strict=True):
+            states[..., columns] += own * coloured((*states.shape[:3], len(columns)), colour, rng)
+    else:
+        drawn = zip(phi, sigma, rngs, strict=True)
+        every = np.array([simulated_trajectories(design, *each) for each in drawn])
     measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
-    return np.where(measured, np.array(every), 0.0)
+    return np.where(measured, every, 0.0)
+
+
+def _simulations(design: Problem, phi: Floats) -> Floats:
+    """Return trajectories without process noise from the design's start states.
+
+    Shape (draw, trajectory, time, body, 6), for phi of shape (draw, p).
+    """
+    states, segments = design.data.smoothed_states, design.segments
+    every = np.repeat(states[None], len(phi), axis=0)
+    # each piece of the design is a whole trajectory
+    every[:, segments.trajectory, 1:] = design.one_world(phi, segments.start, design.inputs)
+    return every
+
+
+def coloured(shape: tuple[int, ...], colour: float, rng: np.random.Generator) -> Floats:
+    """Return standard normal errors that are autoregressive along the second axis, AR(1).
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Of the errors: (trajectory, time, ...).
+    colour : float
+        Correlation of neighbouring rows' errors, at least 0 and below 1.
+    rng : Generator
+        Of the errors.
+    """
+    errors = rng.standard_normal(shape)
+    errors[:, 1:] *= np.sqrt(1.0 - colour**2)
+    for row in range(1, shape[1]):
+        errors[:, row] += colour * errors[:, row - 1]
+    return errors
 
 
 def simulated(design: Problem, values: Floats) -> Problem:
-    """Return the problem with other next states in place of the measured ones.
+    """Return the problem with other measurements in place of the design's.
 
-    Its history has one trajectory a segment, so that each starts from the design's state.
+    Of single transitions its history has one trajectory a segment, so that each starts from the
+    design's state.
 
     Parameters
     ----------
@@ -134,14 +180,32 @@ def simulated(design: Problem, values: Floats) -> Problem:
         Next states, shape (transition, H, body, state), SI units; of whole trajectories all
         measured states, shape (trajectory, time, body, 6).
     """
-    if isinstance(design.likelihood, TrajectoryLikelihood):
+    if not isinstance(design.likelihood, TransitionLikelihood):
         measured = np.isfinite(design.data.history.dataset["observed"].to_numpy())
-        return with_measurements(design, np.where(measured, values, np.nan))
+        values = np.where(measured, values, np.nan)
+        simulation = isinstance(design.likelihood, OutputErrorLikelihood)
+        return (_remeasured if simulation else with_measurements)(design, values)
     segments, observations = design.segments, design.observations
     observed = np.full((*segments.actions.shape[:3], len(STATE)), np.nan)
     observed[..., list(observations.columns)] = np.where(observations.measured, values, np.nan)
     history = from_segments(design.scene, segments.start, segments.inputs, observed)
     return design.with_data(history=history)
+
+
+def _remeasured(design: Problem, observed: Floats) -> Problem:
+    """Return the problem of simulations with other measurements, its noise prior the design's."""
+    dataset = design.data.history.dataset
+    start = np.where(np.isfinite(observed), observed, dataset["start"])
+    history = History(
+        dataset.assign(
+            observed=dataset["observed"].copy(data=observed),
+            start=dataset["start"].copy(data=start),
+        )
+    )
+    centre = np.array([prior.centre for prior in design.layout.priors])
+    problem = along_trajectories(design.with_data(history=history, states=None), centre)
+    problem = in_pieces(problem, design.data.horizon, problem.data.smoothed_states)
+    return problem.with_likelihood(prior=design.likelihood.prior)
 
 
 def replicate(design: Problem, truth: Truth, seed: int, settings: Mapping[str, Any]) -> Record:

@@ -1,7 +1,9 @@
 """Simulation-based calibration: its statistics on toys, the bookkeeping, and the real pipeline."""
 
 import json
+import sys
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -110,6 +112,16 @@ def test_limits_hold_all_coverages_together() -> None:
     assert table["high_50"].iloc[0] == high
 
 
+def test_those_not_judged_do_not_count() -> None:
+    ranks = np.stack([np.arange(200) % 100, np.zeros(200, dtype=int)], axis=1)
+    size = np.full(ranks.shape, 99)
+    assert not Calibration.of(ranks, size, ["mu", "sigma"]).passed
+    result = Calibration.of(ranks, size, ["mu", "sigma"], judged=["mu"])
+    assert result.passed
+    assert result.table()["judged"].to_dict() == {"mu": True, "sigma": False}
+    assert not Calibration.of(ranks, size, ["mu", "sigma"], judged=["sigma"]).passed
+
+
 def test_few_draws_give_uniform_positions() -> None:
     """A chain of few effective draws: ranks among 9 and among 99 on one scale."""
     rng = np.random.default_rng(2)
@@ -187,6 +199,55 @@ def test_simulated_noise_is_sigma(cart: tuple[Scene, History]) -> None:
     truths, _ = draw_truths(design, 100, seed=1)
     z = [(t.values - design.predict(t.phi)) / t.sigma for t in truths]
     assert stats.kstest(np.ravel(z), "norm").pvalue > 0.01
+
+
+def test_coloured_errors_are_correlated_as_stated() -> None:
+    """Standard errors of the autocorrelations of 200,000 numbers are below 0.005."""
+    errors = replication.coloured((1000, 100, 2), 0.8, np.random.default_rng(1))
+    for lag, expected in enumerate((1.0, 0.8, 0.64, 0.512)):
+        product = errors[:, lag:] * errors[:, : 100 - lag]
+        assert np.mean(product) == pytest.approx(expected, abs=0.02)
+    # stationary from the first row on
+    assert np.var(errors[:, 0]) == pytest.approx(1.0, abs=0.15)
+    assert np.mean(errors[..., 0] * errors[..., 1]) == pytest.approx(0.0, abs=0.02)
+    rng = np.random.default_rng(1)
+    np.testing.assert_array_equal(
+        replication.coloured((2, 3), 0.0, np.random.default_rng(1)), rng.standard_normal((2, 3))
+    )
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.7])
+def test_simulations_have_errors_of_measurement_alone(
+    puck: tuple[Scene, History], colour: float
+) -> None:
+    scene, history = puck
+    frame = history.to_dataframe()
+    frame.loc[[1, 6], "vx"] = np.nan
+    history = History.from_dataframe(frame, scene)
+    design = declared_problem(Physics.declare(scene), history, kind="simulation")
+    design = design.with_likelihood(prior=((0.1, 0.2, 0.3, 0.4, 0.5, 0.6), 1.0))
+    truths, redrawn = draw_truths(design, 200, seed=1, colour=colour)
+    assert redrawn == 0
+    measured = np.isfinite(history.dataset["observed"].to_numpy())
+    assert not measured.all()
+    errors = []
+    for truth in truths:
+        states = design.data.smoothed_states.copy()
+        for row in range(3):  # of the one body, step by step
+            inputs = design.inputs[:, row : row + 1]
+            states[:, row + 1] = design.one_world(truth.phi, states[:, row], inputs)[:, 0]
+        off = np.where(measured, truth.values - states, np.nan) / truth.sigma
+        errors.append(off[..., [0, 1, 3, 4]])  # angles may be wrapped
+        assert (truth.values[~measured] == 0.0).all()
+    every = np.array(errors)
+    # standard errors of means over 200 histories are below 0.03
+    assert np.nanmean(every**2) == pytest.approx(1.0, abs=0.1)
+    assert np.nanmean(every[:, :, 1:] * every[:, :, :-1]) == pytest.approx(colour, abs=0.1)
+    again = simulated(design, truths[0].values)
+    np.testing.assert_array_equal(
+        again.data.history.dataset["observed"], np.where(measured, truths[0].values, np.nan)
+    )
+    np.testing.assert_array_equal(again.noise_prior[0], design.noise_prior[0])
 
 
 def test_more_truths_begin_with_the_same(puck: tuple[Scene, History]) -> None:
@@ -448,9 +509,47 @@ def test_result_says_what_it_is_of(puck: tuple[Scene, History], runs: list[int])
     assert data["covered"].dims == ("replication", "parameter", "level")
 
 
-def test_bad_arguments(puck: tuple[Scene, History]) -> None:
-    with pytest.raises(ValueError, match="replications is 1, expected at least 2"):
-        calibrate(*puck, replications=1)
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"replications": 1}, "replications is 1, expected at least 2"),
+        ({"likelihood": "simulations"}, "likelihood is 'simulations', expected one of transitions"),
+        ({"likelihood": "simulation", "colour": 1.0}, "colour is 1.0, expected a correlation of"),
+        ({"likelihood": "simulation", "colour": -0.1}, "colour is -0.1, expected a correlation"),
+        ({"likelihood": "simulation", "colour": np.nan}, "colour is nan, expected a correlation"),
+        ({"colour": 0.5}, "colour is 0.5 with likelihood 'transitions', expected 0"),
+        ({"colour": 0.5, "trajectories": True}, "0.5 with likelihood 'trajectories', expected 0"),
+        ({"likelihood": "simulation", "horizon": 2}, "'simulation', with horizon or library"),
+    ],
+)
+def test_bad_arguments(puck: tuple[Scene, History], options: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        calibrate(*puck, **options)
+
+
+def test_the_old_spelling_of_trajectories(puck: tuple[Scene, History], runs: list[int]) -> None:
+    old, new = (
+        calibrate(*puck, replications=2, **QUICK, **each)
+        for each in ({"trajectories": True}, {"likelihood": "trajectories"})
+    )
+    assert json.loads(old.dataset.attrs["likelihood"]) == "trajectories"
+    xr.testing.assert_identical(old.dataset, new.dataset)
+
+
+def test_effects_have_the_model_s_prior(
+    puck: tuple[Scene, History], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is in natural units, which a recording shows."""
+    given: list[Problem] = []
+
+    def kept(design: Problem, truth: Truth, seed: int, settings: Any) -> Record:
+        given.append(design)
+        return _instead(design, truth, seed, settings)
+
+    monkeypatch.setattr(calibration, "replicate", kept)
+    scene = puck[0].replace(bodies=(replace(puck[0].bodies[0], effects=("linear_drag",)),))
+    calibrate(scene, puck[1], replications=2, **QUICK)
+    assert given[0].layout.priors == design_of(puck[1], scene).layout.priors
 
 
 def test_picture() -> None:
@@ -530,6 +629,29 @@ def test_command_errors(files: Path, runs: list[int], capsys: pytest.CaptureFixt
     assert message.startswith("error: out: holds a calibration with another seed (seed: 4, ")
 
 
+def test_command_s_likelihoods(
+    files: Path, runs: list[int], capsys: pytest.CaptureFixture[str]
+) -> None:
+    simulation = ("--likelihood", "simulation", "--colour", "0.8", "--replications", "30")
+    assert run(*simulation) in (0, 1)
+    out = capsys.readouterr().out
+    assert "not judged, for errors are coloured: sigma[x], " in out
+    with xr.open_dataset(files / "out" / "ranks.nc", engine="h5netcdf") as data:
+        assert json.loads(data.attrs["likelihood"]) == "simulation"
+        assert json.loads(data.attrs["colour"]) == 0.8
+    main(["calibrate", "scene.toml", "train.csv", "-o", "old", "-q", "--trajectories",
+          "--replications", "2"])  # fmt: skip
+    about = json.loads((files / "old" / "design.json").read_text())
+    assert about["likelihood"] == "trajectories"
+    capsys.readouterr()
+    assert run("--likelihood", "simulations") == 2
+    (message,) = capsys.readouterr().err.splitlines()
+    assert message.startswith("error: calibrate: likelihood is 'simulations', expected one of ")
+    assert run("--colour", "0.5") == 2
+    (message,) = capsys.readouterr().err.splitlines()
+    assert message.startswith("error: calibrate: colour is 0.5 with likelihood 'transitions'")
+
+
 def test_command_interrupted(
     files: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -570,6 +692,78 @@ def test_whole_trajectories(monkeypatch: pytest.MonkeyPatch) -> None:
     off = again.whitened(one.phi, one.sigma)
     # 54 innovations: their mean square has sd 0.19, and the first of each trajectory is exact
     assert 0.2 < np.mean(off**2) < 1.8
+
+
+@pytest.mark.slow
+def test_simulations_are_calibrated_with_coloured_errors() -> None:
+    """Two replications of a body whose mass is unknown, with draws about the mode."""
+    prior = {"mass": {"mu": 0.7, "sigma": 0.3}}
+    known = {"r": 0.0, "mu_c": 0.0}
+    body = Body("puck", Shape.circle(0.2), known=known, prior=prior)
+    scene = Scene(time_step=0.1, substeps=2, bodies=(body,))
+    history = simulated_history(scene, {"mass": 2.0}, seed=1, trajectories=2, intervals=10)
+    options = QUICK | {"likelihood": "simulation", "colour": 0.6, "method": "laplace"}
+    result = calibrate(scene, history, replications=2, **options)
+    assert not result.failures
+    names = [f"sigma[{d}]" for d in ("x", "y", "theta", "vx", "vy", "omega")]
+    assert list(result.dataset["parameter"].values) == ["mass[puck]", *names, "log_likelihood"]
+    assert {"rank", "size", "truth", "ess", "r_hat", "position"} <= set(result.dataset)
+    assert result.dataset["judged"].values.tolist() == [True] + 7 * [False]
+    assert (result.dataset["size"] == MOST_DRAWS).all()  # its draws are independent
+    truth = result.dataset["truth"].values
+    assert (truth[:, :-1] > 0).all()
+    assert np.isfinite(truth).all()
+    again = calibrate(scene, history, replications=2, **options)
+    xr.testing.assert_identical(result.dataset, again.dataset)
+
+
+def test_all_is_judged_with_white_errors(puck: tuple[Scene, History], runs: list[int]) -> None:
+    white = calibrate(*puck, replications=2, likelihood="simulation", **QUICK)
+    assert white.dataset["judged"].all()
+
+
+CASES = ["cart", "trajectories", "pair", "push", "hinge", "positions", "simulation", "laplace"]
+
+
+@pytest.mark.usefixtures("benchmarks")
+def test_benchmark_s_designs(runs: list[int]) -> None:
+    """Each is small, and can be simulated almost always."""
+    import calibration as benchmark
+
+    assert list(benchmark.CASES) == CASES
+    for name, case in benchmark.CASES.items():
+        scene, history = case.design()
+        assert len(history.segments(1).start) <= 100, name
+        result = calibrate(scene, history, replications=20, **case.options | QUICK)
+        assert result.dataset.attrs["redrawn"] <= 5, name
+
+
+@pytest.mark.usefixtures("benchmarks")
+@pytest.mark.parametrize("name", ["laplace", pytest.param("hinge", marks=pytest.mark.slow)])
+def test_benchmark_s_case_runs(name: str) -> None:
+    import calibration as benchmark
+
+    case = benchmark.CASES[name]
+    result = calibrate(*case.design(), replications=2, seed=4, **case.options | QUICK)
+    assert not result.failures
+    assert (result.dataset["ess"] > 50).all()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("benchmarks")
+def test_benchmark_prints_its_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import calibration as benchmark
+
+    few = ["--case", "laplace", "--replications", "2", "--jobs", "1", "--json"]
+    monkeypatch.setattr(sys, "argv", ["calibration.py", str(tmp_path / "laplace"), *few])
+    benchmark.main()
+    figures = json.loads(capsys.readouterr().out)
+    assert figures["case"] == "laplace"
+    assert figures["replications"] == 2
+    assert figures["failures"] == 0
+    assert figures["seconds_each"] > 0
 
 
 @pytest.mark.slow
