@@ -18,6 +18,7 @@ CASES = (
     "cart-null transitions",
     "cart-slope transitions",
     "cart-thrust-bias transitions",
+    pytest.param("cart-null trajectories", marks=pytest.mark.slow),
 )
 
 
