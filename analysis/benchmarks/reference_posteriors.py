@@ -45,7 +45,7 @@ MODEL_SEED = 0
 FALSE_ALARM = 2 * float(norm.sf(4.0))
 #: The long runs.
 LONG: dict[str, Any] = {"method": "importance", "draws": 2500, "chains": 4, "seed": 1}
-CHAINS: dict[str, Any] = {"method": "metropolis", "draws": 2000, "chains": 4, "seed": 2}
+CHAINS: dict[str, Any] = {"method": "metropolis", "draws": 800, "chains": 4, "seed": 2}
 #: Seeds of the short fits that check whether effective sample sizes are true.
 SEEDS = range(11, 15)
 
