@@ -128,12 +128,9 @@ class Problem:
 
         The error of few steps hardly depends on the parameters: the difference between both engines
         at phi is added to every prediction (defect correction: P. Zadunaisky, On the estimation of
-        errors propagated in the numerical integration of differential equations, 1976). Where
-        bodies touch it does depend on them, and the problem stays as it is.
+        errors propagated in the numerical integration of differential equations, 1976).
         """
-        likelihood, rough = self.likelihood, self.rough
-        if isinstance(likelihood, TrajectoryLikelihood) and likelihood.noise.touching.any():
-            return self
+        rough = self.rough
         if rough.physics.substeps * _WORTH_CORRECTING > self.physics.substeps:
             return self
         return rough.corrected_to(self, phi)
