@@ -5,7 +5,6 @@ See B. M. Bell, The iterated Kalman smoother as a Gauss-Newton method (1994).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +15,7 @@ from pbrl_ppl.likelihood.noise_scales import SPREAD, noise_medians
 from pbrl_ppl.likelihood.problem import Problem
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.likelihood.trajectory_noise import TrajectoryNoise
-from pbrl_ppl.physics import PartedSimulator, touching
+from pbrl_ppl.physics import touching
 from pbrl_ppl.state import STATE, Bools, Floats
 
 #: Prior scale of an unmeasured state, as a multiple of its range, beside its typical size.
@@ -27,8 +26,6 @@ _SETTLED, _ROUNDS = 0.05, 4
 _STALE = 0.3
 #: Least unexplained acceleration to smooth with, as a share of its prior median.
 _LITTLE = 0.1
-#: Times that a step of the smoother is halved at most.
-_HALVINGS = 3
 #: Steps (of the logarithm) by which unexplained accelerations fall to the given ones.
 _SHARES = (0.5, 1.0)
 #: A position's velocity is so many places on.
@@ -112,12 +109,12 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
         noise = problem.trajectory_noise
         cells = noise.cells
         before, after = noise.smoothed(residual, sigma)
-        variance = np.diagonal(noise.covariance(sigma), axis1=1, axis2=2)
-        spread = np.sqrt(np.median(variance, axis=0))
+        spread = np.sqrt(np.median(np.diagonal(noise.covariance(sigma), axis1=1, axis2=2), axis=0))
         states = _moved(problem, cells, noise.first, before, after)
         if not (np.isfinite(states).all() and np.isfinite(spread).all()):
             break  # diverged: keep the last linearisation
-        moved = _damped(problem, phi, sigma, states, variance)
+        moved = replace(problem, data=replace(problem.data, states=states))
+        moved = replace(moved, data=replace(moved.data, states=with_predicted_gaps(moved, phi)))
         begin = cells.of(moved.segments.start)
         if begun is None:
             moved = moved.along(_sloped(moved, cells, phi, sigma, spread))
@@ -136,69 +133,6 @@ def smoothed(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     return problem
 
 
-def _damped(
-    problem: Problem, phi: Floats, sigma: Floats, states: Floats, variance: Floats
-) -> Problem:
-    """Return the problem at smoothed states, or part of the way there where that fits better.
-
-    Contacts make kinks, beyond which the linearisation says nothing: a full step may end far from
-    what was measured. Each trajectory's step is halved until its path fits no worse than before, or
-    to within its noise (S. Särkkä and L. Svensson, Levenberg-Marquardt and line-search extended
-    Kalman smoothers, 2020).
-    """
-    begin = problem.data.smoothed_states
-    noise = problem.trajectory_noise
-    if not noise.touching.any():
-        return _at(problem, phi, states)
-    count = (noise.seen + (noise.first[:, None] & (noise.wide == 0))).sum(axis=1)
-    enough = np.bincount(problem.segments.trajectory, count, len(begin))
-    enough = np.maximum(_misfit(problem, phi, sigma, variance), enough)
-    share = np.ones(len(begin))
-    for smaller in (*[0.5] * _HALVINGS, 0.0):
-        moved = _at(problem, phi, begin + share[:, None, None, None] * (states - begin))
-        worse = (share > 0) & ~(_misfit(moved, phi, sigma, variance) <= enough)
-        if not worse.any():
-            return moved
-        share = np.where(worse, smaller * share, share)
-    return _at(problem, phi, begin + share[:, None, None, None] * (states - begin))
-
-
-def _at(problem: Problem, phi: Floats, states: Floats) -> Problem:
-    """Return the problem at these states, with unobserved rows predicted."""
-    moved = replace(problem, data=replace(problem.data, states=states))
-    return replace(moved, data=replace(moved.data, states=with_predicted_gaps(moved, phi)))
-
-
-def _misfit(problem: Problem, phi: Floats, sigma: Floats, variance: Floats) -> Floats:
-    """Return the chi-square of each trajectory's path, the problem's states.
-
-    The measurements' deviations count in units of their noise. The steps' defects count in units of
-    process noise and of the filter's uncertainty, ``variance`` of shape (transition, cell): without
-    process noise no path short of the last is without defects.
-    """
-    noise, segments = problem.trajectory_noise, problem.segments
-    cells = noise.cells
-    still = replace(problem, likelihood=problem.likelihood.of_parameters())  # start states as given
-    end, begin = (np.nan_to_num(own) for own in _deviations(problem, cells))
-    begin = np.where(noise.first[:, None], begin, 0.0)
-    step = np.diagonal(cells.steps(sigma), axis1=1, axis2=2)[noise.kind] + variance
-    square = cells.of_residual(still.residual(phi)) ** 2 / step
-    square += (end**2 + begin**2) / np.maximum(cells.white(sigma), 1e-300) ** 2
-    total = np.bincount(segments.trajectory, square.sum(axis=1), len(problem.data.smoothed_states))
-    return np.asarray(total)
-
-
-def _deviations(problem: Problem, cells: Cells) -> tuple[Floats, Floats]:
-    """Return measured minus linearised states after and before transitions, NaN where not measured.
-
-    Shape (transition, cell) each.
-    """
-    trajectory, step = problem.segments.trajectory, problem.segments.step
-    observed = problem.data.history.dataset["observed"].to_numpy()
-    deviation = cells.wrapped(cells.of(observed) - cells.of(problem.data.smoothed_states))
-    return deviation[trajectory, step + 1], deviation[trajectory, step]
-
-
 def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
     """Return the problem with smoothed states that follow phi to first order.
 
@@ -215,10 +149,7 @@ def with_sensitivity(problem: Problem, phi: Floats, sigma: Floats) -> Problem:
         return problem
     noise, segments = problem.trajectory_noise, problem.segments
     cells, nothing = noise.cells, np.zeros_like(noise.measured)
-    slopes = np.empty((segments.n, *segments.start.shape[1:], len(phi)))
-    for rows, engine in _engines(problem, noise.touching):
-        given = segments.start[rows], problem.inputs[rows]
-        slopes[rows] = engine.jacobian(phi, *given)[:, 0]
+    slopes = problem.rough.simulator.jacobian(phi, segments.start, problem.inputs)[:, 0]
     still = replace(noise, begin=nothing, measured=nothing, sensitivity=None)
     before = np.empty((*nothing.shape, len(phi)))
     for j, own in enumerate(cells.of(np.moveaxis(slopes, -1, 0))):
@@ -330,31 +261,15 @@ def _sloped(
         flat[2 * i + 1, :, place] -= steps[i]
     moved = cells.completed(problem.scene, moved).reshape(2 * d * n, *start.shape[1:])
     inputs = np.tile(problem.inputs[chosen], (2 * d, 1, 1, 1))
-    ends = np.empty((len(moved), d))
-    touched = _touching(problem, cells)
-    for rows_of, engine in _engines(problem, np.tile(touched[chosen], 2 * d)):
-        ends[rows_of] = cells.of(engine(phi, moved[rows_of], inputs[rows_of])[:, 0])
-    ahead, behind = np.moveaxis(ends.reshape(d, 2, n, d), 1, 0)
-    own = ((ahead - behind) / (2 * steps[:, None, None])).transpose(1, 2, 0)
+    # a coarse engine's slope agrees with a fine one's
+    ends = cells.of(problem.rough.simulator(phi, moved, inputs)[:, 0]).reshape(d, 2, n, d)
+    own = ((ends[:, 0] - ends[:, 1]) / (2 * steps[:, None, None])).transpose(1, 2, 0)
     slope = np.nan_to_num(own) if rows is None else problem.trajectory_noise.slope.copy()
     slope[chosen] = np.nan_to_num(own)
-    return linearised(problem, cells, slope, sigma, touched)
+    return linearised(problem, cells, slope, sigma)
 
 
-def _engines(problem: Problem, touching: Bools) -> Iterator[tuple[Bools, PartedSimulator]]:
-    """Yield the engine for the slopes of some transitions, with the mask of these.
-
-    The slope of few engine steps agrees with that of many, but where bodies touch: few steps round
-    the time of a contact, by more than the bodies' places are known to.
-    """
-    for rows, engine in ((~touching, problem.rough), (touching, problem)):
-        if rows.any():
-            yield rows, engine.simulator
-
-
-def linearised(
-    problem: Problem, cells: Cells, slope: Floats, sigma: Floats, near: Bools | None = None
-) -> TrajectoryNoise:
+def linearised(problem: Problem, cells: Cells, slope: Floats, sigma: Floats) -> TrajectoryNoise:
     """Return the noise along a problem's trajectories from given slopes.
 
     Parameters
@@ -367,22 +282,23 @@ def linearised(
         Derivative of the next state by the state, shape (transition, cell, cell).
     sigma : ndarray
         Noise parameters at which the states were smoothed, shape (parameter,).
-    near : ndarray of bool, optional
-        Whether bodies touch in each transition, where that is known, shape (transition,).
     """
     segments, states = problem.segments, problem.data.smoothed_states
-    end, begin = _deviations(problem, cells)
+    trajectory, step = segments.trajectory, segments.step
+    observed = problem.data.history.dataset["observed"].to_numpy()
+    deviation = cells.wrapped(cells.of(observed) - cells.of(states))
+    end, begin = deviation[trajectory, step + 1], deviation[trajectory, step]
     far = _FAR * np.ptp(cells.of(states), axis=(0, 1)) + cells.sizes(problem.scene)
     return TrajectoryNoise(
         cells=cells,
         slope=np.ascontiguousarray(slope),
-        first=segments.step == 0,
+        first=step == 0,
         seen=np.isfinite(end),
         measured=np.nan_to_num(end),
         begin=np.nan_to_num(begin),
         wide=np.where(np.isfinite(begin), 0.0, far**2),
         sigma=np.asarray(sigma, dtype=float),
-        touching=_touching(problem, cells) if near is None else near,
+        touching=_touching(problem, cells),
     )
 
 

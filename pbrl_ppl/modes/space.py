@@ -215,21 +215,27 @@ class Space:
             slope = np.where(self.roots, np.log(_ROOT / noise), 0.0).sum(axis=-1)
             return np.asarray(log_noise_prior(self.problem, log_sigma) + slope)
 
-    def log_likelihoods(self, q: Floats, residual: Floats) -> Floats:
-        """Return the log-likelihood of each part at residuals, shape (n, part)."""
-        problem = self.problem
+    def each(self, q: Floats, residual: Floats) -> Floats:
+        """Return the log-likelihood of each transition at residuals, shape (n, transition)."""
         phi, sigma = self.split(q)
         with np.errstate(all="ignore"):
-            if len(self.parts) == 1:
-                value = problem.log_density(residual, sigma, phi).sum(axis=-1)[:, None]
-            else:
-                measured, nu = problem.observations.measured, problem.nu(phi)
-                value = np.empty((len(q), len(self.parts)))
-                for j, part in enumerate(self.parts):
-                    nu_of = nu[..., part.bodies, :] if isinstance(nu, np.ndarray) else nu
-                    some, seen = residual[..., part.bodies, :], measured[..., part.bodies, :]
-                    each = problem.likelihood.log_density(some, sigma, seen, nu_of)
-                    value[:, j] = each.sum(axis=-1)
+            value = self.problem.log_density(residual, sigma, phi)
+        return np.where(np.isnan(value), -np.inf, value)
+
+    def log_likelihoods(self, q: Floats, residual: Floats) -> Floats:
+        """Return the log-likelihood of each part at residuals, shape (n, part)."""
+        if len(self.parts) == 1:
+            return np.asarray(self.each(q, residual).sum(axis=-1)[:, None])
+        problem = self.problem
+        phi, sigma = self.split(q)
+        measured, nu = problem.observations.measured, problem.nu(phi)
+        value = np.empty((len(q), len(self.parts)))
+        with np.errstate(all="ignore"):
+            for j, part in enumerate(self.parts):
+                nu_of = nu[..., part.bodies, :] if isinstance(nu, np.ndarray) else nu
+                some, seen = residual[..., part.bodies, :], measured[..., part.bodies, :]
+                each = problem.likelihood.log_density(some, sigma, seen, nu_of)
+                value[:, j] = each.sum(axis=-1)
         return np.where(np.isnan(value), -np.inf, value)
 
     def residual(self, q: Floats) -> Floats:
@@ -248,8 +254,8 @@ class Space:
         density = self.log_priors(q).sum(axis=-1)
         for first in range(0, len(q), width):
             some = q[first : first + width]
-            density[first : first + width] += self.log_likelihoods(some, self.residual(some)).sum(1)
-        return np.where(np.isnan(density), -np.inf, density)
+            density[first : first + width] += self.each(some, self.residual(some)).sum(axis=1)
+        return density
 
     def prior_draws(self, q: Floats, rng: np.random.Generator) -> Floats:
         """Return points (n, d) with the silent parameters drawn from their prior."""

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import lstsq
 
-from pbrl_ppl.likelihood import Problem
+from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
 from pbrl_ppl.modes import Space
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference
@@ -90,7 +90,11 @@ class Pieces(NamedTuple):
                 chosen = problem.layout.subset(kept).labels
                 places = np.array([labels.index(label) for label in chosen], dtype=int)
                 emulated.append(Piece(places[~silent[places]], np.array([body]), rows))
-        return cls(emulated, exact)
+        pieces = cls(emulated, exact)
+        if isinstance(problem.likelihood, TrajectoryLikelihood):  # no polynomial follows contacts
+            touching = np.flatnonzero(problem.trajectory_noise.touching)
+            return pieces.exactly([touching if len(own.bodies) > 1 else none for own in exact])
+        return pieces
 
     def exactly(self, chosen: list[Ints]) -> Pieces:
         """Return pieces with these transitions of each part by the engine."""
@@ -111,7 +115,7 @@ class Emulator:
     Parameters
     ----------
     space : Space
-        Of a problem with few engine steps.
+        Of the problem, whose engine predicts what is not emulated.
     pieces : Pieces
         Which parameters change which residuals.
     phi : ndarray
@@ -156,6 +160,22 @@ class Emulator:
         return result
 
 
+    def correct(self, phi: Floats, residual: Floats) -> None:
+        """Make up for the error of few engine steps, as a linear function of phi.
+
+        Parameters
+        ----------
+        phi : ndarray
+            Shape (run, p).
+        residual : ndarray
+            What is to be added there, shape (run, transition, H, body, state).
+        """
+        for piece, centre, scale, weights in self.fits:
+            terms = monomials((phi[:, piece.places] - centre) / scale, 1)
+            targets = piece.of(residual).reshape(len(phi), -1)
+            weights[: terms.shape[1]] += lstsq(terms, targets, lapack_driver="gelsy")[0]
+
+
 def _engine(problem: Problem, rows: Ints) -> Callable[[Floats], Floats]:
     """Return residuals of some transitions by the engine, as a function of phi."""
     start, inputs = problem.segments.start[rows], problem.inputs[rows]
@@ -183,14 +203,16 @@ def monomials(z: Floats, degree: int) -> Floats:
 
 
 def emulate(
-    space: Space, reference: Reference, rng: np.random.Generator
+    exact: Space, space: Space, reference: Reference, rng: np.random.Generator
 ) -> tuple[Posterior, Reference] | str:
     """Fit an emulator to engine runs, drawn from the posterior of the emulator before it.
 
     Parameters
     ----------
+    exact : Space
+        Of the problem.
     space : Space
-        Of a problem with few engine steps, corrected at the mode.
+        Of the problem with few engine steps, corrected at the mode.
     reference : Reference
         The first runs are drawn from it.
     rng : Generator
@@ -210,7 +232,7 @@ def emulate(
     alone = np.sqrt(len(space.parts))  # each part is accepted by itself
     particles = Ensemble(reference, reference.draw(half, rng), rng)
     runs: list[tuple[Floats, Floats]] = []
-    posterior, off = Posterior(space), np.inf
+    posterior, off, steps = Posterior(exact), np.inf, np.arange(problem.data.horizon)
     for turn in range(_ROUNDS + 1):
         phi = spread(problem, space.possible(particles.q))
         residual = problem.residual(phi)
@@ -220,6 +242,9 @@ def emulate(
         if turn:  # judge the emulator of the round before, where its particles are
             sigma = np.tile(space.split(particles.q)[1], (2, 1))
             emulated = posterior.predict(phi)
+            for piece in pieces.exact:  # better than few engine steps
+                own = np.ix_(np.arange(len(phi)), piece.rows, steps, piece.bodies)
+                residual[own] = emulated[own]
             heights = (
                 problem.log_density(each, sigma, phi).sum(axis=-1) for each in (emulated, residual)
             )
@@ -231,14 +256,18 @@ def emulate(
                 pieces = pieces.exactly(chosen)
         runs.append((phi[good], residual[good]))
         phi, residual = (np.concatenate(each) for each in zip(*runs[-2:], strict=True))
-        posterior = Posterior(space, Emulator(space, pieces, phi, residual, degree), FLATTER)
+        posterior = Posterior(exact, Emulator(exact, pieces, phi, residual, degree), FLATTER)
         if off < _CLOSE:
             break
-        particles.move(posterior, _SWEEPS)
+        particles.move(posterior, _SWEEPS, noise=False)
         particles.q = space.prior_draws(particles.q, rng)
         particles.learn()
     if not off < _ENOUGH:
         return f"the emulator's log-likelihood is off by {off:.2g} nats"
+    particles.settle(posterior, looks=_SWEEPS)
+    if problem is not exact.problem:
+        few = space.possible(particles.q[: _A_COEFFICIENT * (widest + 1)])
+        posterior.predict.correct(few, exact.problem.residual(few) - problem.residual(few))
     return posterior, reference.learned(particles.q)
 
 

@@ -53,6 +53,9 @@ class Target(Protocol):
     def columns(self, q: Floats, look: Any) -> Floats:
         """Return the log-density of each part and of the noise, shape (n, part + 1)."""
 
+    def heights(self, q: Floats) -> tuple[Floats, Floats]:
+        """Return the log-density, shape (n,), and log-likelihoods, shape (n, transition or 0)."""
+
 
 class Posterior:
     """Log-posterior of a problem, up to the evidence, by the engine or by what stands for it.
@@ -82,6 +85,15 @@ class Posterior:
         there = np.isfinite(total).all(axis=1)
         total[:, :-1] = np.where(there[:, None], total[:, :-1] + likelihood, -np.inf)
         return total
+
+
+    def heights(self, q: Floats) -> tuple[Floats, Floats]:
+        """Return the log-density, shape (n,), and log-likelihoods, shape (n, transition)."""
+        each = self.space.each(q, self.look(q))
+        prior = self.space.log_priors(q).sum(axis=1)
+        with np.errstate(invalid="ignore"):
+            height = prior + self.power * each.sum(axis=1)
+        return np.where(np.isneginf(prior), -np.inf, height), each
 
 
 class Path:
@@ -285,6 +297,10 @@ class Reference:
         noise = sum(block.log_density(q[:, block.places]) for block in self.noise)
         return np.stack([*parts, noise + np.zeros(len(q))], axis=1)
 
+    def heights(self, q: Floats) -> tuple[Floats, Floats]:
+        """Return the log-density, shape (n,), and no likelihoods, shape (n, 0)."""
+        return self.columns(q, None).sum(axis=1), np.zeros((len(q), 0))
+
     def learned(self, q: Floats) -> Reference:
         """Return the product of Gaussians of particles; of several modes, this one."""
         copies = [[Block(b.places, b.modes) for b in blocks] for blocks in (self.parts, self.noise)]
@@ -335,7 +351,13 @@ class Ensemble:
                 yield slice(first, first + width)
 
     def move(
-        self, target: Target, sweeps: int, cheap: Target | None = None, adapt: bool = True
+        self,
+        target: Target,
+        sweeps: int,
+        cheap: Target | None = None,
+        *,
+        adapt: bool = True,
+        noise: bool = True,
     ) -> float:
         """Move all particles by Metropolis sweeps; return the share of accepted moves.
 
@@ -350,19 +372,28 @@ class Ensemble:
             which frees particles from where it is far too low.
         adapt : bool
             Whether step sizes follow acceptance rates.
+        noise : bool
+            Whether the noise moves too.
         """
         rates = []
+        along = not isinstance(self.space.problem.likelihood, TransitionLikelihood)
+        moves = 0 if not noise else _NOISE_ALONG if along else _NOISE
         for chosen in self.groups():
-            self.q[chosen], rate = self._moved(self.q[chosen], target, sweeps, cheap, adapt)
+            self.q[chosen], rate = self._moved(self.q[chosen], target, sweeps, cheap, adapt, moves)
             rates.append(rate)
         return float(np.mean(rates))
 
     def _moved(
-        self, q: Floats, target: Target, sweeps: int, cheap: Target | None, adapt: bool
+        self,
+        q: Floats,
+        target: Target,
+        sweeps: int,
+        cheap: Target | None,
+        adapt: bool,
+        of_noise: int,
     ) -> tuple[Floats, float]:
         look = target.look(q)
         here, rates = target.columns(q, look), []
-        along = not isinstance(self.space.problem.likelihood, TransitionLikelihood)
         for i in range(sweeps):
             ahead = cheap if cheap is not None and i % 2 == 0 else None
             y, gain, kinds = self._proposed(q) if ahead is None else self._ahead(q, ahead, adapt)
@@ -374,7 +405,7 @@ class Ensemble:
             q, look = self._chosen(accepted, y, q), self._merged(accepted, seen, look)
             here[:, :-1] = np.where(accepted, there[:, :-1], here[:, :-1])
             rates.append(rate.mean() if len(rate) else 1.0)
-            for _ in range(_NOISE_ALONG if along else _NOISE):
+            for _ in range(of_noise):
                 for block in self.noise:
                     q, here = self._of_noise(block, q, here, target, look, adapt)
         return q, float(np.mean(rates))
@@ -455,8 +486,10 @@ class Ensemble:
             block.adapt(kind, float(rate))
         return np.where(accepted[:, None], y, q), np.where(accepted[:, None], there, here)
 
-    def settle(self, target: Target, cheap: Target | None = None) -> tuple[float, float]:
-        """Move until particles have forgotten where they were.
+    def settle(
+        self, target: Target, cheap: Target | None = None, looks: int = _LOOKS
+    ) -> tuple[float, float]:
+        """Move until particles have forgotten where they were, or so many times.
 
         Returns
         -------
@@ -468,7 +501,7 @@ class Ensemble:
         begin, rates = self.q.copy(), []
         places = np.concatenate([block.places for block in self.blocks])
         sweeps = 1 if cheap is not None else _SWEEPS
-        for _ in range(_LOOKS):
+        for _ in range(looks):
             rates.append(self.move(target, sweeps, cheap))
             correlation = _correlation(begin[:, places], self.q[:, places])
             if correlation < _FORGOTTEN:
@@ -476,13 +509,11 @@ class Ensemble:
             self.learn()
         return float(np.mean(rates)), correlation
 
-    def heights(self, target: Target) -> Floats:
-        """Return the log-density of all particles, shape (n,)."""
-        height = np.empty(len(self.q))
-        for chosen in self.groups():
-            q = self.q[chosen]
-            height[chosen] = target.columns(q, target.look(q)).sum(axis=1)
-        return height
+    def heights(self, target: Target) -> tuple[Floats, Floats]:
+        """Return what :meth:`Target.heights` does, of all particles."""
+        parts = [target.heights(self.q[chosen]) for chosen in self.groups()]
+        height, each = (np.concatenate(own) for own in zip(*parts, strict=True))
+        return height, each
 
 
 class Annealed(NamedTuple):
@@ -492,6 +523,8 @@ class Annealed(NamedTuple):
     ----------
     log_weight : ndarray
         What is left of the path, up to a constant, shape (n,).
+    each : ndarray
+        Log-likelihoods at the end, shape (n, transition).
     log_z : float
         Logarithm of the ratio of the densities' integrals.
     rungs : int
@@ -503,6 +536,7 @@ class Annealed(NamedTuple):
     """
 
     log_weight: Floats
+    each: Floats
     log_z: float
     rungs: int
     accepted: float
@@ -533,13 +567,14 @@ def anneal(
     beta, log_z, rungs, kept = 0.0, 0.0, 0, 1.0
     rates: list[float] = []
     while beta < 1.0:
+        height, each = ensemble.heights(end)
         with np.errstate(invalid="ignore"):
-            gap = ensemble.heights(end) - ensemble.heights(start)
+            gap = height - ensemble.heights(start)[0]
         gap = np.where(np.isnan(gap), -np.inf, gap)
         rest = (1.0 - beta) * gap
         if rungs == _RUNGS or (weigh and _suffices(rest)):
             log_z += float(logsumexp(rest) - np.log(len(rest)))
-            return Annealed(rest, log_z, rungs, _mean(rates), kept)
+            return Annealed(rest, each, log_z, rungs, _mean(rates), kept)
         step = _step(gap, 1.0 - beta)
         total = logsumexp(step * gap)
         log_z += float(total - np.log(len(gap)))
@@ -547,13 +582,15 @@ def anneal(
         chosen = systematic(np.exp(step * gap - total), len(gap), ensemble.rng)
         ensemble.q = ensemble.q[chosen]
         ensemble.learn()
-        rate, correlation = ensemble.settle(Path(start, end, beta), cheap)
+        looks = _LOOKS if beta == 1.0 else 1  # the next rung forgets again
+        rate, correlation = ensemble.settle(Path(start, end, beta), cheap, looks)
         rates.append(rate)
         rungs += 1
         # copies of a particle are as alike as each is to where they began, squared
         copies = np.bincount(chosen).astype(float)
         kept = len(gap) / float((copies + copies * (copies - 1) * correlation**2).sum())
-    return Annealed(np.zeros(len(ensemble.q)), log_z, rungs, _mean(rates), kept)
+    each = ensemble.heights(end)[1] if weigh else each
+    return Annealed(np.zeros(len(ensemble.q)), each, log_z, rungs, _mean(rates), kept)
 
 
 def _mean(rates: list[float]) -> float:

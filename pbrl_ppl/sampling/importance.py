@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.posterior import smoothed
 from pbrl_ppl.sampling.emulator import emulate
 from pbrl_ppl.sampling.ensemble import Annealed, Ensemble, Posterior, Reference, anneal, systematic
@@ -22,8 +21,6 @@ from pbrl_ppl.state import Floats
 
 #: Measured numbers from which a recording is long: the posterior is near its Laplace approximation.
 _LONG = 300_000
-#: Numbers of residuals that are held at once.
-_NUMBERS = 8_000_000
 
 
 class Pool(NamedTuple):
@@ -77,7 +74,7 @@ def cheaper(reference: Reference, rng: np.random.Generator) -> Cheaper:
     problem = space.problem
     corrected = problem.corrected(space.centre)
     if problem.measured.size <= _LONG:
-        found = emulate(space.on(corrected), reference, rng)
+        found = emulate(space, space.on(corrected), reference, rng)
         if not isinstance(found, str):
             return Cheaper(*found, "an emulator")
     if corrected is not problem:
@@ -100,28 +97,17 @@ def draw_pool(first: Reference, n: int, seed: Any) -> Pool:
     rng, space = np.random.default_rng(seed), first.space
     cheap, reference, name = cheaper(first, rng)
     ensemble, exact = Ensemble(reference, reference.draw(n, rng), rng), Posterior(space)
-    reached = Annealed(np.zeros(n), 0.0, 0, 1.0, 1.0)
+    reached = Annealed(np.zeros(n), np.zeros((n, 0)), 0.0, 0, 1.0, 1.0)
     if cheap is not None:
         reached = anneal(ensemble, reference, cheap)
         ensemble.q = space.prior_draws(ensemble.q, rng)
     weighed = anneal(ensemble, cheap or reference, exact, cheap=cheap, weigh=True)
     phi, sigma = space.split(ensemble.q)
     return Pool(
-        phi, sigma, weighed.log_weight, likelihoods(space.problem, phi, sigma),
+        phi, sigma, weighed.log_weight, weighed.each,
         reached.log_z + weighed.log_z, weighed.rungs, weighed.accepted,
         min(reached.kept, weighed.kept), name,
     )  # fmt: skip
-
-
-def likelihoods(problem: Problem, phi: Floats, sigma: Floats) -> Floats:
-    """Return the engine's log-likelihoods of draws (n, p), shape (n, transition)."""
-    result = np.empty((len(phi), problem.segments.n))
-    width = max(16, _NUMBERS // max(problem.measured.size, 1))
-    for first in range(0, len(phi), width):
-        some = slice(first, first + width)
-        residual = problem.residual(phi[some])
-        result[some] = problem.log_density(residual, sigma[some], phi[some])
-    return result
 
 
 def resample(

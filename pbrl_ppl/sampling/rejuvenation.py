@@ -44,7 +44,7 @@ def rejuvenate(
     cheap = None
     if corrected is not problem:
         few = Posterior(space.on(corrected))
-        if (ensemble.heights(few) - ensemble.heights(exact)).std() < _CLOSE:
+        if (ensemble.heights(few)[0] - ensemble.heights(exact)[0]).std() < _CLOSE:
             cheap = few
     accepted, _ = ensemble.settle(exact, cheap)
     return (*space.split(ensemble.q), accepted)
