@@ -7,7 +7,7 @@ import pytest
 from pbrl_ppl.sampling import fitting
 
 
-def shorten(patch: pytest.MonkeyPatch, draws: int, tune: int) -> None:
-    """Of each chain, where none are asked for: in an update that fits anew, say."""
-    few = replace(fitting.METHODS["metropolis"], draws=draws, tune=tune)
-    patch.setattr(fitting, "METHODS", {**fitting.METHODS, "metropolis": few})
+def shorten(patch: pytest.MonkeyPatch, draws: int) -> None:
+    """Of each chain by default, where none are asked for: in an update that fits anew, say."""
+    few = replace(fitting.METHODS[fitting.DEFAULT], draws=draws)
+    patch.setattr(fitting, "METHODS", {**fitting.METHODS, fitting.DEFAULT: few})

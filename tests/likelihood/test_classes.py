@@ -173,7 +173,7 @@ def test_one_choice_a_class() -> None:
     assert Dynamics.of(idata).mass("chair2") == MASS
 
 
-def test_pooled_and_emulated() -> None:
+def test_pooled_and_emulated(monkeypatch) -> None:
     """Pooled, each chair gets the class's prior; an emulated body has its class's parameters."""
     own = scene().with_effects("chair2", "linear_drag")
     idata = [quick(physics_model(own, recorded(seed=s, intervals=15)), method="laplace")
@@ -184,5 +184,10 @@ def test_pooled_and_emulated() -> None:
     assert "linear_drag_coefficient" in second and "linear_drag_coefficient" not in first
     problem = Problem.of(Physics.declare(own), recorded())
     problem = along_trajectories(problem, np.array([MASS, 0.1]))
-    pieces = Pieces.of(problem).emulated
+    informed = np.zeros(2, dtype=bool)
+    (whole,) = Pieces.of(problem, informed).emulated
+    assert whole.places.tolist() == [0, 1]
+    # where a polynomial of all parameters would have too many terms
+    monkeypatch.setattr("pbrl_ppl.sampling.emulator._MOST", 1)
+    pieces = Pieces.of(problem, informed).emulated
     assert [piece.places.tolist() for piece in pieces] == [[0], [0, 1]]

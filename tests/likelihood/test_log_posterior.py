@@ -5,8 +5,7 @@ import pytest
 from pymc.model.transform.conditioning import remove_value_transforms
 
 from pbrl_ppl.likelihood import log_posterior, log_prior
-from pbrl_ppl.modes import find_mode
-from pbrl_ppl.modes.evidence import Coordinates
+from pbrl_ppl.modes import Space, find_mode
 from pbrl_ppl.modes.noise import profile_sigma
 from pbrl_ppl.parameters import ParameterLibrary, prior_draws
 from pbrl_ppl.posterior import draws, parameter_draws, stored_mode, updated_mode
@@ -146,19 +145,19 @@ def test_the_evidence_s_coordinates_have_the_same_density(history) -> None:
     """In them it is the log-posterior with the volume of the change of coordinates."""
     problem = physics_model(cart_scene(), history).problem
     mode = find_mode(problem, initial=problem.layout.to_vector(CART), rounds=1)
-    coordinates = Coordinates(mode)
-    z = coordinates.origin + np.random.default_rng(2).normal(0, 0.1, (4, len(coordinates.origin)))
+    space = Space(problem, mode.phi)
+    z = space.at(mode.phi, mode.sigma) + np.random.default_rng(2).normal(0, 0.1, (4, space.size))
     step = 1e-5
     volume = np.zeros(4)
     for i in range(z.shape[1]):
         ends = [
-            np.hstack(coordinates.values(z + sign * step * np.eye(z.shape[1])[i]))[:, i]
+            np.hstack(space.split(z + sign * step * np.eye(z.shape[1])[i]))[:, i]
             for sign in (-1, 1)
         ]
         volume += np.log(np.abs(ends[1] - ends[0]) / (2 * step))
-    phi, sigma = coordinates.values(z)
+    phi, sigma = space.split(z)
     expected = log_posterior(problem, phi, sigma) + volume
-    np.testing.assert_allclose(coordinates.log_density(z), expected, atol=2e-3)
+    np.testing.assert_allclose(space.log_density(z), expected, atol=2e-3)
 
 
 @pytest.mark.filterwarnings("ignore:the chains have not converged")  # so few draws

@@ -27,8 +27,7 @@ from pbrl_ppl.modes.configurations import (
     number,
     stored,
 )
-from pbrl_ppl.modes.evidence import Evidence, _Law, importance, laplace
-from pbrl_ppl.parameters import Prior
+from pbrl_ppl.modes.evidence import Evidence, importance, laplace
 from pbrl_ppl.physics import Physics, Simulator
 from pbrl_ppl.planning import Dynamics
 from pbrl_ppl.posterior import (
@@ -154,32 +153,6 @@ def test_named_joints_keep_their_names_without_the_free_ones() -> None:
 
 
 # -- evidence --------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    "prior",
-    [
-        Prior("log_normal", mu=1.0, sigma=1.5),
-        Prior("normal", mu=-1.0, sigma=2.0),
-        Prior("half_normal", sigma=3.0),
-        Prior("half_normal", mu=1.0, sigma=3.0),
-        Prior("truncated_normal", mu=0.5, sigma=1.0, lower=0.0, upper=1.0),
-        Prior("truncated_normal", mu=9.0, sigma=1.0, lower=0.0, upper=1.0),
-        Prior("von_mises", mu=0.0, kappa=0.0),
-        Prior("von_mises", mu=1.0, kappa=0.5),
-        Prior("von_mises", mu=3.0, kappa=2000.0),
-    ],
-    ids=lambda prior: f"{prior.family}-{prior.mu:g}",
-)
-def test_coordinates_make_the_prior_a_standard_normal(prior) -> None:
-    """One false alarm in 10 000, for each prior."""
-    values = prior.sample(np.random.default_rng(1), 20_000)
-    law = _Law(prior, values[0])
-    if prior.family == "von_mises":  # the circle is cut opposite the mode
-        values = values[0] + np.pi - np.mod(np.pi - (values - values[0]), 2 * np.pi)
-    z = np.array([law.standard(x) for x in values[:2000]])
-    assert stats.kstest(z, stats.norm.cdf).pvalue > 1e-4
-    np.testing.assert_allclose(law.value(z), values[:2000], rtol=1e-6, atol=1e-9)
 
 
 def of_wheel(intervals: int) -> Problem:

@@ -20,7 +20,6 @@ from pbrl_ppl.parameters import (
 )
 from pbrl_ppl.physics import build_layout
 from pbrl_ppl.sampling import physics_model
-from pbrl_ppl.sampling.starts import evened_logp
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import simulated_history
 from tests.helpers.marks import OBJECT_MODE
@@ -146,7 +145,7 @@ def test_descriptions_drawn_anew_have_the_prior_s_distribution(name) -> None:
 
 @EVERY
 def test_the_evened_prior_is_the_descriptions_mean(name) -> None:
-    """In numpy and in the model; the same for each of the four."""
+    """The same for each of the four; the prior itself where it is even."""
     layout = layout_of(name)
     (wheel,) = wheels(layout)
     phi = draws_of(layout, 5)
@@ -157,17 +156,7 @@ def test_the_evened_prior_is_the_descriptions_mean(name) -> None:
     turned = wheel.turned(phi, 1)
     after = layout.log_prior(turned).sum(axis=1) + evened(layout, turned).sum(axis=1)
     np.testing.assert_allclose(after, own + change)
-    history = simulated_history(cart_scene(), CART, seed=1, trajectories=1, intervals=3)
-    model = physics_model(cart_scene(prior=PRIORS[name]), history)
-    extra = evened_logp(model, model.problem)
     if PERIODS[name] == 1:
-        assert extra == 0.0
         np.testing.assert_array_equal(change, 0.0)
-        return
-    values = dict(zip(layout.labels, phi[0], strict=True))
-    point = {}
-    for name in ("w_theta", "mu_x", "mu_y"):
-        x = values[f"{name}[cart]"]
-        moved = x if name == "w_theta" else np.log(x / (1 - x))
-        point[model.rvs_to_values[model[name]]] = np.array([moved])
-    assert float(extra.eval(point, mode="FAST_COMPILE")) == pytest.approx(change[0])
+    else:
+        assert change.all()

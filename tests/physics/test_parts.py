@@ -6,11 +6,10 @@ import pytest
 
 from pbrl_ppl.errors import SceneError, SimulationError
 from pbrl_ppl.history import History
-from pbrl_ppl.modes import Mode
+from pbrl_ppl.modes import Space
 from pbrl_ppl.parameters import inside
 from pbrl_ppl.physics import PartedSimulator, Physics, Simulator, build_layout, independent_parts
 from pbrl_ppl.sampling import physics_model
-from pbrl_ppl.sampling.starts import gaussian_blocks
 from pbrl_ppl.scene import Body, Joint, Scene, Shape, Wall
 from tests.helpers.histories import COLUMNS
 from tests.helpers.places import RECORDED
@@ -167,14 +166,11 @@ def test_each_parameter_is_in_one_block_of_the_sampler() -> None:
     model = physics_model(scene, history_of(scene, places))
     layout = model.problem.layout
     phi = inside(layout.priors, np.array([prior.centre for prior in layout.priors]))
-    count = len(phi)
-    mode = Mode(
-        model.problem, phi, np.ones(6), np.zeros((0, count)), 1e-4 * np.eye(count), log_posterior=0
-    )
-    blocks = gaussian_blocks(model, mode)
+    space = Space(model.problem, phi)
+    blocks = [part.places for part in space.parts] + list(space.noise_blocks)
     assert len(blocks) == 4  # a and b, c, d, the noise
-    found = np.concatenate([block.places for block in blocks])
-    assert sorted(found) == list(range(count + 6))
+    assert sorted(np.concatenate(blocks)) == list(range(len(phi) + 6))
+    assert [list(part.bodies) for part in space.parts] == [[0, 1], [2], [3]]
 
 
 def test_labels_of_joints_survive() -> None:

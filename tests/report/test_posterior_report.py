@@ -73,9 +73,6 @@ def test_page_of_importance_draws() -> None:
     assert "Pareto k of their weights is 0.250 (above 0.7" in text
     assert "the draws are worth 432 independent ones" in text
     assert "Warning of the fit" not in text
-    why = {"fallback": "bodies touch"}
-    text = Page(render_posterior(from_groups(groups(chains), chains.attrs | why))).text
-    assert "Chains were run in place of importance sampling: bodies touch." in text
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -19,7 +19,6 @@ from pbrl_ppl.errors import (
     UninformedWarning,
 )
 from pbrl_ppl.modes import find_mode
-from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import (
     convergence,
     data,
@@ -32,9 +31,9 @@ from pbrl_ppl.posterior import (
 )
 from pbrl_ppl.posterior import save_posterior as save
 from pbrl_ppl.posterior.completion import MAX_RHAT, MIN_ESS, complete
-from pbrl_ppl.sampling import physics_model
+from pbrl_ppl.sampling import methods, physics_model
+from pbrl_ppl.sampling.ensemble import Ensemble
 from pbrl_ppl.sampling.fitting import METHODS, fit
-from pbrl_ppl.sampling.starts import unconstrain
 from pbrl_ppl.scene import Shape
 from tests.helpers.carts import CART, cart_scene
 from tests.helpers.histories import NOISE, simulated_history
@@ -278,38 +277,6 @@ def test_a_foreign_model() -> None:
         fit(foreign)
 
 
-@pytest.mark.parametrize(
-    ("prior", "distribution"),
-    [
-        (Prior("log_normal", mu=0.3, sigma=0.5), lambda: pm.LogNormal("x", 0.3, 0.5)),
-        (Prior("half_normal", sigma=2.0), lambda: pm.HalfNormal("x", 2.0)),
-        (
-            Prior("truncated_normal", mu=0.1, sigma=1.0, lower=-0.5, upper=1.5),
-            lambda: pm.TruncatedNormal("x", 0.1, 1.0, lower=-0.5, upper=1.5),
-        ),
-        (Prior("normal", mu=1.0, sigma=2.0), lambda: pm.Normal("x", 1.0, 2.0)),
-        (Prior("von_mises", mu=0.2, kappa=2.0), lambda: pm.VonMises("x", 0.2, 2.0)),
-    ],
-    ids=lambda one: one.family if isinstance(one, Prior) else "",
-)
-def test_unconstrain_is_pymc_s_transform(prior, distribution) -> None:
-    """The value and the derivative, by differences."""
-    with pm.Model() as model:
-        variable = distribution()
-    transform = model.rvs_to_transforms[variable]
-
-    def forward(x: float) -> float:
-        if transform is None:
-            return x
-        value = transform.forward(np.array(x), *variable.owner.inputs)
-        return float(value.eval(mode="FAST_COMPILE"))
-
-    for x in (0.05, 0.4, 1.2):
-        found, slope = unconstrain(prior, x)
-        assert found == pytest.approx(forward(x))
-        assert slope == pytest.approx((forward(x + 1e-5) - forward(x - 1e-5)) / 2e-5, rel=1e-6)
-
-
 def test_an_early_interrupt_leaves_nothing(model, mode, monkeypatch):
     """PyMC's answer to an interrupt before the first draws."""
 
@@ -318,56 +285,74 @@ def test_an_early_interrupt_leaves_nothing(model, mode, monkeypatch):
 
     monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", nothing)
     with pytest.raises(KeyboardInterrupt):
-        fit(model, method="metropolis", draws=10, tune=10, start=mode, progress=False)
+        fit(model, method="demetropolisz", draws=10, tune=10, start=mode, progress=False)
+
+
+def interrupt_at(patch: pytest.MonkeyPatch, number: int) -> None:
+    """Press Ctrl-C at this move of the ensemble."""
+    move, calls = Ensemble.move, []
+
+    def pressed(self, *arguments, **options):
+        calls.append(1)
+        if len(calls) == number:
+            raise KeyboardInterrupt
+        return move(self, *arguments, **options)
+
+    patch.setattr(Ensemble, "move", pressed)
+
+
+@pytest.mark.parametrize("number", [1, 5, 12])
+def test_an_interrupt_before_there_are_draws_leaves_nothing(model, mode, monkeypatch, number):
+    """In tuning, or at the second draw of each walker."""
+    monkeypatch.setattr(methods, "_LITTLE", np.inf)
+    interrupt_at(monkeypatch, number)
+    with pytest.raises(KeyboardInterrupt):
+        fit(model, seed=4, start=mode, **(CHAINS | {"draws": 60}))
 
 
 @pytest.fixture(scope="module")
 def interrupted(model, mode):
-    """PyMC swallows an interrupt and returns the draws so far; here, 30 of 50."""
-    sample = pm.sample
+    """Twenty walkers a chain, 10 moves of tuning, then 2 draws of 3 each: 40 draws of 50."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            "pbrl_ppl.sampling.fitting.pm.sample",
-            lambda **options: sample(**(options | {"draws": 30})),
-        )
+        patch.setattr(methods, "_LITTLE", np.inf)
+        interrupt_at(patch, 13)
         with (
             pytest.warns(ConvergenceWarning, match="have not converged"),
             pytest.warns(
-                ConvergenceWarning, match="after 30 of 50 draws in 2 of 2 chains.*resume="
+                ConvergenceWarning, match="after 40 of 50 draws in 2 of 2 chains.*resume="
             ),
         ):
             return fit(model, seed=4, start=mode, **(CHAINS | {"draws": 50}))
 
 
 def test_an_interrupt_keeps_the_draws(interrupted) -> None:
-    assert group(interrupted, "posterior").sizes["draw"] == 30
+    assert group(interrupted, "posterior").sizes["draw"] == 40
     assert interrupted.attrs["interrupted"] == 1
     assert "interrupted" in json.loads(interrupted.attrs["warnings"])[0]
-    assert group(interrupted, "log_likelihood").sizes["draw"] == 30
-    for name in ("accept", "look_ahead_accept"):
-        assert group(interrupted, "sample_stats")[name].sizes["draw"] == 30
+    assert group(interrupted, "log_likelihood").sizes["draw"] == 40
+    assert group(interrupted, "sample_stats")["accept"].sizes["draw"] == 40
 
 
-def test_chains_that_an_interrupt_left_out_are_missed(model, mode, interrupted, monkeypatch):
+def test_chains_that_an_interrupt_left_out_are_missed(model, mode, monkeypatch):
     """PyMC keeps the chains that had most draws, all of them, and says nothing."""
     sample = pm.sample
+    options = QUICK | {"method": "demetropolisz", "draws": 30, "tune": 0, "thin": 1, "chains": 3}
 
-    def two_of_three(**options):
-        return sample(**(options | {"chains": 2, "initvals": options["initvals"][:2]}))
+    def fewer(chains):
+        return lambda **given: sample(
+            **(given | {"chains": chains, "initvals": given["initvals"][:chains]})
+        )
 
-    monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", two_of_three)
+    monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", fewer(2))
     with (
         pytest.warns(ConvergenceWarning, match="have not converged"),
         pytest.warns(ConvergenceWarning, match="after 30 of 30 draws in 2 of 3 chains"),
     ):
-        cut = fit(model, seed=4, start=mode, **(CHAINS | {"draws": 30, "chains": 3}))
+        cut = fit(model, seed=4, start=mode, **options)
     assert cut.attrs["interrupted"] == 1
-    monkeypatch.setattr(
-        "pbrl_ppl.sampling.fitting.pm.sample",
-        lambda **options: sample(**(options | {"chains": 1, "initvals": options["initvals"][:1]})),
-    )
+    monkeypatch.setattr("pbrl_ppl.sampling.fitting.pm.sample", fewer(1))
     with pytest.raises(KeyboardInterrupt):  # the earlier draws are where they were
-        fit(model, seed=4, resume=interrupted, **(CHAINS | {"draws": 30, "tune": 0}))
+        fit(model, seed=4, resume=cut, **options)
 
 
 def test_too_few_draws_for_r_hat_have_not_converged(model, mode) -> None:
@@ -379,13 +364,13 @@ def test_too_few_draws_for_r_hat_have_not_converged(model, mode) -> None:
 def test_an_interrupted_fit_goes_on(model, interrupted) -> None:
     """New draws follow the old ones, which stay."""
     with pytest.warns(ConvergenceWarning, match="not converged"):
-        whole = fit(model, seed=5, resume=interrupted, **(CHAINS | {"draws": 170, "tune": 0}))
+        whole = fit(model, seed=5, resume=interrupted, **(CHAINS | {"draws": 160, "tune": 0}))
     assert "interrupted" not in whole.attrs
     posterior = group(whole, "posterior")
     assert dict(posterior.sizes) == {"chain": 2, "draw": 200, "body": 1, "state": 6}
     for name in PARAMETERS:
         before = group(interrupted, "posterior")[name].values
-        np.testing.assert_array_equal(posterior[name].values[:, :30], before)
+        np.testing.assert_array_equal(posterior[name].values[:, :40], before)
 
 
 def test_a_start_of_another_model_is_refused(model, interrupted) -> None:

@@ -173,7 +173,7 @@ def test_a_plan_expects_steps_noise_and_not_the_sensors(first) -> None:
 @pytest.mark.slow
 def test_a_first_contact_brings_a_noise_of_its_own(monkeypatch) -> None:
     """Two pucks far apart, then side by side: the posterior knows no noise of contacts."""
-    shorten(monkeypatch, draws=200, tune=200)
+    shorten(monkeypatch, draws=200)
     shape, known = Shape.circle(0.3), {"r": 0.5, "mu_c": 0.2}
     bodies = (Body("one", shape, known=known), Body("two", shape, known=known | {"mass": 1.0}))
     scene = Scene(time_step=0.1, substeps=4, bodies=bodies)
