@@ -96,7 +96,15 @@ class Space:
     @classmethod
     def of(cls, mode: Mode) -> Space:
         """Return the space about a mode, with the parameters that its derivative finds silent."""
-        return cls(mode.problem, mode.phi, silent(mode))
+        centre = mode.phi.copy()
+        for i, prior in enumerate(mode.problem.layout.priors):
+            if prior.family == "von_mises":  # cut where it is farthest from every mode
+                angles = np.sort(np.mod([each.phi[i] for each in (mode, *mode.others)], 2 * np.pi))
+                gaps = np.diff([*angles, angles[0] + 2 * np.pi])
+                widest = int(np.argmax(gaps))
+                middle = angles[widest] + 0.5 * gaps[widest] - np.pi
+                centre[i] += _turned(middle - centre[i])
+        return cls(mode.problem, centre, silent(mode))
 
     @classmethod
     def of_draws(cls, problem: Problem, phi: Floats, sigma: Floats) -> tuple[Space, Floats]:
@@ -142,9 +150,7 @@ class Space:
     @property
     def loud(self) -> Ints:
         """The coordinates that the data inform, shape (loud,)."""
-        return np.concatenate(
-            [np.flatnonzero(~self.silent), np.arange(self.phi_size, self.size)]
-        )
+        return np.concatenate([np.flatnonzero(~self.silent), np.arange(self.phi_size, self.size)])
 
     @cached_property
     def noise_blocks(self) -> tuple[Ints, ...]:
@@ -154,13 +160,16 @@ class Space:
         return tuple(block for block in blocks if len(block))
 
     def at(self, phi: Floats, sigma: Floats) -> Floats:
-        """Return the points of parameters (..., p) and noise (..., parameter), shape (..., d)."""
+        """Return the points of parameters (..., p) and noise (..., parameter), shape (..., d).
+
+        Angles are within half a turn of the centre.
+        """
         priors = self.problem.layout.priors
         phi = inside(priors, phi)
         columns = [unconstrain(prior, phi[..., i])[0] for i, prior in enumerate(priors)]
         u = np.stack(columns, axis=-1) if columns else phi
         for i in self._circles:
-            u[..., i] = self.centre[i] + np.mod(u[..., i] - self.centre[i] + np.pi, 2 * np.pi) - np.pi
+            u[..., i] = self.centre[i] + _turned(u[..., i] - self.centre[i])
         log_sigma = np.log(self.problem.likelihood.free(sigma))
         return np.concatenate([u, self.noise(log_sigma)], axis=-1)
 
@@ -255,7 +264,7 @@ class Space:
         for first in range(0, len(q), width):
             some = q[first : first + width]
             density[first : first + width] += self.each(some, self.residual(some)).sum(axis=1)
-        return density
+        return np.asarray(density)
 
     def prior_draws(self, q: Floats, rng: np.random.Generator) -> Floats:
         """Return points (n, d) with the silent parameters drawn from their prior."""
@@ -273,6 +282,7 @@ class Space:
         data say little, it is that of the prior here.
         """
         p, mean = self.phi_size, self.at(mode.phi, mode.sigma)
+        about = self._about(mean)
         centre, of_noise = _noise_gaussian(mode)
         mean[p:] = self.noise(centre)
         stretch = np.where(self.roots, mean[p:] / _ROOT, 1.0)
@@ -280,11 +290,13 @@ class Space:
         covariance[p:, p:] = stretch[:, None] * of_noise * stretch
         if p:
             priors = self.problem.layout.priors
-            slope = np.array([1.0 / unconstrain(*pair)[1] for pair in zip(priors, mode.phi, strict=True)])
+            slope = np.array(
+                [1.0 / unconstrain(*pair)[1] for pair in zip(priors, mode.phi, strict=True)]
+            )
             jacobian = mode.jacobian * slope
             ends = mean + _STEP * np.eye(len(mean))[:p], mean - _STEP * np.eye(len(mean))[:p]
-            here = self._of_parameters(mean)
-            above, below = (np.diagonal(self._of_parameters(end)) for end in ends)
+            here = about._of_parameters(mean)
+            above, below = (np.diagonal(about._of_parameters(end)) for end in ends)
             curvature = np.maximum((2 * here - above - below) / _STEP**2, _FLAT)
             precision = jacobian.T @ jacobian + np.diag(curvature)
             for place in self.problem.tails:
@@ -298,8 +310,14 @@ class Space:
             step = np.zeros_like(mean)
             step[:p] = covariance[:p, :p] @ pull
             tried = mean + np.array([0.0, 0.25, 0.5, 1.0])[:, None] * step
-            mean = tried[int(np.argmax(self.log_density(tried)))]
+            mean = tried[int(np.argmax(about.log_density(tried)))]
         return mean, (covariance + covariance.T) / 2
+
+    def _about(self, q: Floats) -> Space:
+        """Return the space with circles cut opposite to a point (d,)."""
+        middle = self.centre.copy()
+        middle[self._circles] = q[self._circles]
+        return replace(self, centre=middle)
 
     def widened(self, mean: Floats, covariance: Floats) -> Floats:
         """Return a covariance, widened where the posterior falls off slowly, shape (d, d).
@@ -308,11 +326,15 @@ class Space:
         """
         p = self.phi_size
         loud = np.flatnonzero(~self.silent)
+        if not len(loud):
+            return covariance
         steps = np.sqrt(np.diag(covariance))[loud]
         ends = np.array([*_FAR, *(-far for far in _FAR)])
         moves = np.zeros((len(loud), len(ends), len(mean)))
         moves[np.arange(len(loud)), :, loud] = steps[:, None] * ends
-        top, *heights = self.log_density(np.vstack([mean, mean + moves.reshape(-1, len(mean))]))
+        top, *heights = self._about(mean).log_density(
+            np.vstack([mean, mean + moves.reshape(-1, len(mean))])
+        )
         fall = (top - np.array(heights)).reshape(len(loud), 2, -1)
         # on either side, up to the first point that has fallen
         within = np.nan_to_num(fall, nan=np.inf) < _LOW
@@ -321,6 +343,11 @@ class Space:
         extra = np.zeros(len(mean))
         extra[:p][loud] = steps**2 * (stretch**2 - 1.0)
         return np.asarray(covariance + np.diag(extra))
+
+
+def _turned(angle: Any) -> Any:
+    """Return angles in [-pi, pi)."""
+    return np.mod(angle + np.pi, 2 * np.pi) - np.pi
 
 
 def silent(mode: Mode) -> Bools:

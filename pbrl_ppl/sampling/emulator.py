@@ -56,7 +56,7 @@ class Piece:
     rows: Ints
 
     def of(self, residual: Floats) -> Floats:
-        """Return these residuals of all, shape (run, transition of these, H, body of these, state)."""
+        """Return these residuals of all, shape (run, transition, H, body, state)."""
         return residual[:, self.rows][:, :, :, self.bodies]
 
 
@@ -97,8 +97,11 @@ class Pieces(NamedTuple):
         return pieces
 
     def exactly(self, chosen: list[Ints]) -> Pieces:
-        """Return pieces with these transitions of each part by the engine."""
-        exact = [replace(piece, rows=rows) for piece, rows in zip(self.exact, chosen, strict=True)]
+        """Return pieces with these transitions of each part by the engine too."""
+        exact = [
+            replace(piece, rows=np.union1d(piece.rows, rows))
+            for piece, rows in zip(self.exact, chosen, strict=True)
+        ]
         emulated = []
         for piece in self.emulated:
             (own,) = (part for part in exact if np.isin(piece.bodies, part.bodies).all())
@@ -159,7 +162,6 @@ class Emulator:
             result[where] = engine(own)[:, :, :, piece.bodies]
         return result
 
-
     def correct(self, phi: Floats, residual: Floats) -> None:
         """Make up for the error of few engine steps, as a linear function of phi.
 
@@ -203,16 +205,14 @@ def monomials(z: Floats, degree: int) -> Floats:
 
 
 def emulate(
-    exact: Space, space: Space, reference: Reference, rng: np.random.Generator
+    space: Space, reference: Reference, rng: np.random.Generator
 ) -> tuple[Posterior, Reference] | str:
     """Fit an emulator to engine runs, drawn from the posterior of the emulator before it.
 
     Parameters
     ----------
-    exact : Space
-        Of the problem.
     space : Space
-        Of the problem with few engine steps, corrected at the mode.
+        Of the problem; the runs are of few engine steps, corrected at the centre.
     reference : Reference
         The first runs are drawn from it.
     rng : Generator
@@ -224,7 +224,7 @@ def emulate(
         The emulator's posterior, somewhat flatter than the problem's, with Gaussians of its
         particles; or why there is none.
     """
-    problem = space.problem
+    problem = space.problem.corrected(space.centre)
     pieces = Pieces.of(problem, space.silent)
     widest = max((len(piece.places) for piece in pieces.emulated), default=0)
     degree = 2 if _terms(widest, 2) <= _MOST else 1
@@ -232,23 +232,24 @@ def emulate(
     alone = np.sqrt(len(space.parts))  # each part is accepted by itself
     particles = Ensemble(reference, reference.draw(half, rng), rng)
     runs: list[tuple[Floats, Floats]] = []
-    posterior, off, steps = Posterior(exact), np.inf, np.arange(problem.data.horizon)
+    posterior, emulator, off = Posterior(space), None, np.inf
+    steps = np.arange(problem.data.horizon)
     for turn in range(_ROUNDS + 1):
         phi = spread(problem, space.possible(particles.q))
         residual = problem.residual(phi)
         good = np.asarray(np.isfinite(residual).all(axis=(1, 2, 3, 4)))
         if good.sum() < 0.5 * len(phi):
             return "the engine diverges about the mode"
-        if turn:  # judge the emulator of the round before, where its particles are
+        if emulator is not None:  # judge the emulator of the round before, where its particles are
             sigma = np.tile(space.split(particles.q)[1], (2, 1))
-            emulated = posterior.predict(phi)
+            emulated = emulator(phi)
             for piece in pieces.exact:  # better than few engine steps
                 own = np.ix_(np.arange(len(phi)), piece.rows, steps, piece.bodies)
                 residual[own] = emulated[own]
-            heights = (
+            height, true = (
                 problem.log_density(each, sigma, phi).sum(axis=-1) for each in (emulated, residual)
             )
-            off = float(errors(*heights, half).std()) / alone
+            off = float(errors(height, true, half).std()) / alone
             if not off < _CLOSE and turn >= _KINKS:
                 chosen = _unlike(pieces, emulated[good], residual[good])
                 if sum(map(len, chosen)) > _BUSY * len(chosen) * problem.segments.n:
@@ -256,18 +257,19 @@ def emulate(
                 pieces = pieces.exactly(chosen)
         runs.append((phi[good], residual[good]))
         phi, residual = (np.concatenate(each) for each in zip(*runs[-2:], strict=True))
-        posterior = Posterior(exact, Emulator(exact, pieces, phi, residual, degree), FLATTER)
+        emulator = Emulator(space, pieces, phi, residual, degree)
+        posterior = Posterior(space, emulator, FLATTER)
         if off < _CLOSE:
             break
         particles.move(posterior, _SWEEPS, noise=False)
         particles.q = space.prior_draws(particles.q, rng)
         particles.learn()
-    if not off < _ENOUGH:
+    if emulator is None or not off < _ENOUGH:
         return f"the emulator's log-likelihood is off by {off:.2g} nats"
     particles.settle(posterior, looks=_SWEEPS)
-    if problem is not exact.problem:
+    if problem is not space.problem:
         few = space.possible(particles.q[: _A_COEFFICIENT * (widest + 1)])
-        posterior.predict.correct(few, exact.problem.residual(few) - problem.residual(few))
+        emulator.correct(few, space.problem.residual(few) - problem.residual(few))
     return posterior, reference.learned(particles.q)
 
 
@@ -284,7 +286,7 @@ def _unlike(pieces: Pieces, emulated: Floats, residual: Floats) -> list[Ints]:
         error = np.nan_to_num(square[:, :, piece.bodies]).sum(axis=(1, 2, 3))
         order = np.argsort(error)
         left = int(np.searchsorted(np.cumsum(error[order]), _LEFT * _CLOSE**2))
-        chosen.append(np.union1d(piece.rows, order[left:]))
+        chosen.append(order[left:])
     return chosen
 
 

@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from itertools import permutations
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -53,9 +54,6 @@ class Target(Protocol):
     def columns(self, q: Floats, look: Any) -> Floats:
         """Return the log-density of each part and of the noise, shape (n, part + 1)."""
 
-    def heights(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return the log-density, shape (n,), and log-likelihoods, shape (n, transition or 0)."""
-
 
 class Posterior:
     """Log-posterior of a problem, up to the evidence, by the engine or by what stands for it.
@@ -76,24 +74,15 @@ class Posterior:
 
     def look(self, q: Floats) -> Floats:
         """Return residuals, shape (n, transition, H, body, state)."""
-        return np.asarray(self.predict(self.space.possible(q)))
+        return np.array(self.predict(self.space.possible(q)), dtype=float)
 
     def columns(self, q: Floats, look: Floats) -> Floats:
         """Return log-priors and log-likelihoods, shape (n, part + 1)."""
         total = self.space.log_priors(q)
         likelihood = self.power * self.space.log_likelihoods(q, look)
-        there = np.isfinite(total).all(axis=1)
-        total[:, :-1] = np.where(there[:, None], total[:, :-1] + likelihood, -np.inf)
+        there = np.isfinite(total).all(axis=1, keepdims=True)
+        total[:, :-1] = np.where(there, total[:, :-1] + likelihood, -np.inf)
         return total
-
-
-    def heights(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return the log-density, shape (n,), and log-likelihoods, shape (n, transition)."""
-        each = self.space.each(q, self.look(q))
-        prior = self.space.log_priors(q).sum(axis=1)
-        with np.errstate(invalid="ignore"):
-            height = prior + self.power * each.sum(axis=1)
-        return np.where(np.isneginf(prior), -np.inf, height), each
 
 
 class Path:
@@ -186,10 +175,14 @@ class Block:
     def propose(self, x: Floats, kind: str, rng: np.random.Generator) -> tuple[Floats, Floats]:
         """Return a proposal from each point (n, d), and the logarithm of the Hastings ratio."""
         if kind == "jump":
-            first, second = (self.modes[i] for i in rng.choice(len(self.modes), 2, replace=False))
-            stretch = np.log(np.diag(second.factor) / np.diag(first.factor)).sum()
-            moved = second.mean + first.standardised(x) @ second.factor.T
-            return moved, np.full(len(x), stretch)
+            first = rng.integers(len(self.modes), size=len(x))  # each point's way by itself
+            second = (first + rng.integers(1, len(self.modes), size=len(x))) % len(self.modes)
+            moved, gain = np.empty_like(x), np.empty(len(x))
+            for i, j in permutations(range(len(self.modes)), 2):
+                own, (a, b) = (first == i) & (second == j), (self.modes[i], self.modes[j])
+                moved[own] = b.mean + a.standardised(x[own]) @ b.factor.T
+                gain[own] = np.log(np.diag(b.factor) / np.diag(a.factor)).sum()
+            return moved, gain
         noise = rng.standard_normal(x.shape)
         if kind == "walk":
             return x + np.exp(self.log_scale) * noise @ self.step.T, np.zeros(len(x))
@@ -297,10 +290,6 @@ class Reference:
         noise = sum(block.log_density(q[:, block.places]) for block in self.noise)
         return np.stack([*parts, noise + np.zeros(len(q))], axis=1)
 
-    def heights(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return the log-density, shape (n,), and no likelihoods, shape (n, 0)."""
-        return self.columns(q, None).sum(axis=1), np.zeros((len(q), 0))
-
     def learned(self, q: Floats) -> Reference:
         """Return the product of Gaussians of particles; of several modes, this one."""
         copies = [[Block(b.places, b.modes) for b in blocks] for blocks in (self.parts, self.noise)]
@@ -323,7 +312,7 @@ class Ensemble:
     """
 
     def __init__(self, reference: Reference, q: Floats, rng: np.random.Generator) -> None:
-        self.space, self.q, self.rng = reference.space, q.copy(), rng
+        self.space, self.q, self.rng, self._sweeps = reference.space, q.copy(), rng, 0
         own = reference.learned(q[:0])
         self.parts, self.noise = own.parts, own.noise
 
@@ -340,7 +329,8 @@ class Ensemble:
     def groups(self) -> Iterator[slice]:
         """Yield groups of particles whose predictions fit into memory."""
         problem = self.space.problem
-        size, keeping = problem.measured.size, nullcontext()
+        size = problem.measured.size
+        keeping: AbstractContextManager[None] = nullcontext()
         if isinstance(problem.likelihood, TrajectoryLikelihood):
             size *= len(problem.trajectory_noise.cells.places)
         width = max(8, _NUMBERS // max(size, 1))
@@ -381,6 +371,7 @@ class Ensemble:
         for chosen in self.groups():
             self.q[chosen], rate = self._moved(self.q[chosen], target, sweeps, cheap, adapt, moves)
             rates.append(rate)
+        self._sweeps += sweeps
         return float(np.mean(rates))
 
     def _moved(
@@ -394,12 +385,13 @@ class Ensemble:
     ) -> tuple[Floats, float]:
         look = target.look(q)
         here, rates = target.columns(q, look), []
+        first = self._sweeps
         for i in range(sweeps):
-            ahead = cheap if cheap is not None and i % 2 == 0 else None
+            ahead = cheap if (first + i) % 2 == 0 else None
             y, gain, kinds = self._proposed(q) if ahead is None else self._ahead(q, ahead, adapt)
             seen = target.look(y)
             there = target.columns(y, seen)
-            accepted, rate = self._accepted(there[:, :-1] - here[:, :-1] + gain)
+            accepted, rate = self._accepted(there[:, :-1], here[:, :-1], gain)
             if adapt:
                 self._adapt(kinds, rate)
             q, look = self._chosen(accepted, y, q), self._merged(accepted, seen, look)
@@ -431,7 +423,7 @@ class Ensemble:
         for _ in range(_INNER):
             y, gain, kinds = self._proposed(q)
             there = cheap.columns(y, cheap.look(y))[:, :-1]
-            accepted, rate = self._accepted(there - here + gain)
+            accepted, rate = self._accepted(there, here, gain)
             learned.append((kinds, rate))
             q, here = self._chosen(accepted, y, q), np.where(accepted, there, here)
         if adapt:
@@ -444,10 +436,14 @@ class Ensemble:
         for block, kind, rate in zip(self.parts, kinds, rates, strict=False):
             block.adapt(kind, float(rate))
 
-    def _accepted(self, log_ratio: Floats) -> tuple[Bools, Floats]:
-        """Return which proposals are accepted, same shape, and the mean rates over particles."""
+    def _accepted(self, there: Floats, here: Floats, gain: Floats) -> tuple[Bools, Floats]:
+        """Return which proposals are accepted, same shape, and the mean rates over particles.
+
+        A proposal of no density is not; from a point of none every other is.
+        """
         with np.errstate(invalid="ignore"):
-            rate = np.exp(np.minimum(np.nan_to_num(log_ratio, nan=-np.inf), 0.0))
+            log_ratio = np.where(np.isneginf(there), -np.inf, there - here + gain)
+        rate = np.exp(np.minimum(np.nan_to_num(log_ratio, nan=-np.inf, posinf=0.0), 0.0))
         return self.rng.uniform(size=rate.shape) < rate, rate.mean(axis=0)
 
     def _chosen(self, accepted: Bools, y: Floats, q: Floats) -> Floats:
@@ -480,8 +476,7 @@ class Ensemble:
         y, kind = q.copy(), block.kind(self.rng)
         y[:, block.places], gain = block.propose(q[:, block.places], kind, self.rng)
         there = target.columns(y, look)
-        with np.errstate(invalid="ignore"):
-            accepted, rate = self._accepted(there.sum(axis=1) - here.sum(axis=1) + gain)
+        accepted, rate = self._accepted(there.sum(axis=1), here.sum(axis=1), gain)
         if adapt:
             block.adapt(kind, float(rate))
         return np.where(accepted[:, None], y, q), np.where(accepted[:, None], there, here)
@@ -510,10 +505,18 @@ class Ensemble:
         return float(np.mean(rates)), correlation
 
     def heights(self, target: Target) -> tuple[Floats, Floats]:
-        """Return what :meth:`Target.heights` does, of all particles."""
-        parts = [target.heights(self.q[chosen]) for chosen in self.groups()]
-        height, each = (np.concatenate(own) for own in zip(*parts, strict=True))
-        return height, each
+        """Return the log-density of all particles, shape (n,), and their log-likelihoods.
+
+        Shape (n, transition); (n, 0) of a target that is no posterior.
+        """
+        height, each = np.empty(len(self.q)), []
+        for chosen in self.groups():
+            q = self.q[chosen]
+            look = target.look(q)
+            height[chosen] = target.columns(q, look).sum(axis=1)
+            some = self.space.each(q, look) if isinstance(target, Posterior) else q[:, :0]
+            each.append(some)
+        return height, np.concatenate(each)
 
 
 class Annealed(NamedTuple):
@@ -572,10 +575,10 @@ def anneal(
             gap = height - ensemble.heights(start)[0]
         gap = np.where(np.isnan(gap), -np.inf, gap)
         rest = (1.0 - beta) * gap
-        if rungs == _RUNGS or (weigh and _suffices(rest)):
+        if weigh and (rungs == _RUNGS or _suffices(rest)):
             log_z += float(logsumexp(rest) - np.log(len(rest)))
             return Annealed(rest, each, log_z, rungs, _mean(rates), kept)
-        step = _step(gap, 1.0 - beta)
+        step = _step(gap, 1.0 - beta) if rungs < _RUNGS else 1.0 - beta
         total = logsumexp(step * gap)
         log_z += float(total - np.log(len(gap)))
         beta = 1.0 if step == 1.0 - beta else beta + step

@@ -89,10 +89,10 @@ def fit(
         ``importance``: particles that begin at Gaussians about the modes, move to the posterior of
         an emulator or of few engine steps, and are weighted by the engine in one batch and
         resampled; where the weights do not suffice, the engine moves them on in rungs;
-        ``metropolis``: chains of the same moves under the engine's posterior, each of which
-        is many walkers, one after another; ``paper``: one random walk a variable, by default on the schedule of
-        the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them burn-in,
-        each tenth kept); with a library, on that for the apartment (``draws=400, tune=1000,
+        ``metropolis``: chains of the same moves under the engine's posterior, each of which is
+        many walkers, one after another; ``paper``: one random walk a variable, by default on the
+        schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them
+        burn-in, each tenth kept); with a library, on that for the apartment (``draws=400, tune=1000,
         thin=10, chains=1``), each body's set proposed uniformly;
         ``demetropolisz``; ``smc``; ``nuts``, on the finite-difference gradient; ``laplace``:
         independent draws from the Gaussian at the mode, which no chain has checked; ``map``: the
@@ -143,7 +143,8 @@ def fit(
     -----
     ConvergenceWarning
         If an R-hat of chains is over 1.01, a Pareto k over 0.7 or an effective sample size under
-        400, if sampling was interrupted, or if an evidence is too rough for the probability of a joint.
+        400, if sampling was interrupted, or if an evidence is too rough for the probability of a
+        joint.
     LinearisationWarning
         If states smoothed anew at draws give another likelihood (``attrs["linearisation"]``, nats).
     MeetingWarning

@@ -1,8 +1,8 @@
-"""Importance sampling: particles of a cheaper posterior, weighted by the engine in one batch.
+"""Importance sampling: particles of a cheaper posterior, weighted by the engine in a batch.
 
-Particles begin at Gaussians about the modes and are taken to the posterior of an emulator, or of few
-engine steps. The engine evaluates them all at once, and they are resampled by their Pareto-smoothed
-weights (Vehtari et al., Pareto smoothed importance sampling, 2024). The weights correct every error
+Particles begin at Gaussians about the modes and are taken to the posterior of an emulator, or of
+few engine steps. The engine evaluates them all at once, and they are resampled by their
+Pareto-smoothed weights (Vehtari et al., Pareto smoothed importance sampling, 2024). The weights correct every error
 of the cheaper posterior; where Pareto k says that they cannot, particles are moved on by the engine.
 """
 
@@ -74,7 +74,7 @@ def cheaper(reference: Reference, rng: np.random.Generator) -> Cheaper:
     problem = space.problem
     corrected = problem.corrected(space.centre)
     if problem.measured.size <= _LONG:
-        found = emulate(space, space.on(corrected), reference, rng)
+        found = emulate(space, reference, rng)
         if not isinstance(found, str):
             return Cheaper(*found, "an emulator")
     if corrected is not problem:

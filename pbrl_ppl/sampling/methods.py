@@ -15,6 +15,7 @@ from rich.progress import track
 from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, Space
+from pbrl_ppl.parameters import gathered
 from pbrl_ppl.posterior import (
     CELLS,
     LIKELIHOOD,
@@ -184,7 +185,7 @@ def _metropolis(job: Job) -> Any:
     else:
         phi, sigma = last_draws(job.problem, job.resume, walkers)
         chains = len(phi) // walkers
-        q = Space.of_draws(problem, phi, sigma)[1]
+        q = reference.space.at(gathered(problem.layout, phi), sigma)
     ensemble, exact = Ensemble(reference, q, rng), Posterior(reference.space)
     cost = problem.simulator.steps * problem.segments.n * problem.data.horizon
     cheap = None

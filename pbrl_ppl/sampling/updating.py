@@ -37,8 +37,8 @@ from pbrl_ppl.posterior import (
     parameter_draws,
     problem_of,
 )
-from pbrl_ppl.sampling.fitting import fit
 from pbrl_ppl.sampling.ensemble import systematic
+from pbrl_ppl.sampling.fitting import fit
 from pbrl_ppl.sampling.rejuvenation import rejuvenate
 from pbrl_ppl.sampling.update_checks import (
     as_recorded,
@@ -77,9 +77,9 @@ def update(
     are worth less than half of the draws, or fewer than 400 effective draws are left, at most 1000
     draws are kept and moved by Metropolis steps under all data. When the weights are worth less
     than 5 % of the draws, or their Pareto k is above 0.7, all data are fitted anew, with the
-    defaults of fit: that takes as long as a fit. All data are fitted anew always, by the posterior's own
-    method, where the likelihood is of simulations, whose start states are fitted with the
-    parameters.
+    defaults of fit: that takes as long as a fit. All data are fitted anew always, by the
+    posterior's own method, where the likelihood is of simulations, whose start states are fitted
+    with the parameters.
 
     Parameters
     ----------
