@@ -332,9 +332,8 @@ class Space:
         ends = np.array([*_FAR, *(-far for far in _FAR)])
         moves = np.zeros((len(loud), len(ends), len(mean)))
         moves[np.arange(len(loud)), :, loud] = steps[:, None] * ends
-        top, *heights = self._about(mean).log_density(
-            np.vstack([mean, mean + moves.reshape(-1, len(mean))])
-        )
+        points = np.vstack([mean, mean + moves.reshape(-1, len(mean))])
+        top, *heights = self._about(mean).log_density(points)
         fall = (top - np.array(heights)).reshape(len(loud), 2, -1)
         # on either side, up to the first point that has fallen
         within = np.nan_to_num(fall, nan=np.inf) < _LOW

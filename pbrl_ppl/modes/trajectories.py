@@ -55,8 +55,9 @@ def find_trajectory_mode(problem: Problem, seed: int) -> Mode:
     """
     near = find_mode(single_transitions(problem), seed=seed)
     off = near.draws(np.random.default_rng(seed), _STARTS - 1) - near.phi
-    starts = [near.phi, *inside(problem.layout.priors, near.phi + _WIDER * off)]
-    found = [following(trajectory_mode(problem, phi)) for phi in starts]
+    far = inside(problem.layout.priors, near.phi + _WIDER * off)
+    there = np.isfinite(near.problem.residual(far)).all(axis=(1, 2, 3, 4))
+    found = [following(trajectory_mode(problem, phi)) for phi in (near.phi, *far[there])]
     return max(found, key=lambda mode: mode.log_posterior)
 
 

@@ -141,8 +141,15 @@ class Emulator:
             targets = piece.of(residual).reshape(len(phi), -1)
             weights = np.asarray(lstsq(terms, targets, lapack_driver="gelsy")[0], dtype=float)
             self.fits.append((piece, centre, scale, weights))
+        self.exact: list[tuple[Piece, Callable[[Floats], Floats]]] = []
+        self.run(pieces)
+
+    def run(self, pieces: Pieces) -> None:
+        """Take the exact pieces from the engine."""
         self.exact = [
-            (piece, _engine(space.problem, piece.rows)) for piece in pieces.exact if len(piece.rows)
+            (piece, _engine(self.space.problem, piece.rows))
+            for piece in pieces.exact
+            if len(piece.rows)
         ]
 
     def __call__(self, phi: Floats) -> Floats:
@@ -266,10 +273,11 @@ def emulate(
         particles.learn()
     if emulator is None or not off < _ENOUGH:
         return f"the emulator's log-likelihood is off by {off:.2g} nats"
-    particles.settle(posterior, looks=_SWEEPS)
     if problem is not space.problem:
         few = space.possible(particles.q[: _A_COEFFICIENT * (widest + 1)])
-        emulator.correct(few, space.problem.residual(few) - problem.residual(few))
+        true = space.problem.residual(few)
+        emulator.correct(few, true - problem.residual(few))
+        emulator.run(pieces.exactly(_unlike(pieces, emulator(few), true)))
     return posterior, reference.learned(particles.q)
 
 

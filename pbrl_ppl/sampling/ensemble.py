@@ -33,14 +33,14 @@ _WIDER = 1.3
 _JUMPS = 0.25
 #: Moves under a cheaper density that make one proposal, and moves of the noise for each of the
 #: parameters; along trajectories each runs the filter.
-_INNER, _NOISE, _NOISE_ALONG = 15, 5, 1
+_INNER, _NOISE, _NOISE_ALONG = 10, 5, 1
 #: Numbers held at once: particles move in groups whose predictions are fewer.
 _NUMBERS = 8_000_000
 #: Effective share of the particles that a rung leaves, and that a last weighting must leave.
 _RUNG, _WORTH = 0.5, 0.3
 #: Sweeps between two looks at whether particles have forgotten where they were, looks at most, and
 #: the largest correlation with it then.
-_SWEEPS, _LOOKS, _FORGOTTEN = 3, 8, 0.5
+_SWEEPS, _LOOKS, _FORGOTTEN = 3, 5, 0.5
 #: Rungs at most.
 _RUNGS = 60
 
@@ -585,7 +585,7 @@ def anneal(
         chosen = systematic(np.exp(step * gap - total), len(gap), ensemble.rng)
         ensemble.q = ensemble.q[chosen]
         ensemble.learn()
-        looks = _LOOKS if beta == 1.0 else 1  # the next rung forgets again
+        looks = _LOOKS if beta == 1.0 else 1  # the next rung moves on
         rate, correlation = ensemble.settle(Path(start, end, beta), cheap, looks)
         rates.append(rate)
         rungs += 1

@@ -2,8 +2,9 @@
 
 Particles begin at Gaussians about the modes and are taken to the posterior of an emulator, or of
 few engine steps. The engine evaluates them all at once, and they are resampled by their
-Pareto-smoothed weights (Vehtari et al., Pareto smoothed importance sampling, 2024). The weights correct every error
-of the cheaper posterior; where Pareto k says that they cannot, particles are moved on by the engine.
+Pareto-smoothed weights (Vehtari et al., Pareto smoothed importance sampling, 2024). The weights
+correct every error of the cheaper posterior; where Pareto k says that they cannot, particles are
+moved on by the engine.
 """
 
 from __future__ import annotations
@@ -16,9 +17,11 @@ from numpy.typing import NDArray
 
 from pbrl_ppl.posterior import smoothed
 from pbrl_ppl.sampling.emulator import emulate
-from pbrl_ppl.sampling.ensemble import Annealed, Ensemble, Posterior, Reference, anneal, systematic
+from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference, anneal, systematic
 from pbrl_ppl.state import Floats
 
+#: Times at which particles of a cheaper posterior are taken as proposals.
+_TIMES = 4
 #: Measured numbers from which a recording is long: the posterior is near its Laplace approximation.
 _LONG = 300_000
 
@@ -96,17 +99,26 @@ def draw_pool(first: Reference, n: int, seed: Any) -> Pool:
     """
     rng, space = np.random.default_rng(seed), first.space
     cheap, reference, name = cheaper(first, rng)
-    ensemble, exact = Ensemble(reference, reference.draw(n, rng), rng), Posterior(space)
-    reached = Annealed(np.zeros(n), np.zeros((n, 0)), 0.0, 0, 1.0, 1.0)
-    if cheap is not None:
-        reached = anneal(ensemble, reference, cheap)
-        ensemble.q = space.prior_draws(ensemble.q, rng)
-    weighed = anneal(ensemble, cheap or reference, exact, cheap=cheap, weigh=True)
+    log_z, kept = 0.0, 1.0
+    if cheap is None:
+        q = reference.draw(n, rng)
+    else:
+        few = Ensemble(reference, reference.draw(-(-n // _TIMES), rng), rng)
+        reached = anneal(few, reference, cheap)
+        taken, alike = [few.q], []
+        for _ in range(_TIMES - 1):
+            alike.append(few.settle(cheap, looks=1)[1])
+            taken.append(few.q)
+        # as of chains of so many draws, whose correlation falls geometrically
+        powers = np.mean(alike) ** np.arange(1, _TIMES)
+        kept = reached.kept / float(1.0 + 2.0 * powers @ (1.0 - np.arange(1, _TIMES) / _TIMES))
+        log_z, q = reached.log_z, space.prior_draws(np.concatenate(taken)[:n], rng)
+    ensemble = Ensemble(reference, q, rng)
+    weighed = anneal(ensemble, cheap or reference, Posterior(space), cheap=cheap, weigh=True)
     phi, sigma = space.split(ensemble.q)
     return Pool(
-        phi, sigma, weighed.log_weight, weighed.each,
-        reached.log_z + weighed.log_z, weighed.rungs, weighed.accepted,
-        min(reached.kept, weighed.kept), name,
+        phi, sigma, weighed.log_weight, weighed.each, log_z + weighed.log_z, weighed.rungs,
+        weighed.accepted, weighed.kept if weighed.rungs else kept, name,
     )  # fmt: skip
 
 

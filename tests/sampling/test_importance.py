@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.special import logsumexp
-from scipy.stats import ks_2samp, kstwobign, kstest, norm
+from scipy.stats import ks_2samp, kstest, kstwobign, norm
 
 from pbrl_ppl.background import background
 from pbrl_ppl.effects import Effect, EffectParameter
