@@ -82,9 +82,8 @@ def close_loop(
     method: Annotated[
         Method,
         typer.Option(
-            help="importance weights proposals of an emulator, or runs chains where none is close"
-            " enough; metropolis runs chains; laplace takes Gaussians at the modes, on which the"
-            " verdict then stands."
+            help="importance weights particles of a cheaper posterior by the engine; metropolis"
+            " runs chains; laplace takes Gaussians at the modes, on which the verdict then stands."
         ),
     ] = Method.IMPORTANCE,
     effect_file: effect_files.EffectFiles = None,

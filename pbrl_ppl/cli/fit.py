@@ -66,8 +66,7 @@ def fit(
     method: Annotated[
         str,
         typer.Option(
-            help="importance (chains of metropolis where it does not suit), metropolis, paper,"
-            " demetropolisz, smc, nuts, laplace or map."
+            help="importance, metropolis, paper, demetropolisz, smc, nuts, laplace or map."
         ),
     ] = "importance",
     draws: Annotated[

@@ -198,13 +198,12 @@ class SamplerResult(NamedTuple):
 
 
 def _origin_in_words(attributes: Mapping[str, Any]) -> str:
-    """Return why chains were run, or what the weights of importance sampling are worth; or none."""
-    if "fallback" in attributes:
-        return f" Chains were run in place of importance sampling: {attributes['fallback']}."
+    """Return what the weights of importance sampling are worth; nothing of chains."""
     if PARETO_K not in attributes:
         return ""
     return (
-        f" The draws are resampled proposals of an emulator: Pareto k of their weights is"
+        f" The draws are resampled proposals of {attributes.get('proposals', 'an emulator')}: Pareto"
+        f" k of their weights is"
         f" {number(attributes[PARETO_K])} (above 0.7 the proposals would miss a part of the"
         f" posterior), and by their weights the draws are worth {number(attributes[SIZE])}"
         " independent ones."

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.posterior import smoothed
 from pbrl_ppl.sampling.emulator import emulate
 from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference, anneal, systematic
@@ -103,15 +104,19 @@ def draw_pool(first: Reference, n: int, seed: Any) -> Pool:
     if cheap is None:
         q = reference.draw(n, rng)
     else:
-        few = Ensemble(reference, reference.draw(-(-n // _TIMES), rng), rng)
+        # along trajectories each particle's noise costs runs of the filter
+        whole = isinstance(space.problem.likelihood, TransitionLikelihood)
+        times = 1 if whole else _TIMES
+        few = Ensemble(reference, reference.draw(-(-n // times), rng), rng)
         reached = anneal(few, reference, cheap)
         taken, alike = [few.q], []
-        for _ in range(_TIMES - 1):
+        for _ in range(times - 1):
             alike.append(few.settle(cheap, looks=1)[1])
             taken.append(few.q)
         # as of chains of so many draws, whose correlation falls geometrically
-        powers = np.mean(alike) ** np.arange(1, _TIMES)
-        kept = reached.kept / float(1.0 + 2.0 * powers @ (1.0 - np.arange(1, _TIMES) / _TIMES))
+        lags = np.arange(1, times)
+        shared = (np.mean(alike) if alike else 0.0) ** lags @ (1.0 - lags / times)
+        kept = reached.kept / float(1.0 + 2.0 * shared)
         log_z, q = reached.log_z, space.prior_draws(np.concatenate(taken)[:n], rng)
     ensemble = Ensemble(reference, q, rng)
     weighed = anneal(ensemble, cheap or reference, Posterior(space), cheap=cheap, weigh=True)

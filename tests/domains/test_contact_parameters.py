@@ -5,10 +5,10 @@ import pytest
 
 import pbrl_ppl as pp
 from pbrl_ppl.errors import UninformedWarning
-from pbrl_ppl.likelihood import Problem, along_trajectories, smoothed
+from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode, find_mode, following, trajectory_mode
 from pbrl_ppl.physics import Physics
-from tests.helpers.discs import MEASURED, SCENE, TRUTH, thrown
+from tests.helpers.discs import SCENE, TRUTH, thrown
 from tests.helpers.marks import OBJECT_MODE
 
 #: Half the 95 % interval of a normal distribution, in standard deviations.
@@ -24,39 +24,11 @@ def problem(seed: int) -> tuple[Problem, np.ndarray]:
 
 
 @pytest.mark.one_stack
-def test_smoothed_paths_stay_near_what_was_measured() -> None:
-    """With hardly any process noise, states do not run away over the kinks of contacts.
-
-    Of 900 errors of measuring, one is beyond 5 standard deviations once in 2,000 recordings.
-    """
-    declared, truth = problem(1)
-    noise = np.array([*MEASURED, 1e-3, 1e-3, 1e-2, 1e-2, 1e-2, 1e-1])
-    along = along_trajectories(declared, truth)
-    for _ in range(2):
-        along = smoothed(along, truth, noise)
-        off = along.trajectory_noise.measured.reshape(-1, 2, 6) / MEASURED
-        assert abs(off).max() < 5.0
-        assert np.sqrt((off**2).mean()) < 1.1
-    # steps with contact are explained as well as others
-    touching = along.trajectory_noise.touching
-    white = along.whitened(truth, noise)
-    assert touching.sum() > 10
-    assert np.sqrt((white[touching] ** 2).mean()) < 1.5
-
-
-@pytest.mark.one_stack
-def test_few_engine_steps_are_not_corrected_where_bodies_touch() -> None:
-    declared, truth = problem(1)
-    along = along_trajectories(declared, truth)
-    assert along.corrected(truth) is along
-
-
-@pytest.mark.one_stack
 @pytest.mark.slow
 def test_whole_trajectories_inform_restitution_and_friction() -> None:
     """Of 12 intervals of 95 %, at least 9 hold the truth: false alarms are 0.02 % of runs.
 
-    Measured over 17 recordings, 60 of 68 do; at that rate 4 % of runs have fewer than 9 of 12. The
+    Measured over 17 recordings, 56 of 68 do; at that rate 14 % of runs have fewer than 9 of 12. The
     prior's standard deviations are 0.27 for friction and more for restitution.
     """
     deviations = []

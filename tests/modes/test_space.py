@@ -342,6 +342,10 @@ class Bump(Space):
     def phi_size(self) -> int:
         return 2
 
+    @property
+    def _circles(self) -> list[int]:
+        return []
+
 
 def space_with(density) -> Space:
     return Bump(density, np.zeros(2))
