@@ -329,7 +329,7 @@ def labelled(model: pm.Model, variables: Mapping[str, Any]) -> xr.Dataset:
 #: counted the burn-in among the iterations.)
 METHODS: Mapping[str, Method] = {
     "importance": Method(_importance, draws=250, tune=0, thin=1),
-    "metropolis": Method(_metropolis, draws=1600, tune=500, thin=1),
+    "metropolis": Method(_metropolis, draws=800, tune=500, thin=4),
     "paper": Method(_paper, draws=1900, tune=1000, thin=10, chains=30),
     "demetropolisz": Method(_demetropolisz, draws=1000, tune=2000, thin=10),
     "smc": Method(_smc, draws=1000, tune=0, thin=1),

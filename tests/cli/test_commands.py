@@ -505,14 +505,14 @@ def test_calibrate_takes_the_likelihood_of_fit(
     seen = []
 
     def take(scene: Scene, design: History, **options: Any) -> None:
-        seen.append((dict(scene.noise), options["trajectories"]))
+        seen.append((dict(scene.noise), options["likelihood"]))
         raise FitError("that is all")
 
     monkeypatch.setattr(sampling.calibration, "calibrate", take)
     argv = ["calibrate", "scene.toml", "train.csv", "-o", "ranks"]
     for options in ([], ["--trajectories", "--noise", "x=0.002"]):
         assert "that is all" in message(capsys, *argv, *options)
-    assert seen == [({}, False), ({"x": 0.002}, True)]
+    assert seen == [({}, "transitions"), ({"x": 0.002}, "trajectories")]
     assert 'unknown key "z"' in message(capsys, *argv, "--noise", "z=0.1")
 
 

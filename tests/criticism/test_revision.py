@@ -39,7 +39,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pbrl_ppl.errors.PriorWarning"),
 ]
 #: Of each of four chains: about 250 effective ones, where a verdict needs 100.
-DRAWS = 150
+DRAWS = 300
 #: The Gaussian at the mode will do where the claim is a verdict's, not that of the chains.
 GAUSSIAN = "laplace"
 
