@@ -300,13 +300,12 @@ class Space:
             curvature = np.maximum((2 * here - above - below) / _STEP**2, _FLAT)
             precision = jacobian.T @ jacobian + np.diag(curvature)
             for place in self.problem.tails:
-                precision[place, place] = slope[place] ** 2 / mode.covariance[place, place]
+                precision[place, place] += slope[place] ** 2 / mode.covariance[place, place]
             scale = 1.0 / np.sqrt(np.diag(precision))
             inverse = np.linalg.inv(precision * np.outer(scale, scale) + 1e-12 * np.eye(p))
             covariance[:p, :p] = scale[:, None] * inverse * scale
             residual = np.nan_to_num(self.problem.robust(mode.phi, mode.sigma)).ravel()
             pull = (above - below) / (2 * _STEP) - jacobian.T @ residual
-            pull[list(self.problem.tails)] = 0.0
             step = np.zeros_like(mean)
             step[:p] = covariance[:p, :p] @ pull
             tried = mean + np.array([0.0, 0.25, 0.5, 1.0])[:, None] * step

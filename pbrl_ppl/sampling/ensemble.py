@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
+from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import TrajectoryLikelihood, TransitionLikelihood
 from pbrl_ppl.modes import Mode, Space
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
@@ -574,6 +575,11 @@ def anneal(
         with np.errstate(invalid="ignore"):
             gap = height - ensemble.heights(start)[0]
         gap = np.where(np.isnan(gap), -np.inf, gap)
+        if np.isneginf(gap).all():
+            raise FitError(
+                f"fit: the model gives none of {len(gap)} draws about its mode a density; start"
+                " from another mode, or use method='laplace'"
+            )
         rest = (1.0 - beta) * gap
         if weigh and (rungs == _RUNGS or _suffices(rest)):
             log_z += float(logsumexp(rest) - np.log(len(rest)))

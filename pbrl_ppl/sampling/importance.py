@@ -111,7 +111,7 @@ def draw_pool(first: Reference, n: int, seed: Any) -> Pool:
         reached = anneal(few, reference, cheap)
         taken, alike = [few.q], []
         for _ in range(times - 1):
-            alike.append(few.settle(cheap, looks=1)[1])
+            alike.append(few.settle(cheap, looks=2)[1])
             taken.append(few.q)
         # as of chains of so many draws, whose correlation falls geometrically
         lags = np.arange(1, times)
