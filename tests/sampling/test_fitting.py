@@ -46,7 +46,7 @@ UNITS = ("kg", "m", "m", "rad", "1", "1")
 FORK = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
 QUICK = {"draws": 200, "tune": 200, "chains": 2, "cores": 1, "progress": False}
 SHORT = QUICK | {"draws": 100, "tune": 100}
-CHAINS = QUICK | {"method": "metropolis"}
+CHAINS = QUICK | {"method": "metropolis", "thin": 1}
 
 
 @pytest.fixture(scope="module")
