@@ -109,10 +109,10 @@ def draw_pool(first: Reference, n: int, seed: Any) -> Pool:
         times = 1 if whole else _TIMES
         few = Ensemble(reference, reference.draw(-(-n // times), rng), rng)
         reached = anneal(few, reference, cheap)
-        taken, alike = [few.q], []
+        taken, alike = [few.q.copy()], []
         for _ in range(times - 1):
             alike.append(few.settle(cheap, looks=2)[1])
-            taken.append(few.q)
+            taken.append(few.q.copy())
         # as of chains of so many draws, whose correlation falls geometrically
         lags = np.arange(1, times)
         shared = (np.mean(alike) if alike else 0.0) ** lags @ (1.0 - lags / times)

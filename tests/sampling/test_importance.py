@@ -8,6 +8,7 @@ import sys
 import time
 import warnings
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from scipy.stats import ks_2samp, kstest, kstwobign, norm
 from pbrl_ppl.background import background
 from pbrl_ppl.effects import Effect, EffectParameter
 from pbrl_ppl.errors import ConvergenceWarning, RefitWarning
-from pbrl_ppl.modes import Space, constrain, find_mode, unconstrain
+from pbrl_ppl.modes import Space, constrain, find_mode, trajectory_mode, unconstrain
 from pbrl_ppl.parameters import Prior
 from pbrl_ppl.posterior import (
     MAX_PARETO_K,
@@ -57,10 +58,12 @@ def pucks(names="a", known=FREE, **options) -> Scene:
     return Scene(time_step=0.1, substeps=4, bodies=tuple(bodies), **options)
 
 
+TRUTH = {"mass": 2.0, "linear_drag_coefficient": 1.0, "r": 0.2, "mu_c": 0.3}
+
+
 def pushed(scene, seed=3, trajectories=30, **options):
-    truth = {"mass": 2.0, "linear_drag_coefficient": 1.0, "r": 0.2, "mu_c": 0.3}
     options = {"intervals": 1, "substeps": 4} | options
-    return simulated_history(scene, truth, seed=seed, trajectories=trajectories, **options)
+    return simulated_history(scene, TRUTH, seed=seed, trajectories=trajectories, **options)
 
 
 def quiet(function, *arguments, **options):
@@ -68,6 +71,18 @@ def quiet(function, *arguments, **options):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         return function(*arguments, **options)
+
+
+def test_proposals_along_trajectories_are_of_several_times() -> None:
+    """Particles are taken where they are at each time, not where they end."""
+    scene = pucks()
+    model = physics_model(scene, pushed(scene, trajectories=3, intervals=8), substeps=4)
+    mode = trajectory_mode(model.problem, model.problem.layout.to_vector(TRUTH))
+    pool = draw_pool(Reference.about(Space.of(mode), mode), 400, 1)
+    assert pool.cheaper == "an emulator" and pool.rungs == 0
+    times = pool.phi.reshape(4, 100, -1)
+    for a, b in combinations(times, 2):
+        assert (a != b).mean() > 0.5
 
 
 @pytest.fixture(scope="module")
