@@ -33,7 +33,7 @@ STORED = Path(__file__).parents[2] / "tests" / "sampling" / "reference_posterior
 RECORDINGS = {
     "cart-linear-drag": "linear_drag",
     "cart-null": None,
-    "cart-offset-push": None,  # with it, the default sampler falls back to Metropolis
+    "cart-offset-push": None,
     "cart-slope": "constant_force",
     "cart-thrust-bias": "body_force",
 }

@@ -55,7 +55,7 @@ from pbrl_ppl.history import History, with_units, without_measurements
 from pbrl_ppl.likelihood import Problem
 from pbrl_ppl.modes import Mode
 from pbrl_ppl.physics import Physics, try_effect
-from pbrl_ppl.posterior import compare, identify, interval, versions
+from pbrl_ppl.posterior import MAX_PARETO_K, PARETO_K, compare, identify, interval, versions
 from pbrl_ppl.posterior import draws as posterior_draws
 from pbrl_ppl.scene import Scene
 
@@ -403,9 +403,10 @@ def _posterior(task: _Task, mode: Mode) -> tuple[Any, list[Warning], list[str]]:
 
 
 def _converged(posterior: Any, criteria: Criteria) -> bool:
-    """Return whether chains agree well enough for a verdict; warnings begin earlier."""
+    """Return whether draws are good enough for a verdict; warnings begin earlier."""
     r_hat, ess = posterior.attrs.get("max_rhat", np.inf), posterior.attrs.get("min_ess", 0.0)
-    return bool(r_hat <= criteria.worst_rhat and ess >= criteria.least_ess)
+    weights = posterior.attrs.get(PARETO_K, 0.0) <= MAX_PARETO_K
+    return bool(weights and r_hat <= criteria.worst_rhat and ess >= criteria.least_ess)
 
 
 def _put_together(

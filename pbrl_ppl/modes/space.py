@@ -12,7 +12,7 @@ from scipy.special import expit
 from pbrl_ppl.likelihood import Problem, TransitionLikelihood, exponential, log_noise_prior
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.parameters import Prior, evened, gathered, inside, wheels
-from pbrl_ppl.state import Bools, Floats, Ints
+from pbrl_ppl.state import Bools, Floats, Ints, wrapped
 
 #: Noise that may vanish is a power of its coordinate.
 _ROOT = 3.0
@@ -103,7 +103,7 @@ class Space:
                 gaps = np.diff([*angles, angles[0] + 2 * np.pi])
                 widest = int(np.argmax(gaps))
                 middle = angles[widest] + 0.5 * gaps[widest] - np.pi
-                centre[i] += _turned(middle - centre[i])
+                centre[i] += wrapped(middle - centre[i])
         return cls(mode.problem, centre, silent(mode))
 
     @classmethod
@@ -169,7 +169,7 @@ class Space:
         columns = [unconstrain(prior, phi[..., i])[0] for i, prior in enumerate(priors)]
         u = np.stack(columns, axis=-1) if columns else phi
         for i in self._circles:
-            u[..., i] = self.centre[i] + _turned(u[..., i] - self.centre[i])
+            u[..., i] = self.centre[i] + wrapped(u[..., i] - self.centre[i])
         log_sigma = np.log(self.problem.likelihood.free(sigma))
         return np.concatenate([u, self.noise(log_sigma)], axis=-1)
 
@@ -341,11 +341,6 @@ class Space:
         extra = np.zeros(len(mean))
         extra[:p][loud] = steps**2 * (stretch**2 - 1.0)
         return np.asarray(covariance + np.diag(extra))
-
-
-def _turned(angle: Any) -> Any:
-    """Return angles in [-pi, pi)."""
-    return np.mod(angle + np.pi, 2 * np.pi) - np.pi
 
 
 def silent(mode: Mode) -> Bools:

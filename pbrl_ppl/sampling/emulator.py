@@ -239,7 +239,8 @@ def emulate(
     alone = np.sqrt(len(space.parts))  # each part is accepted by itself
     particles = Ensemble(reference, reference.draw(half, rng), rng)
     runs: list[tuple[Floats, Floats]] = []
-    posterior, emulator, off = Posterior(space), None, np.inf
+    emulator: Emulator | None = None
+    off = np.inf
     steps = np.arange(problem.data.horizon)
     for turn in range(_ROUNDS + 1):
         phi = spread(problem, space.possible(particles.q))
@@ -265,10 +266,9 @@ def emulate(
         runs.append((phi[good], residual[good]))
         phi, residual = (np.concatenate(each) for each in zip(*runs[-2:], strict=True))
         emulator = Emulator(space, pieces, phi, residual, degree)
-        posterior = Posterior(space, emulator, FLATTER)
         if off < _CLOSE:
             break
-        particles.move(posterior, _SWEEPS, noise=False)
+        particles.move(Posterior(space, emulator, FLATTER), _SWEEPS, noise=False)
         particles.q = space.prior_draws(particles.q, rng)
         particles.learn()
     if emulator is None or not off < _ENOUGH:
@@ -278,7 +278,7 @@ def emulate(
         true = space.problem.residual(few)
         emulator.correct(few, true - problem.residual(few))
         emulator.run(pieces.exactly(_unlike(pieces, emulator(few), true)))
-    return posterior, reference.learned(particles.q)
+    return Posterior(space, emulator, FLATTER), reference.learned(particles.q)
 
 
 def _unlike(pieces: Pieces, emulated: Floats, residual: Floats) -> list[Ints]:

@@ -505,19 +505,19 @@ class Ensemble:
             self.learn()
         return float(np.mean(rates)), correlation
 
-    def heights(self, target: Target) -> tuple[Floats, Floats]:
+    def heights(self, target: Target, each: bool = False) -> tuple[Floats, Floats]:
         """Return the log-density of all particles, shape (n,), and their log-likelihoods.
 
-        Shape (n, transition); (n, 0) of a target that is no posterior.
+        Shape (n, transition) with ``each``, of a posterior; else (n, 0).
         """
-        height, each = np.empty(len(self.q)), []
+        height, likelihood = np.empty(len(self.q)), []
         for chosen in self.groups():
             q = self.q[chosen]
             look = target.look(q)
             height[chosen] = target.columns(q, look).sum(axis=1)
-            some = self.space.each(q, look) if isinstance(target, Posterior) else q[:, :0]
-            each.append(some)
-        return height, np.concatenate(each)
+            known = each and isinstance(target, Posterior)
+            likelihood.append(self.space.each(q, look) if known else q[:, :0])
+        return height, np.concatenate(likelihood)
 
 
 class Annealed(NamedTuple):
@@ -528,7 +528,7 @@ class Annealed(NamedTuple):
     log_weight : ndarray
         What is left of the path, up to a constant, shape (n,).
     each : ndarray
-        Log-likelihoods at the end, shape (n, transition).
+        Log-likelihoods at the end, shape (n, transition), where particles were weighted.
     log_z : float
         Logarithm of the ratio of the densities' integrals.
     rungs : int
@@ -571,7 +571,7 @@ def anneal(
     beta, log_z, rungs, kept = 0.0, 0.0, 0, 1.0
     rates: list[float] = []
     while beta < 1.0:
-        height, each = ensemble.heights(end)
+        height, each = ensemble.heights(end, each=weigh)
         with np.errstate(invalid="ignore"):
             gap = height - ensemble.heights(start)[0]
         gap = np.where(np.isnan(gap), -np.inf, gap)
@@ -598,7 +598,7 @@ def anneal(
         # copies of a particle are as alike as each is to where they began, squared
         copies = np.bincount(chosen).astype(float)
         kept = len(gap) / float((copies + copies * (copies - 1) * correlation**2).sum())
-    each = ensemble.heights(end)[1] if weigh else each
+    each = ensemble.heights(end, each=True)[1] if weigh else each
     return Annealed(np.zeros(len(ensemble.q)), each, log_z, rungs, _mean(rates), kept)
 
 

@@ -105,10 +105,9 @@ class Job:
     def reference(self) -> Reference:
         """Return Gaussians about the modes, or of the draws of the posterior to go on from."""
         if self.resume is None:
-            space = Space.of(self.at_mode)
-            rough = space.on(space.problem.with_physics(threads=self.cores).rough)
-            space = space.on(space.problem.with_physics(threads=self.cores))
-            return Reference.about(space, self.at_mode, rough)
+            problem = self.at_mode.problem.with_physics(threads=self.cores)
+            space = Space.of(self.at_mode).on(problem)
+            return Reference.about(space, self.at_mode, space.on(problem.rough))
         phi, sigma = parameter_draws(self.problem, self.resume)
         problem = self.problem.with_physics(threads=self.cores)
         return Reference.of_draws(*Space.of_draws(problem, phi, sigma))

@@ -56,7 +56,7 @@ BASE = "before_updates"
 #: fitted anew.
 _MOVE, _REFIT = 0.5, 0.05
 #: Pareto k of the weights above which all data are fitted anew.
-_HEAVY = 0.7
+_HEAVY = files.MAX_PARETO_K
 #: Most draws that are moved.
 _WALKERS = 1000
 

@@ -14,6 +14,7 @@ import pytest
 from scipy.stats import norm
 
 import pbrl_ppl as pp
+from pbrl_ppl import sampling
 from pbrl_ppl.criticism import close_loop
 from pbrl_ppl.criticism import closing as loop_module
 from pbrl_ppl.criticism.criteria import DEFAULT
@@ -231,6 +232,20 @@ def test_too_few_draws_give_no_verdict(clean) -> None:
     found = loop(clean, method="metropolis", draws=5)
     assert found.verdict == "not-converged"
     assert found.unexplained is None  # the tests are of the mode, and passed
+
+
+@pytest.mark.slow
+def test_weights_that_miss_a_part_give_no_verdict(clean, monkeypatch) -> None:
+    """Whatever the other diagnostics say."""
+
+    def weighted(*arguments, **options):
+        fitted = fit(*arguments, **options)
+        fitted.attrs["pareto_k"] = 0.8
+        return fitted
+
+    fit = sampling.fit
+    monkeypatch.setattr(sampling, "fit", weighted)
+    assert loop(clean).verdict == "not-converged"
 
 
 def test_a_users_effect_that_fails_says_so_at_once(clean) -> None:
