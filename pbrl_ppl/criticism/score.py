@@ -14,9 +14,10 @@ from pbrl_ppl.criticism.results import Candidate
 from pbrl_ppl.criticism.scan import Look, caps, detectable_sizes, detection_limits_of_scan, looks
 from pbrl_ppl.effects import Attached, Noise
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood
-from pbrl_ppl.modes import Mode, in_parallel, posterior_slopes
+from pbrl_ppl.modes import Mode, posterior_slopes
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.threads import in_parallel
 
 #: Decimals of a p-value's logarithm: effects that are the same physics differ by rounding.
 _EQUAL = 3

@@ -24,10 +24,11 @@ from pbrl_ppl.criticism.score import Signature, inseparable, rank_candidates, tw
 from pbrl_ppl.criticism.simulated import Law, Simulated, sizes_of, worth_of
 from pbrl_ppl.criticism.structure_search import structure_mode
 from pbrl_ppl.effects import Attached, Effect, Noise, Structure, candidates
-from pbrl_ppl.modes import Mode, fit_pieces, in_parallel, nearby_mode, trajectory_mode
+from pbrl_ppl.modes import Mode, fit_pieces, nearby_mode, trajectory_mode
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.scene import Scene
 from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import in_parallel
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,13 +27,13 @@ from pbrl_ppl.modes import (
     corrected,
     derivatives,
     fit_pieces,
-    in_parallel,
     ladder,
     refined,
     with_robust_covariance,
 )
 from pbrl_ppl.parameters import prior_residual, prior_slopes
 from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import in_parallel
 
 
 @dataclass(frozen=True)

@@ -119,8 +119,8 @@ class Cells:
         return state_sizes(scene)[self.places % len(STATE)]
 
     def white(self, sigma: Floats) -> Floats:
-        """Return the uncorrelated measurement noise of each cell, shape (cell,)."""
-        return np.where(self.sensor >= 0, sigma[self.sensor], self.fixed)
+        """Return the uncorrelated measurement noise of each cell, shape (..., cell)."""
+        return np.where(self.sensor >= 0, sigma[..., self.sensor], self.fixed)
 
     def errors(self, sigma: Floats) -> Floats:
         """Return the measurement noise of each cell, correlated and not, shape (cell,)."""
@@ -171,18 +171,18 @@ def step_covariances(push: Floats, size: Floats, always: Bools) -> Floats:
     push : ndarray
         Change by a unit of each row, shape (push, coordinate).
     size : ndarray
-        Standard deviation of each row, shape (push,).
+        Standard deviation of each row, shape (..., push).
     always : ndarray of bool
         Which rows act in every step, shape (push,).
 
     Returns
     -------
     ndarray
-        Shape (2, coordinate, coordinate).
+        Shape (..., 2, coordinate, coordinate).
     """
     square = size**2
-    free = np.where(always, square, 0.0)
-    return np.stack([(push.T * own) @ push for own in (free, square)])
+    both = np.stack([np.where(always, square, 0.0), square], axis=-2)
+    return np.asarray((push.T * both[..., None, :]) @ push)
 
 
 def check_moves(cells: Cells, scene: Scene) -> None:

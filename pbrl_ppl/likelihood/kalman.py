@@ -23,6 +23,50 @@ Ints = NDArray[np.int64]
 
 
 @numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _restart(p: Floats, variance: Floats) -> None:
+    """Set the covariance ``p``, shape (cell, cell), to that of a trajectory's first state."""
+    for a in range(len(variance)):
+        for b in range(len(variance)):
+            p[a, b] = variance[a] if a == b else 0.0
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _forward(p: Floats, slope: Floats, step: Floats, moved: Floats) -> None:
+    """Replace the covariance p by ``F p F' + step``; ``moved`` is room for ``F p``."""
+    d = len(p)
+    for a in range(d):
+        for b in range(d):
+            total = 0.0
+            for c in range(d):
+                total += slope[a, c] * p[c, b]
+            moved[a, b] = total
+    for a in range(d):
+        for b in range(a + 1):
+            total = step[a, b]
+            for c in range(d):
+                total += moved[a, c] * slope[b, c]
+            p[a, b] = total
+            p[b, a] = total
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def _take(p: Floats, i: int, sensor: float, gain: Floats) -> float:
+    """Take in a measurement of cell i; return its innovation's variance, and fill its gain."""
+    d = len(p)
+    variance: float = p[i, i] + sensor
+    for a in range(d):
+        gain[a] = p[a, i] / variance
+    for a in range(d):
+        share = gain[a] * variance
+        for b in range(a + 1):
+            p[a, b] -= share * gain[b]
+    for a in range(d):
+        for b in range(a):
+            p[b, a] = p[a, b]
+    return variance
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def gains(
     slope: Floats,
     first: Ints,
@@ -66,36 +110,11 @@ def gains(
     p, moved = np.zeros((d, d)), np.zeros((d, d))
     for k in range(n):
         if first[k]:
-            for a in range(d):
-                for b in range(d):
-                    p[a, b] = begin[k, a] if a == b else 0.0
-        own = slope[k]
-        for a in range(d):  # moved = F p
-            for b in range(d):
-                total = 0.0
-                for c in range(d):
-                    total += own[a, c] * p[c, b]
-                moved[a, b] = total
-        for a in range(d):  # p = moved F' + step
-            for b in range(a + 1):
-                total = step[kind[k], a, b]
-                for c in range(d):
-                    total += moved[a, c] * own[b, c]
-                p[a, b] = total
-                p[b, a] = total
+            _restart(p, begin[k])
+        _forward(p, slope[k], step[kind[k]], moved)
         for i in range(d):
             if seen[k, i]:
-                variance = p[i, i] + sensor[i]
-                scale[k, i] = np.sqrt(variance)
-                for a in range(d):
-                    gain[k, i, a] = p[a, i] / variance
-                for a in range(d):
-                    share = gain[k, i, a] * variance
-                    for b in range(a + 1):
-                        p[a, b] -= share * gain[k, i, b]
-                for a in range(d):
-                    for b in range(a):
-                        p[b, a] = p[a, b]
+                scale[k, i] = np.sqrt(_take(p, i, sensor[i], gain[k, i]))
         for a in range(d):
             for b in range(d):
                 covariance[k, a, b] = p[a, b]
@@ -153,6 +172,76 @@ def innovations(
             for a in range(d):
                 state[a] = filtered[j, k, a] = moved[a]
     return white, filtered
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+def whitened(
+    slope: Floats,
+    first: Ints,
+    seen: Bools,
+    wide: Floats,
+    known: Floats,
+    sensor: Floats,
+    step: Floats,
+    kind: Ints,
+    residual: Floats,
+    begin: Floats,
+    measured: Floats,
+) -> tuple[Floats, Floats]:
+    """Return whitened innovations of sets that each have a noise of their own.
+
+    It is :func:`gains` and :func:`innovations` in one, which keeps nothing but the result.
+
+    Parameters
+    ----------
+    slope, first, seen, kind : ndarray
+        As of :func:`gains`.
+    wide : ndarray
+        Variance of a first state that was not measured, 0 elsewhere, shape (transition, cell).
+    known : ndarray
+        Variance of one that was, shape (set, cell).
+    sensor, step : ndarray
+        As of :func:`gains`, shapes (set, cell) and (set, kind, cell, cell).
+    residual, begin, measured : ndarray
+        As of :func:`innovations`.
+
+    Returns
+    -------
+    white : ndarray
+        Shape (set, transition, cell); 0 where nothing was seen.
+    log_scale : ndarray
+        Log standard deviations, summed over the cells, shape (set, transition).
+    """
+    sets, n, d = residual.shape
+    white, log_scale = np.zeros((sets, n, d)), np.zeros((sets, n))
+    p, moved, gain = np.zeros((d, d)), np.zeros((d, d)), np.zeros(d)
+    state, ahead, variance = np.zeros(d), np.zeros(d), np.zeros(d)
+    for j in range(sets):
+        for k in range(n):
+            if first[k]:
+                for a in range(d):
+                    state[a] = begin[k, a]
+                    variance[a] = wide[k, a] if wide[k, a] > 0.0 else known[j, a]
+                _restart(p, variance)
+            _forward(p, slope[k], step[j, kind[k]], moved)
+            for a in range(d):
+                total = -residual[j, k, a]
+                for b in range(d):
+                    total += slope[k, a, b] * state[b]
+                ahead[a] = total
+            product = 1.0
+            for i in range(d):
+                if seen[k, i]:
+                    innovation = measured[k, i] - ahead[i]
+                    spread = _take(p, i, sensor[j, i], gain)
+                    product *= spread
+                    white[j, k, i] = innovation / np.sqrt(spread)
+                    for a in range(d):
+                        ahead[a] += gain[a] * innovation
+            for a in range(d):
+                state[a] = ahead[a]
+            log_scale[j, k] = 0.5 * np.log(product)
+    return white, log_scale
 
 
 @numba.njit(cache=True, error_model="numpy")

@@ -8,10 +8,14 @@ from functools import cached_property
 import numpy as np
 
 from pbrl_ppl.likelihood.cells import Cells, step_covariances
-from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score
+from pbrl_ppl.likelihood.kalman import adjoint, gains, innovations, score, whitened
 from pbrl_ppl.likelihood.sensitivity import Sensitivity
 from pbrl_ppl.physics import Memory
 from pbrl_ppl.state import Bools, Floats, Ints
+from pbrl_ppl.threads import in_parallel, processors
+
+#: Numbers to filter from which threads pay.
+_MANY = 20_000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -135,12 +139,32 @@ class TrajectoryNoise:
         if sigma.ndim == 1:
             return self.filtered(rows, sigma)[0].reshape(cells.shape), self._gains(sigma)[3]
         sigmas = np.broadcast_to(sigma, (*lead, sigma.shape[-1])).reshape(-1, sigma.shape[-1])
-        own, which = np.unique(sigmas, axis=0, return_inverse=True)
-        white, log_scale = np.empty_like(rows), np.empty(rows.shape[:-1])
-        for i, row in enumerate(own):
-            mine = which.ravel() == i
-            white[mine], log_scale[mine] = self.filtered(rows[mine], row)[0], self._gains(row)[3]
+        white, log_scale = self._whitened(rows, sigmas)
         return white.reshape(cells.shape), log_scale.reshape(cells.shape[:-1])
+
+    def _whitened(self, rows: Floats, sigmas: Floats) -> tuple[Floats, Floats]:
+        """Return the same of residuals (set, transition, cell) that each have their own noise."""
+        own, d = self._extended, len(self.cells.places)
+        sensor = own.padded(self.cells.white(sigmas) ** 2)
+        known = np.hstack([sensor[:, :d], sigmas[:, self.cells.drifted[1]] ** 2])
+        step = own.steps(sigmas)
+        given = own.slope, self.first, own.seen, own.padded(self.wide)
+        begin, measured = own.padded(self.begin), own.padded(self.measured)
+
+        def some(chosen: slice) -> tuple[Floats, Floats]:
+            residual = np.ascontiguousarray(own.padded(rows[chosen]))
+            found: tuple[Floats, Floats] = whitened(
+                *given, known[chosen], sensor[chosen], step[chosen], self.kind, residual,
+                begin, measured,
+            )  # fmt: skip
+            return found
+
+        each = -(-len(rows) // processors())
+        slices = [slice(i, i + each) for i in range(0, len(rows), each)]
+        many = rows.size > _MANY
+        parts = in_parallel(some, slices) if many else list(map(some, slices))
+        white, log_scale = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return white[..., :d], log_scale
 
     def filtered(self, residual: Floats, sigma: Floats) -> tuple[Floats, Floats]:
         """Return whitened innovations and filtered deviations of residuals."""
@@ -349,11 +373,11 @@ class Extended:
         )
 
     def steps(self, sigma: Floats) -> Floats:
-        """Return the process noise of a step without and with contact.
+        """Return the process noise of a step without and with contact, at sigma (..., parameter).
 
-        Shape (2, coordinate, coordinate).
+        Shape (..., 2, coordinate, coordinate).
         """
-        return step_covariances(self.push, sigma[self.pushed], self.always)
+        return step_covariances(self.push, sigma[..., self.pushed], self.always)
 
     def padded(self, values: Floats) -> Floats:
         """Return values of cells (..., cell), padded with zeros for the errors."""

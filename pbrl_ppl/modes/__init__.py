@@ -28,8 +28,6 @@ from .simulation import simulation_mode as simulation_mode
 from .space import Space as Space
 from .space import constrain as constrain
 from .space import unconstrain as unconstrain
-from .threads import in_parallel as in_parallel
-from .threads import one_blas_thread as one_blas_thread
 from .trajectories import find_trajectory_mode as find_trajectory_mode
 from .trajectories import following as following
 from .trajectories import nearby_mode as nearby_mode

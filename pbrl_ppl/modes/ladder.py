@@ -26,9 +26,9 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.modes.laplace import Mode, covariance_of
 from pbrl_ppl.modes.noise import finite
-from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import box, inside, prior_residual, prior_slopes
 from pbrl_ppl.state import Floats, Ints
+from pbrl_ppl.threads import one_blas_thread
 
 #: Intervals of the shortest pieces, and the ratio of a length to the one before.
 SHORTEST, RATIO = 4, 4

@@ -12,9 +12,9 @@ from pbrl_ppl.errors import FitError
 from pbrl_ppl.likelihood import Problem, TrajectoryLikelihood, estimate_sigma
 from pbrl_ppl.modes.laplace import STALLED, Mode, Peak, climb, described, finish
 from pbrl_ppl.modes.noise import FAR_OFF, finite, gaussian_profile
-from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import box, inside, most_probable_wheels, prior_draws
 from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import one_blas_thread
 
 #: Transitions used to tell basins apart, and how many of the best are searched with all data; with
 #: no more than so many transitions, all are.

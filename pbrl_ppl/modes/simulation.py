@@ -6,8 +6,8 @@ from pbrl_ppl.likelihood import NoisePrior, OutputErrorLikelihood, Problem
 from pbrl_ppl.modes.ladder import ladder, with_robust_covariance
 from pbrl_ppl.modes.laplace import Mode
 from pbrl_ppl.modes.search import find_mode
-from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.modes.trajectories import find_trajectory_mode
+from pbrl_ppl.threads import one_blas_thread
 
 #: Rounds of the last climb, which has all engine steps and the prior of sigma.
 _CLIMB = 5

@@ -70,7 +70,8 @@ class Space:
 
     Parameters are as PyMC transforms them. Measurement noise is by its logarithm; unexplained
     accelerations and correlated errors, which may vanish, are by their cube root (E. B. Wilson and
-    M. M. Hilferty, The distribution of chi-square, 1931). The equal descriptions of a wheel share
+    M. M. Hilferty, The distribution of chi-square, 1931) of either sign, so that nothing ends at
+    zero. The equal descriptions of a wheel share
     its prior evenly; see `parameters.evened`. A circle is cut opposite to the centre.
 
     Parameters
@@ -219,9 +220,10 @@ class Space:
         """Return the log-prior of the noise's coordinates, shape (...)."""
         noise = q[..., self.phi_size :]
         with np.errstate(all="ignore"):
-            log_sigma = np.where(self.roots, _ROOT * np.log(noise), noise)
+            size = np.abs(noise)  # a root of either sign is the same noise
+            log_sigma = np.where(self.roots, _ROOT * np.log(size), noise)
             # the density of a root, from that of the logarithm
-            slope = np.where(self.roots, np.log(_ROOT / noise), 0.0).sum(axis=-1)
+            slope = np.where(self.roots, np.log(0.5 * _ROOT / size), 0.0).sum(axis=-1)
             return np.asarray(log_noise_prior(self.problem, log_sigma) + slope)
 
     def each(self, q: Floats, residual: Floats) -> Floats:

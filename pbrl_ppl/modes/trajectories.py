@@ -17,9 +17,9 @@ from pbrl_ppl.likelihood import (
 )
 from pbrl_ppl.modes.laplace import Mode, profiled
 from pbrl_ppl.modes.search import find_mode
-from pbrl_ppl.modes.threads import one_blas_thread
 from pbrl_ppl.parameters import change_from, inside
 from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import one_blas_thread
 
 #: Rounds at most; one that moves phi by less than this, in standard deviations, is the last.
 _ROUNDS, _SETTLED = 6, 0.2

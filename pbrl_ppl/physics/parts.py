@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
 from itertools import combinations, product
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -34,22 +33,10 @@ class Memory:
 
     def __init__(self) -> None:
         self._known: OrderedDict[Hashable, Any] = OrderedDict()
-        self._kept = _REMEMBERED
 
     def __getstate__(self) -> dict[str, object]:
         """Nothing."""
-        return {"_known": OrderedDict(), "_kept": _REMEMBERED}
-
-    @contextmanager
-    def keeping(self, n: int) -> Iterator[None]:
-        """Remember this many results for a while."""
-        self._kept = n
-        try:
-            yield
-        finally:
-            self._kept = _REMEMBERED
-            while len(self._known) > _REMEMBERED:
-                self._known.popitem(last=False)
+        return {"_known": OrderedDict()}
 
     def recall(self, arguments: tuple[Floats, ...], compute: Callable[..., R]) -> R:
         """Return ``compute(*arguments)``, from memory for equal arguments.
@@ -68,7 +55,7 @@ class Memory:
             self._known.move_to_end(key)
         else:
             self._known[key] = compute(*arguments)
-            if len(self._known) > self._kept:
+            if len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
         result: R = self._known[key]
         return result

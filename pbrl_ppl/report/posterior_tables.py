@@ -202,7 +202,7 @@ def _origin_in_words(attributes: Mapping[str, Any]) -> str:
     if PARETO_K not in attributes:
         return ""
     return (
-        f" The draws are resampled proposals of {attributes.get('proposals', 'an emulator')}:"
+        f" The draws are resampled proposals of {attributes.get('proposals', 'another density')}:"
         f" Pareto k of their weights is"
         f" {number(attributes[PARETO_K])} (above 0.7 the proposals would miss a part of the"
         f" posterior), and by their weights the draws are worth {number(attributes[SIZE])}"

@@ -10,7 +10,6 @@ their effective sample size sets.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from itertools import permutations
 from typing import Any, NamedTuple, Protocol
@@ -21,7 +20,7 @@ from scipy.linalg import solve_triangular
 from scipy.special import logsumexp
 
 from pbrl_ppl.errors import FitError
-from pbrl_ppl.likelihood import TrajectoryLikelihood, TransitionLikelihood
+from pbrl_ppl.likelihood import TransitionLikelihood
 from pbrl_ppl.modes import Mode, Space
 from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
 from pbrl_ppl.state import Bools, Floats, Ints
@@ -57,30 +56,31 @@ class Target(Protocol):
 
 
 class Posterior:
-    """Log-posterior of a problem, up to the evidence, by the engine or by what stands for it.
+    """Log-posterior of a problem, up to the evidence.
 
     Parameters
     ----------
     space : Space
         Of the particles.
-    predict : callable, optional
-        From phi, shape (n, p), to residuals; by default the engine.
-    power : float
-        Exponent of the likelihood.
     """
 
-    def __init__(self, space: Space, predict: Any = None, power: float = 1.0) -> None:
-        self.space, self.power = space, power
-        self.predict = predict or space.problem.residual
+    def __init__(self, space: Space) -> None:
+        self.space = space
+
+    @classmethod
+    def of_few_steps(cls, space: Space) -> Posterior | None:
+        """Return that of few engine steps, corrected at the centre; none if it is not cheaper."""
+        corrected = space.problem.corrected(space.centre)
+        return None if corrected is space.problem else cls(space.on(corrected))
 
     def look(self, q: Floats) -> Floats:
         """Return residuals, shape (n, transition, H, body, state)."""
-        return np.array(self.predict(self.space.possible(q)), dtype=float)
+        return np.array(self.space.residual(q), dtype=float)
 
     def columns(self, q: Floats, look: Floats) -> Floats:
         """Return log-priors and log-likelihoods, shape (n, part + 1)."""
         total = self.space.log_priors(q)
-        likelihood = self.power * self.space.log_likelihoods(q, look)
+        likelihood = self.space.log_likelihoods(q, look)
         there = np.isfinite(total).all(axis=1, keepdims=True)
         total[:, :-1] = np.where(there, total[:, :-1] + likelihood, -np.inf)
         return total
@@ -93,11 +93,16 @@ class Path:
         self.start, self.end, self.beta = start, end, beta
 
     def look(self, q: Floats) -> tuple[Any, Any]:
-        """Return what both are, at particles (n, d)."""
-        return (self.start.look(q) if self.beta < 1 else None), self.end.look(q)
+        """Return what both are, at particles (n, d); nothing of one without a share."""
+        return (
+            self.start.look(q) if self.beta < 1 else None,
+            self.end.look(q) if self.beta > 0 else None,
+        )
 
     def columns(self, q: Floats, look: tuple[Any, Any]) -> Floats:
         """Return the weighted mean of both, shape (n, part + 1)."""
+        if self.beta == 0:
+            return self.start.columns(q, look[0])
         end = self.end.columns(q, look[1])
         if self.beta == 1:
             return end
@@ -199,12 +204,17 @@ class Block:
         elif kind == "draw":  # up to draws that forget where they were
             self.log_beta = min(self.log_beta + rate - TARGET_ACCEPTANCE, 0.0)
 
-    def learn(self, x: Floats, wider: float = 1.0) -> None:
-        """Take the particles' mean and covariance; the covariance about modes if several."""
+    def learn(self, x: Floats, wider: float = 1.0, kept: float = 0.0) -> None:
+        """Take the particles' mean and covariance; the covariance about modes if several.
+
+        A share ``kept`` of the covariance stays as it was.
+        """
         if not len(self.places) or len(x) < 3:
             return
         if len(self.modes) == 1:
-            self.modes = (_gaussian(x.mean(axis=0), wider * np.cov(x, rowvar=False)),)
+            old = self.modes[0].factor @ self.modes[0].factor.T
+            new = np.atleast_2d(wider * np.cov(x, rowvar=False))
+            self.modes = (_gaussian(x.mean(axis=0), (1.0 - kept) * new + kept * old),)
             self.step = self.modes[0].factor
             return
         nearest = np.argmax([mode.log_density(x) for mode in self.modes], axis=0)
@@ -291,11 +301,14 @@ class Reference:
         noise = sum(block.log_density(q[:, block.places]) for block in self.noise)
         return np.stack([*parts, noise + np.zeros(len(q))], axis=1)
 
-    def learned(self, q: Floats) -> Reference:
-        """Return the product of Gaussians of particles; of several modes, this one."""
+    def learned(self, q: Floats, kept: float = 0.0) -> Reference:
+        """Return the product of Gaussians of particles; of several modes, this one.
+
+        A share ``kept`` of the covariances stays.
+        """
         copies = [[Block(b.places, b.modes) for b in blocks] for blocks in (self.parts, self.noise)]
         for block in (*copies[0], *copies[1]):
-            block.learn(q[:, block.places], _WIDER)
+            block.learn(q[:, block.places], _WIDER, kept)
         return Reference(self.space, self.origin, *copies)
 
 
@@ -329,17 +342,9 @@ class Ensemble:
 
     def groups(self) -> Iterator[slice]:
         """Yield groups of particles whose predictions fit into memory."""
-        problem = self.space.problem
-        size = problem.measured.size
-        keeping: AbstractContextManager[None] = nullcontext()
-        if isinstance(problem.likelihood, TrajectoryLikelihood):
-            size *= len(problem.trajectory_noise.cells.places)
-        width = max(8, _NUMBERS // max(size, 1))
-        if isinstance(problem.likelihood, TrajectoryLikelihood):
-            keeping = problem.trajectory_noise.memory.keeping(2 * width)
-        with keeping:  # each particle's noise has gains of the filter of its own
-            for first in range(0, len(self.q), width):
-                yield slice(first, first + width)
+        width = max(8, _NUMBERS // max(self.space.problem.measured.size, 1))
+        for first in range(0, len(self.q), width):
+            yield slice(first, first + width)
 
     def move(
         self,
@@ -505,6 +510,24 @@ class Ensemble:
             self.learn()
         return float(np.mean(rates)), correlation
 
+    def snapshots(self, target: Target, cheap: Target | None, times: int) -> tuple[Floats, float]:
+        """Return the particles now and after further moves, and how independent they are.
+
+        Returns
+        -------
+        q : ndarray
+            Shape (times * n, d).
+        independent : float
+            Independent particles over all, as of chains whose correlation falls geometrically.
+        """
+        taken, correlation = [self.q.copy()], []
+        for _ in range(times - 1):
+            correlation.append(self.settle(target, cheap, looks=2)[1])
+            taken.append(self.q.copy())
+        lags = np.arange(1, times)
+        shared = (np.mean(correlation) if correlation else 0.0) ** lags @ (1.0 - lags / times)
+        return np.concatenate(taken), 1.0 / float(1.0 + 2.0 * shared)
+
     def heights(self, target: Target, each: bool = False) -> tuple[Floats, Floats]:
         """Return the log-density of all particles, shape (n,), and their log-likelihoods.
 
@@ -521,14 +544,12 @@ class Ensemble:
 
 
 class Annealed(NamedTuple):
-    """Particles at the end of a path, with their weights.
+    """How particles were taken along a path.
 
     Attributes
     ----------
-    log_weight : ndarray
-        What is left of the path, up to a constant, shape (n,).
-    each : ndarray
-        Log-likelihoods at the end, shape (n, transition), where particles were weighted.
+    beta : float
+        Where on the path they are; 1 at its end.
     log_z : float
         Logarithm of the ratio of the densities' integrals.
     rungs : int
@@ -539,8 +560,7 @@ class Annealed(NamedTuple):
         Independent particles that the moves left, over all.
     """
 
-    log_weight: Floats
-    each: Floats
+    beta: float
     log_z: float
     rungs: int
     accepted: float
@@ -566,12 +586,12 @@ def anneal(
     cheap : Target, optional
         As of :meth:`Ensemble.move`.
     weigh : bool
-        Whether the last rung weights particles, without a move, if their weights suffice.
+        Whether to end where weights suffice for the rest of the path.
     """
     beta, log_z, rungs, kept = 0.0, 0.0, 0, 1.0
     rates: list[float] = []
     while beta < 1.0:
-        height, each = ensemble.heights(end, each=weigh)
+        height = ensemble.heights(end)[0]
         with np.errstate(invalid="ignore"):
             gap = height - ensemble.heights(start)[0]
         gap = np.where(np.isnan(gap), -np.inf, gap)
@@ -583,7 +603,7 @@ def anneal(
         rest = (1.0 - beta) * gap
         if weigh and (rungs == _RUNGS or _suffices(rest)):
             log_z += float(logsumexp(rest) - np.log(len(rest)))
-            return Annealed(rest, each, log_z, rungs, _mean(rates), kept)
+            return Annealed(beta, log_z, rungs, _mean(rates), kept)
         step = _step(gap, 1.0 - beta) if rungs < _RUNGS else 1.0 - beta
         total = logsumexp(step * gap)
         log_z += float(total - np.log(len(gap)))
@@ -598,8 +618,7 @@ def anneal(
         # copies of a particle are as alike as each is to where they began, squared
         copies = np.bincount(chosen).astype(float)
         kept = len(gap) / float((copies + copies * (copies - 1) * correlation**2).sum())
-    each = ensemble.heights(end, each=True)[1] if weigh else each
-    return Annealed(np.zeros(len(ensemble.q)), each, log_z, rungs, _mean(rates), kept)
+    return Annealed(1.0, log_z, rungs, _mean(rates), kept)
 
 
 def _mean(rates: list[float]) -> float:

@@ -21,7 +21,6 @@ from pbrl_ppl.modes import (
     find_simulation_mode,
     find_trajectory_mode,
     following,
-    one_blas_thread,
     weigh,
 )
 from pbrl_ppl.posterior import (
@@ -41,6 +40,7 @@ from pbrl_ppl.posterior import (
 from pbrl_ppl.sampling.methods import METHODS, OVER_LIBRARY, Job, Method
 from pbrl_ppl.sampling.mixture import mix, most_frequent, most_probable, summed
 from pbrl_ppl.state import Floats
+from pbrl_ppl.threads import one_blas_thread
 
 #: Searches for the mode, by the likelihood's name.
 _SEARCHES: Mapping[str, Callable[..., Mode]] = {
@@ -86,9 +86,9 @@ def fit(
     model : pymc.Model
         As made by ``physics_model``.
     method : str
-        ``importance``: particles that begin at Gaussians about the modes, move to the posterior of
-        an emulator or of few engine steps, and are weighted by the engine in one batch and
-        resampled; where the weights do not suffice, the engine moves them on in rungs;
+        ``importance``: proposals from Gaussians about the modes, weighted by the engine in batches
+        of which each teaches the next, and resampled; where the weights do not suffice, particles
+        are moved by the engine in rungs, after one of few engine steps where that is cheaper;
         ``metropolis``: chains of the same moves under the engine's posterior, each of which is
         many walkers, one after another; ``paper``: one random walk a variable, by default on the
         schedule of the paper's Table 2 for the cart (30 chains of 20,000 iterations, 1,000 of them

@@ -1,10 +1,9 @@
-"""Importance sampling: particles of a cheaper posterior, weighted by the engine in a batch.
+"""Importance sampling: proposals from Gaussians about the modes, weighted by the engine in batches.
 
-Particles begin at Gaussians about the modes and are taken to the posterior of an emulator, or of
-few engine steps. The engine evaluates them all at once, and they are resampled by their
-Pareto-smoothed weights (Vehtari et al., Pareto smoothed importance sampling, 2024). The weights
-correct every error of the cheaper posterior; where Pareto k says that they cannot, particles are
-moved on by the engine.
+Each batch of proposals is drawn from Gaussians that all before it taught. Where the weights are not
+good enough after some of them, particles are annealed: to the posterior of few engine steps if that
+is cheaper, from there to the engine's. Pareto k (Vehtari et al., Pareto smoothed importance
+sampling, 2024) says whether weights suffice.
 """
 
 from __future__ import annotations
@@ -14,17 +13,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import logsumexp
 
 from pbrl_ppl.likelihood import TransitionLikelihood
-from pbrl_ppl.posterior import smoothed
-from pbrl_ppl.sampling.emulator import emulate
-from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference, anneal, systematic
+from pbrl_ppl.posterior import MAX_PARETO_K, smoothed
+from pbrl_ppl.sampling.ensemble import Ensemble, Path, Posterior, Reference, anneal, systematic
 from pbrl_ppl.state import Floats
 
-#: Times at which particles of a cheaper posterior are taken as proposals.
-_TIMES = 4
-#: Measured numbers from which a recording is long: the posterior is near its Laplace approximation.
-_LONG = 300_000
+#: Batches of the proposals asked for; while particles are annealed, they are one batch.
+_BATCHES = 4
+#: Effective share of the proposals asked for that suffices; after so many batches it falls with
+#: their number, and they end.
+_ENOUGH, _PATIENT, _MOST = 0.5, 16, 40
+#: Share of that which must be in sight after so many batches; otherwise annealing is faster.
+_IN_SIGHT, _TRIAL = 0.3, 6
+#: Log-likelihoods of transitions that proposals may hold.
+_NUMBERS = 100_000_000
+_GAUSSIANS, _FEW_STEPS = "Gaussians at the modes", "few engine steps"
 
 
 class Pool(NamedTuple):
@@ -61,69 +66,85 @@ class Pool(NamedTuple):
     cheaper: str
 
 
-class Cheaper(NamedTuple):
-    """A posterior that costs less than the engine's, a reference for it, and what it is."""
-
-    posterior: Posterior | None
-    reference: Reference
-    name: str
-
-
-def cheaper(reference: Reference, rng: np.random.Generator) -> Cheaper:
-    """Return an emulator's posterior, or that of few engine steps, corrected at the mode, or none.
-
-    The first that is close, and has fewer engine steps.
-    """
-    space = reference.space
-    problem = space.problem
-    corrected = problem.corrected(space.centre)
-    if problem.measured.size <= _LONG:
-        found = emulate(space, reference, rng)
-        if not isinstance(found, str):
-            return Cheaper(*found, "an emulator")
-    if corrected is not problem:
-        return Cheaper(Posterior(space.on(corrected)), reference, "few engine steps")
-    return Cheaper(None, reference, "Gaussians at the modes")
-
-
-def draw_pool(first: Reference, n: int, seed: Any) -> Pool:
+def draw_pool(reference: Reference, n: int, seed: Any) -> Pool:
     """Draw weighted proposals for a posterior.
 
     Parameters
     ----------
-    first : Reference
+    reference : Reference
         Where particles begin, in the space of the problem.
     n : int
-        Proposals.
+        Proposals that are asked for: about the number of the draws, of which half are independent.
     seed : int or sequence of int
         Source of the draws.
     """
-    rng, space = np.random.default_rng(seed), first.space
-    cheap, reference, name = cheaper(first, rng)
-    log_z, kept = 0.0, 1.0
-    if cheap is None:
-        q = reference.draw(n, rng)
-    else:
-        # along trajectories each particle's noise costs runs of the filter
-        whole = isinstance(space.problem.likelihood, TransitionLikelihood)
-        times = 1 if whole else _TIMES
-        few = Ensemble(reference, reference.draw(-(-n // times), rng), rng)
-        reached = anneal(few, reference, cheap)
-        taken, alike = [few.q.copy()], []
-        for _ in range(times - 1):
-            alike.append(few.settle(cheap, looks=2)[1])
-            taken.append(few.q.copy())
-        # as of chains of so many draws, whose correlation falls geometrically
-        lags = np.arange(1, times)
-        shared = (np.mean(alike) if alike else 0.0) ** lags @ (1.0 - lags / times)
-        kept = reached.kept / float(1.0 + 2.0 * shared)
-        log_z, q = reached.log_z, space.prior_draws(np.concatenate(taken)[:n], rng)
-    ensemble = Ensemble(reference, q, rng)
-    weighed = anneal(ensemble, cheap or reference, Posterior(space), cheap=cheap, weigh=True)
-    phi, sigma = space.split(ensemble.q)
+    rng, batch = np.random.default_rng(seed), -(-n // _BATCHES)
+    pool, reference = _adaptive(reference, _ENOUGH * n, batch, rng)
+    return _annealed(reference, batch, rng) if pool is None else pool
+
+
+def _adaptive(
+    first: Reference, enough: float, batch: int, rng: np.random.Generator
+) -> tuple[Pool | None, Reference]:
+    """Return proposals from Gaussians, if enough are independent, and what they taught.
+
+    The weights are over the mixture of all batches (adaptive multiple importance sampling: Cornuet
+    et al., Scandinavian Journal of Statistics 39, 2012). A share of the first covariance stays, as
+    large as a prior worth a draw a coordinate has it.
+    """
+    space, references, q = first.space, [first], np.zeros((0, len(first.origin)))
+    exact, heights, likelihoods = Posterior(space), [], []
+    best = 0.0
+    most = int(np.clip(_NUMBERS // (batch * space.problem.segments.n), _BATCHES, _MOST))
+    for turn in range(1, most + 1):
+        particles = Ensemble(first, references[-1].draw(batch, rng), rng)
+        height, each = particles.heights(exact, each=True)
+        heights.append(height)
+        likelihoods.append(each)
+        q = np.concatenate([q, particles.q])
+        mixture = logsumexp([one.columns(q, None).sum(axis=1) for one in references], axis=0)
+        log_weight = np.concatenate(heights) - mixture + np.log(turn)
+        there = np.isfinite(log_weight)
+        if there.sum() < 3:
+            break
+        weight, k = smoothed(log_weight[there])
+        size = 1.0 / float((weight**2).sum())
+        if k <= MAX_PARETO_K and size >= enough * min(1.0, _PATIENT / turn):
+            evidence = float(logsumexp(log_weight) - np.log(len(q)))
+            pool = Pool(
+                *space.split(q), log_weight, np.concatenate(likelihoods), evidence, 0, 1.0, 1.0,
+                _GAUSSIANS,
+            )  # fmt: skip
+            return pool, references[-1]
+        best = max(best, size)
+        if turn >= _TRIAL and best * most < _IN_SIGHT * enough * turn:
+            break
+        chosen = q[there][systematic(weight, len(q), rng)]
+        references.append(first.learned(chosen, kept=len(space.loud) / (len(space.loud) + size)))
+    return None, references[-1]
+
+
+def _annealed(reference: Reference, batch: int, rng: np.random.Generator) -> Pool:
+    """Return proposals that were taken from Gaussians towards the engine's posterior."""
+    space = reference.space
+    exact, cheap = Posterior(space), Posterior.of_few_steps(space)
+    # the engine is cheap beside the filter of each particle's noise
+    alone = isinstance(space.problem.likelihood, TransitionLikelihood)
+    times = 1 if alone else _BATCHES
+    particles = Ensemble(reference, reference.draw(batch * _BATCHES // times, rng), rng)
+    first = None if cheap is None else anneal(particles, reference, cheap)
+    start = cheap or reference
+    reached = anneal(particles, start, exact, cheap=cheap, weigh=True)
+    q, independent = particles.snapshots(Path(start, exact, reached.beta), cheap, times)
+    proposals = Ensemble(reference, space.prior_draws(q, rng), rng)
+    height, each = proposals.heights(exact, each=True)
+    with np.errstate(invalid="ignore"):
+        left = (1.0 - reached.beta) * (height - proposals.heights(start)[0])
+    kept = independent * reached.kept * (1.0 if first is None else first.kept)
     return Pool(
-        phi, sigma, weighed.log_weight, weighed.each, log_z + weighed.log_z, weighed.rungs,
-        weighed.accepted, weighed.kept if weighed.rungs else kept, name,
+        *space.split(proposals.q), np.where(np.isnan(left), -np.inf, left), each,
+        reached.log_z + (0.0 if first is None else first.log_z), reached.rungs, reached.accepted,
+        kept, _GAUSSIANS if cheap is None else _FEW_STEPS,
     )  # fmt: skip
 
 

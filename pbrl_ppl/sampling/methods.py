@@ -27,7 +27,7 @@ from pbrl_ppl.posterior import (
     parameter_draws,
 )
 from pbrl_ppl.sampling.ensemble import Ensemble, Posterior, Reference
-from pbrl_ppl.sampling.importance import cheaper, draw_pool, resample, stream
+from pbrl_ppl.sampling.importance import draw_pool, resample, stream
 from pbrl_ppl.sampling.starts import dispersed, last_draws, prior_starts
 from pbrl_ppl.state import Floats
 
@@ -189,7 +189,7 @@ def _metropolis(job: Job) -> Any:
     cost = problem.simulator.steps * problem.segments.n * problem.data.horizon
     cheap = None
     if cost / len(problem.simulator.parts) > _LITTLE:
-        cheap = cheaper(reference, rng).posterior
+        cheap = Posterior.of_few_steps(reference.space)
     tune = -(-job.tune // walkers) * job.thin
     kept, rates = [], []
     steps = track(

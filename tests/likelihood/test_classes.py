@@ -13,7 +13,6 @@ from pbrl_ppl.planning import ActionSet, Dynamics, Goal
 from pbrl_ppl.posterior import learned_library, library_probabilities, updated_scene
 from pbrl_ppl.posterior.store import scalars
 from pbrl_ppl.sampling import fit, physics_model
-from pbrl_ppl.sampling.emulator import Pieces
 from pbrl_ppl.scene import Body, Scene, Shape
 from tests.helpers.histories import simulated_history
 
@@ -173,8 +172,8 @@ def test_one_choice_a_class() -> None:
     assert Dynamics.of(idata).mass("chair2") == MASS
 
 
-def test_pooled_and_emulated(monkeypatch) -> None:
-    """Pooled, each chair gets the class's prior; an emulated body has its class's parameters."""
+def test_pooled() -> None:
+    """Each chair gets the class's prior."""
     own = scene().with_effects("chair2", "linear_drag")
     idata = [quick(physics_model(own, recorded(seed=s, intervals=15)), method="laplace")
              for s in (5, 6)]  # fmt: skip
@@ -182,12 +181,3 @@ def test_pooled_and_emulated(monkeypatch) -> None:
     first, second = (dict(body.prior) for body in pooled.scene.bodies)
     assert first["mass"] == second["mass"]
     assert "linear_drag_coefficient" in second and "linear_drag_coefficient" not in first
-    problem = Problem.of(Physics.declare(own), recorded())
-    problem = along_trajectories(problem, np.array([MASS, 0.1]))
-    informed = np.zeros(2, dtype=bool)
-    (whole,) = Pieces.of(problem, informed).emulated
-    assert whole.places.tolist() == [0, 1]
-    # where a polynomial of all parameters would have too many terms
-    monkeypatch.setattr("pbrl_ppl.sampling.emulator._MOST", 1)
-    pieces = Pieces.of(problem, informed).emulated
-    assert [piece.places.tolist() for piece in pieces] == [[0], [0, 1]]

@@ -35,9 +35,14 @@ def in_parallel(function: Callable[[T], R], items: Iterable[T]) -> list[R]:
 
     Simulations and linear algebra release the interpreter's lock.
     """
-    pool = ThreadPoolExecutor(os.cpu_count() or 1)
+    pool = ThreadPoolExecutor(processors())
     with pool, _pools().limit(limits=1, user_api="blas"):
         return list(pool.map(function, items))
+
+
+def processors() -> int:
+    """Return the number of processors."""
+    return os.cpu_count() or 1
 
 
 @cache
