@@ -146,8 +146,13 @@ def test_candidates_are_ranked_as_on_the_similar_rig(scales) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the likelihood is linearised where it does not hold")
 def test_the_loop_of_a_ship_is_that_of_the_cart() -> None:
-    """The demo's recording: the same name, and its size within 1 %; as a ship, and as it is."""
+    """The demo's recording: the same name, and its size within 1 %; as a ship, and as it is.
+
+    Modes differ by friction's grain, and with them how well 16 draws are linearised: 0.5 nats at
+    one of them, 2.9 at one that is 1.7 nats higher.
+    """
     scene, _ = cart()
     files = [CART / "recorded" / f"{part}.csv" for part in ("train", "test")]
     train, test = (pp.History.load(file, scene) for file in files)
