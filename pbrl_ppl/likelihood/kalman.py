@@ -174,7 +174,7 @@ def innovations(
     return white, filtered
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
+@numba.njit(cache=True, nogil=True, error_model="numpy")
 def whitened(
     slope: Floats,
     first: Ints,
@@ -229,18 +229,17 @@ def whitened(
                 for b in range(d):
                     total += slope[k, a, b] * state[b]
                 ahead[a] = total
-            product = 1.0
             for i in range(d):
                 if seen[k, i]:
                     innovation = measured[k, i] - ahead[i]
                     spread = _take(p, i, sensor[j, i], gain)
-                    product *= spread
-                    white[j, k, i] = innovation / np.sqrt(spread)
+                    scale = np.sqrt(spread)
+                    white[j, k, i] = innovation / scale
+                    log_scale[j, k] += np.log(scale)
                     for a in range(d):
                         ahead[a] += gain[a] * innovation
             for a in range(d):
                 state[a] = ahead[a]
-            log_scale[j, k] = 0.5 * np.log(product)
     return white, log_scale
 
 

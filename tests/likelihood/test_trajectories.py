@@ -81,6 +81,21 @@ def test_whitening_is_that_of_the_whole_covariance(problem) -> None:
     np.testing.assert_allclose(density, expected, rtol=1e-9)
 
 
+def test_many_noises_are_whitened_as_one_by_one(problem) -> None:
+    """Each residual with its own noise; one that diverged is no number, and leaves the others."""
+    rng, noise = np.random.default_rng(1), problem.trajectory_noise
+    sigma = NOISE * np.exp(0.3 * rng.standard_normal((40, len(NOISE))))
+    residual = problem.residual(PHI) + 1e-3 * rng.standard_normal((40, *problem.measured.shape))
+    residual[7, 2, 0, 0, 1] = np.nan
+    white, log_scale = noise.whitened(residual, sigma)
+    alone = [noise.whitened(*each) for each in zip(residual, sigma, strict=True)]
+    np.testing.assert_allclose(white, [each[0] for each in alone], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(log_scale, [each[1] for each in alone], rtol=1e-9)
+    assert np.isnan(white[7]).any() and np.isfinite(np.delete(white, 7, axis=0)).all()
+    density = problem.log_density(residual, sigma).sum(axis=1)
+    assert np.isneginf(density[7]) and np.isfinite(np.delete(density, 7)).all()
+
+
 def test_what_was_not_measured_is_left_out(problem) -> None:
     """A cell that is missing is one of a very large error, but for its own density."""
     dataset = problem.data.history.dataset.copy()
